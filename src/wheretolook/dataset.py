@@ -1,0 +1,137 @@
+"""Where a dataset keeps its files: `<data>/<dataset>/<scene>/`, and which scene belongs to which split."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import pandas as pd
+
+from wheretolook.errors import TableError
+from wheretolook.geometry import PinholeCamera
+from wheretolook.localization_map import LocalizationMap
+from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.table import fingerprint, read_table
+from wheretolook.visibility import StoredOcclusion
+
+Split = Literal["train", "val", "test"]
+
+
+@dataclass(frozen=True)
+class SceneFolder:
+    """Files of one scene.
+
+    Attributes:
+        folder: `<data>/<dataset>/<scene>`.
+        split: the split the whole scene belongs to.
+    """
+
+    folder: Path
+    split: Split
+
+    @property
+    def name(self) -> str:
+        """Name of the scene."""
+        return self.folder.name
+
+    @property
+    def mesh(self) -> Path:
+        """Textured mesh, GLB, metres, z up."""
+        return self.folder / "mesh.glb"
+
+    @property
+    def map(self) -> Path:
+        """Folder of the COLMAP model, with `landmarks.npz` beside it."""
+        return self.folder / "map"
+
+    @property
+    def landmarks(self) -> Path:
+        """Landmarks with their attributes."""
+        return self.map / "landmarks.npz"
+
+    @property
+    def table(self) -> Path:
+        """Table of viewpoints."""
+        return self.folder / "viewpoints.parquet"
+
+    @property
+    def occlusion(self) -> Path:
+        """Which landmark each sampled location has a free line of sight to."""
+        return self.folder / "occlusion.npz"
+
+    def read_table(self) -> pd.DataFrame:
+        """The scene's viewpoints. Raises TableError if there are none or the file is damaged."""
+        return read_table(self.table)
+
+    def localization_map(self, camera: PinholeCamera, device: str = "cpu") -> LocalizationMap:
+        """The scene's map with the occlusion stored for its sampled locations; the mesh is not needed."""
+        return LocalizationMap(Landmarks.load(self.landmarks), camera, StoredOcclusion.load(self.occlusion), device)
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A folder of scenes with one camera.
+
+    Attributes:
+        root: `<data>/<dataset>`.
+        camera: intrinsics of every viewpoint.
+        scenes: all scenes in the order they were made.
+    """
+
+    root: Path
+    camera: PinholeCamera
+    scenes: tuple[SceneFolder, ...]
+
+    @property
+    def name(self) -> str:
+        """Name of the dataset."""
+        return self.root.name
+
+    def split(self, split: Split) -> tuple[SceneFolder, ...]:
+        """Scenes of one split."""
+        return tuple(scene for scene in self.scenes if scene.split == split)
+
+    def fingerprint(self) -> str:
+        """16 hexadecimal digits that change with any scene's table, landmarks or occlusion."""
+        digest = hashlib.sha256()
+        for scene in self.scenes:
+            parts = [fingerprint(path) for path in (scene.table, scene.landmarks, scene.occlusion) if path.is_file()]
+            digest.update("".join([scene.name, scene.split, *parts]).encode())
+        return digest.hexdigest()[:16]
+
+    def save(self) -> None:
+        """Write `dataset.json`, which makes the folder a dataset."""
+        content = {
+            "camera": asdict(self.camera),
+            "scenes": [{"name": scene.name, "split": scene.split} for scene in self.scenes],
+        }
+        write_json(self.root / "dataset.json", content)
+
+    @classmethod
+    def load(cls, root: Path) -> Dataset:
+        """Read a dataset folder.
+
+        Raises:
+            TableError: there is no valid `dataset.json`.
+        """
+        path = root / "dataset.json"
+        try:
+            content = json.loads(path.read_text())
+            scenes = tuple(SceneFolder(root / scene["name"], scene["split"]) for scene in content["scenes"])
+            return cls(root, PinholeCamera(**content["camera"]), scenes)
+        except FileNotFoundError as error:
+            raise TableError("this folder is no dataset", path=path, fix="Run the scenes stage first.") from error
+        except (ValueError, KeyError, TypeError) as error:
+            raise TableError(f"damaged dataset description: {error}", path=path, fix="Run the scenes stage again.") from error
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write JSON atomically, keys in the order given."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(json.dumps(content, indent=2) + "\n")
+    os.replace(partial, path)

@@ -1,0 +1,47 @@
+"""Errors a user can act on. Each names the offending file and value and says what to do."""
+
+from __future__ import annotations
+
+from os import PathLike
+
+
+class WhereToLookError(Exception):
+    """Base of every error this package raises on bad input. The command line exits with code 2 on it.
+
+    Args:
+        problem: what is wrong, in one sentence.
+        path: the offending file or folder, if there is one.
+        value: the offending value, if there is one.
+        fix: what the user can do about it.
+    """
+
+    def __init__(
+        self, problem: str, *, path: str | PathLike[str] | None = None, value: object = None, fix: str | None = None
+    ) -> None:
+        self.problem, self.path, self.value, self.fix = problem, path, value, fix
+        message = problem if path is None else f"{path}: {problem}"
+        if value is not None:
+            message += f" (got {value!r})"
+        if fix is not None:
+            message += f". {fix}"
+        super().__init__(message)
+
+
+class ConfigError(WhereToLookError):
+    """A configuration has an unknown key or a value out of range."""
+
+
+class SceneError(WhereToLookError):
+    """A mesh is missing, empty, untextured, not finite, or leaves no free space."""
+
+
+class MapError(WhereToLookError):
+    """A COLMAP model is missing, empty, unreadable or lacks what a stage needs."""
+
+
+class TableError(WhereToLookError):
+    """A table of viewpoints is missing, truncated or lacks columns or labels."""
+
+
+class WeightsError(WhereToLookError):
+    """Trained weights are missing or do not fit the network or the inputs asked for."""

@@ -1,0 +1,218 @@
+"""The network's input: visible landmarks averaged in the cells of a grid over the image (paper, Sec. 3.3 "Data").
+
+Every landmark a viewpoint sees falls into one of 30 x 30 bins by its pixel. A bin holds the mean of its landmarks'
+channels; an empty bin holds zero *in place*. The paper says so; its released code instead drops empty bins and moves
+the filled ones to the front, so that an input has no fixed place in the image. That layout is kept as "compact".
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from wheretolook.errors import ConfigError
+from wheretolook.geometry import Float, PinholeCamera, transform
+from wheretolook.rendering.warp_setup import start_warp
+from wheretolook.visibility.frustum import MIN_DEPTH_M, VisibleSets
+
+CHANNELS = ("u", "v", "x", "y", "z")
+"""Channels of every landmark: pixel (u, v) and position (x, y, z) in the camera frame in metres."""
+
+INPUT_VARIANTS: dict[str, tuple[str, ...]] = {
+    "2d": ("u", "v"),
+    "2d+z": ("u", "v", "z"),
+    "2d+3d": ("u", "v", "x", "y", "z"),
+}
+"""The paper's inputs by name: 1,800, 2,700 and 4,500 values at 30 x 30 bins (its "4220" is a stale number)."""
+
+Layout = Literal["in_place", "compact"]
+
+
+@dataclass(frozen=True, eq=False)
+class BinnedViews:
+    """Landmarks of a batch of views, binned.
+
+    Attributes:
+        means: (B, C, bins, bins) float32, mean of each channel over a bin's landmarks, zero where there are none. Rows
+            go down the image, columns right.
+        counts: (B, bins, bins) int32, landmarks in each bin.
+        channels: names of the C channels.
+    """
+
+    means: NDArray[np.float32]
+    counts: NDArray[np.int32]
+    channels: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def n_visible(self) -> NDArray[np.int32]:
+        """Landmarks each view sees, (B,)."""
+        return self.counts.sum((1, 2), dtype=np.int32)
+
+    @property
+    def n_filled(self) -> NDArray[np.int32]:
+        """Bins with at least one landmark, (B,)."""
+        return (self.counts > 0).sum((1, 2), dtype=np.int32)
+
+    def select(self, channels: tuple[str, ...]) -> BinnedViews:
+        """The same views with only the named channels, in the order asked for.
+
+        Raises:
+            ConfigError: a channel is not there.
+        """
+        unknown = [name for name in channels if name not in self.channels]
+        if unknown:
+            raise ConfigError("unknown input channel", value=unknown[0], fix=f"There are {', '.join(self.channels)}.")
+        return BinnedViews(self.means[:, [self.channels.index(name) for name in channels]], self.counts, channels)
+
+
+def arrange(means: NDArray[np.float32], filled: NDArray[np.bool_], layout: Layout) -> NDArray[np.float32]:
+    """Lay out bins for a network with a flat input.
+
+    Args:
+        means: (B, C, bins, bins), empty bins zero.
+        filled: (B, bins, bins).
+        layout: "in_place" keeps every bin where it is; "compact" moves the filled bins to the front in row-major order,
+            as the released code does.
+
+    Returns:
+        (B, C, bins, bins).
+    """
+    if layout == "in_place":
+        return means
+    if layout != "compact":
+        raise ConfigError("unknown bin layout", value=layout, fix="Use in_place or compact.")
+    flat = means.reshape(*means.shape[:2], -1)
+    order = np.argsort(~filled.reshape(len(filled), -1), axis=1, kind="stable")
+    return np.take_along_axis(flat, order[:, None, :], axis=2).reshape(means.shape)
+
+
+@wp.kernel
+def _bin_kernel(
+    rotations: wp.array[wp.mat33],
+    translations: wp.array[wp.vec3],
+    location_rows: wp.array[wp.int32],
+    points: wp.array[wp.vec3],
+    starts: wp.array[wp.int32],
+    indices: wp.array[wp.int32],
+    focal: float,
+    cx: float,
+    cy: float,
+    width: float,
+    height: float,
+    min_depth: float,
+    bins: int,
+    means: wp.array3d[wp.float32],
+    counts: wp.array2d[wp.int32],
+) -> None:
+    view = wp.tid()
+    rotation = rotations[view]
+    translation = translations[view]
+    location = location_rows[view]
+    for entry in range(starts[location], starts[location + 1]):
+        p = rotation * points[indices[entry]] + translation
+        x = focal * p[0] + cx * p[2]
+        y = focal * p[1] + cy * p[2]
+        if p[2] > min_depth and x >= 0.0 and x < width * p[2] and y >= 0.0 and y < height * p[2]:
+            u = x / p[2]
+            v = y / p[2]
+            column = wp.min(int(u * float(bins) / width), bins - 1)
+            row = wp.min(int(v * float(bins) / height), bins - 1)
+            cell = row * bins + column
+            counts[view, cell] = counts[view, cell] + 1
+            means[view, 0, cell] = means[view, 0, cell] + u
+            means[view, 1, cell] = means[view, 1, cell] + v
+            means[view, 2, cell] = means[view, 2, cell] + p[0]
+            means[view, 3, cell] = means[view, 3, cell] + p[1]
+            means[view, 4, cell] = means[view, 4, cell] + p[2]
+    for cell in range(bins * bins):
+        if counts[view, cell] > 1:
+            scale = 1.0 / float(counts[view, cell])
+            for channel in range(5):
+                means[view, channel, cell] = means[view, channel, cell] * scale
+
+
+def bin_views(
+    camera: PinholeCamera,
+    cam_from_world: Float,
+    points: Float,
+    visible: VisibleSets,
+    location_rows: NDArray[np.integer[Any]],
+    bins: int = 30,
+    device: str = "cpu",
+    block_bytes: int = 1 << 30,
+) -> BinnedViews:
+    """Bin the visible landmarks of every view, with all of `CHANNELS`.
+
+    Args:
+        camera: pinhole intrinsics.
+        cam_from_world: (B, 3, 4).
+        points: (N, 3) landmarks in metres.
+        visible: landmarks not occluded from each of L locations.
+        location_rows: (B,) row of each view's location in `visible`.
+        bins: bins along each side of the image.
+        device: "cpu" or a CUDA device; one thread a view, so that sums do not depend on the order of threads.
+        block_bytes: views are worked through in blocks of about this many bytes.
+    """
+    device = start_warp(device)
+    n_views, n_channels = len(cam_from_world), len(CHANNELS)
+    means = np.empty((n_views, n_channels, bins, bins), dtype=np.float32)
+    counts = np.empty((n_views, bins, bins), dtype=np.int32)
+    block = max(1, block_bytes // (bins * bins * (n_channels + 1) * 4))
+    points_on_device = wp.array(np.asarray(points, dtype=np.float32), dtype=wp.vec3, device=device)
+    starts, indices = (wp.array(part, dtype=wp.int32, device=device) for part in (visible.starts, visible.indices))
+    for begin in range(0, n_views, block):
+        rows = slice(begin, min(begin + block, n_views))
+        poses = np.asarray(cam_from_world[rows], dtype=np.float64)
+        shape = (len(poses), bins * bins)
+        block_means = wp.zeros((shape[0], n_channels, shape[1]), dtype=wp.float32, device=device)
+        block_counts = wp.zeros(shape, dtype=wp.int32, device=device)
+        wp.launch(
+            _bin_kernel,
+            dim=len(poses),
+            inputs=[
+                wp.array(poses[..., :3].astype(np.float32), dtype=wp.mat33, device=device),
+                wp.array(poses[..., 3].astype(np.float32), dtype=wp.vec3, device=device),
+                wp.array(np.asarray(location_rows[rows], dtype=np.int32), dtype=wp.int32, device=device),
+                points_on_device, starts, indices,
+                float(camera.focal_px), float(camera.cx), float(camera.cy), float(camera.width), float(camera.height),
+                MIN_DEPTH_M, bins,
+            ],
+            outputs=[block_means, block_counts],
+            device=device,
+        )  # fmt: skip
+        means[rows] = block_means.numpy().reshape(-1, n_channels, bins, bins)
+        counts[rows] = block_counts.numpy().reshape(-1, bins, bins)
+    return BinnedViews(means, counts, CHANNELS)
+
+
+def bin_views_plain(
+    camera: PinholeCamera,
+    cam_from_world: Float,
+    points: Float,
+    visible: VisibleSets,
+    location_rows: NDArray[np.integer[Any]],
+    bins: int = 30,
+) -> BinnedViews:
+    """What `bin_views` computes, in NumPy."""
+    n_views, n_cells = len(cam_from_world), bins * bins
+    means = np.zeros((n_views, len(CHANNELS), n_cells), dtype=np.float32)
+    counts = np.zeros((n_views, n_cells), dtype=np.int32)
+    for view, (pose, location) in enumerate(zip(cam_from_world, location_rows, strict=True)):
+        seen = transform(pose, points[visible.indices[visible.starts[location] : visible.starts[location + 1]]])
+        pixels = camera.project(seen)
+        inside = (seen[:, 2] > MIN_DEPTH_M) & camera.in_image(pixels)
+        seen, pixels = seen[inside], pixels[inside]
+        column, row = (pixels * bins / (camera.width, camera.height)).astype(int).T
+        cell = np.minimum(row, bins - 1) * bins + np.minimum(column, bins - 1)
+        counts[view] = np.bincount(cell, minlength=n_cells)
+        for channel, values in enumerate([*pixels.T, *seen.T]):
+            total = np.bincount(cell, weights=values, minlength=n_cells)
+            means[view, channel] = total / np.maximum(counts[view], 1)
+    return BinnedViews(means.reshape(n_views, -1, bins, bins), counts.reshape(n_views, bins, bins), CHANNELS)

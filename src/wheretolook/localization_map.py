@@ -1,0 +1,74 @@
+"""What a scorer is built from: landmarks, a camera and a model of occlusion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from wheretolook.features import BinnedViews, bin_views
+from wheretolook.geometry import Float, PinholeCamera, camera_centers
+from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
+from wheretolook.visibility import NoOcclusion, OcclusionModel, VisibleSets
+
+SAME_LOCATION_DECIMALS = 6
+"""Camera centres that agree to this many decimals of a metre share one visibility test."""
+
+
+@dataclass(frozen=True, eq=False)
+class LocalizationMap:
+    """A map to localize against, as seen by everything that scores viewpoints.
+
+    Attributes:
+        landmarks: what a camera may recognize.
+        camera: the camera that will look.
+        occlusion: which landmarks have a free line of sight from a location.
+        device: where kernels run, "cpu" or a CUDA device.
+    """
+
+    landmarks: Landmarks
+    camera: PinholeCamera = PinholeCamera()
+    occlusion: OcclusionModel = NoOcclusion()
+    device: str = "cpu"
+
+    @classmethod
+    def from_colmap(
+        cls,
+        model: str | Path,
+        camera: PinholeCamera = PinholeCamera(),
+        mesh: str | Path | None = None,
+        max_reprojection_error_px: float = 0.5,
+        device: str = "cpu",
+    ) -> LocalizationMap:
+        """From any COLMAP model (binary or text) in metres, z up.
+
+        Args:
+            model: folder of the model.
+            camera: the camera that will look, which need not be the one that mapped.
+            mesh: a mesh of the scene, for true occlusion; without one, landmarks are seen through walls.
+            max_reprojection_error_px: landmarks with a larger mean error are left out.
+            device: where kernels run.
+
+        Raises:
+            MapError: no usable model in the folder.
+            SceneError: the mesh cannot be used.
+        """
+        landmarks = load_colmap_landmarks(Path(model), max_reprojection_error_px=max_reprojection_error_px)
+        occlusion: OcclusionModel = NoOcclusion()
+        if mesh is not None:
+            from wheretolook.rendering import MeshRaycaster
+            from wheretolook.scenes.loading import load_mesh
+            from wheretolook.visibility import MeshOcclusion
+
+            occlusion = MeshOcclusion(MeshRaycaster(load_mesh(Path(mesh)), device))
+        return cls(landmarks, camera, occlusion, device)
+
+    def bin_views(self, cam_from_world: Float, bins: int = 30) -> BinnedViews:
+        """Bin the landmarks that views (B, 3, 4) see. Views that share a location share its occlusion test."""
+        centers = np.round(camera_centers(cam_from_world), SAME_LOCATION_DECIMALS)
+        locations, rows = np.unique(centers, axis=0, return_inverse=True)
+        visible = VisibleSets.from_mask(self.occlusion.unoccluded(locations, self.landmarks.points))
+        return bin_views(
+            self.camera, cam_from_world, self.landmarks.points, visible, rows.reshape(-1), bins=bins, device=self.device
+        )

@@ -1,0 +1,196 @@
+"""SIFT keypoints and descriptors. The same extractor serves the images of the map and the queries."""
+
+from __future__ import annotations
+
+import multiprocessing
+import warnings
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from itertools import islice
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wheretolook.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class ExtractorConfig:
+    """Settings of the keypoint extractor.
+
+    Args:
+        method: whose SIFT to run. `colmap` is what COLMAP's own feature extraction gives on the CPU; `opencv` finds
+            nearly the same keypoints, for comparison.
+        first_octave: -1 doubles the image first, which gives about three times as many (and smaller) keypoints at four
+            times the cost; 0 starts at the image's own size.
+        max_keypoints: the most keypoints kept an image. `colmap` prefers large scales, `opencv` strong contrast.
+        peak_threshold: least contrast (difference of Gaussians, grey values in [0, 1]). COLMAP's default is 0.02 / 3.
+        edge_threshold: largest ratio of principal curvatures (Lowe 2004, section 4.1).
+    """
+
+    method: Literal["colmap", "opencv"] = "colmap"
+    first_octave: int = 0
+    max_keypoints: int = 2048
+    peak_threshold: float = 0.02 / 3
+    edge_threshold: float = 10.0
+
+    def __post_init__(self) -> None:
+        if self.method not in ("colmap", "opencv"):
+            raise ConfigError("unknown extractor method", value=self.method, fix="Choose colmap or opencv")
+        if self.first_octave not in (-1, 0):
+            raise ConfigError("first_octave must be -1 or 0", value=self.first_octave)
+        if self.max_keypoints < 1:
+            raise ConfigError("max_keypoints must be positive", value=self.max_keypoints)
+        if not (self.peak_threshold > 0 and self.edge_threshold > 0):
+            raise ConfigError(
+                "peak_threshold and edge_threshold must be positive", value=(self.peak_threshold, self.edge_threshold)
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Keypoints:
+    """Keypoints of one image.
+
+    Attributes:
+        pixels: (N, 2) float32, (x, y) in pixels; (0.5, 0.5) is the centre of the top-left pixel.
+        descriptors: (N, 128) float32 RootSIFT (Arandjelovic and Zisserman, CVPR 2012) of unit length.
+        scales_px: (N,) float32, standard deviation in pixels of the Gaussian at which the keypoint was found.
+    """
+
+    pixels: NDArray[np.float32]
+    descriptors: NDArray[np.float32]
+    scales_px: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+
+def quantize_descriptors(descriptors: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
+    """Unit descriptors (N, D) as COLMAP stores them: 512 times the value, rounded, at most 255. Returns (N, D) uint8."""
+    return np.clip(np.rint(512 * descriptors), 0, 255).astype(np.uint8)
+
+
+def unit_descriptors(descriptors: NDArray[Any]) -> NDArray[np.float32]:
+    """Stored descriptors (N, D), e.g. uint8, as float32 of unit length (rows of zeros stay zero)."""
+    values = descriptors.astype(np.float32)
+    length = np.linalg.norm(values, axis=1, keepdims=True)
+    return values / np.where(length > 0, length, 1)
+
+
+class KeypointExtractor:
+    """Extracts SIFT keypoints on one CPU core.
+
+    Args:
+        config: see `ExtractorConfig`.
+    """
+
+    def __init__(self, config: ExtractorConfig | None = None) -> None:
+        self.config = config or ExtractorConfig()
+        self._extractor = _colmap_sift(self.config) if self.config.method == "colmap" else _opencv_sift(self.config)
+
+    def extract(self, rgb: NDArray[np.uint8]) -> Keypoints:
+        """Extract keypoints of one image.
+
+        Args:
+            rgb: (H, W, 3) uint8.
+
+        Returns:
+            At most `max_keypoints` keypoints, in an order that depends on the image alone.
+
+        Raises:
+            ValueError: when the image is not (H, W, 3) uint8.
+        """
+        if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3:
+            raise ValueError(f"expected an (H, W, 3) uint8 image, got {rgb.shape} {rgb.dtype}")
+        import pycolmap
+
+        # COLMAP's own conversion to grey (Rec. 709 weights): with other weights other keypoints pass the thresholds.
+        grey = pycolmap.Bitmap.from_array(np.ascontiguousarray(rgb)).clone_as_grey()
+        return self._extract_colmap(grey) if self.config.method == "colmap" else self._extract_opencv(grey.to_array())
+
+    def extract_many(self, images: Iterable[NDArray[np.uint8]], workers: int = 1) -> Iterator[Keypoints]:
+        """Extract keypoints of many images, in processes of their own (pycolmap's extractor holds Python's lock).
+
+        Args:
+            images: each (H, W, 3) uint8; read only a few images ahead of what is returned.
+            workers: processes; 1 stays in this one.
+
+        Yields:
+            Keypoints in the order of the images, the same whatever the number of workers.
+        """
+        if workers <= 1:
+            yield from map(self.extract, images)
+            return
+        context = multiprocessing.get_context("spawn")
+        with ProcessPoolExecutor(workers, context, initializer=_start_worker, initargs=(self.config,)) as pool:
+            source = iter(images)
+            pending = [pool.submit(_extract_in_worker, rgb) for rgb in islice(source, 2 * workers)]
+            while pending:
+                yield pending.pop(0).result()
+                pending += [pool.submit(_extract_in_worker, rgb) for rgb in islice(source, 1)]
+
+    def _extract_colmap(self, bitmap: Any) -> Keypoints:
+        keypoints, descriptors = self._extractor.extract(bitmap)
+        if len(keypoints) == 0:
+            return _no_keypoints()
+        table = np.array([(k.x, k.y, k.compute_scale()) for k in keypoints], dtype=np.float32)
+        # COLMAP's own cap keeps whole scale levels from the largest down, so it can overshoot; cut what is beyond.
+        keep = np.argsort(-table[:, 2], kind="stable")[: self.config.max_keypoints]
+        return Keypoints(table[keep, :2], unit_descriptors(descriptors.data[keep]), table[keep, 2])
+
+    def _extract_opencv(self, grey: NDArray[np.uint8]) -> Keypoints:
+        found, descriptors = self._extractor.detectAndCompute(np.ascontiguousarray(grey), None)
+        if len(found) == 0:
+            return _no_keypoints()
+        octave = np.array([k.octave & 255 for k in found], dtype=np.uint8).view(np.int8)
+        table = np.array([(*k.pt, k.size / 2, k.response, k.angle) for k in found], dtype=np.float32)
+        usable = np.flatnonzero(octave >= self.config.first_octave)
+        x, y, scale, response, angle = table[usable].T
+        keep = usable[np.lexsort((angle, scale, y, x, -response))[: self.config.max_keypoints]]
+        descriptors = descriptors[keep]
+        descriptors = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-12))
+        # OpenCV puts (0, 0) at the centre of the top-left pixel.
+        return Keypoints(table[keep, :2] + np.float32(0.5), unit_descriptors(descriptors), table[keep, 2])
+
+
+def _no_keypoints() -> Keypoints:
+    return Keypoints(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32), np.zeros(0, np.float32))
+
+
+def _colmap_sift(config: ExtractorConfig) -> Any:
+    import pycolmap
+
+    options = pycolmap.FeatureExtractionOptions()
+    options.num_threads = 1
+    options.sift.first_octave = config.first_octave
+    options.sift.max_num_features = config.max_keypoints
+    options.sift.peak_threshold = config.peak_threshold
+    options.sift.edge_threshold = config.edge_threshold
+    return pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
+
+
+def _opencv_sift(config: ExtractorConfig) -> Any:
+    import cv2
+
+    layers = 3
+    # OpenCV divides its contrast threshold by the number of layers; without the precise upscale, keypoints are biased.
+    return cv2.SIFT_create(0, layers, layers * config.peak_threshold, config.edge_threshold, 1.6, True)
+
+
+_worker: KeypointExtractor | None = None
+
+
+def _start_worker(config: ExtractorConfig) -> None:
+    global _worker
+    warnings.simplefilter("ignore")
+    import pycolmap
+
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.WARNING.value
+    _worker = KeypointExtractor(config)
+
+
+def _extract_in_worker(rgb: NDArray[np.uint8]) -> Keypoints:
+    assert _worker is not None
+    return _worker.extract(rgb)

@@ -1,0 +1,204 @@
+"""Landmarks of a map and what is known about each: the input of visibility, features and scorers."""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from wheretolook.errors import MapError
+from wheretolook.mapping.colmap_model import ModelArrays, model_arrays, read_descriptors, read_model
+from wheretolook.mapping.extraction import quantize_descriptors, unit_descriptors
+
+_BLOCK = 4096
+
+
+@dataclass(frozen=True, eq=False)
+class Landmarks:
+    """Landmarks, one a row, sorted by id.
+
+    Attributes:
+        ids: (N,) int64, COLMAP's point3D_id.
+        points: (N, 3) float64, world, metres.
+        track_length: (N,) int32, number of observations.
+        reprojection_error_px: (N,) float32, mean over the observations.
+        triangulation_angle_deg: (N,) float32, largest angle between two rays of the track.
+        mapping_direction: (N, 3) float32, unit mean direction from the mapping cameras to the landmark, world.
+        mapping_direction_spread: (N,) float32, 1 - |mean of the unit directions|: 0 when all look from one side.
+        mapping_distance_m: (N,) float32, mean distance of the mapping cameras.
+        descriptors: (N, 128) uint8, mean over the track of the unit descriptors, as COLMAP stores descriptors (512
+            times the unit vector); None where the model came without a database.
+        ambiguity: (N,) float32, cosine between the landmark's descriptor and the nearest one of another landmark; NaN
+            without descriptors or other landmarks.
+    """
+
+    ids: NDArray[np.int64]
+    points: NDArray[np.float64]
+    track_length: NDArray[np.int32]
+    reprojection_error_px: NDArray[np.float32]
+    triangulation_angle_deg: NDArray[np.float32]
+    mapping_direction: NDArray[np.float32]
+    mapping_direction_spread: NDArray[np.float32]
+    mapping_distance_m: NDArray[np.float32]
+    descriptors: NDArray[np.uint8] | None
+    ambiguity: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def save(self, path: str | Path) -> None:
+        """Write an NPZ file, atomically. The same landmarks give the same bytes."""
+        path = Path(path)
+        partial = path.with_name(path.name + ".partial")
+        with partial.open("wb") as file:
+            np.savez(file, **{f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not None})
+        os.replace(partial, path)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Landmarks:
+        """Read what `save` wrote.
+
+        Raises:
+            MapError: the file is missing, truncated, or no file of landmarks.
+        """
+        path, fix = Path(path), "Run the map stage again."
+        if not path.is_file():
+            raise MapError("there is no file of landmarks", path=path, fix=fix)
+        try:
+            with np.load(path) as stored:
+                values = {name: stored[name] for name in stored.files}
+        except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+            raise MapError(f"not a readable NPZ file: {error}", path=path, fix=fix) from error
+        names = {f.name for f in fields(cls)}
+        if set(values) | {"descriptors"} != names:
+            raise MapError("not a file of landmarks", path=path, value=sorted(values), fix=fix)
+        if len({len(v) for v in values.values()}) != 1 or values["points"].shape[1:] != (3,):
+            raise MapError("the arrays disagree on the number of landmarks", path=path, fix=fix)
+        return cls(**{"descriptors": None, **values})
+
+
+def load_colmap_landmarks(
+    model_dir: str | Path,
+    database: str | Path | None = None,
+    max_reprojection_error_px: float = 0.5,
+    device: str = "cpu",
+) -> Landmarks:
+    """Landmarks of a COLMAP model, with their attributes.
+
+    Args:
+        model_dir: folder of a model (binary or text), in metres. Images may differ in intrinsics.
+        database: the COLMAP database the model was built from, for descriptors and ambiguity.
+        max_reprojection_error_px: landmarks with a larger mean reprojection error are left out (the paper's 0.5).
+        device: torch device that searches for the nearest descriptors.
+
+    Raises:
+        MapError: the folder, a file or the database is missing, corrupt, or does not match; or no landmark is left.
+    """
+    reconstruction = read_model(model_dir)
+    if reconstruction.num_points3D() == 0:
+        raise MapError("the model has no points", path=model_dir, fix="Triangulate it, or map with more overlap or texture.")
+    model = model_arrays(reconstruction)
+    keep = np.flatnonzero(model.errors_px <= max_reprojection_error_px)
+    if len(keep) == 0:
+        raise MapError(
+            f"all {len(model.point_ids)} points have more than {max_reprojection_error_px} px mean reprojection error",
+            path=model_dir,
+            value=f"least {model.errors_px.min():.2f} px",
+            fix="Raise max_reprojection_error_px, or check the intrinsics and poses of the model.",
+        )
+    if not np.isfinite(model.points[keep]).all():
+        raise MapError("some points are not finite", path=model_dir, fix="Triangulate the model again.")
+    model = _select_points(model, keep)
+    descriptors, ambiguity = None, np.full(len(keep), np.nan, dtype=np.float32)
+    if database is not None:
+        descriptors = _mean_descriptors(model, read_descriptors(database, model_dir, reconstruction, model))
+        ambiguity = nearest_other_cosine(descriptors, device)
+    return Landmarks(
+        ids=model.point_ids,
+        points=model.points,
+        track_length=np.diff(model.observation_start).astype(np.int32),
+        reprojection_error_px=model.errors_px.astype(np.float32),
+        **_viewing_geometry(model),
+        descriptors=descriptors,
+        ambiguity=ambiguity,
+    )
+
+
+def nearest_other_cosine(descriptors: NDArray[np.uint8], device: str = "cpu") -> NDArray[np.float32]:
+    """Cosine between each descriptor (N, D) uint8 and the nearest one of another row. Returns (N,), NaN if N is 1.
+
+    Sums of products of such integers are exact in float32, so the result does not depend on the machine.
+    """
+    n = len(descriptors)
+    values = torch.as_tensor(descriptors, dtype=torch.float32, device=device)
+    inverse = 1 / torch.as_tensor(np.linalg.norm(descriptors.astype(np.float64), axis=1), device=device).clamp(min=1).float()
+    best = torch.full((n,), -torch.inf, device=device)
+    for i in range(0, n, _BLOCK):
+        rows = slice(i, min(i + _BLOCK, n))
+        for j in range(i, n, _BLOCK):  # each pair of blocks once: the product serves rows and columns
+            columns = slice(j, min(j + _BLOCK, n))
+            cosine = (values[rows] @ values[columns].T) * inverse[columns]
+            cosine *= inverse[rows, None]
+            if i == j:
+                cosine.fill_diagonal_(-torch.inf)
+            best[rows] = torch.maximum(best[rows], cosine.amax(1))
+            if i != j:
+                best[columns] = torch.maximum(best[columns], cosine.amax(0))
+    return torch.where(best.isinf(), torch.nan, best).cpu().numpy()
+
+
+def _select_points(model: ModelArrays, keep: NDArray[np.int64]) -> ModelArrays:
+    lengths = np.diff(model.observation_start)[keep]
+    start = np.concatenate([[0], np.cumsum(lengths)])
+    rows = np.repeat(model.observation_start[keep] - start[:-1], lengths) + np.arange(start[-1])
+    return ModelArrays(
+        model.point_ids[keep],
+        model.points[keep],
+        model.errors_px[keep],
+        model.image_ids,
+        model.image_names,
+        model.image_centers,
+        start,
+        model.observation_image[rows],
+        model.observation_keypoint[rows],
+    )
+
+
+def _viewing_geometry(model: ModelArrays) -> dict[str, NDArray[np.float32]]:
+    start, lengths = model.observation_start, np.diff(model.observation_start)
+    rays = np.repeat(model.points, lengths, axis=0) - model.image_centers[model.observation_image]
+    distance = np.linalg.norm(rays, axis=1)
+    rays /= np.maximum(distance, 1e-12)[:, None]
+    mean = np.add.reduceat(rays, start[:-1]) / lengths[:, None]
+    length = np.linalg.norm(mean, axis=1)
+    angle = np.zeros(len(lengths))
+    for n in np.unique(lengths):  # tracks of one length at a time, so that all pairs of rays are one product
+        members = np.flatnonzero(lengths == n)
+        for block in np.array_split(members, -(-len(members) * int(n) ** 2 // 4_000_000)):
+            track = rays[start[block][:, None] + np.arange(n)]
+            # The chord between unit vectors is accurate at small angles, where arccos of the cosine is not.
+            chord = np.sqrt(np.maximum(2 - 2 * (track @ track.swapaxes(1, 2)).min((1, 2)), 0))
+            angle[block] = np.degrees(2 * np.arcsin(np.clip(chord / 2, 0, 1)))
+    return {
+        "triangulation_angle_deg": angle.astype(np.float32),
+        "mapping_direction": (mean / np.maximum(length, 1e-12)[:, None]).astype(np.float32),
+        "mapping_direction_spread": np.clip(1 - length, 0, 1).astype(np.float32),
+        "mapping_distance_m": (np.add.reduceat(distance, start[:-1]) / lengths).astype(np.float32),
+    }
+
+
+def _mean_descriptors(model: ModelArrays, by_image: list[NDArray[np.uint8]]) -> NDArray[np.uint8]:
+    first_row = np.cumsum([0, *(len(d) for d in by_image)])
+    rows = first_row[model.observation_image] + model.observation_keypoint
+    stored, start = np.concatenate(by_image), model.observation_start
+    mean = np.empty((len(start) - 1, stored.shape[1]), dtype=np.uint8)
+    for i in range(0, len(mean), _BLOCK):
+        last = min(i + _BLOCK, len(mean))
+        track = unit_descriptors(stored[rows[start[i] : start[last]]])
+        mean[i:last] = quantize_descriptors(unit_descriptors(np.add.reduceat(track, start[i:last] - start[i])))
+    return mean

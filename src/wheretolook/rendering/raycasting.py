@@ -1,0 +1,169 @@
+"""Ray and distance queries on a mesh with NVIDIA Warp, on CUDA or the CPU."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike, NDArray
+
+from wheretolook.rendering.warp_setup import start_warp, vec3_array, warp_mesh
+from wheretolook.scenes.mesh import TexturedMesh
+
+
+@dataclass(frozen=True, eq=False)
+class RayHits:
+    """First hits of R rays.
+
+    Attributes:
+        distance_m: (R,) float32, from the ray's origin; infinite where nothing is hit.
+        triangle: (R,) int32, the triangle hit; -1 where nothing is hit.
+        front: (R,) bool, whether the triangle's front (corners counter-clockwise) was hit.
+    """
+
+    distance_m: NDArray[np.float32]
+    triangle: NDArray[np.int32]
+    front: NDArray[np.bool_]
+
+
+@wp.kernel
+def _occluded_kernel(
+    mesh: wp.uint64,
+    origins: wp.array[wp.vec3],
+    points: wp.array[wp.vec3],
+    margin_m: wp.float32,
+    occluded: wp.array2d[wp.bool],
+):
+    i, j = wp.tid()
+    ray = points[j] - origins[i]
+    distance = wp.length(ray)
+    reach = distance - margin_m
+    blocked = wp.bool(False)
+    if reach > 0.0:
+        blocked = wp.mesh_query_ray_anyhit(mesh, origins[i], ray / distance, reach)
+    occluded[i, j] = blocked
+
+
+@wp.kernel
+def _cast_kernel(
+    mesh: wp.uint64,
+    origins: wp.array[wp.vec3],
+    directions: wp.array[wp.vec3],
+    distance_m: wp.array[wp.float32],
+    triangle: wp.array[wp.int32],
+    front: wp.array[wp.bool],
+):
+    i = wp.tid()
+    hit = wp.mesh_query_ray(mesh, origins[i], wp.normalize(directions[i]), 1.0e6)
+    if hit.result:
+        distance_m[i] = hit.t
+        triangle[i] = hit.face
+        front[i] = hit.sign > 0.0
+    else:
+        distance_m[i] = wp.inf
+        triangle[i] = -1
+        front[i] = False
+
+
+@wp.kernel
+def _distance_kernel(
+    mesh: wp.uint64, points: wp.array[wp.vec3], max_distance_m: wp.float32, distance_m: wp.array[wp.float32]
+):
+    i = wp.tid()
+    nearest = wp.mesh_query_point_no_sign(mesh, points[i], max_distance_m)
+    distance_m[i] = wp.inf
+    if nearest.result:
+        at = wp.mesh_eval_position(mesh, nearest.face, nearest.u, nearest.v)
+        distance_m[i] = wp.length(at - points[i])
+
+
+class MeshRaycaster:
+    """Answers ray and distance queries on a mesh.
+
+    Args:
+        mesh: the geometry; textures are not used.
+        device: "cpu" (one core) or a CUDA device such as "cuda" or "cuda:1".
+        block_rays: rays traced at a time in `occluded`, which bounds the memory on the device.
+
+    Raises:
+        ConfigError: if there is no such device.
+    """
+
+    def __init__(self, mesh: TexturedMesh, device: str = "cpu", block_rays: int = 1 << 28) -> None:
+        self.device = start_warp(device)
+        self.block_rays = block_rays
+        self.warp_mesh = warp_mesh(mesh, self.device)
+
+    def occluded(self, origins: ArrayLike, points: ArrayLike, margin_m: float = 0.02) -> NDArray[np.bool_]:
+        """Whether something lies between each origin and each point.
+
+        Args:
+            origins: (L, 3) metres.
+            points: (N, 3) metres.
+            margin_m: geometry closer to the point than this does not count, so that a landmark on (or, by its
+                triangulation error, a little behind) a surface is not hidden by that surface.
+
+        Returns:
+            (L, N) bool, True where the open segment from the origin to `margin_m` before the point meets a triangle.
+            Segments shorter than the margin are never occluded.
+        """
+        origins_at = np.asarray(origins, dtype=np.float32).reshape(-1, 3)
+        points_at = np.asarray(points, dtype=np.float32).reshape(-1, 3)
+        occluded = np.zeros((len(origins_at), len(points_at)), dtype=np.bool_)
+        if occluded.size == 0:
+            return occluded
+        points_on_device = vec3_array(points_at, self.device)
+        block = max(1, self.block_rays // len(points_at))
+        for start in range(0, len(origins_at), block):
+            stop = min(start + block, len(origins_at))
+            result = wp.empty((stop - start, len(points_at)), dtype=wp.bool, device=self.device)
+            wp.launch(
+                _occluded_kernel,
+                dim=result.shape,
+                inputs=[self.warp_mesh.id, vec3_array(origins_at[start:stop], self.device), points_on_device, margin_m],
+                outputs=[result],
+                device=self.device,
+            )
+            occluded[start:stop] = result.numpy()
+        return occluded
+
+    def cast(self, origins: ArrayLike, directions: ArrayLike) -> RayHits:
+        """First hit of each ray.
+
+        Args:
+            origins: (R, 3) metres.
+            directions: (R, 3), need not be of unit length.
+
+        Returns:
+            Distances, triangles and sides of the R hits.
+        """
+        origins_on_device = vec3_array(origins, self.device)
+        directions_on_device = vec3_array(directions, self.device)
+        if origins_on_device.shape != directions_on_device.shape:
+            raise ValueError(f"{origins_on_device.shape[0]} origins for {directions_on_device.shape[0]} directions")
+        n_rays = origins_on_device.shape[0]
+        distance_m = wp.empty(n_rays, dtype=wp.float32, device=self.device)
+        triangle = wp.empty(n_rays, dtype=wp.int32, device=self.device)
+        front = wp.empty(n_rays, dtype=wp.bool, device=self.device)
+        wp.launch(
+            _cast_kernel,
+            dim=n_rays,
+            inputs=[self.warp_mesh.id, origins_on_device, directions_on_device],
+            outputs=[distance_m, triangle, front],
+            device=self.device,
+        )
+        return RayHits(distance_m.numpy(), triangle.numpy(), front.numpy().astype(np.bool_))
+
+    def distance_to_surface(self, points: ArrayLike, max_distance_m: float) -> NDArray[np.float32]:
+        """Distance from points (N, 3) to the nearest triangle, (N,) metres; infinite beyond `max_distance_m`."""
+        points_on_device = vec3_array(points, self.device)
+        distance_m = wp.empty(points_on_device.shape[0], dtype=wp.float32, device=self.device)
+        wp.launch(
+            _distance_kernel,
+            dim=points_on_device.shape[0],
+            inputs=[self.warp_mesh.id, points_on_device, max_distance_m],
+            outputs=[distance_m],
+            device=self.device,
+        )
+        return distance_m.numpy()

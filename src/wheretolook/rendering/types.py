@@ -1,0 +1,59 @@
+"""What every renderer takes and returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from wheretolook.geometry import PinholeCamera
+
+
+@dataclass(frozen=True, eq=False)
+class Rendering:
+    """Images of a batch of B poses.
+
+    Attributes:
+        rgb: (B, H, W, 3) uint8, sRGB; black where the ray through the pixel's centre meets nothing.
+        depth_m: (B, H, W) float32, z-depth along the optical axis in metres; 0 where the ray meets nothing.
+    """
+
+    rgb: NDArray[np.uint8]
+    depth_m: NDArray[np.float32]
+
+
+class Renderer(Protocol):
+    """Renders a fixed mesh.
+
+    The image is unlit: the texture's colour (times the vertex colour) as it is stored, seen from both sides of a
+    triangle, since light is baked into the textures of scanned and generated scenes.
+    """
+
+    def render(self, camera: PinholeCamera, cam_from_world: ArrayLike) -> Rendering:
+        """Render the poses `cam_from_world` (B, 3, 4) with one camera. Raises ValueError on another shape or NaN."""
+        ...
+
+
+def check_poses(cam_from_world: ArrayLike) -> NDArray[np.float64]:
+    """The poses as float64 (B, 3, 4). Raises ValueError on another shape or on values that are not finite."""
+    poses = np.asarray(cam_from_world, dtype=np.float64)
+    if poses.ndim != 3 or poses.shape[1:] != (3, 4):
+        raise ValueError(f"cam_from_world must have shape (B, 3, 4), got {poses.shape}")
+    if not np.isfinite(poses).all():
+        raise ValueError("cam_from_world has NaN or infinite entries")
+    return poses
+
+
+def camera_rays(
+    camera: PinholeCamera, cam_from_world: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Camera centres (B, 3) and the maps (B, 3, 3) from a pixel (x, y, 1) to its ray in the world.
+
+    A ray's direction has length 1 along the optical axis, so the ray parameter of a hit is its z-depth, and the first
+    two columns of the map are the derivatives of the direction by the pixel's x and y.
+    """
+    rotation = np.swapaxes(cam_from_world[:, :, :3], 1, 2)
+    centers = -(rotation @ cam_from_world[:, :, 3:])[..., 0]
+    return centers, rotation @ np.linalg.inv(camera.matrix)

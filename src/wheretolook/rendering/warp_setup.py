@@ -1,0 +1,46 @@
+"""Starting Warp and putting a mesh on a device."""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike
+
+from wheretolook.errors import ConfigError
+from wheretolook.scenes.mesh import TexturedMesh
+
+
+def start_warp(device: str = "cpu") -> str:
+    """Initialize Warp without its banner and check that a device exists.
+
+    Called when something is built on a device, never on import, so that worker processes start Warp themselves.
+
+    Args:
+        device: "cpu", "cuda" or "cuda:<index>".
+
+    Returns:
+        The device's full name, such as "cuda:0".
+
+    Raises:
+        ConfigError: if this machine has no such device.
+    """
+    wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
+    wp.init()
+    try:
+        return str(wp.get_device(device))
+    except (ValueError, RuntimeError) as error:
+        available = ", ".join(str(found) for found in wp.get_devices())
+        raise ConfigError("no such device", value=device, fix=f"Use one of: {available}") from error
+
+
+def warp_mesh(mesh: TexturedMesh, device: str) -> wp.Mesh:
+    """The mesh with its bounding volume hierarchy on a device. Warp must have been started."""
+    return wp.Mesh(
+        points=wp.array(mesh.vertices, dtype=wp.vec3, device=device),
+        indices=wp.array(np.ascontiguousarray(mesh.triangles).reshape(-1), dtype=wp.int32, device=device),
+    )
+
+
+def vec3_array(points: ArrayLike, device: str) -> wp.array:
+    """Points (N, 3) as a float32 array of vectors on a device."""
+    return wp.array(np.ascontiguousarray(points, dtype=np.float32).reshape(-1, 3), dtype=wp.vec3, device=device)

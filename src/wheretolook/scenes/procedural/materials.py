@@ -1,0 +1,240 @@
+"""Surfaces that can be painted at any size: plaster, wood, planks, tiles, wallpaper, fabric, marble.
+
+A painter fills a `Canvas` with albedo in display space (sRGB, 0 to 1). Plain surfaces stay below what a feature
+detector fires on; repeated ones (tiles, wallpaper) repeat exactly, because that is what makes homes ambiguous.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from wheretolook.scenes.procedural.noise import SIZE, Canvas, Image
+
+Colour = tuple[float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Material:
+    """How a surface looks.
+
+    Attributes:
+        paint: fills a canvas: (height, width, 3) float32, sRGB albedo in 0 to 1.
+        emissive: shown as painted, whatever light falls on it (window panes, lamp shades).
+        shared: all patches of this material share one small piece of texture in a few brightness levels (leaves,
+            covers of books), instead of each having its own.
+        casts_shadow: whether it blocks light.
+    """
+
+    paint: Callable[[Canvas], Image]
+    emissive: bool = False
+    shared: bool = False
+    casts_shadow: bool = True
+
+
+def mix(a: ArrayLike, b: ArrayLike, amount: Image) -> Image:
+    """Colours (3,) blended by amount (H, W), 0 for `a` and 1 for `b`."""
+    first, second = np.asarray(a, np.float32), np.asarray(b, np.float32)
+    return first + (second - first) * np.asarray(amount, np.float32)[..., None]
+
+
+def shade(colour: ArrayLike, factor: float) -> Colour:
+    """Colour made darker (factor < 1) or lighter."""
+    r, g, b = np.clip(np.asarray(colour, float) * factor, 0, 0.97)
+    return float(r), float(g), float(b)
+
+
+def vary(rng: np.random.Generator, colour: ArrayLike, amount: float = 0.04) -> Colour:
+    """Colour near the given one."""
+    r, g, b = np.clip(np.asarray(colour, float) + rng.normal(0, amount, 3), 0.02, 0.96)
+    return float(r), float(g), float(b)
+
+
+def _shift(rng: np.random.Generator) -> tuple[int, int]:
+    a, b = rng.integers(0, SIZE, 2)
+    return int(a), int(b)
+
+
+def line(distance_px: Image, width_px: float) -> Image:
+    """Coverage of a line of a given width by texels at a distance from its middle, antialiased."""
+    return np.clip(width_px / 2 + 0.5 - np.abs(distance_px), 0, min(1.0, width_px))
+
+
+def plain(rng: np.random.Generator, colour: ArrayLike, *, mottle: float = 0.003, speckle: float = 0.0,
+          shared: bool = False) -> Material:  # fmt: skip
+    """Paint, plaster, plastic, ceramic: one colour with faint broad clouds and, if asked for, fine speckle."""
+    base, first, second = np.asarray(colour, np.float32), _shift(rng), _shift(rng)
+
+    def paint(canvas: Canvas) -> Image:
+        tone = 1 + mottle * canvas.crop(canvas.noise.cloud, first)
+        if speckle:
+            tone = tone + speckle * canvas.crop(canvas.noise.fine, second)
+        return base * tone[..., None]
+
+    return Material(paint, shared=shared)
+
+
+def wood(rng: np.random.Generator, colour: ArrayLike, contrast: float = 1.0, *, shared: bool = False) -> Material:
+    """Wood with its grain along the longer edge."""
+    shift, dark = _shift(rng), np.asarray(colour, float) * np.array([0.62, 0.55, 0.5])
+
+    def paint(canvas: Canvas) -> Image:
+        upright = canvas.height > canvas.width
+        value = 0.26 * canvas.crop(canvas.noise.grain, shift, upright=upright)
+        value = 0.35 + contrast * (value + 0.05 * canvas.crop(canvas.noise.fine, shift))
+        return mix(colour, dark, np.clip(value, 0, 1))
+
+    return Material(paint, shared=shared)
+
+
+def planks(rng: np.random.Generator, colour: ArrayLike, *, width_m: float = 0.16, length_m: float = 1.4,
+           contrast: float = 1.0, along_x: bool = True) -> Material:  # fmt: skip
+    """Floor of boards, each with its own tone and its own piece of grain, staggered from row to row."""
+    dark = np.asarray(colour, float) * np.array([0.6, 0.53, 0.47])
+    tone = rng.normal(0, 1, (64, 64)).astype(np.float32)
+    jump = rng.integers(0, SIZE, (64, 64))
+    stagger = rng.random(64).astype(np.float32)
+
+    def paint(canvas: Canvas) -> Image:
+        scale = canvas.texels_per_m
+        along, across = (canvas.x, canvas.y) if along_x else (canvas.y, canvas.x)
+        row = np.floor(across / width_m).astype(int)
+        position = along / length_m + stagger[row % 64]
+        column = np.floor(position).astype(int)
+        cell = (row % 64, column % 64)
+        a = ((along * scale).astype(int) + jump[cell]) % SIZE
+        b = ((across * scale).astype(int) + 7 * jump[cell]) % SIZE
+        value = 0.3 + contrast * (0.17 * canvas.noise.grain[b, a] + 0.11 * tone[cell])
+        across_px = (across / width_m - np.round(across / width_m)) * width_m * scale
+        along_px = (position - np.round(position)) * length_m * scale
+        seam = np.maximum(line(across_px, 0.6), line(along_px, 0.6)) * min(1.0, 0.5 + 0.5 * contrast)
+        return mix(colour, dark, np.clip(value, 0, 1)) * (1 - 0.45 * seam)[..., None]
+
+    return Material(paint)
+
+
+def tiles(rng: np.random.Generator, colour: ArrayLike, grout: ArrayLike, *, size_m: tuple[float, float],
+          second: ArrayLike | None = None, veins: float = 0.0, variation: float = 0.004,
+          brick: bool = False) -> Material:  # fmt: skip
+    """Tiles with grout. Every tile carries the same print; `second` makes a chequerboard."""
+    shift = _shift(rng)
+    tone = rng.normal(0, variation, (16, 16)).astype(np.float32)
+    width, height = size_m
+
+    def paint(canvas: Canvas) -> Image:
+        scale = canvas.texels_per_m
+        row_position = canvas.y / height
+        row = np.floor(row_position).astype(int)
+        column_position = canvas.x / width + (0.5 * (row % 2) if brick else 0)
+        column = np.floor(column_position).astype(int)
+        albedo = np.broadcast_to(np.asarray(colour, np.float32), (canvas.height, canvas.width, 3))
+        if second is not None:
+            albedo = mix(colour, second, np.broadcast_to((row + column) % 2, albedo.shape[:2]))
+        factor = 1 + np.broadcast_to(tone[row % 16, column % 16], albedo.shape[:2])
+        if veins:
+            a = (((column_position - column) * width * scale).astype(int) + shift[1]) % SIZE
+            b = (((row_position - row) * height * scale).astype(int) + shift[0]) % SIZE
+            factor = factor - veins * np.maximum(canvas.noise.veins[b, a], 0) * 0.25
+            factor = factor + 0.25 * veins * canvas.noise.cloud[b, a]
+        across_px = (column_position - np.round(column_position)) * width * scale
+        along_px = (row_position - np.round(row_position)) * height * scale
+        gap = np.maximum(line(across_px, 0.004 * scale), line(along_px, 0.004 * scale))
+        return mix_images(albedo * factor[..., None], np.asarray(grout, np.float32), gap)
+
+    return Material(paint)
+
+
+def mix_images(a: Image, b: Image, amount: Image) -> Image:
+    """Images (H, W, 3) or colours (3,) blended by amount (H, W)."""
+    return a + (b - a) * amount[..., None]
+
+
+def wallpaper(rng: np.random.Generator, colour: ArrayLike, second: ArrayLike, *, period_m: float = 0.16,
+              motif: bool = True) -> Material:  # fmt: skip
+    """Vertical stripes with, if asked for, the same small flower on each, over and over."""
+    petals = int(rng.integers(4, 8))
+    phase = float(rng.uniform(0, 6))
+
+    def paint(canvas: Canvas) -> Image:
+        u = canvas.x / period_m
+        stripe = np.clip((np.abs(u - np.floor(u) - 0.5) - 0.25) * period_m * canvas.texels_per_m + 0.5, 0, 1)
+        albedo = mix(colour, second, np.broadcast_to(0.35 * stripe, (canvas.height, canvas.width)))
+        if motif:
+            cell_x = (u - np.floor(u) - 0.5) * period_m
+            v = canvas.y / (1.6 * period_m) + 0.5 * (np.floor(u) % 2)
+            cell_y = (v - np.floor(v) - 0.5) * 1.6 * period_m
+            radius = np.hypot(cell_x, cell_y) / period_m
+            lobes = 0.2 * (0.75 + 0.25 * np.cos(petals * np.arctan2(cell_y, cell_x) + phase))
+            inside = np.clip((lobes - radius) * period_m * canvas.texels_per_m + 0.5, 0, 1)
+            albedo = mix_images(albedo, np.asarray(second, np.float32), 0.8 * inside)
+        return albedo
+
+    return Material(paint)
+
+
+def fabric(rng: np.random.Generator, colour: ArrayLike, *, weave: float = 0.02, second: ArrayLike | None = None,
+           pattern: str = "plain", period_m: float = 0.12, shared: bool = False) -> Material:  # fmt: skip
+    """Cloth: `plain`, `stripes`, `checks`, `dots` or `zigzag` in a second colour."""
+    shift = _shift(rng)
+    other = np.asarray(colour if second is None else second, np.float32)
+
+    def paint(canvas: Canvas) -> Image:
+        x, y = canvas.x / period_m, canvas.y / period_m
+        sharp = period_m * canvas.texels_per_m
+        if pattern == "stripes":
+            amount = np.clip((np.abs(y % 1 - 0.5) - 0.25) * sharp + 0.5, 0, 1) + 0 * x
+        elif pattern == "checks":
+            amount = 0.5 * (np.abs(x % 1 - 0.5) > 0.25) + 0.5 * (np.abs(y % 1 - 0.5) > 0.25)
+        elif pattern == "dots":
+            amount = np.clip((0.27 - np.hypot(x % 1 - 0.5, y % 1 - 0.5)) * sharp + 0.5, 0, 1)
+        elif pattern == "zigzag":
+            amount = np.clip((np.abs((y + np.abs(x % 1 - 0.5)) % 1 - 0.5) - 0.25) * sharp + 0.5, 0, 1)
+        else:
+            amount = np.zeros((1, 1), np.float32)
+        amount = np.broadcast_to(amount, (canvas.height, canvas.width))
+        tone = 1 + weave * canvas.crop(canvas.noise.fine, shift) + 0.4 * weave * canvas.crop(canvas.noise.cloud, shift)
+        return mix(colour, other, amount) * tone[..., None]
+
+    return Material(paint, shared=shared)
+
+
+def marble(rng: np.random.Generator, colour: ArrayLike, vein: ArrayLike, amount: float = 0.5) -> Material:
+    """Stone worktops: veins and speckle."""
+    shift = _shift(rng)
+
+    def paint(canvas: Canvas) -> Image:
+        value = 0.12 * canvas.crop(canvas.noise.cloud, shift) + 0.3 * np.maximum(
+            canvas.crop(canvas.noise.veins, shift), 0
+        )
+        value = value + 0.1 * canvas.crop(canvas.noise.fine, shift)
+        return mix(colour, vein, np.clip(amount * value, 0, 1))
+
+    return Material(paint)
+
+
+def glow(colour: ArrayLike) -> Material:
+    """A lit lamp shade: bright, and no obstacle to the light inside it."""
+    base = np.asarray(colour, np.float32)
+
+    def paint(canvas: Canvas) -> Image:
+        return np.broadcast_to(base, (canvas.height, canvas.width, 3)).copy()
+
+    return Material(paint, emissive=True, casts_shadow=False)
+
+
+def leaf(rng: np.random.Generator, colour: ArrayLike) -> Material:
+    """A leaf with its veins, stem at the bottom."""
+    tip = vary(rng, np.asarray(colour) * 1.25, 0.02)
+    veins = int(rng.integers(5, 9))
+
+    def paint(canvas: Canvas) -> Image:
+        x, y = canvas.unit_x - 0.5, canvas.unit_y
+        albedo = mix(tip, colour, np.broadcast_to(y, (canvas.height, canvas.width)))
+        rib = np.clip(1 - np.abs(x) * canvas.width / 1.5, 0, 1) + 0 * y
+        side = np.clip(1 - np.abs(((y + np.abs(x)) * veins) % 1 - 0.5) * canvas.height / veins / 1.5, 0, 1)
+        return albedo * (1 + 0.25 * np.maximum(rib, 0.5 * side))[..., None]
+
+    return Material(paint, shared=True)

@@ -1,0 +1,247 @@
+"""The one geometric primitive of the generator: a grid of vertices that maps onto a rectangle of texture.
+
+Every surface, from a wall to a leaf, is a `Patch`. Seen from its front, s runs right and t runs down, like the columns
+and rows of the texture it gets; triangles are counter-clockwise from there. Solids are made of patches that together
+close the surface.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from wheretolook.scenes.procedural.materials import Material
+
+Float = NDArray[np.floating[Any]]
+
+HIDDEN = 0.2
+"""Texel density, relative to what is in view, of faces that stand against a wall or on the floor."""
+
+
+@dataclass(frozen=True, eq=False)
+class Patch:
+    """A grid of (m, n) cells.
+
+    Attributes:
+        positions: (m + 1, n + 1, 3) metres; row = t (down), column = s (right), seen from the front.
+        s: (n + 1,) texture coordinate of the columns, 0 to 1.
+        t: (m + 1,) texture coordinate of the rows, 0 to 1.
+        size_m: width and height of the surface in metres, which set the number of texels.
+        material: what is painted on it.
+        room: index of the room whose lamps and windows light it best.
+        density: texels per metre relative to the apartment's.
+        mask: (m, n) False for cells that are holes, or None for no holes.
+        offset_m: where the painted pattern starts, metres right and down.
+    """
+
+    positions: Float
+    s: Float
+    t: Float
+    size_m: tuple[float, float]
+    material: Material
+    room: int = 0
+    density: float = 1.0
+    mask: NDArray[np.bool_] | None = None
+    offset_m: tuple[float, float] = (0.0, 0.0)
+
+    def triangles(self) -> tuple[NDArray[np.int64], Float]:
+        """Triangles as indices into the flattened grid (T, 3) and the (s, t) of their corners (T, 3, 2)."""
+        m, n = len(self.t) - 1, len(self.s) - 1
+        row, column = np.mgrid[0:m, 0:n]
+        top_left = (row * (n + 1) + column)[self.mask if self.mask is not None else np.ones((m, n), bool)].ravel()
+        bottom_left = top_left + n + 1
+        triangles = np.concatenate(
+            [
+                np.stack([top_left, bottom_left, bottom_left + 1], 1),
+                np.stack([top_left, bottom_left + 1, top_left + 1], 1),
+            ]
+        )
+        corners = self.positions.reshape(-1, 3)[triangles]
+        area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        triangles = triangles[area > 1e-9]  # the poles of closed surfaces of revolution
+        st = np.stack([self.s[triangles % (n + 1)], self.t[triangles // (n + 1)]], -1)
+        return triangles, st
+
+
+def grid_patch(positions: Float, material: Material, size_m: tuple[float, float], **options: Any) -> Patch:
+    """Patch over an evenly parametrized grid of positions (m + 1, n + 1, 3)."""
+    m, n = positions.shape[0] - 1, positions.shape[1] - 1
+    return Patch(positions, np.linspace(0, 1, n + 1), np.linspace(0, 1, m + 1), size_m, material, **options)
+
+
+def plane(origin: ArrayLike, right: ArrayLike, down: ArrayLike, material: Material, **options: Any) -> Patch:
+    """Flat rectangle: top-left corner, and the edges that run right and down seen from its front (metres)."""
+    o, u, v = (np.asarray(a, float) for a in (origin, right, down))
+    positions = np.stack([np.stack([o, o + u]), np.stack([o + v, o + u + v])])
+    size = (float(np.linalg.norm(u)), float(np.linalg.norm(v)))
+    return grid_patch(positions, material, size, **options)
+
+
+FACES: dict[str, tuple[tuple[int, int, int], tuple[int, int, int], tuple[int, int, int]]] = {
+    # face: (corner it starts at, right, down), as signs on the half extents
+    "front": ((1, 1, 1), (-1, 0, 0), (0, 0, -1)),
+    "back": ((-1, -1, 1), (1, 0, 0), (0, 0, -1)),
+    "right": ((1, -1, 1), (0, 1, 0), (0, 0, -1)),
+    "left": ((-1, 1, 1), (0, -1, 0), (0, 0, -1)),
+    "top": ((-1, 1, 1), (1, 0, 0), (0, -1, 0)),
+    "bottom": ((-1, -1, -1), (1, 0, 0), (0, 1, 0)),
+}
+"""In the furniture frame: y points from the wall into the room (front = +y), z up."""
+
+
+def box(
+    low: ArrayLike,
+    high: ArrayLike,
+    material: Material,
+    *,
+    faces: Mapping[str, Material] | None = None,
+    hidden: Iterable[str] = ("bottom",),
+    offset_m: tuple[float, float] = (0.0, 0.0),
+    density: float = 1.0,
+) -> list[Patch]:
+    """Closed axis-aligned box from corner `low` to corner `high`; `faces` overrides the material of single faces."""
+    lo, hi = np.asarray(low, float), np.asarray(high, float)
+    centre, half = (lo + hi) / 2, (hi - lo) / 2
+    hidden = set(hidden)
+    return [
+        plane(
+            centre + half * np.array(corner),
+            2 * half * np.array(right),
+            2 * half * np.array(down),
+            (faces or {}).get(face, material),
+            density=density * (HIDDEN if face in hidden else 1.0),
+            offset_m=(offset_m[0] + 0.37 * i, offset_m[1] + 0.23 * i),
+        )
+        for i, (face, (corner, right, down)) in enumerate(FACES.items())
+    ]
+
+
+def cushion(
+    low: ArrayLike,
+    high: ArrayLike,
+    material: Material,
+    *,
+    radius_m: float = 0.05,
+    puff: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    rounding: int = 3,
+    span: int = 4,
+    hidden: Iterable[str] = ("bottom",),
+    density: float = 1.0,
+    offset_m: tuple[float, float] = (0.0, 0.0),
+) -> list[Patch]:
+    """Box with rounded edges; `puff` (metres per axis) swells the middle of its faces outwards."""
+    lo, hi = np.asarray(low, float), np.asarray(high, float)
+    centre, half = (lo + hi) / 2, (hi - lo) / 2
+    radius = min(radius_m, float(half.min()) * 0.999)
+    hidden = set(hidden)
+
+    def knots(extent: float) -> Float:
+        # Even angles on the rounded edge: a point h - r + r tan(a) of the box face lands at angle a.
+        edge = extent - radius + radius * np.tan(np.linspace(0, np.pi / 4, rounding + 1))
+        middle = np.linspace(-(extent - radius), extent - radius, span + 1)[1:-1]
+        return np.concatenate([-edge[::-1], middle, edge])
+
+    patches = []
+    for i, (face, (corner, right, down)) in enumerate(FACES.items()):
+        c, u, v = np.array(corner), np.array(right), np.array(down)
+        a, b = knots(float(half[u != 0][0])), knots(float(half[v != 0][0]))
+        fixed = c * ((u == 0) & (v == 0))
+        q = fixed * half + a[None, :, None] * u + b[:, None, None] * v
+        core = np.clip(q, -(half - radius), half - radius)
+        d = q - core
+        p = core + radius * d / np.linalg.norm(d, axis=-1, keepdims=True)
+        unit = np.clip(p / half, -1, 1)
+        for axis in range(3):
+            others = [k for k in range(3) if k != axis]
+            bulge = np.prod(1 - unit[..., others] ** 2, axis=-1)
+            p[..., axis] += puff[axis] * np.sign(unit[..., axis]) * np.abs(unit[..., axis]) ** 0.5 * bulge
+        s, t = (a - a[0]) / (a[-1] - a[0]), (b - b[0]) / (b[-1] - b[0])
+        size = (2 * float(half[u != 0][0]), 2 * float(half[v != 0][0]))
+        patches.append(
+            Patch(
+                centre + p,
+                s,
+                t,
+                size,
+                material,
+                density=density * (HIDDEN if face in hidden else 1.0),
+                offset_m=(offset_m[0] + 0.37 * i, offset_m[1] + 0.23 * i),
+            )
+        )
+    return patches
+
+
+def lathe(
+    profile: Sequence[tuple[float, float]], material: Material, *, sides: int = 16, centre: ArrayLike = (0, 0, 0),
+    density: float = 1.0,
+) -> list[Patch]:
+    """Surface of revolution about z; `profile` lists (radius, z) from top to bottom, radius 0 at both ends closes it."""
+    rz = np.asarray(profile, float)
+    angle = np.linspace(0, 2 * np.pi, sides + 1)
+    angle[-1] = 0.0
+    ring = np.stack([np.cos(angle), np.sin(angle)], -1)
+    positions = np.empty((len(rz), sides + 1, 3))
+    positions[..., :2] = rz[:, None, :1] * ring[None]
+    positions[..., 2] = rz[:, None, 1]
+    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(rz, axis=0), axis=1))])
+    size = (2 * np.pi * float(rz[:, 0].max()), float(arc[-1]))
+    return [
+        Patch(positions + np.asarray(centre, float), np.linspace(0, 1, sides + 1), arc / arc[-1], size, material,
+              density=density)
+    ]  # fmt: skip
+
+
+def cylinder(radius_m: float, z0: float, z1: float, material: Material, **options: Any) -> list[Patch]:
+    """Closed cylinder about z."""
+    return lathe([(0, z1), (radius_m, z1), (radius_m, z0), (0, z0)], material, **options)
+
+
+def tube(path: ArrayLike, radius_m: ArrayLike, material: Material, *, sides: int = 8, density: float = 1.0) -> list[Patch]:
+    """Closed tube along a polyline (K, 3), with one radius or one per point."""
+    points = np.asarray(path, float)
+    tangent = np.gradient(points, axis=0)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    radii = np.broadcast_to(np.asarray(radius_m, float), (len(points),))
+    points = np.concatenate([points[:1], points, points[-1:]])
+    tangent = np.concatenate([tangent[:1], tangent, tangent[-1:]])
+    radii = np.concatenate([[0.0], radii, [0.0]])
+    helper = np.array([0.0, 0.0, 1.0]) if abs(tangent[:, 2]).max() < 0.9 else np.array([0.31, 0.95, 0.0])
+    side = np.cross(tangent, helper)
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    other = np.cross(tangent, side)
+    angle = np.linspace(0, 2 * np.pi, sides + 1)
+    angle[-1] = 0.0
+    ring = np.cos(angle)[None, :, None] * side[:, None] - np.sin(angle)[None, :, None] * other[:, None]
+    positions = points[:, None] + radii[:, None, None] * ring
+    length = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+    return [grid_patch(positions, material, (2 * np.pi * float(radii.max()), length), density=density)]
+
+
+def slab_between(front: Float, back: Float, material: Material, size_m: tuple[float, float], **options: Any) -> list[Patch]:
+    """Closed sheet from two grids (m + 1, n + 1, 3) of equal shape, both indexed as seen from the front."""
+    edges = (
+        np.stack([back[0], front[0]]),  # top
+        np.stack([front[-1], back[-1]]),  # bottom
+        np.stack([back[:, 0], front[:, 0]], 1),  # left
+        np.stack([front[:, -1], back[:, -1]], 1),  # right
+    )
+    patches = [grid_patch(front, material, size_m, **options), grid_patch(back[:, ::-1], material, size_m, **options)]
+    for i, edge in enumerate(edges):
+        thickness = max(float(np.linalg.norm(edge[0, 0] - (edge[1, 0] if i < 2 else edge[0, 1]))), 0.004)
+        size = (size_m[0], thickness) if i < 2 else (thickness, size_m[1])
+        patches.append(grid_patch(edge, material, size, **options))
+    return patches
+
+
+def move(patches: Iterable[Patch], *, rotation: ArrayLike | None = None, angle_rad: float = 0.0,
+         shift: ArrayLike = (0, 0, 0)) -> list[Patch]:  # fmt: skip
+    """Patches rotated (a (3, 3) matrix, or an angle about z) and then shifted."""
+    if rotation is None:
+        c, s = np.cos(angle_rad), np.sin(angle_rad)
+        rotation = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    matrix, offset = np.asarray(rotation, float), np.asarray(shift, float)
+    return [replace(p, positions=p.positions @ matrix.T + offset) for p in patches]

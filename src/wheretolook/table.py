@@ -1,0 +1,96 @@
+"""The table of viewpoints: one Parquet file a scene, one row a viewpoint, joined by ids and never by file order."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from wheretolook.errors import TableError
+from wheretolook.geometry import Float, quaternion_from_rotation, rotation_from_quaternion
+
+POSE_COLUMNS = ("qw", "qx", "qy", "qz", "tx", "ty", "tz")
+LABEL_COLUMNS = ("status", "error_m", "error_deg", "n_inliers")
+
+SCHEMA = pa.schema(
+    [
+        ("viewpoint_id", pa.int64()),
+        ("location_id", pa.int32()),
+        ("direction_id", pa.int32()),
+        *[(name, pa.float64()) for name in POSE_COLUMNS],
+        ("n_visible", pa.int32()),
+        ("visibility_rank", pa.int32()),
+        ("status", pa.string()),
+        ("error_m", pa.float32()),
+        ("error_deg", pa.float32()),
+        ("n_inliers", pa.int32()),
+    ]
+)
+"""Columns of `viewpoints.parquet`. The pose is cam_from_world (quaternion wxyz, translation in metres), rank 0 is the
+direction that sees most landmarks at its location. Until a viewpoint is labelled its status is "unlabelled"; afterwards
+it is "localized", "too_few_matches" or "no_pose", and both errors are NaN unless there is a pose to compare."""
+
+UNLABELLED, LOCALIZED, TOO_FEW_MATCHES, NO_POSE = "unlabelled", "localized", "too_few_matches", "no_pose"
+
+
+def poses(table: pd.DataFrame) -> Float:
+    """cam_from_world poses (B, 3, 4) of a table's rows."""
+    rotation = rotation_from_quaternion(table[list(POSE_COLUMNS[:4])].to_numpy(np.float64))
+    return np.concatenate([rotation, table[list(POSE_COLUMNS[4:])].to_numpy(np.float64)[..., None]], axis=-1)
+
+
+def pose_columns(cam_from_world: Float) -> dict[str, Float]:
+    """Pose columns, by name, of poses (B, 3, 4)."""
+    values = np.concatenate([quaternion_from_rotation(cam_from_world[..., :3]), cam_from_world[..., 3]], axis=-1)
+    return dict(zip(POSE_COLUMNS, values.T, strict=True))
+
+
+def is_good(table: pd.DataFrame, max_error_m: float = 0.05, max_error_deg: float = 0.4) -> np.ndarray:
+    """Labels: True where the viewpoint was localized with both errors strictly under their limits. (B,)
+
+    Raises:
+        TableError: some row has no label yet.
+    """
+    unlabelled = int((table["status"] == UNLABELLED).sum())
+    if unlabelled:
+        raise TableError("viewpoints without labels", value=unlabelled, fix="Run the label stage (it resumes).")
+    good = (table["status"] == LOCALIZED) & (table["error_m"] < max_error_m) & (table["error_deg"] < max_error_deg)
+    return good.to_numpy()
+
+
+def write_table(table: pd.DataFrame, path: Path) -> None:
+    """Write a table atomically as zstd Parquet. The same rows give the same bytes."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".partial")
+    pq.write_table(pa.Table.from_pandas(table, schema=SCHEMA, preserve_index=False), partial, compression="zstd")
+    os.replace(partial, path)
+
+
+def read_table(path: Path) -> pd.DataFrame:
+    """Read a table of viewpoints.
+
+    Raises:
+        TableError: the file is missing, truncated, no Parquet file, or lacks columns.
+    """
+    if not path.is_file():
+        raise TableError("there is no table of viewpoints", path=path, fix="Run the sample stage first.")
+    try:
+        table = pq.read_table(path)
+    except (pa.ArrowException, OSError) as error:
+        raise TableError(
+            f"not a readable Parquet file: {error}", path=path, fix="It may be truncated: delete it and run the stage that writes it."
+        ) from error
+    missing = [name for name in SCHEMA.names if name not in table.column_names]
+    if missing:
+        raise TableError("columns are missing", path=path, value=missing, fix="Run the sample stage again.")
+    return table.select(SCHEMA.names).cast(SCHEMA).to_pandas()
+
+
+def fingerprint(path: Path) -> str:
+    """First 16 hexadecimal digits of a file's SHA-256."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]

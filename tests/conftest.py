@@ -1,0 +1,39 @@
+"""Shared fixtures: small random maps and views."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from wheretolook.geometry import Float, PinholeCamera, poses_looking_along
+from wheretolook.visibility import VisibleSets
+
+
+@dataclass(frozen=True)
+class RandomViews:
+    """Views from a few locations at random landmarks, some of them occluded at random."""
+
+    camera: PinholeCamera
+    points: Float
+    locations: Float
+    directions: Float
+    mask: np.ndarray
+    visible: VisibleSets
+    location_rows: np.ndarray
+    cam_from_world: Float
+
+
+@pytest.fixture(params=[0, 1, 2])
+def random_views(request: pytest.FixtureRequest) -> RandomViews:
+    rng = np.random.default_rng(request.param)
+    camera = PinholeCamera(320, 200 + 20 * request.param, 150.0 + 30 * request.param)
+    points, locations = rng.uniform(-4, 4, (800, 3)), rng.uniform(-2, 2, (5, 3))
+    directions = rng.normal(size=(17, 3))
+    mask = rng.random((len(locations), len(points))) < 0.6
+    location_rows = rng.integers(0, len(locations), 40)
+    poses = poses_looking_along(locations[location_rows], rng.normal(size=(40, 3)))
+    return RandomViews(
+        camera, points, locations, directions, mask, VisibleSets.from_mask(mask), location_rows, poses
+    )

@@ -1,0 +1,78 @@
+"""Binned inputs against bins counted by hand and the plain twin."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from conftest import RandomViews
+from wheretolook.errors import ConfigError
+from wheretolook.features import CHANNELS, INPUT_VARIANTS, arrange, bin_views, bin_views_plain
+from wheretolook.geometry import PinholeCamera
+from wheretolook.visibility import VisibleSets
+
+LOOKING_ALONG_Z = np.eye(3, 4)[None]
+
+
+def hand_counted(points: list[list[float]]) -> VisibleSets:
+    return VisibleSets.from_mask(np.ones((1, len(points)), dtype=bool))
+
+
+@pytest.mark.parametrize("bin_function", [bin_views, bin_views_plain])
+def test_bins_counted_by_hand(bin_function) -> None:  # type: ignore[no-untyped-def]
+    # 60 x 30 pixels, f = 30: bins of 2 x 1 pixels. The optical axis passes through (30, 15).
+    camera = PinholeCamera(60, 30, 30.0)
+    points = [
+        [0.01, 0.01, 1.0],  # pixel (30.3, 15.3): row 15, column 15
+        [0.09, 0.05, 3.0],  # pixel (30.9, 15.5): the same bin
+        [-0.98, -0.48, 1.0],  # pixel (0.6, 0.6): row 0, column 0
+        [0.98, 0.48, 1.0],  # pixel (59.4, 29.4): row 29, column 29
+        [1.01, 0.0, 1.0],  # pixel (60.3, 15): outside
+        [0.0, 0.0, -1.0],  # behind
+    ]
+    binned = bin_function(camera, LOOKING_ALONG_Z, np.array(points), hand_counted(points), np.zeros(1, int))
+    assert {tuple(cell): int(binned.counts[0][tuple(cell)]) for cell in np.argwhere(binned.counts[0])} == {
+        (0, 0): 1, (15, 15): 2, (29, 29): 1,
+    }  # fmt: skip
+    np.testing.assert_allclose(binned.means[0, :, 15, 15], [30.6, 15.4, 0.05, 0.03, 2.0], rtol=1e-5)
+    np.testing.assert_allclose(binned.means[0, :, 0, 0], [0.6, 0.6, -0.98, -0.48, 1.0], rtol=1e-5)
+    assert binned.n_visible.tolist() == [4] and binned.n_filled.tolist() == [3]
+    assert np.all(binned.means[:, :, binned.counts[0] == 0] == 0)
+
+
+def test_kernel_bins_as_its_plain_twin(random_views: RandomViews) -> None:
+    v = random_views
+    arguments = v.camera, v.cam_from_world, v.points, v.visible, v.location_rows
+    kernel, plain = bin_views(*arguments, bins=12), bin_views_plain(*arguments, bins=12)
+    same = kernel.counts == plain.counts  # single precision may move a landmark on a bin's edge to the next bin
+    assert same.mean() > 0.999 and plain.counts.sum() > 500
+    both = np.broadcast_to(same[:, None], plain.means.shape)
+    np.testing.assert_allclose(kernel.means[both], plain.means[both], rtol=1e-4, atol=2e-4)
+
+
+def test_blocks_do_not_change_the_bins(random_views: RandomViews) -> None:
+    v = random_views
+    arguments = v.camera, v.cam_from_world, v.points, v.visible, v.location_rows
+    whole, blocks = bin_views(*arguments, bins=6), bin_views(*arguments, bins=6, block_bytes=7 * 36 * 24)
+    np.testing.assert_array_equal(whole.means, blocks.means)
+    np.testing.assert_array_equal(whole.counts, blocks.counts)
+
+
+def test_input_sizes_are_those_of_the_variants(random_views: RandomViews) -> None:
+    v = random_views
+    binned = bin_views(v.camera, v.cam_from_world, v.points, v.visible, v.location_rows)
+    sizes = {name: binned.select(channels).means[0].size for name, channels in INPUT_VARIANTS.items()}
+    assert sizes == {"2d": 1800, "2d+z": 2700, "2d+3d": 4500}
+    np.testing.assert_array_equal(binned.select(("z",)).means[:, 0], binned.means[:, CHANNELS.index("z")])
+    with pytest.raises(ConfigError, match="unknown input channel"):
+        binned.select(("u", "colour"))
+
+
+def test_compact_layout_moves_filled_bins_to_the_front_in_order() -> None:
+    means = np.zeros((1, 2, 2, 2), dtype=np.float32)
+    means[0, :, 0, 1], means[0, :, 1, 1] = (5, 6), (7, 8)
+    filled = np.array([[[False, True], [False, True]]])
+    assert arrange(means, filled, "compact").reshape(2, 4).tolist() == [[5, 7, 0, 0], [6, 8, 0, 0]]
+    assert arrange(means, filled, "in_place") is means
+    with pytest.raises(ConfigError, match="layout"):
+        arrange(means, filled, "sideways")  # type: ignore[arg-type]

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,12 +22,12 @@ _POINT_BYTES = 51  # id, position, colour, error, track length; the track's elem
 
 
 @contextmanager
-def quiet_colmap() -> Iterator[None]:
-    """Silence COLMAP's log below warnings, which would tear the progress bars."""
+def quiet_colmap(least: Literal["WARNING", "ERROR"] = "WARNING") -> Iterator[None]:
+    """Silence COLMAP's log below a level: it would tear the progress bars."""
     import pycolmap
 
     level = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = max(level, pycolmap.logging.Level.WARNING.value)
+    pycolmap.logging.minloglevel = max(level, getattr(pycolmap.logging.Level, least).value)
     try:
         yield
     finally:
@@ -74,11 +74,17 @@ def read_model(model_dir: str | Path) -> Any:
 
     folder = Path(model_dir)
     if not folder.is_dir():
-        raise MapError("there is no such folder", path=folder, fix="Give the folder that holds cameras.bin, images.bin and points3D.bin.")
+        raise MapError(
+            "there is no such folder",
+            path=folder,
+            fix="Give the folder that holds cameras.bin, images.bin and points3D.bin.",
+        )
     suffix = next((s for s in (".bin", ".txt") if any((folder / (n + s)).is_file() for n in MODEL_FILES)), None)
     if suffix is None:
         raise MapError(
-            "no COLMAP model here", path=folder, fix="Give the folder that holds cameras, images and points3D (.bin or .txt)."
+            "no COLMAP model here",
+            path=folder,
+            fix="Give the folder that holds cameras, images and points3D (.bin or .txt).",
         )
     for name in MODEL_FILES:
         if not (folder / (name + suffix)).is_file():
@@ -97,24 +103,29 @@ def read_model(model_dir: str | Path) -> Any:
     if suffix == ".bin":
         images, cameras = reconstruction.images.values(), reconstruction.cameras.values()
         _check_size(folder / "cameras.bin", 8 + sum(24 + 8 * len(c.params) for c in cameras))
-        _check_size(
-            folder / "images.bin", 8 + sum(73 + len(i.name.encode()) + 24 * i.num_points2D() for i in images)
-        )
+        _check_size(folder / "images.bin", 8 + sum(73 + len(i.name.encode()) + 24 * i.num_points2D() for i in images))
     return reconstruction
 
 
 def model_arrays(reconstruction: Any) -> ModelArrays:
-    """Arrays of a `pycolmap.Reconstruction`. Errors it does not hold yet are computed from the observations."""
+    """Arrays of a `pycolmap.Reconstruction`. Errors it does not hold yet are computed from the observations.
+
+    Raises:
+        MapError: a track names an image that has no pose.
+    """
     points = reconstruction.points3D
     point_ids = np.array(sorted(points), dtype=np.int64)
     ordered = [points[i] for i in point_ids]
     if not all(p.has_error() for p in ordered):
         reconstruction.update_point_3d_errors()
-    # Points may refer to images of a rig that were never registered; COLMAP does not triangulate from those.
     image_ids = np.array(sorted(i for i, image in reconstruction.images.items() if image.has_pose), dtype=np.int64)
     images = [reconstruction.images[i] for i in image_ids]
     tracks = [p.track.elements for p in ordered]
-    observations = np.array([(e.image_id, e.point2D_idx) for track in tracks for e in track], dtype=np.int64).reshape(-1, 2)
+    observations = np.array([(e.image_id, e.point2D_idx) for track in tracks for e in track], dtype=np.int64).reshape(
+        -1, 2
+    )
+    if not np.isin(observations[:, 0], image_ids).all():
+        raise MapError("points were observed by images without a pose", fix=_REBUILD)
     return ModelArrays(
         point_ids=point_ids,
         points=np.array([p.xyz for p in ordered], dtype=np.float64).reshape(-1, 3),
@@ -128,7 +139,9 @@ def model_arrays(reconstruction: Any) -> ModelArrays:
     )
 
 
-def read_descriptors(database: str | Path, model_dir: str | Path, reconstruction: Any, model: ModelArrays) -> list[NDArray[np.uint8]]:
+def read_descriptors(
+    database: str | Path, model_dir: str | Path, reconstruction: Any, model: ModelArrays
+) -> list[NDArray[np.uint8]]:
     """Descriptors (K, 128) uint8 of the model's images, in the order of `model.image_ids`, joined by image name.
 
     Raises:
@@ -138,7 +151,9 @@ def read_descriptors(database: str | Path, model_dir: str | Path, reconstruction
 
     path = Path(database)
     if not path.is_file():
-        raise MapError("there is no such database", path=path, fix="Give the database.db the model was built from, or none.")
+        raise MapError(
+            "there is no such database", path=path, fix="Give the database.db the model was built from, or none."
+        )
     mismatch = f"Give the database that {model_dir} was built from, or none."
     descriptors = []
     try:
@@ -153,8 +168,13 @@ def read_descriptors(database: str | Path, model_dir: str | Path, reconstruction
                 if len(keypoints) != image.num_points2D() or len(values) != image.num_points2D():
                     problem = f"the database and the model disagree on the number of keypoints of {name}"
                     raise MapError(problem, path=path, value=(len(values), image.num_points2D()), fix=mismatch)
-                if len(keypoints) and np.abs(keypoints[[0, -1], :2] - [image.points2D[0].xy, image.points2D[-1].xy]).max() > 0.01:
-                    raise MapError("the database holds other keypoints than the model", path=path, value=name, fix=mismatch)
+                if (
+                    len(keypoints)
+                    and np.abs(keypoints[[0, -1], :2] - [image.points2D[0].xy, image.points2D[-1].xy]).max() > 0.01
+                ):
+                    raise MapError(
+                        "the database holds other keypoints than the model", path=path, value=name, fix=mismatch
+                    )
                 if values.ndim != 2 or values.shape[1] != 128 or values.dtype != np.uint8:
                     raise MapError("the descriptors are not SIFT", path=path, value=values.shape, fix=mismatch)
                 descriptors.append(values)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import warnings
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wheretolook.errors import ConfigError
+from wheretolook.mapping.colmap_model import quiet_colmap
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Keypoints:
 
 
 def quantize_descriptors(descriptors: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
-    """Unit descriptors (N, D) as COLMAP stores them: 512 times the value, rounded, at most 255. Returns (N, D) uint8."""
+    """Unit descriptors (N, D) as COLMAP stores them, (N, D) uint8: 512 times the value, rounded, at most 255."""
     return np.clip(np.rint(512 * descriptors), 0, 255).astype(np.uint8)
 
 
@@ -168,7 +168,8 @@ def _colmap_sift(config: ExtractorConfig) -> Any:
     options.sift.max_num_features = config.max_keypoints
     options.sift.peak_threshold = config.peak_threshold
     options.sift.edge_threshold = config.edge_threshold
-    return pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
+    with quiet_colmap():
+        return pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
 
 
 def _opencv_sift(config: ExtractorConfig) -> Any:
@@ -184,10 +185,6 @@ _worker: KeypointExtractor | None = None
 
 def _start_worker(config: ExtractorConfig) -> None:
     global _worker
-    warnings.simplefilter("ignore")
-    import pycolmap
-
-    pycolmap.logging.minloglevel = pycolmap.logging.Level.WARNING.value
     _worker = KeypointExtractor(config)
 
 

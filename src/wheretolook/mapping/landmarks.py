@@ -101,14 +101,19 @@ def load_colmap_landmarks(
     """
     reconstruction = read_model(model_dir)
     if reconstruction.num_points3D() == 0:
-        raise MapError("the model has no points", path=model_dir, fix="Triangulate it, or map with more overlap or texture.")
+        raise MapError(
+            "the model has no points", path=model_dir, fix="Triangulate it, or map with more overlap or texture."
+        )
     model = model_arrays(reconstruction)
-    keep = np.flatnonzero(model.errors_px <= max_reprojection_error_px)
+    observed = np.diff(model.observation_start) > 0
+    if not observed.any():
+        raise MapError("no point of the model has a track", path=model_dir, fix="Triangulate the model from keypoints.")
+    keep = np.flatnonzero(observed & (model.errors_px <= max_reprojection_error_px))
     if len(keep) == 0:
         raise MapError(
-            f"all {len(model.point_ids)} points have more than {max_reprojection_error_px} px mean reprojection error",
+            f"all {observed.sum()} points have more than {max_reprojection_error_px} px mean reprojection error",
             path=model_dir,
-            value=f"least {model.errors_px.min():.2f} px",
+            value=f"least {model.errors_px[observed].min():.2f} px",
             fix="Raise max_reprojection_error_px, or check the intrinsics and poses of the model.",
         )
     if not np.isfinite(model.points[keep]).all():
@@ -136,7 +141,9 @@ def nearest_other_cosine(descriptors: NDArray[np.uint8], device: str = "cpu") ->
     """
     n = len(descriptors)
     values = torch.as_tensor(descriptors, dtype=torch.float32, device=device)
-    inverse = 1 / torch.as_tensor(np.linalg.norm(descriptors.astype(np.float64), axis=1), device=device).clamp(min=1).float()
+    inverse = (
+        1 / torch.as_tensor(np.linalg.norm(descriptors.astype(np.float64), axis=1), device=device).clamp(min=1).float()
+    )
     best = torch.full((n,), -torch.inf, device=device)
     for i in range(0, n, _BLOCK):
         rows = slice(i, min(i + _BLOCK, n))
@@ -181,9 +188,7 @@ def _viewing_geometry(model: ModelArrays) -> dict[str, NDArray[np.float32]]:
         members = np.flatnonzero(lengths == n)
         for block in np.array_split(members, -(-len(members) * int(n) ** 2 // 4_000_000)):
             track = rays[start[block][:, None] + np.arange(n)]
-            # The chord between unit vectors is accurate at small angles, where arccos of the cosine is not.
-            chord = np.sqrt(np.maximum(2 - 2 * (track @ track.swapaxes(1, 2)).min((1, 2)), 0))
-            angle[block] = np.degrees(2 * np.arcsin(np.clip(chord / 2, 0, 1)))
+            angle[block] = np.degrees(np.arccos(np.clip((track @ track.swapaxes(1, 2)).min((1, 2)), -1, 1)))
     return {
         "triangulation_angle_deg": angle.astype(np.float32),
         "mapping_direction": (mean / np.maximum(length, 1e-12)[:, None]).astype(np.float32),

@@ -78,6 +78,36 @@ def _distance_kernel(
         distance_m[i] = wp.length(at - points[i])
 
 
+@wp.kernel
+def _clear_kernel(
+    mesh: wp.uint64,
+    starts: wp.array[wp.vec3],
+    ends: wp.array[wp.vec3],
+    clearance_m: wp.float32,
+    clear: wp.array[wp.bool],
+):
+    # The ball around a point up to the nearest surface is empty: step by what it leaves beyond the clearance.
+    i = wp.tid()
+    start = starts[i]
+    length = wp.length(ends[i] - start)
+    toward = (ends[i] - start) / wp.max(length, 1.0e-9)
+    reach = length + 2.0 * clearance_m  # no need to look farther for the nearest surface
+    travelled = wp.float32(0.0)
+    result = wp.bool(True)
+    while result and travelled <= length:
+        nearest = wp.mesh_query_point_no_sign(mesh, start + travelled * toward, reach)
+        if not nearest.result:
+            break
+        at = wp.mesh_eval_position(mesh, nearest.face, nearest.u, nearest.v)
+        distance = wp.length(at - start - travelled * toward)
+        if distance < clearance_m:
+            result = False
+        if travelled == length:
+            break
+        travelled = wp.min(travelled + wp.max(distance - clearance_m, 0.1 * clearance_m), length)
+    clear[i] = result
+
+
 class MeshRaycaster:
     """Answers ray and distance queries on a mesh.
 
@@ -167,3 +197,28 @@ class MeshRaycaster:
             device=self.device,
         )
         return distance_m.numpy()
+
+    def segments_are_clear(self, a: ArrayLike, b: ArrayLike, clearance_m: float) -> NDArray[np.bool_]:
+        """Whether straight segments keep a distance from the geometry.
+
+        Args:
+            a: (N, 3) metres.
+            b: (N, 3) metres.
+            clearance_m: least distance to any triangle along the segment. Where the segment runs parallel to a surface
+                at about this distance it is tested every tenth of it, and may come closer by less than 0.2 %.
+
+        Returns:
+            (N,) bool.
+        """
+        starts, ends = vec3_array(a, self.device), vec3_array(b, self.device)
+        if starts.shape != ends.shape:
+            raise ValueError(f"{starts.shape[0]} starts for {ends.shape[0]} ends")
+        clear = wp.empty(starts.shape[0], dtype=wp.bool, device=self.device)
+        wp.launch(
+            _clear_kernel,
+            dim=starts.shape[0],
+            inputs=[self.warp_mesh.id, starts, ends, clearance_m],
+            outputs=[clear],
+            device=self.device,
+        )
+        return clear.numpy().astype(np.bool_)

@@ -245,3 +245,9 @@ def move(patches: Iterable[Patch], *, rotation: ArrayLike | None = None, angle_r
         rotation = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
     matrix, offset = np.asarray(rotation, float), np.asarray(shift, float)
     return [replace(p, positions=p.positions @ matrix.T + offset) for p in patches]
+
+
+def tilted_back(patches: Iterable[Patch], angle_rad: float) -> list[Patch]:
+    """Patches turned about the x axis so that their tops lean towards -y."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    return move(patches, rotation=[[1, 0, 0], [0, c, -s], [0, s, c]])

@@ -1,0 +1,66 @@
+# make demo   sets everything up and runs the whole line on the embedded default
+# make test   sets everything up and runs linter, type checker and tests
+# Options: TORCH=cuda for the CUDA build of PyTorch, PYTHON=python3.12 for a certain interpreter. See environment.md.
+
+TORCH ?= cpu
+TORCH_VERSION := 2.13.0
+PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
+  $$p -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' 2>/dev/null && echo $$p && break; done)
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --progress-bar off
+CONSTRAINTS := configs/constraints.txt
+READY := $(VENV)/ready-$(TORCH)
+
+.PHONY: demo test setup ui notebooks clean help
+
+help:
+	@sed -n '1,3s/^# //p' Makefile
+
+demo: $(READY)
+	@$(BIN)/wheretolook demo
+
+test: $(READY)
+	$(BIN)/ruff check . && $(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/python -m pytest
+
+ui: $(READY)
+	$(BIN)/mlflow ui --backend-store-uri sqlite:///mlruns/mlflow.db
+
+notebooks: $(READY)
+	$(BIN)/jupyter lab notebooks
+
+setup: $(READY)
+
+$(READY): pyproject.toml $(CONSTRAINTS) Makefile
+	@test -n "$(PYTHON)" || { echo "wheretolook needs Python 3.11, 3.12 or 3.13: sudo apt-get install python3 python3-venv" >&2; exit 1; }
+	@missing=""; \
+	for pair in libusb-1.0.so.0=libusb-1.0-0 libGL.so.1=libgl1 libgomp.so.1=libgomp1; do \
+	  ldconfig -p 2>/dev/null | grep -q "$${pair%%=*}" || missing="$$missing $${pair##*=}"; done; \
+	if [ -n "$$missing" ]; then \
+	  echo "installing system libraries:$$missing"; \
+	  if [ "$$(id -u)" = 0 ]; then as=""; else as="sudo -n"; fi; \
+	  { $$as apt-get update -qq && $$as env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq $$missing; } >/dev/null 2>&1 || \
+	  { echo "system libraries are missing, install them with: sudo apt-get install$$missing" >&2; exit 1; }; fi
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || \
+	  { rm -rf $(VENV); echo "cannot make a virtual environment: sudo apt-get install python3-venv" >&2; exit 1; }
+	@echo "installing Python packages into $(VENV) (a few minutes the first time)"
+	@$(MAKE) --no-print-directory torch-$(TORCH)
+	@$(PIP) -c $(CONSTRAINTS) -e '.[test]'
+	@rm -f $(VENV)/ready-*; touch $@
+
+# The index in use may carry CPU builds itself; if not, uv knows where PyTorch keeps them; the CUDA build runs on a CPU too.
+.PHONY: torch-cpu torch-cuda
+torch-cpu:
+	@$(BIN)/python -c 'import torch, sys; sys.exit(torch.__version__.split("+")[0] != "$(TORCH_VERSION)")' 2>/dev/null || \
+	$(PIP) 'torch==$(TORCH_VERSION)+cpu' 2>/dev/null || \
+	{ $(PIP) uv && $(BIN)/uv pip install --quiet --python $(BIN)/python --torch-backend cpu 'torch==$(TORCH_VERSION)'; } 2>/dev/null || \
+	$(PIP) 'torch==$(TORCH_VERSION)'
+
+torch-cuda:
+	@$(BIN)/python -c 'import torch, sys; sys.exit(torch.version.cuda is None)' 2>/dev/null || \
+	{ $(BIN)/python -m pip uninstall --quiet --yes torch; $(PIP) 'torch==$(TORCH_VERSION)'; }
+
+clean:
+	rm -rf $(VENV) build dist .pytest_cache .ruff_cache .mypy_cache

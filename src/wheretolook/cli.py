@@ -1,0 +1,183 @@
+"""The command line: `wheretolook STAGE --config configs/demo.yaml`, one sub-command for each stage."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+import time
+import traceback
+import warnings
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from wheretolook import __version__
+from wheretolook.errors import ConfigError, WhereToLookError
+
+if TYPE_CHECKING:
+    from jsonargparse import ArgumentParser
+
+    from wheretolook.config import Experiment
+
+STAGES = {
+    "scenes": ("make_scenes", "Make or load the textured meshes.", ("scenes",)),
+    "map": ("make_maps", "Build a COLMAP map of every scene from renders along a walk.", ("map",)),
+    "sample": ("sample", "Choose viewpoints by the landmarks they see.", ("sample",)),
+    "label": ("label", "Render and localize every viewpoint, measure the pose error. Resumes.", ("label",)),
+    "train": ("train", "Train one network for each input variant.", ("train", "tracking")),
+    "evaluate": ("evaluate", "Score all methods on the test scenes.", ("evaluate", "tracking")),
+}
+"""Sub-command: function in `wheretolook.stages`, what it does, groups of settings it reads."""
+
+DEMO = "Run all stages on the embedded default and draw the score figure."
+
+USAGE = """\
+wheretolook: where to point a camera so that it knows where it is
+
+usage: wheretolook STAGE [--config FILE.yaml] [--GROUP.SETTING VALUE ...] [--debug]
+
+stages, in order; each reads what the one before it left in <data>/<name>/
+{stages}
+
+  wheretolook STAGE --help         the settings a stage reads, with their defaults
+  wheretolook demo                 is configs/demo.yaml unless --config names another
+  wheretolook map --config configs/demo.yaml --map.n_images 120
+  wheretolook --version
+"""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line. Returns the exit code: 0, 2 for bad input, 130 when interrupted."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    debug = "--debug" in arguments
+    arguments = [argument for argument in arguments if argument != "--debug"]
+    if not arguments or arguments[0] in ("-h", "--help", "help"):
+        print(_usage())
+        return 0
+    if arguments[0] == "--version":
+        print(f"wheretolook {__version__}")
+        return 0
+    if not debug:
+        _quieten()
+    try:
+        return _run(arguments[0], arguments[1:])
+    except WhereToLookError as error:
+        if debug:
+            traceback.print_exc()
+        print(f"wheretolook: error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("\nwheretolook: interrupted; what is finished is kept, run the same command to go on", file=sys.stderr)
+        return 130
+
+
+def _usage() -> str:
+    rows = [*((name, entry[1]) for name, entry in STAGES.items()), ("demo", DEMO)]
+    return USAGE.format(stages="\n".join(f"  {name:<10}{text}" for name, text in rows))
+
+
+def _run(command: str, arguments: list[str]) -> int:
+    if command not in (*STAGES, "demo"):
+        raise ConfigError("unknown stage", value=command, fix=f"Use one of {', '.join((*STAGES, 'demo'))}.")
+    experiment = parse_experiment(command, arguments)
+    if experiment is None:
+        return 0
+    from wheretolook import stages
+
+    if command == "demo":
+        from wheretolook.demo import run_demo
+
+        run_demo(experiment)
+    else:
+        start = time.monotonic()
+        getattr(stages, STAGES[command][0])(experiment)
+        print(f"done in {time.monotonic() - start:.0f} s: {experiment.root}")
+    return 0
+
+
+def parse_experiment(command: str, arguments: list[str]) -> Experiment | None:
+    """The experiment that a YAML file and the command line's overrides describe; None if only help was asked for.
+
+    Raises:
+        ConfigError: a file is missing, or a key or value does not fit.
+    """
+    from wheretolook.config import Experiment
+
+    if command == "demo" and not any(argument.startswith("--config") for argument in arguments):
+        arguments = ["--config", str(_default_config()), *arguments]
+    parser = _parser(command)
+    if "-h" in arguments or "--help" in arguments:
+        print(_help(parser, command))
+        return None
+    from jsonargparse import ArgumentError
+
+    try:
+        return Experiment(**vars(parser.instantiate(parser.parse_args(arguments))))
+    except (ArgumentError, WhereToLookError) as error:
+        for cause in _causes(error):
+            if isinstance(cause, WhereToLookError):
+                raise cause from error
+        path = next((value for flag, value in pairwise(arguments) if flag == "--config"), None)
+        problem = " ".join(str(error).split())
+        raise ConfigError(problem, path=path, fix=f"`wheretolook {command} --help` lists the settings.") from error
+
+
+def _parser(command: str) -> ArgumentParser:
+    from jsonargparse import ArgumentParser
+
+    from wheretolook.config import Experiment
+
+    text = DEMO if command == "demo" else STAGES[command][1]
+    parser = ArgumentParser(
+        prog=f"wheretolook {command}",
+        usage=f"wheretolook {command} [--config FILE.yaml] [--GROUP.SETTING VALUE ...]",
+        description=text,
+        exit_on_error=False,
+    )
+    parser.add_argument("--config", action="config", help="YAML file of an experiment, such as configs/demo.yaml")
+    parser.add_class_arguments(Experiment)
+    return parser
+
+
+def _help(parser: ArgumentParser, command: str) -> str:
+    """The settings this stage reads; the file may hold those of every other stage too."""
+    groups = tuple(f"{group}." for group in STAGES[command][2]) if command in STAGES else ()
+
+    def belongs(dest: str) -> bool:
+        return not groups or dest.startswith((*groups, "camera.")) or "." not in dest and dest not in _GROUPS
+
+    for group in parser._action_groups:
+        group._group_actions = [action for action in group._group_actions if belongs(action.dest)]
+    return str(parser.format_help())
+
+
+_GROUPS = {group for _, _, groups in STAGES.values() for group in groups}
+
+
+def _causes(error: BaseException) -> Iterator[BaseException]:
+    cause: BaseException | None = error
+    while cause is not None:
+        yield cause
+        cause = cause.__cause__ or cause.__context__
+
+
+def _default_config() -> Path:
+    path = Path("configs/demo.yaml")
+    if not path.is_file():
+        raise ConfigError("the demo's configuration is not here", path=path, fix="Run in the project's folder, or give --config.")
+    return path
+
+
+def _quieten() -> None:
+    """Keep libraries' chatter out of the progress; --debug brings it back."""
+    os.environ.setdefault("GLOG_minloglevel", "2")
+    os.environ.setdefault("PYTHONWARNINGS", "ignore")  # for worker processes
+    warnings.simplefilter("ignore")
+    for name in ("lightning", "lightning.pytorch", "lightning.fabric", "mlflow", "alembic"):
+        logging.getLogger(name).setLevel(logging.ERROR)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

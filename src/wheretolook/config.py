@@ -1,0 +1,112 @@
+"""One experiment: every stage's settings in one frozen dataclass, read from one YAML file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from wheretolook.errors import ConfigError
+from wheretolook.evaluation.config import EvaluateConfig
+from wheretolook.geometry import PinholeCamera
+from wheretolook.labelling.labeller import LabelConfig
+from wheretolook.learning.config import TrainConfig
+from wheretolook.mapping.building import MapConfig
+from wheretolook.sampling import SampleConfig
+from wheretolook.scenes.free_space import FreeSpaceConfig
+from wheretolook.scenes.procedural import ApartmentConfig
+from wheretolook.tracking import TrackingConfig
+
+
+@dataclass(frozen=True)
+class MeshSource:
+    """A mesh of one's own as a scene.
+
+    Args:
+        path: GLB, PLY or OBJ file with textures, in metres, or a Habitat-Matterport folder `<id>-<name>`.
+        split: where its viewpoints go: train, val or test.
+        name: of the scene; the file's own name if empty.
+        up: which axis of the file points up: x, y or z, with a minus sign if it points down.
+    """
+
+    path: Path
+    split: Literal["train", "val", "test"] = "test"
+    name: str = ""
+    up: str = "z"
+
+    @property
+    def scene_name(self) -> str:
+        """Name of the scene's folder."""
+        return self.name or self.path.stem
+
+
+@dataclass(frozen=True)
+class ScenesConfig:
+    """Settings of the scenes stage.
+
+    Args:
+        train: procedural apartments to learn from.
+        val: procedural apartments for validation; with none, some locations of the training scenes are held out.
+        test: procedural apartments to evaluate on.
+        seed: of the first apartment; each further one counts up.
+        apartment: what an apartment is like.
+        meshes: scenes from meshes of one's own, beside the apartments.
+        free_space: where a camera may be.
+    """
+
+    train: int = 3
+    val: int = 0
+    test: int = 1
+    seed: int = 0
+    apartment: ApartmentConfig = field(default_factory=ApartmentConfig)
+    meshes: tuple[MeshSource, ...] = ()
+    free_space: FreeSpaceConfig = field(default_factory=FreeSpaceConfig)
+
+    def __post_init__(self) -> None:
+        if min(self.train, self.val, self.test) < 0 or self.train + self.val + self.test + len(self.meshes) == 0:
+            raise ConfigError("an experiment needs scenes", value=(self.train, self.val, self.test, self.meshes))
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """Settings of all stages. Each stage reads what it needs; results lie in `<data>/<name>/`.
+
+    Args:
+        name: of the dataset's folder.
+        data: folder of all datasets.
+        device: "cpu", "cuda", "cuda:<index>", or "auto" for the first GPU there is.
+        camera: the camera that will look, and with which the map's images are rendered.
+        scenes: stage 1, meshes.
+        map: stage 2, COLMAP maps.
+        sample: stage 3, viewpoints and what they see.
+        label: stage 4, localization errors.
+        train: stage 5, the network.
+        evaluate: stage 6, scores of all methods.
+        tracking: where MLflow keeps its runs.
+    """
+
+    name: str = "demo"
+    data: Path = Path("data")
+    device: str = "auto"
+    camera: PinholeCamera = field(default_factory=PinholeCamera)
+    scenes: ScenesConfig = field(default_factory=ScenesConfig)
+    map: MapConfig = field(default_factory=MapConfig)
+    sample: SampleConfig = field(default_factory=SampleConfig)
+    label: LabelConfig = field(default_factory=LabelConfig)
+    train: TrainConfig = field(default_factory=TrainConfig)
+    evaluate: EvaluateConfig = field(default_factory=EvaluateConfig)
+    tracking: TrackingConfig = field(default_factory=TrackingConfig)
+
+    @property
+    def root(self) -> Path:
+        """Folder of the dataset."""
+        return self.data / self.name
+
+    @property
+    def warp_device(self) -> str:
+        """The device kernels run on, with "auto" resolved."""
+        if self.device != "auto":
+            return self.device
+        import torch
+
+        return "cuda" if torch.cuda.is_available() else "cpu"

@@ -1,0 +1,97 @@
+"""How many of each location's best-scored views are good, and how many could be."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaln
+
+from wheretolook.geometry import Float
+
+
+@dataclass(frozen=True, eq=False)
+class TestViews:
+    """Labelled views to choose from.
+
+    Attributes:
+        location: (B,) int64, number of each view's location, 0 .. L-1 over all scenes.
+        viewpoint_id: (B,) int64, unique within a location.
+        good: (B, T) bool, whether the view localizes within each of T thresholds.
+        location_scene: (L,) int64, number of each location's scene.
+    """
+
+    __test__ = False  # no test class, whatever its name says
+
+    location: NDArray[np.int64]
+    viewpoint_id: NDArray[np.int64]
+    good: NDArray[np.bool_]
+    location_scene: NDArray[np.int64]
+
+    @property
+    def n_locations(self) -> int:
+        """L."""
+        return len(self.location_scene)
+
+
+@dataclass(frozen=True, eq=False)
+class TopN:
+    """What the views chosen at each location are worth.
+
+    Attributes:
+        chosen: (L,) views chosen at each location: N, or all there are.
+        good: (L, T) how many of them are good within each threshold (an expectation for random choice).
+        any_good: (L, T) whether at least one is (a probability for random choice).
+    """
+
+    chosen: Float
+    good: Float
+    any_good: Float
+
+
+def choose_best(views: TestViews, scores: Float, n: int) -> TopN:
+    """Choose the N views of every location with the highest scores; the smaller viewpoint_id wins a tie.
+
+    Args:
+        views: the candidates.
+        scores: (B,).
+        n: N. A location with fewer views contributes all it has.
+    """
+    order = np.lexsort((views.viewpoint_id, -scores, views.location))
+    location = views.location[order]
+    first = np.searchsorted(location, np.arange(views.n_locations))
+    chosen = np.arange(len(order)) - first[location] < n
+    good = _sum_by_location(views, views.good[order] & chosen[:, None], location)
+    return TopN(np.minimum(_n_views(views), n), good, (good > 0).astype(np.float64))
+
+
+def choose_by_truth(views: TestViews, n: int) -> TopN:
+    """The oracle: for each threshold the N views of every location that are best by it. No choice of N does better."""
+    good = np.minimum(_sum_by_location(views, views.good, views.location), n)
+    return TopN(np.minimum(_n_views(views), n), good, (good > 0).astype(np.float64))
+
+
+def choose_at_random(views: TestViews, n: int) -> TopN:
+    """The exact expectation of choosing N views of every location uniformly at random, without replacement.
+
+    With g good views of m, min(N, m) g / m of the chosen ones are good, and at least one is with probability
+    1 - C(m - g, N) / C(m, N) (hypergeometric).
+    """
+    total, good = _n_views(views)[:, None], _sum_by_location(views, views.good, views.location)
+    chosen = np.minimum(total, n)
+    none_possible = total - good >= chosen
+    bad = np.where(none_possible, total - good, chosen)
+    log_none = gammaln(bad + 1) - gammaln(bad - chosen + 1) - gammaln(total + 1) + gammaln(total - chosen + 1)
+    none = np.where(none_possible, np.exp(log_none), 0.0)
+    return TopN(chosen[:, 0], chosen * good / total, 1 - none)
+
+
+def _n_views(views: TestViews) -> Float:
+    return np.bincount(views.location, minlength=views.n_locations).astype(np.float64)
+
+
+def _sum_by_location(views: TestViews, flags: NDArray[np.bool_], location: NDArray[np.integer[Any]]) -> Float:
+    columns = [np.bincount(location, weights=column, minlength=views.n_locations) for column in flags.T]
+    return np.stack(columns, axis=-1)

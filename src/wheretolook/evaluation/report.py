@@ -1,0 +1,78 @@
+"""The score table for people, in Markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import pandas as pd
+
+from wheretolook.evaluation.config import threshold_label
+from wheretolook.evaluation.scores import ALL
+from wheretolook.figures.style import method_style
+
+
+def threshold_keys(scores: pd.DataFrame) -> list[str]:
+    """Thresholds of a score table, by the names its columns use."""
+    return [name.removeprefix("any_") for name in scores.columns if name.startswith("any_")]
+
+
+def score_markdown(scores: pd.DataFrame, title: str = "Localization score") -> str:
+    """Tables of a score table (`wheretolook.evaluation.scores.score_table`): one for each N, then one by scene.
+
+    Args:
+        scores: the table.
+        title: first line.
+    """
+    pooled = scores[scores["scene"] == ALL]
+    scenes = [name for name in scores["scene"].unique() if name != ALL]
+    keys = threshold_keys(scores)
+    parts = [
+        f"# {title}",
+        f"Scenes: {', '.join(scenes)}; {pooled['n_locations'].iloc[0]:,} locations. Share in % of the chosen viewpoints "
+        "that localize within both limits, divided by the oracle's share [95 % bootstrap interval over locations], and "
+        "undivided in round brackets. AP and AUC (ROC) of the scores are against the first limits. Random is an exact "
+        "expectation, its AP and AUC are one draw.",
+    ]
+    for n, rows in pooled.groupby("top_n", sort=False):
+        parts.append(f"## Best {n} of each location ({rows['n_views'].iloc[0]:,} viewpoints)" if n != 1 else
+                     f"## Best viewpoint of each location ({rows['n_views'].iloc[0]:,} viewpoints)")  # fmt: skip
+        parts.append(_table(["method", *map(threshold_label, keys), "AP", "AUC"], [
+            [method_style(row["method"], row["inputs"]).label,
+             *(_share(row, key, interval=index == 0) for index, key in enumerate(keys)),
+             _number(row["average_precision"]), _number(row["roc_auc"])]
+            for row in rows.to_dict("records")
+        ]))  # fmt: skip
+    first = scores[(scores["top_n"] == scores["top_n"].iloc[0]) & (scores["scene"] != ALL)]
+    if len(scenes) > 1:
+        parts.append(f"## Best {scores['top_n'].iloc[0]} by scene, within {threshold_label(keys[0])}")
+        methods = list(dict.fromkeys(zip(first["method"], first["inputs"], strict=True)))
+        by_key = {(row["scene"], row["method"], row["inputs"]): row for row in first.to_dict("records")}
+        parts.append(_table(["method", *scenes], [
+            [method_style(*method).label, *(_share(by_key[(scene, *method)], keys[0], interval=True) for scene in scenes)]
+            for method in methods
+        ]))  # fmt: skip
+    return "\n\n".join(parts) + "\n"
+
+
+def _share(row: dict[str, float], key: str, interval: bool) -> str:
+    normalized, raw = row[f"normalized_{key}"], row[f"raw_{key}"]
+    low, high = row[f"normalized_low_{key}"], row[f"normalized_high_{key}"]
+    ends = f" [{100 * low:.1f}, {100 * high:.1f}]" if interval and pd.notna(low) and low < high else ""
+    return f"{_percent(normalized)}{ends} ({_percent(raw)})"
+
+
+def _percent(value: float) -> str:
+    return "–" if pd.isna(value) else f"{100 * value:.1f}"
+
+
+def _number(value: float) -> str:
+    return "–" if pd.isna(value) else f"{value:.3f}"
+
+
+def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table whose columns also line up as plain text."""
+    widths = [max(len(line[column]) for line in [header, *rows]) for column in range(len(header))]
+    lines = [header, ["-" * width for width in widths], *rows]
+    return "\n".join(
+        "| " + " | ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)) + " |" for line in lines
+    )

@@ -1,0 +1,83 @@
+"""The lattices of directions, side by side."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.style import context
+from scipy.spatial import ConvexHull, cKDTree
+
+from wheretolook.figures.style import GRID, INK, RC, new_figure
+from wheretolook.geometry import Float
+from wheretolook.grid import azimuth_elevation_lattice, fibonacci_sphere, released_lattice
+
+
+def covering_radius_deg(directions: Float) -> float:
+    """Largest angle from any direction of the sphere to the nearest of the given ones, in degrees.
+
+    The farthest direction is a vertex of the spherical Voronoi diagram, that is, the outward normal of a face of the
+    convex hull; its distance is that of the face's plane. Exact.
+
+    Args:
+        directions: (n, 3) unit vectors, not all in one half-space.
+    """
+    return float(np.degrees(np.arccos(np.clip(-ConvexHull(directions).equations[:, 3].max(), -1, 1))))
+
+
+def nearest_angles_deg(directions: Float) -> Float:
+    """Angle from each of (n, 3) unit vectors to the nearest other one, (n,) degrees."""
+    chord = cKDTree(directions).query(directions, k=2)[0][:, 1]
+    return np.degrees(2 * np.arcsin(np.clip(chord / 2, 0, 1)))
+
+
+def fibonacci_figure(n: int = 500) -> Figure:
+    """The spherical Fibonacci lattice, the azimuth-elevation lattice and the one of the paper's released code.
+
+    Args:
+        n: number of directions of each (the azimuth-elevation lattice has the nearest product of rows and columns).
+
+    Returns:
+        One sphere each, seen from 25 degrees above the equator; the directions on the far side are pale.
+    """
+    lattices = (
+        ("spherical Fibonacci", fibonacci_sphere(n), "#D55E00"),
+        ("azimuth-elevation", azimuth_elevation_lattice(n), "#0072B2"),
+        ("released code of the paper", released_lattice(n), "#009E73"),
+    )
+    with context(RC):
+        figure = new_figure(10.5, 4.2)
+        for column, (name, directions, color) in enumerate(lattices):
+            axes = figure.add_subplot(1, 3, column + 1)
+            _draw_sphere(axes, directions, color)
+            nearest = nearest_angles_deg(directions)
+            axes.set_title(f"{name}, n = {len(directions)}")
+            axes.text(0, -1.12, f"covering radius {covering_radius_deg(directions):.1f}°\n"
+                      f"nearest neighbours {nearest.min():.1f}° to {nearest.max():.1f}°", ha="center", va="top")  # fmt: skip
+        return figure
+
+
+def _draw_sphere(axes, directions: Float, color: str) -> None:  # type: ignore[no-untyped-def]
+    """Orthographic view of directions on a sphere."""
+    tilt = np.radians(25)
+    # rows: right, up and towards the eye, for an eye 25 degrees above the equator in the direction of -y
+    view = np.array([[1, 0, 0], [0, np.sin(tilt), np.cos(tilt)], [0, -np.cos(tilt), np.sin(tilt)]])
+    x, y, depth = view @ directions.T
+    turn = np.linspace(0, 2 * np.pi, 200)
+    axes.fill(np.cos(turn), np.sin(turn), color="#f7f7f7", zorder=0)
+    axes.plot(np.cos(turn), np.sin(turn), color=INK, linewidth=0.8, zorder=0)
+    for height in np.sin(np.radians([-60, -30, 0, 30, 60])):
+        radius = np.sqrt(1 - height**2)
+        _draw_arc(axes, view @ [radius * np.cos(turn), radius * np.sin(turn), np.full_like(turn, height)])
+    for azimuth in np.radians(np.arange(0, 180, 30)):
+        _draw_arc(axes, view @ [np.sin(turn) * np.cos(azimuth), np.sin(turn) * np.sin(azimuth), np.cos(turn)])
+    front = depth > 0
+    axes.scatter(x[~front], y[~front], s=5, color=color, alpha=0.18, linewidths=0)
+    axes.scatter(x[front], y[front], s=13, color=color, linewidths=0)
+    axes.set_aspect("equal")
+    axes.set(xlim=(-1.05, 1.05), ylim=(-1.42, 1.05))
+    axes.axis("off")
+
+
+def _draw_arc(axes, points: Float) -> None:  # type: ignore[no-untyped-def]
+    x, y, depth = points
+    axes.plot(np.where(depth > 0, x, np.nan), y, color=GRID, linewidth=0.6, zorder=1)

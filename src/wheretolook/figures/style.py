@@ -1,0 +1,100 @@
+"""One look for every figure: colours that the colour-blind can tell apart, and marks that survive in greyscale."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+from matplotlib.style import context
+
+INK = "#333333"
+GRID = "#d9d9d9"
+
+RC: dict[str, Any] = {
+    "font.size": 10,
+    "axes.titlesize": 11,
+    "axes.labelsize": 10,
+    "axes.edgecolor": INK,
+    "axes.labelcolor": INK,
+    "text.color": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": GRID,
+    "grid.linewidth": 0.6,
+    "legend.frameon": False,
+    "legend.fontsize": 9,
+    "lines.linewidth": 1.6,
+    "hatch.linewidth": 0.7,
+    "figure.dpi": 100,
+    "savefig.dpi": 160,
+    "savefig.bbox": "tight",
+    "svg.hashsalt": "wheretolook",
+}
+
+
+@dataclass(frozen=True)
+class MethodStyle:
+    """How a method is drawn and named, the same in every figure and table.
+
+    Attributes:
+        label: name for people.
+        color: from the palette of Okabe and Ito (2008).
+        marker: Matplotlib marker.
+        hatch: Matplotlib hatch of bars.
+        dashes: Matplotlib line style.
+    """
+
+    label: str
+    color: str
+    marker: str
+    hatch: str
+    dashes: Any
+
+
+_STYLES = {
+    ("oracle", ""): MethodStyle("oracle", "#000000", "*", "", "-"),
+    ("random", ""): MethodStyle("random", "#999999", "x", "..", ":"),
+    ("visible", ""): MethodStyle("most visible landmarks", "#E69F00", "s", "//", "--"),
+    ("bins", ""): MethodStyle("reprojections with bins", "#009E73", "D", "\\\\", "-."),
+    ("mlp", "2d"): MethodStyle("MLP, 2d", "#56B4E9", "v", "--", (0, (5, 1))),
+    ("mlp", "2d+z"): MethodStyle("MLP, 2d + z", "#0072B2", "^", "xx", (0, (3, 1, 1, 1))),
+    ("mlp", "2d+3d"): MethodStyle("MLP, 2d + 3d", "#D55E00", "o", "", "-"),
+}
+
+_SPARE = (("#CC79A7", "P", "++", (0, (1, 1))), ("#F0E442", "X", "oo", (0, (4, 2))), ("#7F3C8D", "h", "OO", (0, (2, 1))))
+
+
+def method_style(method: str, inputs: str = "") -> MethodStyle:
+    """Style of a method; one that is not listed gets a style that depends on its name alone.
+
+    Args:
+        method: name of the scorer.
+        inputs: its input variant, "" if it has none.
+    """
+    known = _STYLES.get((method, inputs))
+    if known is not None:
+        return known
+    label = f"{method}, {inputs}" if inputs else method
+    return MethodStyle(label, *_SPARE[sum(label.encode()) % len(_SPARE)])
+
+
+def new_figure(width_in: float, height_in: float) -> Figure:
+    """An empty figure in this style, independent of pyplot and its global state. Draw in `with context(RC):`."""
+    with context(RC):
+        return Figure(figsize=(width_in, height_in), layout="constrained")
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a figure as PNG, atomically; its folder is made when needed."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".partial")
+    with context(RC):
+        figure.savefig(partial, format="png")
+    os.replace(partial, path)

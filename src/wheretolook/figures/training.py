@@ -1,0 +1,42 @@
+"""Learning curves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import pandas as pd
+from matplotlib.figure import Figure
+from matplotlib.style import context
+
+from wheretolook.figures.style import RC, method_style, new_figure
+
+
+def training_figure(histories: Mapping[str, pd.DataFrame]) -> Figure:
+    """Loss and average precision over the epochs.
+
+    Args:
+        histories: for each input variant, one row an epoch with `epoch`, `train_bce`, `val_bce`,
+            `train_average_precision` and `val_average_precision`.
+
+    Returns:
+        Two panels; training thin and dotted, validation thick, a ring at the best validation average precision.
+    """
+    with context(RC):
+        figure = new_figure(9, 3.4)
+        panels = figure.subplots(1, 2)
+        for variant, history in histories.items():
+            style = method_style("mlp", variant)
+            for panel, name in zip(panels, ("bce", "average_precision"), strict=True):
+                panel.plot(history["epoch"], history[f"train_{name}"], ":", color=style.color, linewidth=1.1,
+                           label=f"{style.label}: training")  # fmt: skip
+                panel.plot(history["epoch"], history[f"val_{name}"], "-", color=style.color,
+                           label=f"{style.label}: validation")  # fmt: skip
+            best = history.loc[history["val_average_precision"].idxmax()]
+            panels[1].plot(best["epoch"], best["val_average_precision"], "o", markersize=8, markerfacecolor="none",
+                           color=style.color)  # fmt: skip
+        panels[0].set(xlabel="epoch", ylabel="weighted cross-entropy")
+        panels[1].set(xlabel="epoch", ylabel="average precision")
+        for panel in panels:
+            panel.xaxis.get_major_locator().set_params(integer=True)
+        panels[1].legend(loc="lower right")
+        return figure

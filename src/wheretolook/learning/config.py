@@ -1,0 +1,94 @@
+"""Options of training."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from wheretolook.errors import ConfigError
+from wheretolook.features import INPUT_VARIANTS, Layout
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Options of training. The defaults are the paper's where it says something (Sec. 3.3 and 4).
+
+    Args:
+        variants: inputs to train a network for, of "2d", "2d+z" and "2d+3d".
+        epochs: passes over the training viewpoints (paper: 300).
+        batch_size: viewpoints a step (the paper gives none; 128 is the released code's).
+        learning_rate: Adam's initial learning rate (paper: 1e-3; released code: 1e-4).
+        schedule: "constant" as in the paper, or "cosine", which lets the rate fall to zero over the epochs.
+        l2: lambda, the factor of the sum of squared weights (paper: a lambda without a value; released code: 0).
+        dropout: share of hidden units dropped after every ReLU (paper: 0.5).
+        input_dropout: share of input values dropped (paper: 0; released code: 0.5).
+        hidden: widths of the hidden layers (paper: 300, 300).
+        bins: bins along each side of the image (paper: 30).
+        layout: "in_place" keeps empty bins where they are, as the paper says; "compact" moves filled bins to the front,
+            as its released code does.
+        noise_px: standard deviation of noise on (u, v) while training, in pixels (released code: 1).
+        noise_m: standard deviation of noise on (x, y, z) while training, in metres (released code: 0.02).
+        max_error_m: a viewpoint is positive if its position error is strictly smaller, in metres.
+        max_error_deg: and its orientation error too, in degrees.
+        val_fraction: share of the locations of each training scene held out for validation when the dataset has no
+            validation scene.
+        keep: "best" keeps the weights of the epoch with the best validation average precision, "last" those of the
+            last epoch.
+        patience: stop after so many epochs without a better validation average precision; null trains them all.
+        seed: seed of the split, the initial weights, dropout, noise and the order of batches.
+        accelerator: where to train: "auto", "cpu" or "gpu".
+    """
+
+    variants: tuple[str, ...] = tuple(INPUT_VARIANTS)
+    epochs: int = 300
+    batch_size: int = 128
+    learning_rate: float = 1e-3
+    schedule: Literal["constant", "cosine"] = "constant"
+    l2: float = 1e-4
+    dropout: float = 0.5
+    input_dropout: float = 0.0
+    hidden: tuple[int, ...] = (300, 300)
+    bins: int = 30
+    layout: Layout = "in_place"
+    noise_px: float = 0.0
+    noise_m: float = 0.0
+    max_error_m: float = 0.05
+    max_error_deg: float = 0.4
+    val_fraction: float = 0.15
+    keep: Literal["best", "last"] = "best"
+    patience: int | None = None
+    seed: int = 0
+    accelerator: Literal["auto", "cpu", "gpu"] = "auto"
+
+    def __post_init__(self) -> None:
+        unknown = [name for name in self.variants if name not in INPUT_VARIANTS]
+        if unknown or not self.variants or len(set(self.variants)) < len(self.variants):
+            raise ConfigError(
+                "variants must be known and named once", value=self.variants, fix=f"There are {', '.join(INPUT_VARIANTS)}."
+            )
+        for name, choices in (
+            ("schedule", ("constant", "cosine")),
+            ("layout", ("in_place", "compact")),
+            ("keep", ("best", "last")),
+            ("accelerator", ("auto", "cpu", "gpu")),
+        ):
+            if getattr(self, name) not in choices:
+                raise ConfigError(f"unknown {name}", value=getattr(self, name), fix=f"Use {' or '.join(choices)}.")
+        for name in ("epochs", "batch_size", "bins"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"{name} must be at least 1", value=getattr(self, name))
+        for name in ("learning_rate", "max_error_m", "max_error_deg"):
+            if not getattr(self, name) > 0:
+                raise ConfigError(f"{name} must be positive", value=getattr(self, name))
+        for name in ("l2", "noise_px", "noise_m"):
+            if not getattr(self, name) >= 0:
+                raise ConfigError(f"{name} must not be negative", value=getattr(self, name))
+        for name in ("dropout", "input_dropout"):
+            if not 0 <= getattr(self, name) < 1:
+                raise ConfigError(f"{name} must be at least 0 and less than 1", value=getattr(self, name))
+        if not 0 < self.val_fraction < 1:
+            raise ConfigError("val_fraction must lie strictly between 0 and 1", value=self.val_fraction)
+        if min(self.hidden, default=1) < 1:
+            raise ConfigError("hidden layers must be at least one unit wide", value=self.hidden)
+        if self.patience is not None and self.patience < 1:
+            raise ConfigError("patience must be at least 1 epoch, or null", value=self.patience)

@@ -1,0 +1,165 @@
+"""The network that scores a viewpoint, from binned landmarks to a logit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from wheretolook.errors import ConfigError
+from wheretolook.features import CHANNELS, INPUT_VARIANTS, Layout
+from wheretolook.geometry import PinholeCamera
+
+STATISTICS_BLOCK = 4096
+"""Views worked through at a time when statistics are taken."""
+
+
+@dataclass(frozen=True)
+class InputStatistics:
+    """Mean and standard deviation of each kind of input over the filled bins of the training views.
+
+    Attributes:
+        channels: names of the channels, as in `wheretolook.features.CHANNELS`.
+        mean: mean of each channel, in its unit (pixels or metres).
+        std: standard deviation of each channel, in its unit; 1 where it would be 0.
+    """
+
+    channels: tuple[str, ...]
+    mean: tuple[float, ...]
+    std: tuple[float, ...]
+
+    @classmethod
+    def of(cls, means: Tensor, filled: Tensor, rows: Tensor, channels: tuple[str, ...] = CHANNELS) -> InputStatistics:
+        """Statistics over the filled bins of some views.
+
+        Args:
+            means: (B, C, bins, bins) binned views, empty bins zero.
+            filled: (B, bins, bins) bool.
+            rows: views to use, (n,) int64.
+            channels: names of the C channels.
+        """
+        count = torch.zeros((), dtype=torch.float64, device=means.device)
+        total = torch.zeros(len(channels), dtype=torch.float64, device=means.device)
+        for block in rows.split(STATISTICS_BLOCK):  # empty bins are zero: they add nothing to the sum
+            count += filled[block].sum()
+            total += means[block].sum((0, 2, 3), dtype=torch.float64)
+        mean = total / count.clamp(min=1)
+        squares = torch.zeros_like(total)
+        for block in rows.split(STATISTICS_BLOCK):  # a second pass: no cancellation between large numbers
+            centred = (means[block] - mean.float()[:, None, None]) * filled[block][:, None]
+            squares += centred.square_().sum((0, 2, 3), dtype=torch.float64)
+        std = (squares / count.clamp(min=1)).sqrt()
+        std = torch.where(std > 0, std, 1.0)
+        return cls(channels, tuple(mean.tolist()), tuple(std.tolist()))
+
+    def select(self, channels: tuple[str, ...]) -> InputStatistics:
+        """Statistics of some channels."""
+        index = [self.channels.index(name) for name in channels]
+        return InputStatistics(channels, tuple(self.mean[i] for i in index), tuple(self.std[i] for i in index))
+
+
+@dataclass(frozen=True)
+class NetworkSpec:
+    """Everything that defines a network but its weights.
+
+    Attributes:
+        variant: name of the input variant.
+        camera: camera of the training views; pixels mean something only with it.
+        statistics: of the variant's channels over the training views.
+        bins: bins along each side of the image.
+        layout: order of the bins in the input.
+        hidden: widths of the hidden layers.
+        dropout: share of hidden units dropped in training.
+        input_dropout: share of input values dropped in training.
+    """
+
+    variant: str
+    camera: PinholeCamera
+    statistics: InputStatistics
+    bins: int = 30
+    layout: Layout = "in_place"
+    hidden: tuple[int, ...] = (300, 300)
+    dropout: float = 0.5
+    input_dropout: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.variant not in INPUT_VARIANTS:
+            raise ConfigError("unknown input variant", value=self.variant, fix=f"There are {', '.join(INPUT_VARIANTS)}.")
+        if self.statistics.channels != self.channels:
+            raise ConfigError(f"statistics of {self.statistics.channels} do not fit the input", value=self.variant)
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Channels of the input, in order."""
+        return INPUT_VARIANTS[self.variant]
+
+    @property
+    def input_size(self) -> int:
+        """Values the first layer takes in."""
+        return len(self.channels) * self.bins**2
+
+
+class BinnedInput(nn.Module):
+    """Turns binned views with all of `CHANNELS` into a network's standardized, flat input.
+
+    Each channel is standardized by its kind (paper, Sec. 3.3 "Data"); empty bins are exactly zero afterwards, that is,
+    the mean of their kind.
+
+    Args:
+        spec: variant, statistics, bins and layout.
+    """
+
+    def __init__(self, spec: NetworkSpec) -> None:
+        super().__init__()
+        self.layout, self.input_size = spec.layout, spec.input_size
+        # these follow from the specification, which is stored beside the weights: persistent=False
+        self.register_buffer("index", torch.tensor([CHANNELS.index(name) for name in spec.channels]), persistent=False)
+        self.register_buffer("mean", torch.tensor(spec.statistics.mean)[:, None, None], persistent=False)
+        self.register_buffer("std", torch.tensor(spec.statistics.std)[:, None, None], persistent=False)
+
+    def forward(self, means: Tensor, filled: Tensor) -> Tensor:
+        """(B, len(CHANNELS), bins, bins) float32 and (B, bins, bins) bool to (B, input_size) float32."""
+        values = (means.index_select(1, self.index) - self.mean) / self.std * filled[:, None]
+        if self.layout == "compact":
+            values = move_to_front(values, filled)
+        return values.reshape(-1, self.input_size)
+
+
+def move_to_front(values: Tensor, filled: Tensor) -> Tensor:
+    """`wheretolook.features.arrange(..., "compact")` on tensors of any device.
+
+    Args:
+        values: (B, C, bins, bins), zero in empty bins.
+        filled: (B, bins, bins) bool.
+    """
+    flat = filled.flatten(1)
+    n_filled = flat.sum(1, keepdim=True)
+    # the k-th filled bin goes to place k, the k-th empty bin behind all filled ones: a permutation
+    place = torch.where(flat, flat.cumsum(1) - 1, n_filled + (~flat).cumsum(1) - 1)
+    moved = torch.empty_like(values).flatten(2)
+    moved.scatter_(2, place[:, None].expand_as(moved), values.flatten(2))
+    return moved.view_as(values)
+
+
+class ViewpointNetwork(nn.Module):
+    """The paper's classifier (its architecture table): linear layers with ReLU and dropout between, one logit out.
+
+    Args:
+        spec: what defines it.
+    """
+
+    def __init__(self, spec: NetworkSpec) -> None:
+        super().__init__()
+        self.spec = spec
+        self.input = BinnedInput(spec)
+        layers: list[nn.Module] = [nn.Dropout(spec.input_dropout)] if spec.input_dropout > 0 else []
+        width = spec.input_size
+        for hidden in spec.hidden:
+            layers += [nn.Linear(width, hidden), nn.ReLU(), nn.Dropout(spec.dropout)]
+            width = hidden
+        self.layers = nn.Sequential(*layers, nn.Linear(width, 1))
+
+    def forward(self, means: Tensor, filled: Tensor) -> Tensor:
+        """Logits (B,) of binned views: means (B, len(CHANNELS), bins, bins), filled (B, bins, bins) bool."""
+        return self.layers(self.input(means, filled)).squeeze(-1)

@@ -1,0 +1,246 @@
+"""A walk through a scene with a camera at eye height, which leaves part of the floor unvisited."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components, dijkstra
+
+from wheretolook.errors import ConfigError, SceneError
+
+Float = NDArray[np.float64]
+
+
+class FreeSpaceQueries(Protocol):
+    """What a walk asks of free space, see `wheretolook.scenes.free_space.FreeSpace`."""
+
+    def is_free(self, points: Any) -> NDArray[np.bool_]: ...
+
+    def segments_are_free(self, a: Any, b: Any) -> NDArray[np.bool_]: ...
+
+    def floor_below(self, points: Any) -> NDArray[np.floating[Any]]: ...
+
+
+@dataclass(frozen=True)
+class WalkConfig:
+    """How a person with a camera walks through a scene.
+
+    Args:
+        coverage: share of the reachable floor that gets visited; the walk ends there.
+        visit_radius_m: floor within this walking distance of the walk counts as visited.
+        eye_height_m: mean height of the camera above the floor in metres.
+        eye_height_variation_m: largest deviation from it.
+        cell_m: distance between neighbouring places of the grid that the walk runs on.
+        max_step_height_m: largest change of the floor's height from one place to the next (stairs).
+        swing_deg: how far the camera swings to either side of the walk.
+        swing_period: number of images in one swing from left to right and back.
+        pitch_deg: mean pitch, negative is down.
+        pitch_variation_deg: largest deviation from it.
+    """
+
+    coverage: float = 0.7
+    visit_radius_m: float = 1.2
+    eye_height_m: float = 1.45
+    eye_height_variation_m: float = 0.2
+    cell_m: float = 0.3
+    max_step_height_m: float = 0.4
+    swing_deg: float = 45.0
+    swing_period: float = 7.0
+    pitch_deg: float = -5.0
+    pitch_variation_deg: float = 10.0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.coverage <= 1:
+            raise ConfigError("coverage must be in (0, 1]", value=self.coverage)
+        for name in ("visit_radius_m", "eye_height_m", "cell_m", "swing_period"):
+            if not getattr(self, name) > 0:
+                raise ConfigError(f"{name} must be positive", value=getattr(self, name))
+        if not 0 <= self.eye_height_variation_m < self.eye_height_m:
+            raise ConfigError(
+                "eye_height_variation_m must be at least 0 and below eye_height_m", value=self.eye_height_variation_m
+            )
+        if not abs(self.pitch_deg) + abs(self.pitch_variation_deg) < 90:
+            raise ConfigError("the pitch must stay within 90 degrees", value=(self.pitch_deg, self.pitch_variation_deg))
+
+
+@dataclass(frozen=True, eq=False)
+class Walk:
+    """A walk and the camera poses along it.
+
+    Attributes:
+        positions: (n, 3) metres, camera centres in the order of the walk.
+        directions: (n, 3) unit optical axes in the world.
+        path: (M, 3) metres, corners of the walk at mean eye height; every segment between two corners is free.
+        coverage: share of the reachable floor within `visit_radius_m` walking distance of the walk.
+    """
+
+    positions: Float
+    directions: Float
+    path: Float
+    coverage: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Places:
+    """Places a person can stand: eye positions (P, 3) and a symmetric graph of free steps weighted by length."""
+
+    eyes: Float
+    steps: csr_matrix
+
+
+def plan_walk(
+    free_space: FreeSpaceQueries, bounds: ArrayLike, n_images: int, config: WalkConfig | None = None, seed: int = 0
+) -> Walk:
+    """Plan a walk from a random place, always on to the nearest unvisited floor, until enough of it is visited.
+
+    Args:
+        free_space: what is free and where the floor is.
+        bounds: (2, 3) metres, lowest and highest corner of the scene.
+        n_images: number of poses, spaced evenly along the walk.
+        config: see `WalkConfig`.
+        seed: of the start and of the camera's motion.
+
+    Returns:
+        The walk. Cameras look mostly along it.
+
+    Raises:
+        ConfigError: fewer than two images.
+        SceneError: there is no floor to walk on.
+    """
+    config = config or WalkConfig()
+    if n_images < 2:
+        raise ConfigError("a map needs at least two images", value=n_images)
+    rng = np.random.default_rng(seed)
+    places = _reachable_places(free_space, np.asarray(bounds, dtype=np.float64), config)
+    corners, coverage = _visit(places, config, rng)
+    path = places.eyes[corners]
+    positions, headings = _along(path, n_images, rng)
+    return Walk(_vary_height(free_space, positions, config, rng), _swing(headings, config, rng), path, coverage)
+
+
+def _reachable_places(free_space: FreeSpaceQueries, bounds: Float, config: WalkConfig) -> _Places:
+    """The largest connected set of places, found on every storey of the scene."""
+    low, high = bounds
+    nx, ny = np.maximum(np.ceil((high - low)[:2] / config.cell_m).astype(int), 1)
+    heights = np.arange(low[2] + config.eye_height_m, high[2] + config.eye_height_m, 1.0)
+    i, j, h = np.meshgrid(np.arange(nx), np.arange(ny), np.arange(len(heights)), indexing="ij")
+    cell = np.stack([i.ravel(), j.ravel()], axis=1)
+    probes = np.column_stack([low[:2] + (cell + 0.5) * config.cell_m, heights[h.ravel()]])
+    floor = np.asarray(free_space.floor_below(probes), dtype=np.float64)
+    found = np.isfinite(floor)
+    # One place for each floor of a cell, however many probes fell on it.
+    key = np.column_stack([cell[found], np.rint(100 * floor[found]).astype(np.int64)])
+    key, first = np.unique(key, axis=0, return_index=True)
+    eyes = probes[found][first]
+    eyes[:, 2] = floor[found][first] + config.eye_height_m
+    # Below the top of the scene: a roof is no floor.
+    free = eyes[:, 2] < high[2]
+    free[free] = free_space.is_free(eyes[free])
+    key, eyes = key[free], eyes[free]
+    if len(eyes) == 0:
+        raise SceneError(
+            "there is no free floor to walk on at eye height",
+            value=f"eye height {config.eye_height_m} m",
+            fix="Check that the scene is in metres with z up, or lower eye_height_m or the clearance of free space.",
+        )
+    a, b = _neighbours(key)
+    near = np.abs(eyes[a, 2] - eyes[b, 2]) <= config.max_step_height_m
+    a, b = a[near], b[near]
+    if len(a):
+        clear = np.asarray(free_space.segments_are_free(eyes[a], eyes[b]), dtype=bool)
+        a, b = a[clear], b[clear]
+    length = np.linalg.norm(eyes[a] - eyes[b], axis=1)
+    both = (np.concatenate([length, length]), (np.concatenate([a, b]), np.concatenate([b, a])))
+    steps = csr_matrix(both, shape=(len(eyes), len(eyes)))
+    _, component = connected_components(steps, directed=False)
+    members = np.flatnonzero(component == np.bincount(component).argmax())
+    if len(members) < 2:
+        raise SceneError(
+            "no two neighbouring places of the floor are joined by a free step",
+            value=f"cell {config.cell_m} m",
+            fix="Lower cell_m or the clearance of free space.",
+        )
+    return _Places(eyes[members], steps[members][:, members])
+
+
+def _neighbours(key: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Pairs of places (a, b) whose cells (first two columns) touch at a side or corner, each pair once."""
+    width = int(key[:, 1].max()) + 3
+    code = key[:, 0] * width + key[:, 1]  # sorted, since the rows of key are
+    pairs = []
+    for di, dj in ((0, 1), (1, -1), (1, 0), (1, 1)):
+        target = code + di * width + dj
+        valid = (key[:, 1] + dj) >= 0
+        first, last = np.searchsorted(code, target, "left"), np.searchsorted(code, target, "right")
+        count = np.where(valid, last - first, 0)
+        a = np.repeat(np.arange(len(code)), count)
+        b = np.repeat(first, count) + np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+        pairs.append(np.stack([a, b]))
+    a, b = np.concatenate(pairs, axis=1)
+    return a, b
+
+
+def _visit(places: _Places, config: WalkConfig, rng: np.random.Generator) -> tuple[NDArray[np.int64], float]:
+    """Indices of the places along the walk and the share of all places visited."""
+    n = len(places.eyes)
+    here = int(rng.integers(n))
+    corners = [here]
+    visited = np.zeros(n, dtype=bool)
+    fresh = [here]
+    while True:
+        reached = dijkstra(places.steps, indices=fresh, min_only=True, limit=config.visit_radius_m)
+        visited |= np.isfinite(reached)
+        if visited.mean() >= config.coverage:
+            break
+        distance, previous = dijkstra(places.steps, indices=here, return_predecessors=True)
+        target = int(np.where(visited, np.inf, distance).argmin())
+        fresh = [target]
+        while (last := int(previous[fresh[-1]])) != here and last >= 0:
+            fresh.append(last)
+        fresh.reverse()
+        corners += fresh
+        here = target
+    return np.array(corners), float(visited.mean())
+
+
+def _along(path: Float, n_images: int, rng: np.random.Generator) -> tuple[Float, Float]:
+    """Points spaced evenly along the path (n, 3) and the direction in which the path goes on from each (n, 3)."""
+    look_ahead_m = 1.0
+    start = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+    at = np.linspace(0, start[-1], n_images)
+
+    def point(s: Float) -> Float:
+        return np.stack([np.interp(s, start, path[:, k]) for k in range(3)], axis=1)
+
+    behind = np.maximum(np.minimum(at, start[-1] - look_ahead_m), 0)
+    heading = point(behind + look_ahead_m) - point(behind)
+    heading[:, 2] = 0
+    # Where the walk turns back on itself, its two halves cancel; keep the last heading there.
+    length = np.linalg.norm(heading, axis=1)
+    angle = rng.uniform(0, 2 * np.pi)
+    last = np.array([np.cos(angle), np.sin(angle), 0.0])
+    for k in range(n_images):
+        if length[k] > 0.1:
+            last = heading[k] / length[k]
+        heading[k] = last
+    return point(at), heading
+
+
+def _vary_height(free_space: FreeSpaceQueries, positions: Float, config: WalkConfig, rng: np.random.Generator) -> Float:
+    varied = positions.copy()
+    varied[:, 2] += config.eye_height_variation_m * rng.uniform(-1, 1, len(positions))
+    free = np.asarray(free_space.segments_are_free(positions, varied), dtype=bool)
+    return np.where(free[:, None], varied, positions)
+
+
+def _swing(headings: Float, config: WalkConfig, rng: np.random.Generator) -> Float:
+    n = len(headings)
+    phase = 2 * np.pi * (np.arange(n) / config.swing_period + rng.uniform())
+    yaw = np.arctan2(headings[:, 1], headings[:, 0])
+    yaw = yaw + np.radians(config.swing_deg * np.sin(phase) + rng.normal(0, 5, n))
+    pitch = np.radians(config.pitch_deg + config.pitch_variation_deg * rng.uniform(-1, 1, n))
+    return np.column_stack([np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)])

@@ -1,0 +1,135 @@
+"""From a map to a table of viewpoints: locations, directions, visibility, the best K kept (paper, Sec. 3.1-3.2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike, NDArray
+
+from wheretolook.errors import ConfigError, SceneError
+from wheretolook.geometry import PinholeCamera, poses_looking_along, rotation_looking_along
+from wheretolook.grid import Lattice, VoxelGrid, direction_lattice
+from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.table import LABEL_COLUMNS, UNLABELLED, pose_columns
+from wheretolook.visibility import OcclusionModel, StoredOcclusion, VisibleSets, count_in_frustum
+
+if TYPE_CHECKING:
+    from wheretolook.scenes.free_space import FreeSpace
+
+
+@dataclass(frozen=True)
+class SampleConfig:
+    """Settings of the sample stage.
+
+    Args:
+        grid: voxels along x, y and z over the scene's bounds; the paper has 8 x 8 x 8.
+        directions: directions at each location; the released code has 500.
+        lattice: how they are spread: "fibonacci" is even, "azimuth-elevation" is the paper's comparison, "released" is
+            what the released code does.
+        keep: K, the directions kept at each location, those that see most landmarks; 0 keeps all.
+        min_visible: directions that see fewer landmarks are dropped ("none or only a minimal number", Sec. 3.2).
+        max_locations: a random subset of the free locations, 0 for all.
+        max_directions: a random subset of the kept directions of each location, 0 for all.
+        seed: of those subsets.
+    """
+
+    grid: tuple[int, int, int] = (8, 8, 8)
+    directions: int = 500
+    lattice: Lattice = "fibonacci"
+    keep: int = 100
+    min_visible: int = 1
+    max_locations: int = 0
+    max_directions: int = 0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("keep", "min_visible", "max_locations", "max_directions"):
+            if getattr(self, name) < 0:
+                raise ConfigError(f"sample.{name} must not be negative", value=getattr(self, name))
+
+
+def free_locations(grid: VoxelGrid, free_space: FreeSpace) -> NDArray[np.int64]:
+    """Ids of the grid's locations in free space, ascending.
+
+    Raises:
+        SceneError: there is none.
+    """
+    ids = np.flatnonzero(free_space.is_free(grid.centers()))
+    if len(ids) == 0:
+        raise SceneError(
+            f"none of the {len(grid)} locations is in free space",
+            value=(grid.lower, grid.upper),
+            fix="Refine sample.grid, lower the clearance, or check the mesh's units (metres) and up axis.",
+        )
+    return ids
+
+
+def sample_viewpoints(
+    grid: VoxelGrid,
+    location_ids: ArrayLike,
+    landmarks: Landmarks,
+    camera: PinholeCamera,
+    occlusion: OcclusionModel,
+    config: SampleConfig | None = None,
+    device: str = "cpu",
+) -> tuple[pd.DataFrame, StoredOcclusion]:
+    """Choose viewpoints by what they see.
+
+    At every location all directions of the lattice are ranked by the number of landmarks in view (descending, then by
+    direction id), and the best K are kept.
+
+    Args:
+        grid: voxel grid; a location is the centre of a voxel.
+        location_ids: ids of the locations to use, (L,).
+        landmarks: of the map.
+        camera: intrinsics of the viewpoints.
+        occlusion: which landmarks have a free line of sight.
+        config: how many of what.
+        device: where visibility is counted.
+
+    Returns:
+        The table of viewpoints, unlabelled, in the order of their ids; a viewpoint's id is its location's times the
+        number of directions plus its direction's. And the occlusion of the table's locations, for later stages.
+    """
+    config = config or SampleConfig()
+    rng = np.random.default_rng(config.seed)
+    ids = np.sort(_subset(np.asarray(location_ids, dtype=np.int64), config.max_locations, rng))
+    locations = grid.centers()[ids]
+    directions = direction_lattice(config.directions, config.lattice)
+    mask = occlusion.unoccluded(locations, landmarks.points)
+    counts = count_in_frustum(
+        camera, rotation_looking_along(directions), locations, landmarks.points, VisibleSets.from_mask(mask), device
+    )
+    order = np.argsort(-counts, axis=1, kind="stable")
+    rank = np.empty_like(order)
+    np.put_along_axis(rank, order, np.arange(order.shape[1])[None], axis=1)
+
+    rows, columns = [], []
+    for row in range(len(ids)):
+        kept = order[row, : config.keep or None]
+        kept = kept[counts[row, kept] >= config.min_visible]
+        kept = np.sort(_subset(kept, config.max_directions, rng))
+        rows.append(np.full(len(kept), row))
+        columns.append(kept)
+    row_index, direction = np.concatenate(rows), np.concatenate(columns)
+    table = pd.DataFrame(
+        {
+            "viewpoint_id": ids[row_index] * len(directions) + direction,
+            "location_id": ids[row_index],
+            "direction_id": direction,
+            **pose_columns(poses_looking_along(locations[row_index], directions[direction])),
+            "n_visible": counts[row_index, direction],
+            "visibility_rank": rank[row_index, direction],
+        }
+    )
+    unlabelled = dict(zip(LABEL_COLUMNS, (UNLABELLED, np.float32(np.nan), np.float32(np.nan), 0), strict=True))
+    return table.assign(**unlabelled), StoredOcclusion(locations, mask)
+
+
+def _subset(values: NDArray[np.int64], at_most: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    if at_most == 0 or len(values) <= at_most:
+        return values
+    return rng.choice(values, at_most, replace=False)

@@ -1,0 +1,310 @@
+"""Reading textured meshes from GLB, PLY and OBJ files, and writing them as GLB."""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from PIL import Image
+
+from wheretolook.errors import ConfigError, SceneError
+from wheretolook.scenes.mesh import TexturedMesh
+from wheretolook.scenes.texture_references import check_texture_references
+
+# Rotations that turn the named axis of a file into the world's z axis.
+_Z_UP_FROM = {
+    "x": [[0, 0, -1], [0, 1, 0], [1, 0, 0]],
+    "-x": [[0, 0, 1], [0, 1, 0], [-1, 0, 0]],
+    "y": [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
+    "-y": [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
+    "z": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+    "-z": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
+}
+_SUFFIXES = (".glb", ".ply", ".obj")
+_MIN_AREA_M2 = 1e-12  # a square of a thousandth of a millimetre
+_MIN_EXTENT_M = 1e-3
+_WHITE = np.full((1, 1, 3), 255, dtype=np.uint8)
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """One geometry of a file, in the file's coordinates."""
+
+    vertices: NDArray[np.float64]
+    triangles: NDArray[np.int64]
+    uvs: NDArray[np.float64] | None  # (V, 2), v down
+    texture: NDArray[np.uint8]
+    colors: NDArray[np.uint8] | None  # (V, 3)
+    colored: bool  # whether the file says anything about its colour
+
+
+def load_mesh(path: str | PathLike[str], up: str = "z") -> TexturedMesh:
+    """Read a scene in metres from a file or a Habitat-Matterport folder.
+
+    Several materials in one file stay several textures. A material without an image becomes a texture of one pixel in
+    its colour. Vertex colours multiply the texture; they are taken as stored (as sRGB). Triangles without area are
+    dropped.
+
+    Args:
+        path: a .glb, .ply (with texture coordinates and a `TextureFile`, or coloured vertices or faces) or .obj file
+            (with its .mtl), or a folder `<id>-<name>` that holds `<name>.glb`, as in the Habitat-Matterport dataset.
+        up: the axis of the file that points up: "z", "y", "x" or one of these with a minus sign. glTF prescribes y,
+            and many exporters of GLB files obey; many scans are z up in the file nevertheless. A scene with the wrong
+            axis has no free space.
+
+    Raises:
+        SceneError: if the file is missing, unreadable, empty, flat, not finite, without any texture or colour, or
+            refers to a texture that is missing or in a format that is not supported.
+        ConfigError: if `up` is none of the six axes.
+    """
+    if up not in _Z_UP_FROM:
+        raise ConfigError("unknown up axis", value=up, fix=f"Use one of {', '.join(_Z_UP_FROM)}")
+    file = _mesh_file(Path(path))
+    check_texture_references(file)
+    try:
+        scene = trimesh.load_scene(str(file), process=False)
+        parts = list(_parts(scene))
+    except Exception as error:  # trimesh raises whatever its parsers stumble over
+        raise SceneError("the mesh cannot be read", path=file, value=str(error), fix="Check the file") from error
+    if not parts:
+        raise SceneError("the file has no triangles", path=file, fix="Export the scene as a triangle mesh")
+    if not any(part.colored for part in parts):
+        raise SceneError(
+            "the mesh has no texture and no colours",
+            path=file,
+            fix="Export it with its textures; a map cannot be built from a plain surface",
+        )
+    mesh = _merge(parts, np.array(_Z_UP_FROM[up], dtype=np.float64))
+    _check(mesh, file)
+    return _without_degenerate(mesh, file)
+
+
+def save_glb(mesh: TexturedMesh, path: str | PathLike[str], jpeg_quality: int = 90) -> None:
+    """Write a mesh as a binary glTF file with JPEG textures, unlit and double sided, in its own z-up coordinates.
+
+    Positions and texture coordinates keep their float32 values (v to within rounding, since it is flipped twice), but
+    triangles are grouped by texture and corners that share position and texture coordinates share a vertex. The file
+    appears at once or not at all.
+
+    Args:
+        mesh: what to write.
+        path: file to write, ending in .glb.
+        jpeg_quality: 1 to 95.
+    """
+    scene = trimesh.Scene()
+    for index, texture in enumerate(mesh.textures):
+        faces = np.flatnonzero(mesh.triangle_texture == index)
+        if len(faces):
+            scene.add_geometry(_geometry(mesh, faces, _EncodedJpeg(texture, jpeg_quality)), node_name=f"part_{index}")
+    target = Path(path)
+    temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
+    try:
+        temporary.write_bytes(trimesh.exchange.gltf.export_glb(scene, tree_postprocessor=_mark_unlit))
+        os.replace(temporary, target)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _mesh_file(path: Path) -> Path:
+    file = path
+    if path.is_dir():
+        file = path / f"{path.name.partition('-')[2]}.glb"
+        if not file.is_file():
+            raise SceneError(
+                "the folder holds no scene",
+                path=path,
+                value=file.name,
+                fix="A Habitat-Matterport folder <id>-<name> holds <name>.glb; otherwise give the mesh file itself",
+            )
+    if not file.is_file():
+        raise SceneError("no such file", path=file, fix="Give an existing .glb, .ply or .obj file")
+    if file.suffix.lower() not in _SUFFIXES:
+        raise SceneError("unknown kind of mesh", path=file, value=file.suffix, fix=f"Use {', '.join(_SUFFIXES)}")
+    if file.stat().st_size == 0:
+        raise SceneError("the file is empty", path=file, fix="Check that it was copied whole")
+    return file
+
+
+def _parts(scene: trimesh.Scene) -> Iterator[_Part]:
+    """The triangle meshes of a scene with their node transforms applied."""
+    for node in scene.graph.nodes_geometry:
+        matrix, name = scene.graph[node]
+        geometry = scene.geometry[name]
+        if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces):
+            part = geometry.copy()
+            if part.visual.kind == "face":  # colours by face become colours by vertex
+                part.unmerge_vertices()
+            part.apply_transform(matrix)
+            yield _part(part)
+
+
+def _part(geometry: trimesh.Trimesh) -> _Part:
+    visual = geometry.visual
+    uvs, colors, texture, colored = None, None, _WHITE, False
+    if visual.kind == "texture":
+        material = visual.material
+        colors = visual.vertex_attributes.get("color")
+        image, factor = _material(material)
+        if image is not None and visual.uv is not None:
+            uvs = np.asarray(visual.uv, dtype=np.float64) * (1, -1) + (0, 1)
+            texture = _image_array(image)
+        if factor is not None:
+            texture = _tinted(texture, factor)
+        colored = uvs is not None or factor is not None or colors is not None
+    elif visual.kind in ("vertex", "face"):
+        colors, colored = visual.vertex_colors, True
+    return _Part(
+        np.asarray(geometry.vertices, dtype=np.float64),
+        np.asarray(geometry.faces, dtype=np.int64),
+        uvs,
+        texture,
+        None if colors is None else _as_uint8(np.asarray(colors)[:, :3]),
+        colored,
+    )
+
+
+def _material(material: Any) -> tuple[Image.Image | None, NDArray[np.float64] | None]:
+    """A material's image, and the colour in sRGB 0..1 that multiplies it, or None where it has none or white."""
+    if isinstance(material, trimesh.visual.material.PBRMaterial):
+        image, factor = material.baseColorTexture, material.baseColorFactor
+        if factor is None:
+            return image, None
+        linear = np.asarray(factor, dtype=np.float64)[:3] / 255  # glTF factors are linear, and trimesh keeps 8 bits
+        color = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+        return image, None if image is not None and (linear == 1).all() else color
+    image = getattr(material, "image", None)
+    diffuse = getattr(material, "diffuse", None)
+    # trimesh's default is a grey that no file asked for; with an image, viewers of OBJ files disagree on Kd: ignore it.
+    default = trimesh.visual.material.SimpleMaterial().diffuse
+    if image is not None or diffuse is None or np.array_equal(diffuse, default):
+        return image, None
+    return None, np.asarray(diffuse, dtype=np.float64)[:3] / 255
+
+
+def _image_array(image: Image.Image) -> NDArray[np.uint8]:
+    return np.array(image.convert("RGB"), dtype=np.uint8)
+
+
+def _as_uint8(colors: NDArray[Any]) -> NDArray[np.uint8]:
+    if colors.dtype == np.uint8:
+        return colors
+    scale = 255.0 / np.iinfo(colors.dtype).max if np.issubdtype(colors.dtype, np.integer) else 255.0
+    return np.clip(np.rint(colors * scale), 0, 255).astype(np.uint8)
+
+
+def _tinted(texture: NDArray[np.uint8], color: NDArray[np.float64]) -> NDArray[np.uint8]:
+    return np.rint(texture * color).astype(np.uint8)
+
+
+def _merge(parts: list[_Part], rotation: NDArray[np.float64]) -> TexturedMesh:
+    """One mesh of all parts; parts that share an image share a texture."""
+    textures: dict[bytes, int] = {}
+    images: list[NDArray[np.uint8]] = []
+    triangle_texture, corner_uvs, triangles = [], [], []
+    n_vertices = 0
+    for part in parts:
+        key = bytes(str(part.texture.shape), "ascii") + part.texture.tobytes()
+        if key not in textures:
+            textures[key] = len(images)
+            images.append(part.texture)
+        uvs = np.full((len(part.vertices), 2), 0.5) if part.uvs is None else part.uvs
+        corner_uvs.append(uvs[part.triangles])
+        triangle_texture.append(np.full(len(part.triangles), textures[key], dtype=np.int32))
+        triangles.append(part.triangles + n_vertices)
+        n_vertices += len(part.vertices)
+    colors = None
+    if any(part.colors is not None for part in parts):
+        white = [np.full((len(p.vertices), 3), 255, np.uint8) if p.colors is None else p.colors for p in parts]
+        colors = np.concatenate(white)
+    return TexturedMesh(
+        (np.concatenate([part.vertices for part in parts]) @ rotation.T).astype(np.float32),
+        np.concatenate(triangles).astype(np.int32),
+        np.concatenate(corner_uvs).astype(np.float32),
+        np.concatenate(triangle_texture),
+        tuple(images),
+        colors,
+    )
+
+
+def _check(mesh: TexturedMesh, path: Path) -> None:
+    for what, values in (("vertices", mesh.vertices), ("texture coordinates", mesh.corner_uvs)):
+        bad = ~np.isfinite(values).reshape(len(values), -1).all(axis=1)
+        if bad.any():
+            raise SceneError(
+                f"{bad.sum()} {what} are NaN or infinite",
+                path=path,
+                value=values[np.flatnonzero(bad)[0]].tolist(),
+                fix="Clean the mesh, for instance in MeshLab",
+            )
+
+
+def _without_degenerate(mesh: TexturedMesh, path: Path) -> TexturedMesh:
+    """The mesh without triangles that have no area and without vertices that nothing uses."""
+    a, b, c = np.moveaxis(mesh.vertices[mesh.triangles].astype(np.float64), 1, 0)
+    keep = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1) > _MIN_AREA_M2
+    if not keep.any():
+        raise SceneError("all triangles are degenerate", path=path, value=len(keep), fix="Check the export")
+    used, triangles = np.unique(mesh.triangles[keep], return_inverse=True)
+    cleaned = TexturedMesh(
+        mesh.vertices[used],
+        triangles.reshape(-1, 3).astype(np.int32),
+        mesh.corner_uvs[keep],
+        mesh.triangle_texture[keep],
+        mesh.textures,
+        None if mesh.vertex_colors is None else mesh.vertex_colors[used],
+    )
+    extent = np.ptp(cleaned.bounds, axis=0)
+    if (extent < _MIN_EXTENT_M).any():
+        raise SceneError(
+            "the mesh is flat", path=path, value=extent.tolist(), fix="A scene needs an extent in x, y and z, in metres"
+        )
+    return cleaned
+
+
+def _geometry(mesh: TexturedMesh, faces: NDArray[np.int64], image: _EncodedJpeg) -> trimesh.Trimesh:
+    """The triangles of one texture, with a vertex for each position and texture coordinates they use."""
+    index = mesh.triangles[faces].reshape(-1)
+    uv = mesh.corner_uvs[faces].reshape(-1, 2)
+    keys = np.column_stack([index.astype(np.int32), uv.view(np.int32)])
+    _, first, corners = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    material = trimesh.visual.material.PBRMaterial(
+        baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True
+    )
+    visual = trimesh.visual.TextureVisuals(uv=uv[first].astype(np.float64) * (1, -1) + (0, 1), material=material)
+    if mesh.vertex_colors is not None:
+        opaque = np.full((len(first), 1), 255, dtype=np.uint8)
+        visual.vertex_attributes["color"] = np.hstack([mesh.vertex_colors[index[first]], opaque])
+    return trimesh.Trimesh(mesh.vertices[index[first]], corners.reshape(-1, 3), visual=visual, process=False)
+
+
+class _EncodedJpeg:
+    """What trimesh needs of a PIL image, saved as the bytes given: trimesh would encode again, at quality 75."""
+
+    format = "JPEG"
+
+    def __init__(self, texture: NDArray[np.uint8], quality: int) -> None:
+        buffer = io.BytesIO()
+        # Chroma at full resolution: subsampling would bleed colours across the charts of an atlas.
+        Image.fromarray(texture).save(buffer, format="JPEG", quality=quality, subsampling=0)
+        self.encoded = buffer.getvalue()
+
+    def save(self, file: io.BytesIO, **_: Any) -> None:
+        file.write(self.encoded)
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[np.uint8]:
+        return np.frombuffer(self.encoded, dtype=np.uint8)  # trimesh tells materials apart by it
+
+
+def _mark_unlit(tree: dict[str, Any]) -> None:
+    """Light is baked into the textures: tell viewers (KHR_materials_unlit)."""
+    for material in tree.get("materials", []):
+        material["extensions"] = {"KHR_materials_unlit": {}}
+    tree.setdefault("extensionsUsed", []).append("KHR_materials_unlit")

@@ -1,0 +1,161 @@
+"""Walls, floors, ceilings, door frames, skirting and windows: a closed shell around the rooms of a plan."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from wheretolook.scenes.procedural import artwork, fixtures, materials
+from wheretolook.scenes.procedural.materials import Material
+from wheretolook.scenes.procedural.patches import Patch, box, move, plane, tube
+from wheretolook.scenes.procedural.plan import INNER_WALL_M, Opening, Plan, Room
+from wheretolook.scenes.procedural.style import ACCENTS, WALLS, Style
+
+WALL_ENDS = ("back", "bottom", "left", "right")
+REVEAL_M = 0.16
+"""How deep a window sits in the wall."""
+
+
+@dataclass(frozen=True, eq=False)
+class Finish:
+    """Surface materials of one room: four walls, floor, ceiling."""
+
+    walls: tuple[Material, Material, Material, Material]
+    floor: Material
+    ceiling: Material
+
+
+def choose_finish(style: Style, room: Room) -> Finish:
+    """Paint, paper or tiles for a room of its kind."""
+    rng = style.rng
+    colour = materials.vary(rng, style.pick(WALLS), 0.012)
+    paint = materials.plain(rng, colour)
+    walls = [paint] * 4
+    ceiling = materials.plain(rng, (0.92, 0.92, 0.91))
+    contrast = 0.3 + 0.9 * style.richness
+    floor = materials.planks(rng, style.floor_colour, width_m=float(rng.uniform(0.12, 0.2)), length_m=float(rng.uniform(1.1, 1.8)),
+                             contrast=contrast, along_x=room.width > room.depth)  # fmt: skip
+    if room.kind == "bathroom":
+        size = style.pick([(0.3, 0.6), (0.2, 0.2), (0.3, 0.3), (0.15, 0.15)])
+        tile = materials.vary(rng, style.pick([(0.90, 0.91, 0.90), (0.72, 0.80, 0.82), (0.84, 0.80, 0.72)]), 0.02)
+        wall = materials.tiles(rng, tile, (0.70, 0.70, 0.68), size_m=size, brick=style.chance(0.3), veins=0.15 * style.richness)
+        walls = [wall] * 4
+        floor = materials.tiles(rng, (0.62, 0.62, 0.60), (0.48, 0.48, 0.47), size_m=(0.3, 0.3), veins=0.4 * style.richness,
+                                second=(0.38, 0.40, 0.42) if style.chance(0.4) else None)  # fmt: skip
+    elif room.kind == "kitchen":
+        floor = materials.tiles(rng, materials.vary(rng, (0.70, 0.66, 0.60)), (0.52, 0.50, 0.47), size_m=(0.4, 0.4), veins=0.5 * style.richness,
+                                second=(0.55, 0.48, 0.42) if style.chance(0.3) else None)  # fmt: skip
+    elif room.kind == "bedroom":
+        if style.chance(0.35 + 0.3 * style.richness):
+            paper = materials.wallpaper(rng, colour, materials.vary(rng, style.pick(ACCENTS), 0.03), period_m=float(rng.uniform(0.12, 0.24)),
+                                        motif=style.chance(0.6))  # fmt: skip
+            walls = [paper] * 4 if style.chance(0.4) else [*walls[:2], paper, walls[3]]
+        if style.chance(0.4):
+            floor = materials.plain(rng, materials.vary(rng, (0.62, 0.57, 0.50)), speckle=0.02 + 0.03 * style.richness)
+    if room.kind in ("living", "study") and style.chance(0.6):
+        walls[int(rng.integers(4))] = materials.plain(rng, materials.vary(rng, style.pick(ACCENTS), 0.02))
+    return Finish((walls[0], walls[1], walls[2], walls[3]), floor, ceiling)
+
+
+def _wall(room: Room, side: int, height: float, material: Material) -> Patch:
+    corner, right, _ = room.wall_frame(side)
+    length = room.wall_length(side)
+    openings = room.openings[side]
+    a = np.unique([0.0, length, *(x for o in openings for x in (o.a0, o.a1))])
+    z = np.unique([0.0, height, *(x for o in openings for x in (o.z0, o.z1))])[::-1]
+    mask = np.ones((len(z) - 1, len(a) - 1), bool)
+    for o in openings:
+        columns = (a[:-1] > o.a0 - 1e-9) & (a[1:] < o.a1 + 1e-9)
+        rows = (z[1:] > o.z0 - 1e-9) & (z[:-1] < o.z1 + 1e-9)
+        mask[np.ix_(rows, columns)] = False
+    positions = corner + a[None, :, None] * right + z[:, None, None] * np.array([0, 0, 1.0])
+    return Patch(positions, a / length, 1 - z / height, (length, height), material, room=room.index, mask=mask,
+                 offset_m=(3.1 * side, 0.0))  # fmt: skip
+
+
+def wall_items(room: Room, side: int, at: float, patches: list[Patch]) -> list[Patch]:
+    """Patches of the furniture frame put at wall coordinate `at`, standing against that wall of the room."""
+    corner, right, normal = room.wall_frame(side)
+    rotation = np.stack([-right, normal, [0, 0, 1]], 1)
+    return [replace(p, room=room.index) for p in move(patches, rotation=rotation, shift=corner + at * right)]
+
+
+def _reveal(depth: float, o: Opening, material: Material, sill: Material | None) -> list[Patch]:
+    """Inner faces of a hole in the wall, in the furniture frame around the middle of the opening."""
+    w = (o.a1 - o.a0) / 2
+    patches = [
+        plane((w, 0, o.z1), (0, -depth, 0), (0, 0, o.z0 - o.z1), material),  # faces -x
+        plane((-w, -depth, o.z1), (0, depth, 0), (0, 0, o.z0 - o.z1), material),
+        plane((-w, -depth, o.z1), (2 * w, 0, 0), (0, depth, 0), material),  # head, faces down
+    ]
+    if sill is not None:
+        patches.append(plane((-w, 0, o.z0), (2 * w, 0, 0), (0, -depth, 0), sill))
+    return patches
+
+
+def _architrave(style: Style, o: Opening) -> list[Patch]:
+    w, face, thick = (o.a1 - o.a0) / 2, 0.07, 0.018
+    patches: list[Patch] = []
+    for x0, x1 in ((-w - face, -w), (w, w + face)):
+        patches += box((x0, 0, 0), (x1, thick, o.z1 + face), style.trim, hidden=("back", "bottom"))
+    return patches + box((-w, 0, o.z1), (w, thick, o.z1 + face), style.trim, hidden=("back",))
+
+
+def _window(style: Style, room: Room, o: Opening, height: float, cloth: Material) -> list[Patch]:
+    w, y = (o.a1 - o.a0) / 2, -REVEAL_M
+    patches = _reveal(REVEAL_M, o, style.trim, style.trim)
+    patches.append(plane((w, y, o.z1), (-2 * w, 0, 0), (0, 0, o.z0 - o.z1), artwork.view(style.rng), density=0.9))
+    bar, thick = 0.05, 0.05
+    frame = style.trim
+    for z0, z1 in ((o.z0, o.z0 + bar), (o.z1 - bar, o.z1)):
+        patches += box((-w, y + 0.004, z0), (w, y + thick, z1), frame, hidden=("back",))
+    posts = 2 if w < 0.45 else 3
+    for x in np.linspace(-w + bar / 2, w - bar / 2, posts):
+        patches += box((x - bar / 2, y + 0.004, o.z0 + bar), (x + bar / 2, y + thick, o.z1 - bar), frame, hidden=("back",))
+    patches += box((-w - 0.04, -0.02, o.z0 - 0.03), (w + 0.04, 0.05, o.z0 + 0.004), style.trim, hidden=("back",))
+    if room.kind in ("bathroom", "kitchen"):
+        return patches
+    top = min(o.z1 + 0.18, height - 0.05)
+    patches += tube([(-w - 0.35, 0.1, top + 0.015), (w + 0.35, 0.1, top + 0.015)], 0.012, style.metal, sides=10)
+    drop = top - 0.03
+    share = w + 0.25 if room.curtains_closed else 0.38
+    for sign in (-1, 1):
+        x = sign * ((w + 0.25) / 2 if room.curtains_closed else w + 0.08)
+        patches += move(fixtures.curtain(style, share, drop, cloth), shift=(x, 0.1, top))
+    return patches
+
+
+def build_shell(style: Style, plan: Plan) -> tuple[list[Patch], list[Finish]]:
+    """All surfaces of the empty apartment, and the finish of each room."""
+    finishes = [choose_finish(style, room) for room in plan.rooms]
+    patches: list[Patch] = []
+    cloth = style.patterned() if style.chance(0.3) else materials.fabric(style.rng, materials.vary(style.rng, (0.80, 0.76, 0.68), 0.05), weave=0.02)
+    for room, finish in zip(plan.rooms, finishes, strict=True):
+        x0, y0, x1, y1 = room.x0, room.y0, room.x1, room.y1
+        size = (room.width, room.depth)
+        patches.append(plane((x0, y1, 0), (size[0], 0, 0), (0, -size[1], 0), finish.floor, room=room.index, offset_m=(x0 + 20, 20 - y1)))
+        patches.append(plane((x0, y0, plan.height), (size[0], 0, 0), (0, size[1], 0), finish.ceiling, room=room.index, density=0.7))
+        for side in range(4):
+            patches.append(_wall(room, side, plan.height, finish.walls[side]))
+            gaps = sorted((o.a0 - 0.07, o.a1 + 0.07) for o in room.openings[side] if o.z0 == 0)
+            at = 0.0
+            for low, high in [*gaps, (room.wall_length(side), 0.0)]:
+                if low - at > 0.03 and room.kind != "bathroom":
+                    half = (low - at) / 2
+                    board = box((-half, 0, 0), (half, 0.012, 0.07), style.trim, hidden=WALL_ENDS, density=0.7)
+                    patches += wall_items(room, side, at + half, board)
+                at = high
+            for o in room.openings[side]:
+                middle = (o.a0 + o.a1) / 2
+                if o.kind == "window":
+                    patches += wall_items(room, side, middle, _window(style, room, o, plan.height, cloth))
+                    continue
+                if o.kind == "door":
+                    patches += wall_items(room, side, middle, _architrave(style, o))
+                if o.owner:
+                    jamb = style.trim if o.kind == "door" else finish.walls[side]
+                    patches += wall_items(room, side, middle, _reveal(INNER_WALL_M, o, jamb, style.second_wood))
+    return patches, finishes
+
+

@@ -1,0 +1,87 @@
+"""What every method of scoring viewpoints has in common."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import ClassVar
+
+import numpy as np
+
+from wheretolook.features import BinnedViews
+from wheretolook.geometry import Float
+from wheretolook.localization_map import LocalizationMap
+
+BLOCK = 4096
+"""Views scored at a time: about 80 MB of bins."""
+
+
+class Scorer(ABC):
+    """A method that says how well a camera would localize: the paper's f_P(R, t) -> [0, 1].
+
+    A scorer is built from a map, the camera that will look, and whatever else the method needs. It answers for any
+    batch of poses:
+
+    - The score of a pose depends on the pose alone: not on its place in the batch, nor on the other poses.
+    - Higher is better. Scores lie in [0, 1] where the method allows; only their order counts for choosing a view.
+    - The same scorer gives the same scores to the same poses.
+
+    A new method is one file with a subclass, registered in `wheretolook.scoring.SCORERS`. One that needs binned
+    landmarks derives from `BinnedScorer` instead.
+
+    Attributes:
+        name: short name of the method, as in tables and on the command line.
+        inputs: input variant of a learned method, "" for others.
+    """
+
+    name: ClassVar[str]
+    inputs: str = ""
+
+    def __init__(self, localization_map: LocalizationMap) -> None:
+        self.localization_map = localization_map
+
+    @abstractmethod
+    def score(self, cam_from_world: Float) -> Float:
+        """Score poses (B, 3, 4). Returns (B,) float64, finite."""
+
+    def score_binned(self, cam_from_world: Float, binned: BinnedViews) -> Float:
+        """Score poses whose landmarks have been binned already, so that several methods share the binning.
+
+        Args:
+            cam_from_world: (B, 3, 4).
+            binned: the same views, as `localization_map.bin_views` bins them, with all channels.
+
+        Returns:
+            (B,) float64, the same as `score` gives.
+        """
+        return self.score(cam_from_world)
+
+
+class BinnedScorer(Scorer):
+    """A method that scores a view by its binned landmarks alone.
+
+    Args:
+        localization_map: the map.
+        bins: bins along each side of the image.
+    """
+
+    def __init__(self, localization_map: LocalizationMap, bins: int = 30) -> None:
+        super().__init__(localization_map)
+        self.bins = bins
+
+    def score(self, cam_from_world: Float) -> Float:
+        """Score poses (B, 3, 4). Returns (B,) float64."""
+        scores = np.empty(len(cam_from_world))
+        for begin in range(0, len(scores), BLOCK):
+            poses = cam_from_world[begin : begin + BLOCK]
+            scores[begin : begin + BLOCK] = self.score_bins(self.localization_map.bin_views(poses, bins=self.bins))
+        return scores
+
+    def score_binned(self, cam_from_world: Float, binned: BinnedViews) -> Float:
+        """Score binned views; views with another number of bins are binned again."""
+        if binned.counts.shape[-1] != self.bins:
+            return self.score(cam_from_world)
+        return self.score_bins(binned)
+
+    @abstractmethod
+    def score_bins(self, binned: BinnedViews) -> Float:
+        """Score binned views with all channels. Returns (B,) float64, finite."""

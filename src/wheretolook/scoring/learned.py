@@ -1,0 +1,94 @@
+"""The learned score."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import torch
+
+from wheretolook.errors import WeightsError
+from wheretolook.features import CHANNELS, BinnedViews
+from wheretolook.geometry import Float, PinholeCamera
+from wheretolook.learning.network import ViewpointNetwork
+from wheretolook.learning.weights import load_classifier
+from wheretolook.localization_map import LocalizationMap
+from wheretolook.scoring.base import BLOCK, BinnedScorer
+
+FIELD_OF_VIEW_TOLERANCE = 1e-3
+"""Relative difference in width / focal length and height / focal length up to which fields of view are the same."""
+
+
+class LearnedScorer(BinnedScorer):
+    """The paper's classifier: the predicted probability that a view localizes.
+
+    A network knows the field of view it was trained with. A camera of another resolution but the same field of view is
+    served by scaling its pixels; another field of view is refused, since the network has never seen one.
+
+    Args:
+        localization_map: the map.
+        network: a trained network.
+    """
+
+    name: ClassVar[str] = "mlp"
+
+    def __init__(self, localization_map: LocalizationMap, network: ViewpointNetwork) -> None:
+        super().__init__(localization_map, network.spec.bins)
+        self.inputs = network.spec.variant
+        self.device = localization_map.device
+        self.network = network.to(self.device).eval()
+        trained, camera = network.spec.camera, localization_map.camera
+        if not _same_field_of_view(trained, camera):
+            raise WeightsError(
+                f"the network was trained for a camera of {_describe(trained)}",
+                value=_describe(camera),
+                fix="Use a camera with that field of view, or train with this one.",
+            )
+        scale = {"u": trained.width / camera.width, "v": trained.height / camera.height}
+        self._scale = torch.tensor([scale.get(name, 1.0) for name in CHANNELS], device=self.device)[:, None, None]
+
+    @classmethod
+    def load(cls, weights: str | Path, localization_map: LocalizationMap) -> LearnedScorer:
+        """Build a scorer from a weights file that the train stage wrote.
+
+        Raises:
+            WeightsError: the file cannot be used, or was trained for another field of view than the map's camera.
+        """
+        network = load_classifier(weights)
+        try:
+            return cls(localization_map, network)
+        except WeightsError as error:
+            raise WeightsError(error.problem, path=weights, value=error.value, fix=error.fix) from None
+
+    def score_bins(self, binned: BinnedViews) -> Float:
+        """(B,) probabilities in [0, 1]."""
+        binned = binned.select(CHANNELS) if binned.channels != CHANNELS else binned
+        scores = np.empty(len(binned))
+        with torch.inference_mode():
+            for begin in range(0, len(scores), BLOCK):
+                rows = slice(begin, begin + BLOCK)
+                means = torch.from_numpy(binned.means[rows]).to(self.device) * self._scale
+                filled = torch.from_numpy(binned.counts[rows] > 0).to(self.device)
+                # float64 keeps views apart whose probabilities round to 1 in float32
+                scores[rows] = self.network(means, filled).double().sigmoid().cpu().numpy()
+        return scores
+
+
+def load_scorer(weights: str | Path, localization_map: LocalizationMap) -> LearnedScorer:
+    """The learned scorer of a weights file for a map: `load_scorer(weights, map).score(cam_from_world)`.
+
+    Raises:
+        WeightsError: the file cannot be used, or was trained for another field of view than the map's camera.
+    """
+    return LearnedScorer.load(weights, localization_map)
+
+
+def _same_field_of_view(a: PinholeCamera, b: PinholeCamera) -> bool:
+    spans = [(camera.width / camera.focal_px, camera.height / camera.focal_px) for camera in (a, b)]
+    return bool(np.allclose(*spans, rtol=FIELD_OF_VIEW_TOLERANCE, atol=0))
+
+
+def _describe(camera: PinholeCamera) -> str:
+    across, down = (2 * np.degrees(np.arctan(side / 2 / camera.focal_px)) for side in (camera.width, camera.height))
+    return f"{camera.width} x {camera.height} px, {across:.1f} x {down:.1f} degrees"

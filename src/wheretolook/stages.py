@@ -1,0 +1,252 @@
+"""The stages, one function each, for Python, notebooks and the command line alike.
+
+A stage works through the scenes of an experiment and leaves its result on disk with a stamp that says what it was made
+from. Called again, it reuses what is there if its settings and inputs are the same, and otherwise makes it anew.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from wheretolook.config import Experiment
+from wheretolook.dataset import Dataset, SceneFolder, Split, write_json
+from wheretolook.errors import ConfigError, MapError, SceneError
+from wheretolook.table import fingerprint, write_table
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from wheretolook.learning.training import TrainedModel
+
+STAGES = ("scenes", "map", "sample", "label")
+"""Stages that work scene by scene, in order."""
+
+Say = Callable[[str], None]
+Tick = Callable[[float], None]
+
+
+def make_scenes(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> Dataset:
+    """Stage 1: a textured mesh for every scene, `<scene>/mesh.glb`, and the dataset's description.
+
+    Raises:
+        SceneError: a mesh of one's own cannot be used, or two scenes have the same name.
+    """
+    from wheretolook.scenes.loading import load_mesh, save_glb
+    from wheretolook.scenes.procedural import generate_apartment
+
+    config, root = experiment.scenes, experiment.root
+    splits: list[Split] = ["train"] * config.train + ["val"] * config.val + ["test"] * config.test  # type: ignore[list-item]
+    sources: dict[SceneFolder, Callable[[], Any]] = {}
+    keys: dict[SceneFolder, Any] = {}
+    for index, split in enumerate(splits):
+        seed = config.seed + index
+        scene = SceneFolder(root / f"apartment-{seed:03d}", split)
+        sources[scene] = lambda seed=seed: generate_apartment(config.apartment, seed, device=experiment.warp_device)
+        keys[scene] = [asdict(config.apartment), seed]
+    for source in config.meshes:
+        scene = SceneFolder(root / source.scene_name, source.split)
+        if scene.name in {other.name for other in sources}:
+            raise SceneError("two scenes have the same name", path=source.path, value=scene.name, fix="Give it a name.")
+        sources[scene] = lambda source=source: load_mesh(source.path, up=source.up)
+        keys[scene] = [_mesh_fingerprint(source.path), source.up]
+
+    for scene, make in sources.items():
+        key = _key("scenes", keys[scene])
+        if not _is_done(scene, "scenes", key, scene.mesh):
+            mesh = make()
+            save_glb(mesh, scene.mesh)
+            _stamp(scene, "scenes", key)
+            say(f"{scene.name}: {len(mesh.triangles):,} triangles -> {scene.mesh}")
+        else:
+            say(f"{scene.name}: reusing {scene.mesh}")
+        tick(1)
+    dataset = Dataset(root, experiment.camera, tuple(sources))
+    dataset.save()
+    return dataset
+
+
+def make_maps(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> Dataset:
+    """Stage 2: a COLMAP model of every scene with its landmarks' attributes, `<scene>/map/`.
+
+    Raises:
+        SceneError, MapError: a mesh cannot be read, or no landmark could be triangulated.
+    """
+    from wheretolook.mapping.building import build_map
+    from wheretolook.rendering import MeshRaycaster, WarpRenderer
+    from wheretolook.scenes.free_space import FreeSpace
+    from wheretolook.scenes.loading import load_mesh
+
+    dataset, device = _dataset(experiment), experiment.warp_device
+    for index, scene in enumerate(dataset.scenes):
+        key = _key("map", [asdict(experiment.map), asdict(experiment.scenes.free_space), asdict(dataset.camera), index,
+                           _existing(scene.mesh, SceneError, "scenes")])  # fmt: skip
+        if not _is_done(scene, "map", key, scene.landmarks):
+            mesh = load_mesh(scene.mesh)
+            raycaster = MeshRaycaster(mesh, device)
+            report = build_map(
+                mesh,
+                WarpRenderer(mesh, device),
+                FreeSpace(mesh, experiment.scenes.free_space, device),
+                dataset.camera,
+                experiment.map,
+                seed=index,
+                out_dir=scene.map,
+                raycaster=raycaster,
+            )
+            _stamp(scene, "map", key)
+            say(f"{scene.name}: {report.n_landmarks:,} landmarks from {report.n_registered} images, median "
+                f"{report.median_surface_distance_cm:.2f} cm from the mesh -> {scene.map}")  # fmt: skip
+        else:
+            say(f"{scene.name}: reusing {scene.map}")
+        tick(1)
+    return dataset
+
+
+def sample(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> Dataset:
+    """Stage 3: viewpoints and which landmarks their locations see, `<scene>/viewpoints.parquet` and `occlusion.npz`.
+
+    Raises:
+        SceneError: no location is free. MapError: there is no map.
+    """
+    from wheretolook.grid import VoxelGrid
+    from wheretolook.mapping.landmarks import Landmarks
+    from wheretolook.rendering import MeshRaycaster
+    from wheretolook.sampling import free_locations, sample_viewpoints
+    from wheretolook.scenes.free_space import FreeSpace
+    from wheretolook.scenes.loading import load_mesh
+    from wheretolook.visibility import MeshOcclusion
+
+    dataset, device = _dataset(experiment), experiment.warp_device
+    for scene in dataset.scenes:
+        key = _key("sample", [asdict(experiment.sample), asdict(experiment.scenes.free_space), asdict(dataset.camera),
+                              _existing(scene.mesh, SceneError, "scenes"),
+                              _existing(scene.landmarks, MapError, "map")])  # fmt: skip
+        if not _is_done(scene, "sample", key, scene.table, scene.occlusion):
+            mesh, landmarks = load_mesh(scene.mesh), Landmarks.load(scene.landmarks)
+            grid = VoxelGrid.over(mesh.bounds, experiment.sample.grid)
+            free = free_locations(grid, FreeSpace(mesh, experiment.scenes.free_space, device))
+            occlusion = MeshOcclusion(MeshRaycaster(mesh, device))
+            table, stored = sample_viewpoints(
+                grid, free, landmarks, dataset.camera, occlusion, experiment.sample, device
+            )
+            stored.save(scene.occlusion)
+            write_table(table, scene.table)
+            _stamp(scene, "sample", key)
+            say(f"{scene.name}: {len(table):,} viewpoints at {table['location_id'].nunique()} of {len(free)} free "
+                f"locations -> {scene.table}")  # fmt: skip
+        else:
+            say(f"{scene.name}: reusing {scene.table}")
+        tick(1)
+    return dataset
+
+
+def label(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> Dataset:
+    """Stage 4: every viewpoint rendered and localized; status and errors into `<scene>/viewpoints.parquet`.
+
+    Resumes after an interruption, see `wheretolook.labelling.label_viewpoints`.
+    """
+    from wheretolook.labelling import label_viewpoints
+    from wheretolook.table import is_good
+
+    dataset = _dataset(experiment)
+    for scene in dataset.scenes:
+        table = scene.read_table()
+        key = _key("label", [asdict(experiment.label.localizer), asdict(experiment.map.extractor),
+                             _existing(scene.mesh, SceneError, "scenes"),
+                             _existing(scene.landmarks, MapError, "map"), _read_stamp(scene, "sample")])  # fmt: skip
+        if not _is_done(scene, "label", key, scene.table):
+            shards = scene.folder / "shards"
+            table = label_viewpoints(
+                table, scene.mesh, scene.landmarks, dataset.camera, shards, experiment.label, experiment.map.extractor,
+                experiment.warp_device, description=f"label {scene.name}",
+            )  # fmt: skip
+            write_table(table, scene.table)
+            _stamp(scene, "label", key)
+            shutil.rmtree(shards)
+        say(f"{scene.name}: {is_good(table).mean():.0%} of {len(table):,} viewpoints localize within 5 cm and 0.4 "
+            f"degrees -> {scene.table}")  # fmt: skip
+        tick(1)
+    return dataset
+
+
+def train(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> Sequence[TrainedModel]:
+    """Stage 5: one network for each input variant, `<dataset>/weights/`, and an MLflow run for each."""
+    from wheretolook.learning.training import train as train_variants
+
+    models = train_variants(_dataset(experiment), experiment.train, experiment.tracking)
+    for model in models:
+        say(f"{model.variant}: -> {model.path}")
+    tick(1)
+    return models
+
+
+def evaluate(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> pd.DataFrame:
+    """Stage 6: the score table of all methods on the test scenes, `<dataset>/results/`, and nested MLflow runs."""
+    from wheretolook.evaluation import evaluate as evaluate_methods
+
+    dataset = _dataset(experiment)
+    scores = evaluate_methods(dataset, experiment.evaluate, experiment.tracking, device=experiment.warp_device)
+    tick(1)
+    return scores
+
+
+def _dataset(experiment: Experiment) -> Dataset:
+    dataset = Dataset.load(experiment.root)
+    if dataset.camera != experiment.camera:
+        raise ConfigError(
+            "the dataset was made with another camera", path=experiment.root, value=dataset.camera,
+            fix="Run the scenes stage with this configuration, or give the experiment another name.",
+        )  # fmt: skip
+    return dataset
+
+
+def _key(stage: str, parts: list[Any]) -> str:
+    text = json.dumps([stage, parts], sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _existing(path: Path, error: type[SceneError] | type[MapError], stage: str) -> str:
+    """Fingerprint of a file that an earlier stage makes."""
+    if not path.is_file():
+        raise error("this file is missing", path=path, fix=f"Run the {stage} stage first.")
+    return fingerprint(path)
+
+
+def _mesh_fingerprint(path: Path) -> str:
+    """A mesh file changes when its size or date does; it may be gigabytes."""
+    if not path.exists():
+        raise SceneError("there is no such mesh", path=path, fix="Check the path.")
+    status = path.stat()
+    return f"{path.resolve()}:{status.st_size}:{status.st_mtime_ns}"
+
+
+def _stamp_path(scene: SceneFolder) -> Path:
+    return scene.folder / "stages.json"
+
+
+def _read_stamps(scene: SceneFolder) -> dict[str, str]:
+    try:
+        return dict(json.loads(_stamp_path(scene).read_text()))
+    except (OSError, ValueError):
+        return {}
+
+
+def _read_stamp(scene: SceneFolder, stage: str) -> str | None:
+    return _read_stamps(scene).get(stage)
+
+
+def _stamp(scene: SceneFolder, stage: str, key: str) -> None:
+    """Record a finished stage. The scene's later stages worked on what is now replaced: their stamps go."""
+    earlier = STAGES[: STAGES.index(stage)]
+    stamps = {name: stamp for name, stamp in _read_stamps(scene).items() if name in earlier}
+    write_json(_stamp_path(scene), {**stamps, stage: key})
+
+
+def _is_done(scene: SceneFolder, stage: str, key: str, *results: Path) -> bool:
+    return _read_stamp(scene, stage) == key and all(result.exists() for result in results)

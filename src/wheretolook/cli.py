@@ -114,13 +114,15 @@ def parse_experiment(command: str, arguments: list[str]) -> Experiment | None:
     from jsonargparse import ArgumentError
 
     try:
-        return Experiment(**vars(parser.instantiate(parser.parse_args(arguments))))
+        settings = vars(parser.instantiate(parser.parse_args(arguments)))
+        return Experiment(**{name: value for name, value in settings.items() if name != "config"})
     except (ArgumentError, WhereToLookError) as error:
         for cause in _causes(error):
             if isinstance(cause, WhereToLookError):
                 raise cause from error
-        path = next((value for flag, value in pairwise(arguments) if flag == "--config"), None)
         problem = " ".join(str(error).split())
+        file = next((value for flag, value in pairwise(arguments) if flag == "--config"), None)
+        path = None if problem.startswith("unrecognized arguments") else file
         raise ConfigError(problem, path=path, fix=f"`wheretolook {command} --help` lists the settings.") from error
 
 

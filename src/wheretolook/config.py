@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -9,9 +10,9 @@ from typing import Literal
 from wheretolook.errors import ConfigError
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.geometry import PinholeCamera
-from wheretolook.labelling.labeller import LabelConfig
+from wheretolook.labelling.config import LabelConfig
 from wheretolook.learning.config import TrainConfig
-from wheretolook.mapping.building import MapConfig
+from wheretolook.mapping.config import MapConfig
 from wheretolook.sampling import SampleConfig
 from wheretolook.scenes.free_space import FreeSpaceConfig
 from wheretolook.scenes.procedural import ApartmentConfig
@@ -101,6 +102,11 @@ class Experiment:
     def root(self) -> Path:
         """Folder of the dataset."""
         return self.data / self.name
+
+    @property
+    def n_workers(self) -> int:
+        """Worker processes: as `label.workers` says, by default one for each CPU core this process may use."""
+        return self.label.workers or len(os.sched_getaffinity(0))
 
     @property
     def warp_device(self) -> str:

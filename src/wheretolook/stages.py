@@ -60,6 +60,7 @@ def make_scenes(experiment: Experiment, say: Say = print, tick: Tick = lambda wo
         key = _key("scenes", keys[scene])
         if not _is_done(scene, "scenes", key, scene.mesh):
             mesh = make()
+            scene.folder.mkdir(parents=True, exist_ok=True)
             save_glb(mesh, scene.mesh)
             _stamp(scene, "scenes", key)
             say(f"{scene.name}: {len(mesh.triangles):,} triangles -> {scene.mesh}")
@@ -97,11 +98,12 @@ def make_maps(experiment: Experiment, say: Say = print, tick: Tick = lambda work
                 experiment.map,
                 seed=index,
                 out_dir=scene.map,
+                workers=experiment.n_workers,
                 raycaster=raycaster,
             )
             _stamp(scene, "map", key)
             say(f"{scene.name}: {report.n_landmarks:,} landmarks from {report.n_registered} images, median "
-                f"{report.median_surface_distance_cm:.2f} cm from the mesh -> {scene.map}")  # fmt: skip
+                f"{report.median_distance_to_mesh_cm:.2f} cm from the mesh -> {scene.map}")  # fmt: skip
         else:
             say(f"{scene.name}: reusing {scene.map}")
         tick(1)

@@ -132,7 +132,7 @@ def log(
     now = int(time.time() * 1000)
     mlflow_client.log_batch(
         run_id,
-        metrics=[Metric(key, float(value), now, step) for key, value in (metrics or {}).items() if math.isfinite(value)],
+        metrics=[Metric(key, float(v), now, step) for key, v in (metrics or {}).items() if math.isfinite(v)],
         params=[Param(key, str(value)) for key, value in (params or {}).items()],
     )
 

@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 
 from wheretolook.geometry import Float
 
+PERCENTILES = (2.5, 97.5)
+"""Ends of a 95 % interval."""
+
 
 class LocationBootstrap:
     """Resamples of the locations, with replacement within each scene, drawn once for all methods.
@@ -20,12 +23,10 @@ class LocationBootstrap:
     Args:
         location_scene: (L,) scene of each location.
         resamples: number R of resamples.
-        confidence: share of the resamples inside an interval.
         seed: the same seed and locations give the same resamples.
     """
 
-    def __init__(self, location_scene: NDArray[np.integer[Any]], resamples: int, confidence: float, seed: int) -> None:
-        self._tail = 50 * (1 - confidence)
+    def __init__(self, location_scene: NDArray[np.integer[Any]], resamples: int, seed: int) -> None:
         self._times = np.zeros((resamples, len(location_scene)), dtype=np.float32)  # how often a location was drawn
         for scene in np.unique(location_scene):
             columns = np.flatnonzero(location_scene == scene)
@@ -36,7 +37,7 @@ class LocationBootstrap:
         self._sizes = np.bincount(location_scene)
 
     def ratio(self, numerator: Float, denominator: Float) -> tuple[Float, Float]:
-        """Percentile interval of the ratio of two sums over locations.
+        """95 % percentile interval of the ratio of two sums over locations.
 
         Args:
             numerator: (L, T).
@@ -54,5 +55,5 @@ class LocationBootstrap:
         for column, values in enumerate(ratio.T):
             known = values[np.isfinite(values)]
             if len(known):
-                ends[:, column] = np.percentile(known, [self._tail, 100 - self._tail])
+                ends[:, column] = np.percentile(known, PERCENTILES)
         return ends[0], ends[1]

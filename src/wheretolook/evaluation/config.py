@@ -9,7 +9,7 @@ from typing import Literal
 from wheretolook.errors import ConfigError
 
 THRESHOLDS = ((0.05, 0.4), (0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
-"""Error limits in metres and degrees: those of the Long-Term Visual Localization benchmark, and the paper's finer one."""
+"""Error limits in metres and degrees: the Long-Term Visual Localization benchmark's and the paper's finer one."""
 
 
 @dataclass(frozen=True)
@@ -24,8 +24,7 @@ class EvaluateConfig:
         thresholds: pairs of limits, in metres and degrees, that both errors of a good viewpoint stay strictly under.
             The first pair is the label.
         seed: seed of the random method and of the bootstrap.
-        resamples: bootstrap resamples of the locations.
-        confidence: share of the resamples inside an interval.
+        resamples: bootstrap resamples of the locations, for 95 % intervals.
     """
 
     methods: tuple[str, ...] = ("random", "visible", "bins", "mlp")
@@ -35,14 +34,14 @@ class EvaluateConfig:
     thresholds: tuple[tuple[float, float], ...] = THRESHOLDS
     seed: int = 0
     resamples: int = 2000
-    confidence: float = 0.95
 
     def __post_init__(self) -> None:
         from wheretolook.scoring.registry import SCORERS
 
         unknown = [name for name in self.methods if name not in SCORERS]
         if unknown or not self.methods or len(set(self.methods)) < len(self.methods):
-            raise ConfigError("methods must be known and named once", value=self.methods, fix=f"There are {', '.join(SCORERS)}.")
+            known = f"There are {', '.join(SCORERS)}."
+            raise ConfigError("methods must be known and named once", value=self.methods, fix=known)
         if self.split not in ("train", "val", "test"):
             raise ConfigError("unknown split", value=self.split, fix="Use train, val or test.")
         if not self.top_n or min(self.top_n) < 1 or len(set(self.top_n)) < len(self.top_n):
@@ -51,8 +50,6 @@ class EvaluateConfig:
             raise ConfigError("thresholds needs pairs of positive limits", value=self.thresholds)
         if self.resamples < 1:
             raise ConfigError("resamples must be at least 1", value=self.resamples)
-        if not 0 < self.confidence < 1:
-            raise ConfigError("confidence must lie strictly between 0 and 1", value=self.confidence)
 
 
 def threshold_key(threshold: tuple[float, float]) -> str:

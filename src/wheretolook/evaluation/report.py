@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import pandas as pd
 
@@ -28,33 +29,35 @@ def score_markdown(scores: pd.DataFrame, title: str = "Localization score") -> s
     keys = threshold_keys(scores)
     parts = [
         f"# {title}",
-        f"Scenes: {', '.join(scenes)}; {pooled['n_locations'].iloc[0]:,} locations. Share in % of the chosen viewpoints "
-        "that localize within both limits, divided by the oracle's share [95 % bootstrap interval over locations], and "
+        f"Scenes: {', '.join(scenes)}; {pooled['n_locations'].iloc[0]:,} locations. "
+        "Share in % of the chosen viewpoints that localize within both limits, divided by the oracle's share "
+        "[95 % bootstrap interval over locations], and "
         "undivided in round brackets. AP and AUC (ROC) of the scores are against the first limits. Random is an exact "
         "expectation, its AP and AUC are one draw.",
     ]
     for n, rows in pooled.groupby("top_n", sort=False):
-        parts.append(f"## Best {n} of each location ({rows['n_views'].iloc[0]:,} viewpoints)" if n != 1 else
-                     f"## Best viewpoint of each location ({rows['n_views'].iloc[0]:,} viewpoints)")  # fmt: skip
-        parts.append(_table(["method", *map(threshold_label, keys), "AP", "AUC"], [
-            [method_style(row["method"], row["inputs"]).label,
-             *(_share(row, key, interval=index == 0) for index, key in enumerate(keys)),
-             _number(row["average_precision"]), _number(row["roc_auc"])]
-            for row in rows.to_dict("records")
-        ]))  # fmt: skip
+        chosen = "viewpoint" if n == 1 else f"{n} viewpoints"
+        parts.append(f"## Best {chosen} of each location ({rows['n_views'].iloc[0]:,} in all)")
+        lines = []
+        for row in rows.to_dict("records"):
+            shares = [_share(row, key, interval=index == 0) for index, key in enumerate(keys)]
+            metrics = [_number(row["average_precision"]), _number(row["roc_auc"])]
+            lines.append([method_style(row["method"], row["inputs"]).label, *shares, *metrics])
+        parts.append(_table(["method", *map(threshold_label, keys), "AP", "AUC"], lines))
     first = scores[(scores["top_n"] == scores["top_n"].iloc[0]) & (scores["scene"] != ALL)]
     if len(scenes) > 1:
-        parts.append(f"## Best {scores['top_n'].iloc[0]} by scene, within {threshold_label(keys[0])}")
+        parts.append(f"## By scene: best {scores['top_n'].iloc[0]} of each location, within {threshold_label(keys[0])}")
         methods = list(dict.fromkeys(zip(first["method"], first["inputs"], strict=True)))
         by_key = {(row["scene"], row["method"], row["inputs"]): row for row in first.to_dict("records")}
-        parts.append(_table(["method", *scenes], [
-            [method_style(*method).label, *(_share(by_key[(scene, *method)], keys[0], interval=True) for scene in scenes)]
-            for method in methods
-        ]))  # fmt: skip
+        lines = []
+        for method in methods:
+            shares = [_share(by_key[(scene, *method)], keys[0], interval=True) for scene in scenes]
+            lines.append([method_style(*method).label, *shares])
+        parts.append(_table(["method", *scenes], lines))
     return "\n\n".join(parts) + "\n"
 
 
-def _share(row: dict[str, float], key: str, interval: bool) -> str:
+def _share(row: dict[Any, Any], key: str, interval: bool) -> str:
     normalized, raw = row[f"normalized_{key}"], row[f"raw_{key}"]
     low, high = row[f"normalized_low_{key}"], row[f"normalized_high_{key}"]
     ends = f" [{100 * low:.1f}, {100 * high:.1f}]" if interval and pd.notna(low) and low < high else ""

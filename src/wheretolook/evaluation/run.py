@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from wheretolook.dataset import Dataset, SceneFolder
@@ -18,6 +19,7 @@ from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.ranking import TestViews
 from wheretolook.evaluation.report import score_markdown
 from wheretolook.evaluation.scores import ALL, Method, score_table
+from wheretolook.features import INPUT_VARIANTS
 from wheretolook.geometry import Float
 from wheretolook.localization_map import LocalizationMap
 from wheretolook.scoring import Scorer, make_scorer
@@ -65,7 +67,8 @@ def evaluate(
     """
     scenes = dataset.split(config.split)
     if not scenes:
-        raise TableError(f"the dataset has no {config.split} scene", path=dataset.root, fix="Make one, or choose another split.")
+        fix = "Make one, or choose another split."
+        raise TableError(f"the dataset has no {config.split} scene", path=dataset.root, fix=fix)
     weights = _weights(dataset, config, models)
     tables = [scene.read_table() for scene in scenes]
     views = _test_views(scenes, tables, config)
@@ -78,15 +81,14 @@ def evaluate(
     return table
 
 
-def _weights(
-    dataset: Dataset, config: EvaluateConfig, models: Sequence[TrainedModel | Path] | None
-) -> list[Path]:
+def _weights(dataset: Dataset, config: EvaluateConfig, models: Sequence[TrainedModel | Path] | None) -> list[Path]:
     if "mlp" not in config.methods:
         return []
     if models is not None:
-        weights = [Path(getattr(model, "path", model)) for model in models]
+        weights = [model if isinstance(model, Path) else model.path for model in models]
     else:
-        weights = list(config.weights) or sorted((dataset.root / "weights").glob("mlp-*.safetensors"))
+        trained = (dataset.root / "weights" / f"mlp-{variant}.safetensors" for variant in INPUT_VARIANTS)
+        weights = list(config.weights) or [path for path in trained if path.is_file()]
     if not weights:
         raise WeightsError(
             "there are no weights to evaluate", path=dataset.root / "weights",
@@ -96,7 +98,9 @@ def _weights(
 
 
 def _test_views(scenes: Sequence[SceneFolder], tables: Sequence[pd.DataFrame], config: EvaluateConfig) -> TestViews:
-    location, location_scene, good = [], [], []
+    location: list[NDArray[np.int64]] = []
+    location_scene: list[NDArray[np.int64]] = []
+    good: list[NDArray[np.bool_]] = []
     for number, (scene, table) in enumerate(zip(scenes, tables, strict=True)):
         if table.empty:
             raise TableError("the table has no viewpoints", path=scene.table, fix="Run the sample stage again.")
@@ -105,7 +109,7 @@ def _test_views(scenes: Sequence[SceneFolder], tables: Sequence[pd.DataFrame], c
         except TableError as error:
             raise TableError(error.problem, path=scene.table, value=error.value, fix=error.fix) from None
         names, rows = np.unique(table["location_id"].to_numpy(np.int64), return_inverse=True)
-        location.append(rows + sum(map(len, location_scene)))
+        location.append(rows + sum(len(part) for part in location_scene))
         location_scene.append(np.full(len(names), number))
     ids = np.concatenate([table["viewpoint_id"].to_numpy(np.int64) for table in tables])
     return TestViews(np.concatenate(location), ids, np.concatenate(good), np.concatenate(location_scene))
@@ -136,7 +140,9 @@ def _score_scenes(
     return {method: np.concatenate(parts) for method, parts in scores.items()}
 
 
-def _scorers(localization_map: LocalizationMap, config: EvaluateConfig, weights: Sequence[Path]) -> dict[Method, Scorer]:
+def _scorers(
+    localization_map: LocalizationMap, config: EvaluateConfig, weights: Sequence[Path]
+) -> dict[Method, Scorer]:
     scorers: dict[Method, Scorer] = {}
     for name in config.methods:
         for path in weights if name == "mlp" else [None]:
@@ -174,16 +180,19 @@ def _log(
         "dataset_fingerprint": Dataset(dataset.root, dataset.camera, tuple(scenes)).fingerprint(),
         "scenes": " ".join(scene.name for scene in scenes),
         **{name: value for name, value in asdict(config).items() if name not in ("weights", "methods")},
-        **{f"weights_{path.stem}": fingerprint(path) for path in weights},
+        "weights": " ".join(f"{path.stem}:{fingerprint(path)}" for path in weights),
     }
-    with start_run(tracking, f"evaluate {dataset.name}", "evaluate", params, tags={"dataset": dataset.name}) as (client, run):
-        metrics = {"n_locations": views.n_locations, "n_views": len(views.good), "positives": float(views.good[:, 0].mean())}
+    positives = float(views.good[:, 0].mean())
+    tags = {"dataset": dataset.name}
+    with start_run(tracking, f"evaluate {dataset.name}", "evaluate", params, tags=tags) as (client, run):
+        metrics = {"n_locations": views.n_locations, "n_views": len(views.good), "positives": positives}
         log(client, run, metrics=metrics)
         client.log_artifacts(run, str(dataset.root / "results"))
         for row in table[table["scene"] == ALL].to_dict("records"):
             name = " ".join(part for part in (row["method"], row["inputs"], f"best {row['top_n']}") if part)
             child_params = {"dataset": dataset.name, **{key: row[key] for key in ("method", "inputs", "top_n")}}
-            numbers = {key: value for key, value in row.items() if key not in ("method", "inputs", "scene", "top_n")}
+            named = ("method", "inputs", "scene", "top_n")
+            numbers = {str(key): float(value) for key, value in row.items() if key not in named}
             with start_run(tracking, name, "evaluate", child_params, parent=run) as (_, child):
                 log(client, child, metrics=numbers)
 

@@ -56,7 +56,7 @@ def score_table(
     rows = []
     for name, locations in pools:
         inside = locations[views.location]
-        bootstrap = LocationBootstrap(views.location_scene[locations], config.resamples, config.confidence, config.seed)
+        bootstrap = LocationBootstrap(views.location_scene[locations], config.resamples, config.seed)
         ranked = {method: _ranking_metrics(views.good[inside, 0], values[inside]) for method, values in scores.items()}
         for method in methods:
             for n in config.top_n:

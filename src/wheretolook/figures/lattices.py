@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.style import context
 from scipy.spatial import ConvexHull, cKDTree
@@ -51,12 +52,13 @@ def fibonacci_figure(n: int = 500) -> Figure:
             _draw_sphere(axes, directions, color)
             nearest = nearest_angles_deg(directions)
             axes.set_title(f"{name}, n = {len(directions)}")
-            axes.text(0, -1.12, f"covering radius {covering_radius_deg(directions):.1f}°\n"
-                      f"nearest neighbours {nearest.min():.1f}° to {nearest.max():.1f}°", ha="center", va="top")  # fmt: skip
+            covering = f"covering radius {covering_radius_deg(directions):.1f}°"
+            spread = f"nearest neighbours {nearest.min():.1f}° to {nearest.max():.1f}°"
+            axes.text(0, -1.12, f"{covering}\n{spread}", ha="center", va="top")
         return figure
 
 
-def _draw_sphere(axes, directions: Float, color: str) -> None:  # type: ignore[no-untyped-def]
+def _draw_sphere(axes: Axes, directions: Float, color: str) -> None:
     """Orthographic view of directions on a sphere."""
     tilt = np.radians(25)
     # rows: right, up and towards the eye, for an eye 25 degrees above the equator in the direction of -y
@@ -78,6 +80,6 @@ def _draw_sphere(axes, directions: Float, color: str) -> None:  # type: ignore[n
     axes.axis("off")
 
 
-def _draw_arc(axes, points: Float) -> None:  # type: ignore[no-untyped-def]
+def _draw_arc(axes: Axes, points: Float) -> None:
     x, y, depth = points
     axes.plot(np.where(depth > 0, x, np.nan), y, color=GRID, linewidth=0.6, zorder=1)

@@ -31,7 +31,7 @@ def training_figure(histories: Mapping[str, pd.DataFrame]) -> Figure:
                            label=f"{style.label}: training")  # fmt: skip
                 panel.plot(history["epoch"], history[f"val_{name}"], "-", color=style.color,
                            label=f"{style.label}: validation")  # fmt: skip
-            best = history.loc[history["val_average_precision"].idxmax()]
+            best = history.iloc[int(history["val_average_precision"].to_numpy().argmax())]
             panels[1].plot(best["epoch"], best["val_average_precision"], "o", markersize=8, markerfacecolor="none",
                            color=style.color)  # fmt: skip
         panels[0].set(xlabel="epoch", ylabel="weighted cross-entropy")

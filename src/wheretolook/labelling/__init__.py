@@ -1,6 +1,25 @@
 """Labels without people: render a viewpoint, localize the image against the map, measure the pose error."""
 
-from wheretolook.labelling.labeller import LabelConfig, label_viewpoints
-from wheretolook.labelling.localizer import Localization, Localizer, LocalizerConfig
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from wheretolook.labelling.config import LabelConfig, LocalizerConfig
+
+if TYPE_CHECKING:
+    from wheretolook.labelling.labeller import label_viewpoints
+    from wheretolook.labelling.localizer import Localization, Localizer
 
 __all__ = ["LabelConfig", "Localization", "Localizer", "LocalizerConfig", "label_viewpoints"]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "label_viewpoints":  # loads PyTorch and pycolmap
+        from wheretolook.labelling.labeller import label_viewpoints
+
+        return label_viewpoints
+    if name in ("Localization", "Localizer"):
+        from wheretolook.labelling import localizer
+
+        return getattr(localizer, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -8,7 +8,7 @@ import multiprocessing
 import os
 import threading
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,34 +16,16 @@ import numpy as np
 import pandas as pd
 from tqdm.auto import tqdm
 
-from wheretolook.errors import ConfigError, MapError
+from wheretolook.errors import MapError
 from wheretolook.geometry import PinholeCamera, pose_error
-from wheretolook.labelling.localizer import Localizer, LocalizerConfig
+from wheretolook.labelling.config import LabelConfig, LocalizerConfig
+from wheretolook.labelling.localizer import Localizer
 from wheretolook.mapping.extraction import ExtractorConfig
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.table import LABEL_COLUMNS, fingerprint, poses, read_table, write_table
 
 if TYPE_CHECKING:
     from wheretolook.rendering import Renderer
-
-
-@dataclass(frozen=True)
-class LabelConfig:
-    """Settings of the label stage.
-
-    Args:
-        localizer: matching and pose estimation.
-        workers: processes; 0 means one for each CPU core this process may use.
-        shard_size: viewpoints a shard, the unit of work and of what an interruption can lose.
-    """
-
-    localizer: LocalizerConfig = field(default_factory=LocalizerConfig)
-    workers: int = 0
-    shard_size: int = 16
-
-    def __post_init__(self) -> None:
-        if self.workers < 0 or self.shard_size < 1:
-            raise ConfigError("workers must be >= 0 and shard_size >= 1", value=(self.workers, self.shard_size))
 
 
 def label_viewpoints(

@@ -9,39 +9,12 @@ import pycolmap
 import torch
 from numpy.typing import NDArray
 
-from wheretolook.errors import ConfigError, MapError
+from wheretolook.errors import MapError
 from wheretolook.geometry import Float, PinholeCamera
+from wheretolook.labelling.config import LocalizerConfig
 from wheretolook.mapping.extraction import ExtractorConfig, KeypointExtractor, unit_descriptors
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.table import LOCALIZED, NO_POSE, TOO_FEW_MATCHES
-
-
-@dataclass(frozen=True)
-class LocalizerConfig:
-    """Settings of matching and pose estimation.
-
-    Args:
-        max_ratio: Lowe's ratio: the nearest landmark's descriptor distance over the second nearest's must be below it.
-        min_matches: with fewer matches no pose is sought; four is the least that determines and checks one.
-        max_error_px: reprojection error under which RANSAC counts a match as an inlier.
-        min_inliers: poses with fewer inliers are taken for accidents: RANSAC finds some pose for almost any image.
-        seed: of RANSAC, the same for every image, so that a label depends on its viewpoint alone.
-    """
-
-    max_ratio: float = 0.85
-    min_matches: int = 4
-    max_error_px: float = 8.0
-    min_inliers: int = 10
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if not 0 < self.max_ratio <= 1:
-            raise ConfigError("max_ratio must be in (0, 1]", value=self.max_ratio)
-        if self.min_matches < 4 or self.min_inliers < 4 or self.max_error_px <= 0:
-            raise ConfigError(
-                "the localizer needs min_matches >= 4, min_inliers >= 4 and max_error_px > 0",
-                value=(self.min_matches, self.min_inliers, self.max_error_px),
-            )
 
 
 @dataclass(frozen=True, eq=False)

@@ -63,9 +63,8 @@ class TrainConfig:
     def __post_init__(self) -> None:
         unknown = [name for name in self.variants if name not in INPUT_VARIANTS]
         if unknown or not self.variants or len(set(self.variants)) < len(self.variants):
-            raise ConfigError(
-                "variants must be known and named once", value=self.variants, fix=f"There are {', '.join(INPUT_VARIANTS)}."
-            )
+            known = f"There are {', '.join(INPUT_VARIANTS)}."
+            raise ConfigError("variants must be known and named once", value=self.variants, fix=known)
         for name, choices in (
             ("schedule", ("constant", "cosine")),
             ("layout", ("in_place", "compact")),

@@ -85,7 +85,8 @@ class NetworkSpec:
 
     def __post_init__(self) -> None:
         if self.variant not in INPUT_VARIANTS:
-            raise ConfigError("unknown input variant", value=self.variant, fix=f"There are {', '.join(INPUT_VARIANTS)}.")
+            known = f"There are {', '.join(INPUT_VARIANTS)}."
+            raise ConfigError("unknown input variant", value=self.variant, fix=known)
         if self.statistics.channels != self.channels:
             raise ConfigError(f"statistics of {self.statistics.channels} do not fit the input", value=self.variant)
 
@@ -109,6 +110,10 @@ class BinnedInput(nn.Module):
     Args:
         spec: variant, statistics, bins and layout.
     """
+
+    index: Tensor
+    mean: Tensor
+    std: Tensor
 
     def __init__(self, spec: NetworkSpec) -> None:
         super().__init__()

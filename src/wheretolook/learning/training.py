@@ -7,6 +7,7 @@ import json
 import logging
 import signal
 import threading
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -16,9 +17,9 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 import torch
-from lightning.fabric.utilities.seed import isolate_rng
 from lightning.pytorch import Callback, LightningModule, Trainer, seed_everything
 from lightning.pytorch.callbacks import EarlyStopping
+from lightning.pytorch.utilities.seed import isolate_rng
 from tqdm.auto import tqdm
 
 import wheretolook
@@ -160,7 +161,11 @@ def _train_variant(
 
 
 def _fit(
-    classifier: ViewpointClassifier, data: ViewpointDataModule, record: EpochRecord, tracking: TrackingConfig, run_id: str
+    classifier: ViewpointClassifier,
+    data: ViewpointDataModule,
+    record: EpochRecord,
+    tracking: TrackingConfig,
+    run_id: str,
 ) -> None:
     from lightning.pytorch.loggers import MLFlowLogger
 
@@ -217,7 +222,8 @@ class EpochRecord(Callback):
         if not self.keep_best or metrics[MONITORED] > best:
             self.kept = len(self.rows) - 1
             self._weights = {name: tensor.detach().clone() for name, tensor in pl_module.state_dict().items()}
-        self._bar.set_postfix_str(f"AP {metrics[MONITORED]:.3f}, best {max(best, metrics[MONITORED]):.3f}", refresh=False)
+        now = metrics[MONITORED]
+        self._bar.set_postfix_str(f"AP {now:.3f}, best {max(best, now):.3f}", refresh=False)
         self._bar.update()
 
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
@@ -255,7 +261,9 @@ def _quiet() -> Iterator[None]:
     for logger in loggers:
         logger.setLevel(logging.WARNING)
     try:
-        yield
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "The number of training batches")  # metrics are logged by epoch
+            yield
     except SystemExit as stop:
         if isinstance(stop.__context__, KeyboardInterrupt):
             raise KeyboardInterrupt from stop

@@ -78,11 +78,13 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}
+            names = file.keys()  # the file is no dict, whatever it looks like
+            tensors = {name: file.get_tensor(name) for name in names}
     except (SafetensorError, OSError) as error:
         raise WeightsError(f"not a readable safetensors file: {error}", path=path, fix="Train again.") from error
     if METADATA_KEY not in metadata:
-        raise WeightsError("these weights were not written by wheretolook", path=path, fix="Give weights that the train stage wrote.")
+        fix = "Give weights that the train stage wrote."
+        raise WeightsError("these weights were not written by wheretolook", path=path, fix=fix)
     try:
         header = dict(json.loads(metadata[METADATA_KEY]))
     except ValueError as error:
@@ -99,11 +101,12 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
 
 def _spec(path: Path, header: dict[str, Any]) -> NetworkSpec:
     try:
-        statistics = header["statistics"]
+        stored = header["statistics"]
+        statistics = InputStatistics(tuple(stored["channels"]), tuple(stored["mean"]), tuple(stored["std"]))
         return NetworkSpec(
             variant=header["variant"],
             camera=PinholeCamera(**header["camera"]),
-            statistics=InputStatistics(tuple(statistics["channels"]), tuple(statistics["mean"]), tuple(statistics["std"])),
+            statistics=statistics,
             bins=int(header["bins"]),
             layout=header["layout"],
             hidden=tuple(header["hidden"]),

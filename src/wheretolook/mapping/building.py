@@ -50,6 +50,7 @@ class MapReport:
         p90_distance_to_mesh_cm: 90th percentile of the same.
         walk_length_m: length of the walk.
         coverage: share of the reachable floor that the walk visits.
+        visit_radius_m: walking distance from the walk within which floor counts as visited.
         seed: seed of the walk and of COLMAP.
         config: the configuration, as a dictionary.
         seconds: wall-clock time of each step.
@@ -67,6 +68,7 @@ class MapReport:
     p90_distance_to_mesh_cm: float
     walk_length_m: float
     coverage: float
+    visit_radius_m: float
     seed: int
     config: dict[str, Any]
     seconds: dict[str, float]
@@ -171,8 +173,9 @@ def build_map(
             mean_reprojection_error_px=float(landmarks.reprojection_error_px.mean()),
             median_distance_to_mesh_cm=float(np.median(distance_cm)),
             p90_distance_to_mesh_cm=float(np.quantile(distance_cm, 0.9)),
-            walk_length_m=float(np.linalg.norm(np.diff(walk.path, axis=0), axis=1).sum()),
+            walk_length_m=walk.length_m,
             coverage=walk.coverage,
+            visit_radius_m=walk.visit_radius_m,
             seed=seed,
             config=asdict(config),
             seconds={**clock.seconds, "total": sum(clock.seconds.values())},

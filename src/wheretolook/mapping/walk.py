@@ -31,7 +31,9 @@ class WalkConfig:
 
     Args:
         coverage: share of the reachable floor that gets visited; the walk ends there.
-        visit_radius_m: floor within this walking distance of the walk counts as visited.
+        visit_radius_m: floor within this walking distance of the walk counts as visited. It grows until the walk is
+            short enough for the images to be `image_spacing_m` apart.
+        image_spacing_m: largest distance along the walk between two images. Images farther apart overlap too little.
         eye_height_m: mean height of the camera above the floor in metres.
         eye_height_variation_m: largest deviation from it.
         cell_m: distance between neighbouring places of the grid that the walk runs on.
@@ -43,20 +45,21 @@ class WalkConfig:
     """
 
     coverage: float = 0.7
-    visit_radius_m: float = 1.2
+    visit_radius_m: float = 1.0
+    image_spacing_m: float = 0.6
     eye_height_m: float = 1.45
     eye_height_variation_m: float = 0.2
     cell_m: float = 0.3
     max_step_height_m: float = 0.4
-    swing_deg: float = 45.0
-    swing_period: float = 7.0
+    swing_deg: float = 40.0
+    swing_period: float = 12.0
     pitch_deg: float = -5.0
     pitch_variation_deg: float = 10.0
 
     def __post_init__(self) -> None:
         if not 0 < self.coverage <= 1:
             raise ConfigError("coverage must be in (0, 1]", value=self.coverage)
-        for name in ("visit_radius_m", "eye_height_m", "cell_m", "swing_period"):
+        for name in ("visit_radius_m", "image_spacing_m", "eye_height_m", "cell_m", "swing_period"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"{name} must be positive", value=getattr(self, name))
         if not 0 <= self.eye_height_variation_m < self.eye_height_m:
@@ -76,12 +79,19 @@ class Walk:
         directions: (n, 3) unit optical axes in the world.
         path: (M, 3) metres, corners of the walk at mean eye height; every segment between two corners is free.
         coverage: share of the reachable floor within `visit_radius_m` walking distance of the walk.
+        visit_radius_m: the radius used.
     """
 
     positions: Float
     directions: Float
     path: Float
     coverage: float
+    visit_radius_m: float
+
+    @property
+    def length_m(self) -> float:
+        """Length of the path in metres."""
+        return _length_m(self.path)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,10 +126,21 @@ def plan_walk(
         raise ConfigError("a map needs at least two images", value=n_images)
     rng = np.random.default_rng(seed)
     places = _reachable_places(free_space, np.asarray(bounds, dtype=np.float64), config)
-    corners, coverage = _visit(places, config, rng)
-    path = places.eyes[corners]
+    start = int(rng.integers(len(places.eyes)))
+    radius_m = config.visit_radius_m
+    while True:
+        corners, coverage = _visit(places, start, radius_m, config.coverage)
+        path = places.eyes[corners]
+        if len(corners) == 1 or _length_m(path) <= (n_images - 1) * config.image_spacing_m:
+            break
+        radius_m *= 1.2
     positions, headings = _along(path, n_images, rng)
-    return Walk(_vary_height(free_space, positions, config, rng), _swing(headings, config, rng), path, coverage)
+    positions = _vary_height(free_space, positions, config, rng)
+    return Walk(positions, _swing(headings, config, rng), path, coverage, radius_m)
+
+
+def _length_m(path: Float) -> float:
+    return float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
 
 
 def _reachable_places(free_space: FreeSpaceQueries, bounds: Float, config: WalkConfig) -> _Places:
@@ -130,7 +151,7 @@ def _reachable_places(free_space: FreeSpaceQueries, bounds: Float, config: WalkC
     i, j, h = np.meshgrid(np.arange(nx), np.arange(ny), np.arange(len(heights)), indexing="ij")
     cell = np.stack([i.ravel(), j.ravel()], axis=1)
     probes = np.column_stack([low[:2] + (cell + 0.5) * config.cell_m, heights[h.ravel()]])
-    floor = np.asarray(free_space.floor_below(probes), dtype=np.float64)
+    floor = _floor(free_space, probes)
     found = np.isfinite(floor)
     # One place for each floor of a cell, however many probes fell on it.
     key = np.column_stack([cell[found], np.rint(100 * floor[found]).astype(np.int64)])
@@ -148,7 +169,10 @@ def _reachable_places(free_space: FreeSpaceQueries, bounds: Float, config: WalkC
             fix="Check that the scene is in metres with z up, or lower eye_height_m or the clearance of free space.",
         )
     a, b = _neighbours(key)
-    near = np.abs(eyes[a, 2] - eyes[b, 2]) <= config.max_step_height_m
+    # The floor must go on from one place to the next, also half way: no stepping off a gallery or over a gap.
+    middle = (eyes[a] + eyes[b]) / 2
+    drop = np.column_stack([eyes[a, 2] - eyes[b, 2], middle[:, 2] - config.eye_height_m - _floor(free_space, middle)])
+    near = (np.abs(drop) <= config.max_step_height_m).all(1)  # False where there is no floor (NaN)
     a, b = a[near], b[near]
     if len(a):
         clear = np.asarray(free_space.segments_are_free(eyes[a], eyes[b]), dtype=bool)
@@ -165,6 +189,10 @@ def _reachable_places(free_space: FreeSpaceQueries, bounds: Float, config: WalkC
             fix="Lower cell_m or the clearance of free space.",
         )
     return _Places(eyes[members], steps[members][:, members])
+
+
+def _floor(free_space: FreeSpaceQueries, points: Float) -> Float:
+    return np.asarray(free_space.floor_below(points), dtype=np.float64)
 
 
 def _neighbours(key: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -184,17 +212,15 @@ def _neighbours(key: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.i
     return a, b
 
 
-def _visit(places: _Places, config: WalkConfig, rng: np.random.Generator) -> tuple[NDArray[np.int64], float]:
+def _visit(places: _Places, start: int, radius_m: float, coverage: float) -> tuple[NDArray[np.int64], float]:
     """Indices of the places along the walk and the share of all places visited."""
-    n = len(places.eyes)
-    here = int(rng.integers(n))
-    corners = [here]
-    visited = np.zeros(n, dtype=bool)
-    fresh = [here]
+    here = start
+    corners, fresh = [here], [here]
+    visited = np.zeros(len(places.eyes), dtype=bool)
     while True:
-        reached = dijkstra(places.steps, indices=fresh, min_only=True, limit=config.visit_radius_m)
+        reached = dijkstra(places.steps, indices=fresh, min_only=True, limit=radius_m)
         visited |= np.isfinite(reached)
-        if visited.mean() >= config.coverage:
+        if visited.mean() >= coverage:
             break
         distance, previous = dijkstra(places.steps, indices=here, return_predecessors=True)
         target = int(np.where(visited, np.inf, distance).argmin())

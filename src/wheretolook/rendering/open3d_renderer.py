@@ -15,6 +15,15 @@ from wheretolook.scenes.mesh import TexturedMesh
 Float = NDArray[np.floating[Any]]
 
 
+def raycasting_scene(mesh: TexturedMesh) -> Any:
+    """The mesh as an `open3d.t.geometry.RaycastingScene`."""
+    import open3d as o3d
+
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(o3d.core.Tensor(mesh.vertices), o3d.core.Tensor(mesh.triangles.astype(np.uint32)))  # type: ignore[call-overload]
+    return scene
+
+
 class Open3DRenderer:
     """What `WarpRenderer` computes, with `open3d.t.geometry.RaycastingScene` and NumPy on the CPU.
 
@@ -23,11 +32,8 @@ class Open3DRenderer:
     """
 
     def __init__(self, mesh: TexturedMesh) -> None:
-        import open3d as o3d
-
         self.mesh = mesh
-        self._scene = o3d.t.geometry.RaycastingScene()
-        self._scene.add_triangles(mesh.vertices.astype(np.float32), mesh.triangles.astype(np.uint32))
+        self._scene = raycasting_scene(mesh)
         self._pyramids = build_pyramids(mesh.textures)
         self._texel_gradients = texel_gradients(mesh)
 
@@ -41,14 +47,16 @@ class Open3DRenderer:
             rgb[i], depth_m[i] = colors, depths
         return Rendering(rgb, depth_m)
 
-    def _render_one(self, camera: PinholeCamera, pose: Float) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    def _render_one(
+        self, camera: PinholeCamera, pose: NDArray[np.float64]
+    ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         import open3d as o3d
 
         (center,), (ray_from_pixel,) = camera_rays(camera, pose)
         x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
         directions = np.stack([x, y, np.ones_like(x)], axis=-1) @ ray_from_pixel.T
         rays = np.concatenate([np.broadcast_to(center, directions.shape), directions], axis=-1)
-        hits = self._scene.cast_rays(o3d.core.Tensor(rays.astype(np.float32)))
+        hits = self._scene.cast_rays(o3d.core.Tensor(rays.astype(np.float32)))  # type: ignore[call-overload]
         depth_m = hits["t_hit"].numpy()
         hit = np.isfinite(depth_m)
 
@@ -67,7 +75,9 @@ class Open3DRenderer:
         rgb[hit] = np.clip(np.floor(colors + 0.5), 0, 255).astype(np.uint8)
         return rgb, np.where(hit, depth_m, 0).astype(np.float32)
 
-    def _footprint(self, face: NDArray[np.int64], t: Float, normals: Float, rays: Float, ray_from_pixel: Float) -> Float:
+    def _footprint(
+        self, face: NDArray[np.int64], t: Float, normals: Float, rays: Float, ray_from_pixel: Float
+    ) -> Float:
         """How the hit moves on the texture as the pixel moves by one in x and y: (N, 2, 2) texels a pixel."""
         slant = np.einsum("nd,nd->n", normals, rays)
         slant = np.where(np.abs(slant) < 1e-4, np.where(slant < 0, -1e-4, 1e-4), slant)

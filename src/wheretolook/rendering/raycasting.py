@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
+from wheretolook.rendering.ray_kernels import cast_kernel, clear_kernel, distance_kernel, occluded_kernel
 from wheretolook.rendering.warp_setup import start_warp, vec3_array, warp_mesh
 from wheretolook.scenes.mesh import TexturedMesh
 
@@ -25,87 +26,6 @@ class RayHits:
     distance_m: NDArray[np.float32]
     triangle: NDArray[np.int32]
     front: NDArray[np.bool_]
-
-
-@wp.kernel
-def _occluded_kernel(
-    mesh: wp.uint64,
-    origins: wp.array[wp.vec3],
-    points: wp.array[wp.vec3],
-    margin_m: wp.float32,
-    occluded: wp.array2d[wp.bool],
-):
-    i, j = wp.tid()
-    ray = points[j] - origins[i]
-    distance = wp.length(ray)
-    reach = distance - margin_m
-    blocked = wp.bool(False)
-    if reach > 0.0:
-        blocked = wp.mesh_query_ray_anyhit(mesh, origins[i], ray / distance, reach)
-    occluded[i, j] = blocked
-
-
-@wp.kernel
-def _cast_kernel(
-    mesh: wp.uint64,
-    origins: wp.array[wp.vec3],
-    directions: wp.array[wp.vec3],
-    distance_m: wp.array[wp.float32],
-    triangle: wp.array[wp.int32],
-    front: wp.array[wp.bool],
-):
-    i = wp.tid()
-    hit = wp.mesh_query_ray(mesh, origins[i], wp.normalize(directions[i]), 1.0e6)
-    if hit.result:
-        distance_m[i] = hit.t
-        triangle[i] = hit.face
-        front[i] = hit.sign > 0.0
-    else:
-        distance_m[i] = wp.inf
-        triangle[i] = -1
-        front[i] = False
-
-
-@wp.kernel
-def _distance_kernel(
-    mesh: wp.uint64, points: wp.array[wp.vec3], max_distance_m: wp.float32, distance_m: wp.array[wp.float32]
-):
-    i = wp.tid()
-    nearest = wp.mesh_query_point_no_sign(mesh, points[i], max_distance_m)
-    distance_m[i] = wp.inf
-    if nearest.result:
-        at = wp.mesh_eval_position(mesh, nearest.face, nearest.u, nearest.v)
-        distance_m[i] = wp.length(at - points[i])
-
-
-@wp.kernel
-def _clear_kernel(
-    mesh: wp.uint64,
-    starts: wp.array[wp.vec3],
-    ends: wp.array[wp.vec3],
-    clearance_m: wp.float32,
-    clear: wp.array[wp.bool],
-):
-    # The ball around a point up to the nearest surface is empty: step by what it leaves beyond the clearance.
-    i = wp.tid()
-    start = starts[i]
-    length = wp.length(ends[i] - start)
-    toward = (ends[i] - start) / wp.max(length, 1.0e-9)
-    reach = length + 2.0 * clearance_m  # no need to look farther for the nearest surface
-    travelled = wp.float32(0.0)
-    result = wp.bool(True)
-    while result and travelled <= length:
-        nearest = wp.mesh_query_point_no_sign(mesh, start + travelled * toward, reach)
-        if not nearest.result:
-            break
-        at = wp.mesh_eval_position(mesh, nearest.face, nearest.u, nearest.v)
-        distance = wp.length(at - start - travelled * toward)
-        if distance < clearance_m:
-            result = False
-        if travelled == length:
-            break
-        travelled = wp.min(travelled + wp.max(distance - clearance_m, 0.1 * clearance_m), length)
-    clear[i] = result
 
 
 class MeshRaycaster:
@@ -149,7 +69,7 @@ class MeshRaycaster:
             stop = min(start + block, len(origins_at))
             result = wp.empty((stop - start, len(points_at)), dtype=wp.bool, device=self.device)
             wp.launch(
-                _occluded_kernel,
+                occluded_kernel,
                 dim=result.shape,
                 inputs=[self.warp_mesh.id, vec3_array(origins_at[start:stop], self.device), points_on_device, margin_m],
                 outputs=[result],
@@ -177,7 +97,7 @@ class MeshRaycaster:
         triangle = wp.empty(n_rays, dtype=wp.int32, device=self.device)
         front = wp.empty(n_rays, dtype=wp.bool, device=self.device)
         wp.launch(
-            _cast_kernel,
+            cast_kernel,
             dim=n_rays,
             inputs=[self.warp_mesh.id, origins_on_device, directions_on_device],
             outputs=[distance_m, triangle, front],
@@ -190,7 +110,7 @@ class MeshRaycaster:
         points_on_device = vec3_array(points, self.device)
         distance_m = wp.empty(points_on_device.shape[0], dtype=wp.float32, device=self.device)
         wp.launch(
-            _distance_kernel,
+            distance_kernel,
             dim=points_on_device.shape[0],
             inputs=[self.warp_mesh.id, points_on_device, max_distance_m],
             outputs=[distance_m],
@@ -215,7 +135,7 @@ class MeshRaycaster:
             raise ValueError(f"{starts.shape[0]} starts for {ends.shape[0]} ends")
         clear = wp.empty(starts.shape[0], dtype=wp.bool, device=self.device)
         wp.launch(
-            _clear_kernel,
+            clear_kernel,
             dim=starts.shape[0],
             inputs=[self.warp_mesh.id, starts, ends, clearance_m],
             outputs=[clear],

@@ -51,11 +51,11 @@ def build_pyramids(textures: tuple[NDArray[np.uint8], ...]) -> TexturePyramids:
 
     texels = np.zeros((total, 4), dtype=np.uint8)
     for k, texture in enumerate(textures):
-        image = texture
+        image: NDArray[np.uint8] = texture
         for level in range(n_levels[k]):
             height, width = max(1, texture.shape[0] >> level), max(1, texture.shape[1] >> level)
             if level > 0:
-                image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+                image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
             start = level_start[k, level]
             texels[start : start + width * height, :3] = image.reshape(-1, 3)
     size = [(t.shape[1], t.shape[0], levels) for t, levels in zip(textures, n_levels, strict=True)]

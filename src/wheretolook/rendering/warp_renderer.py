@@ -6,163 +6,14 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.geometry import PinholeCamera
-from wheretolook.rendering.textures import MAX_ANISOTROPY, build_pyramids, texel_gradients
+from wheretolook.rendering.render_kernel import TILE, Appearance, render_kernel
+from wheretolook.rendering.textures import build_pyramids, texel_gradients
 from wheretolook.rendering.types import Rendering, camera_rays, check_poses
 from wheretolook.rendering.warp_setup import start_warp, vec3_array, warp_mesh
 from wheretolook.scenes.mesh import TexturedMesh
-
-_MAX_TAPS = wp.constant(MAX_ANISOTROPY)
-_TILE = wp.constant(8)
-
-
-@wp.struct
-class _Appearance:
-    corner_uvs: wp.array2d[wp.vec2]
-    texel_gradients: wp.array2d[wp.vec3]
-    triangle_texture: wp.array[wp.int32]
-    texels: wp.array[wp.uint32]
-    level_start: wp.array2d[wp.int32]
-    texture_size: wp.array2d[wp.int32]
-    indices: wp.array[wp.int32]
-    vertex_colors: wp.array[wp.vec3]
-
-
-@wp.func
-def _texel(texels: wp.array[wp.uint32], index: wp.int32):
-    value = texels[index]
-    return wp.vec3(
-        wp.float32(value & wp.uint32(255)),
-        wp.float32((value >> wp.uint32(8)) & wp.uint32(255)),
-        wp.float32((value >> wp.uint32(16)) & wp.uint32(255)),
-    )
-
-
-@wp.func
-def _bilinear(a: _Appearance, texture: wp.int32, level: wp.int32, uv: wp.vec2):
-    """Colour at uv in one mip level, the texture repeated."""
-    width = wp.max(1, a.texture_size[texture, 0] >> level)
-    height = wp.max(1, a.texture_size[texture, 1] >> level)
-    x = (uv[0] - wp.floor(uv[0])) * wp.float32(width) - 0.5
-    y = (uv[1] - wp.floor(uv[1])) * wp.float32(height) - 0.5
-    x0 = wp.int32(wp.floor(x))
-    y0 = wp.int32(wp.floor(y))
-    fx = x - wp.float32(x0)
-    fy = y - wp.float32(y0)
-    # x0 is in [-1, width - 1] (or width, by rounding): one wrap each way is enough.
-    left = wp.where(x0 < 0, width - 1, wp.where(x0 >= width, x0 - width, x0))
-    top = wp.where(y0 < 0, height - 1, wp.where(y0 >= height, y0 - height, y0))
-    right = wp.where(left + 1 == width, 0, left + 1)
-    bottom = wp.where(top + 1 == height, 0, top + 1)
-    start = a.level_start[texture, level]
-    row0 = start + top * width
-    row1 = start + bottom * width
-    upper = (1.0 - fx) * _texel(a.texels, row0 + left) + fx * _texel(a.texels, row0 + right)
-    lower = (1.0 - fx) * _texel(a.texels, row1 + left) + fx * _texel(a.texels, row1 + right)
-    return (1.0 - fy) * upper + fy * lower
-
-
-@wp.func
-def _shade(a: _Appearance, hit: wp.MeshQueryRay, direction: wp.vec3, by_x: wp.vec3, by_y: wp.vec3):
-    """Colour of a hit, filtered over the pixel's footprint; `Open3DRenderer` says the same in NumPy."""
-    face = hit.face
-    # Warp's barycentrics weight the first and the second corner.
-    w0 = hit.u
-    w1 = hit.v
-    w2 = 1.0 - hit.u - hit.v
-    uv = w0 * a.corner_uvs[face, 0] + w1 * a.corner_uvs[face, 1] + w2 * a.corner_uvs[face, 2]
-    texture = a.triangle_texture[face]
-
-    # How the hit moves on the plane, in metres, as the pixel moves by one to the right and one down.
-    slant = wp.dot(hit.normal, direction)
-    if wp.abs(slant) < 1.0e-4:
-        slant = wp.where(slant < 0.0, -1.0e-4, 1.0e-4)
-    step_x = hit.t * (by_x - direction * (wp.dot(hit.normal, by_x) / slant))
-    step_y = hit.t * (by_y - direction * (wp.dot(hit.normal, by_y) / slant))
-    # The same in texels: the columns of the footprint matrix J.
-    grad_x = a.texel_gradients[face, 0]
-    grad_y = a.texel_gradients[face, 1]
-    j00 = wp.dot(grad_x, step_x)
-    j10 = wp.dot(grad_y, step_x)
-    j01 = wp.dot(grad_x, step_y)
-    j11 = wp.dot(grad_y, step_y)
-    # Axes of the footprint's ellipse from J J^T = [[p, q], [q, r]].
-    p = j00 * j00 + j01 * j01
-    q = j00 * j10 + j01 * j11
-    r = j10 * j10 + j11 * j11
-    root = wp.sqrt((p - r) * (p - r) + 4.0 * q * q)
-    major = wp.sqrt(0.5 * (p + r + root))
-    minor = wp.abs(j00 * j11 - j01 * j10) / wp.max(major, 1.0e-12)
-    width = wp.max(wp.max(minor, major / wp.float32(_MAX_TAPS)), 1.0)
-    n_taps = wp.clamp(wp.int32(wp.floor(major / width + 0.5)), 1, _MAX_TAPS)
-    axis = wp.vec2(0.5 * (p - r + root), q)
-    if p < r:
-        axis = wp.vec2(q, 0.5 * (r - p + root))
-    axis = axis * (major / wp.max(wp.length(axis), 1.0e-12))
-    along = wp.vec2(
-        axis[0] / wp.float32(a.texture_size[texture, 0]), axis[1] / wp.float32(a.texture_size[texture, 1])
-    )
-
-    last = a.texture_size[texture, 2] - 1
-    level = wp.min(wp.log2(width), wp.float32(last))
-    fine = wp.int32(wp.floor(level))
-    blend = level - wp.float32(fine)
-    color = wp.vec3(0.0, 0.0, 0.0)
-    for tap in range(n_taps):
-        at = uv + ((wp.float32(tap) + 0.5) / wp.float32(n_taps) - 0.5) * along
-        sample = _bilinear(a, texture, fine, at)
-        if blend > 0.0:
-            sample = (1.0 - blend) * sample + blend * _bilinear(a, texture, wp.min(fine + 1, last), at)
-        color += sample
-    color = color / wp.float32(n_taps)
-
-    if a.vertex_colors.shape[0] > 0:
-        tint = (
-            w0 * a.vertex_colors[a.indices[3 * face]]
-            + w1 * a.vertex_colors[a.indices[3 * face + 1]]
-            + w2 * a.vertex_colors[a.indices[3 * face + 2]]
-        )
-        color = wp.cw_mul(color, tint)
-    return color
-
-
-@wp.kernel
-def _render_kernel(
-    mesh: wp.uint64,
-    appearance: _Appearance,
-    centers: wp.array[wp.vec3],
-    ray_from_pixel: wp.array[wp.mat33],
-    rgb: wp.array3d[wp.vec3ub],
-    depth_m: wp.array3d[wp.float32],
-):
-    # Threads run tile by tile, so that neighbouring rays, which visit the same nodes and texels, run together.
-    b, tile, within = wp.tid()
-    height = depth_m.shape[1]
-    width = depth_m.shape[2]
-    tiles_across = (width + _TILE - 1) / _TILE
-    column = (tile % tiles_across) * _TILE + within % _TILE
-    row = (tile / tiles_across) * _TILE + within / _TILE
-    if column >= width or row >= height:
-        return
-
-    to_ray = ray_from_pixel[b]
-    direction = to_ray * wp.vec3(wp.float32(column) + 0.5, wp.float32(row) + 0.5, 1.0)
-    hit = wp.mesh_query_ray(mesh, centers[b], direction, 1.0e6)
-    if not hit.result:
-        rgb[b, row, column] = wp.vec3ub(wp.uint8(0), wp.uint8(0), wp.uint8(0))
-        depth_m[b, row, column] = 0.0
-        return
-    by_x = wp.vec3(to_ray[0, 0], to_ray[1, 0], to_ray[2, 0])
-    by_y = wp.vec3(to_ray[0, 1], to_ray[1, 1], to_ray[2, 1])
-    color = _shade(appearance, hit, direction, by_x, by_y)
-    rgb[b, row, column] = wp.vec3ub(
-        wp.uint8(wp.clamp(color[0] + 0.5, 0.0, 255.0)),
-        wp.uint8(wp.clamp(color[1] + 0.5, 0.0, 255.0)),
-        wp.uint8(wp.clamp(color[2] + 0.5, 0.0, 255.0)),
-    )
-    depth_m[b, row, column] = hit.t
 
 
 class WarpRenderer:
@@ -188,12 +39,12 @@ class WarpRenderer:
         self._appearance = self._upload(mesh)
 
     def _upload(self, mesh: TexturedMesh) -> Any:
-        def upload(values: ArrayLike, dtype: Any) -> wp.array:
+        def upload(values: NDArray[Any], dtype: Any) -> Any:
             return wp.array(values, dtype=dtype, device=self.device)
 
         pyramids = build_pyramids(mesh.textures)
         colors = np.zeros((0, 3)) if mesh.vertex_colors is None else mesh.vertex_colors / 255.0
-        appearance = _Appearance()
+        appearance = Appearance()
         appearance.corner_uvs = upload(mesh.corner_uvs, wp.vec2)
         appearance.texel_gradients = upload(texel_gradients(mesh), wp.vec3)
         appearance.triangle_texture = upload(mesh.triangle_texture, wp.int32)
@@ -222,7 +73,7 @@ class WarpRenderer:
         rgb = np.empty((len(poses), height, width, 3), dtype=np.uint8)
         depth_m = np.empty((len(poses), height, width), dtype=np.float32)
         centers, ray_from_pixel = camera_rays(camera, poses)
-        tile = int(_TILE)
+        tile = int(TILE)
         tiles = -(-height // tile) * -(-width // tile)
         block = max(1, self.block_bytes // (height * width * 7))
         for start in range(0, len(poses), block):
@@ -230,7 +81,7 @@ class WarpRenderer:
             rgb_block = wp.empty((stop - start, height, width), dtype=wp.vec3ub, device=self.device)
             depth_block = wp.empty((stop - start, height, width), dtype=wp.float32, device=self.device)
             wp.launch(
-                _render_kernel,
+                render_kernel,
                 dim=(stop - start, tiles, tile * tile),
                 inputs=[
                     self.warp_mesh.id,

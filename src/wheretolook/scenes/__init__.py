@@ -1,1 +1,1 @@
-"""Scenes: textured triangle meshes in metres, z up, and the free space in them."""
+"""Scenes: textured meshes, where they come from, and where a camera can be in them."""

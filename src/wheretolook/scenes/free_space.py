@@ -63,9 +63,7 @@ class FreeSpace:
         ConfigError: if there is no such device.
     """
 
-    def __init__(
-        self, mesh: TexturedMesh, config: FreeSpaceConfig | None = None, device: str = "cpu"
-    ) -> None:
+    def __init__(self, mesh: TexturedMesh, config: FreeSpaceConfig | None = None, device: str = "cpu") -> None:
         self.config = config or FreeSpaceConfig()
         self.bounds = mesh.bounds
         self._raycaster = MeshRaycaster(mesh, device)
@@ -137,7 +135,8 @@ class FreeSpace:
 
     def _sees_fronts(self) -> bool:
         """Whether most of the points that are free in a two-sided scene see mostly fronts."""
-        points = np.random.default_rng(0).uniform(*self.bounds, size=(_N_AUTO_POINTS, 3))
+        low, high = self.bounds
+        points = np.random.default_rng(0).uniform(low, high, size=(_N_AUTO_POINTS, 3))
         hits = self._look_around(points[self.is_free(points)])
         hit = np.isfinite(hits.distance_m)
         if not hit.any():

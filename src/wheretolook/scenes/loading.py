@@ -139,7 +139,7 @@ def _parts(scene: trimesh.Scene) -> Iterator[_Part]:
         matrix, name = scene.graph[node]
         geometry = scene.geometry[name]
         if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces):
-            part = geometry.copy()
+            part: Any = geometry.copy()
             if part.visual.kind == "face":  # colours by face become colours by vertex
                 part.unmerge_vertices()
             part.apply_transform(matrix)
@@ -147,7 +147,7 @@ def _parts(scene: trimesh.Scene) -> Iterator[_Part]:
 
 
 def _part(geometry: trimesh.Trimesh) -> _Part:
-    visual = geometry.visual
+    visual: Any = geometry.visual
     uvs, colors, texture, colored = None, None, _WHITE, False
     if visual.kind == "texture":
         material = visual.material

@@ -85,8 +85,8 @@ def load_scorer(weights: str | Path, localization_map: LocalizationMap) -> Learn
 
 
 def _same_field_of_view(a: PinholeCamera, b: PinholeCamera) -> bool:
-    spans = [(camera.width / camera.focal_px, camera.height / camera.focal_px) for camera in (a, b)]
-    return bool(np.allclose(*spans, rtol=FIELD_OF_VIEW_TOLERANCE, atol=0))
+    spans = np.array([(camera.width / camera.focal_px, camera.height / camera.focal_px) for camera in (a, b)])
+    return bool(np.allclose(spans[0], spans[1], rtol=FIELD_OF_VIEW_TOLERANCE, atol=0))
 
 
 def _describe(camera: PinholeCamera) -> str:

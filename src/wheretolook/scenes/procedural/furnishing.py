@@ -44,6 +44,7 @@ class Furnisher:
                 self._front_door(layout)
             getattr(self, f"_{room.kind}")(layout)
             self._plants(layout)
+            self._wall_shelves(layout)
             self._pictures(layout)
             self._radiators(layout)
             self._ceiling_lamp(layout)
@@ -289,15 +290,26 @@ class Furnisher:
         if room.kind == "bathroom":
             return
         for side in range(4):
-            if not style.chance(0.25 + 0.6 * style.richness):
+            if not style.chance(0.35 + 0.5 * style.richness):
                 continue
-            for _ in range(int(style.rng.integers(1, 3))):
-                width, height = float(style.rng.uniform(0.3, 0.95)), float(style.rng.uniform(0.3, 0.75))
+            for _ in range(int(style.rng.integers(1, 3 + round(1.5 * style.richness)))):
+                width, height = float(style.rng.uniform(0.35, 1.2)), float(style.rng.uniform(0.35, 0.85))
                 middle = float(style.rng.uniform(1.45, 1.65))
                 at = layout.hang(width, middle - height / 2, middle + height / 2, side)
                 if at is not None:
                     frame = decor.picture_frame(style, width, height)
                     layout.patches += wall_items(room, side, at, move(frame, shift=(0, 0, middle)))
+
+    def _wall_shelves(self, layout: Layout) -> None:
+        style = self.style
+        if layout.room.kind in ("bathroom", "hall"):
+            return
+        for side in range(4):
+            if style.chance(0.15 + 0.5 * style.clutter):
+                width, height = float(style.rng.uniform(0.7, 1.3)), float(style.rng.uniform(1.3, 1.6))
+                at = layout.hang(width, height - 0.05, height + 0.4, side)
+                if at is not None:
+                    layout.patches += wall_items(layout.room, side, at, move(furniture.wall_shelf(style, width), shift=(0, 0, height)))
 
     def _radiators(self, layout: Layout) -> None:
 

@@ -14,7 +14,7 @@ WALL_SIDE = ("back", "bottom")
 
 def leg(x: float, y: float, top: float, material: Material, *, radius: float = 0.022, splay: tuple[float, float] = (0, 0)) -> list[Patch]:
     """Tapered round leg."""
-    return tube([(x, y, top), (x + splay[0] / 2, y + splay[1] / 2, top / 2), (x + splay[0], y + splay[1], 0)],
+    return tube([(x, y, top), (x + splay[0] / 2, y + splay[1] / 2, top / 2), (x + splay[0], y + splay[1], 0.001)],
                 [radius, 0.85 * radius, 0.65 * radius], material, sides=10)  # fmt: skip
 
 
@@ -151,6 +151,24 @@ def bookshelf(style: Style, width: float, height: float, depth: float = 0.28) ->
                 item = decor.vase(style, min(gap * 0.85, 0.26)) if style.chance(0.5) else decor.book_stack(style, int(rng.integers(1, 4)))
                 patches += move(item, shift=(x + run / 2, depth / 2, low + board))
             x += run + 0.005
+    return patches
+
+
+def wall_shelf(style: Style, width: float) -> list[Patch]:
+    """Board on the wall, its top at z = 0, with books and a few things on it."""
+    rng, w, x = style.rng, width / 2, -width / 2 + 0.03
+    patches = box((-w, 0, -0.025), (w, 0.22, 0), style.wood, hidden=("back",))
+    while w - x > 0.15:
+        run = float(min(rng.uniform(0.2, 0.6), w - 0.03 - x))
+        draw = rng.random()
+        if draw < 0.55:
+            patches += move(decor.books_in_row(style, run, 0.3, 0.2), shift=(x, 0.02, 0))
+        elif draw < 0.7:
+            patches += move(decor.plant(style, 0.32, 16), shift=(x + run / 2, 0.12, 0))
+        else:
+            item = decor.vase(style, 0.22) if draw < 0.85 else decor.package(style)
+            patches += move(item, shift=(x + run / 2, 0.11, 0))
+        x += run
     return patches
 
 

@@ -48,8 +48,8 @@ def shade(colour: ArrayLike, factor: float) -> Colour:
 
 
 def vary(rng: np.random.Generator, colour: ArrayLike, amount: float = 0.04) -> Colour:
-    """Colour near the given one."""
-    r, g, b = np.clip(np.asarray(colour, float) + rng.normal(0, amount, 3), 0.02, 0.96)
+    """Colour near the given one: lighter or darker, with a slight change of hue."""
+    r, g, b = np.clip(np.asarray(colour, float) + amount * (rng.normal() + 0.35 * rng.normal(size=3)), 0.02, 0.96)
     return float(r), float(g), float(b)
 
 
@@ -138,7 +138,7 @@ def tiles(rng: np.random.Generator, colour: ArrayLike, grout: ArrayLike, *, size
             a = (((column_position - column) * width * scale).astype(int) + shift[1]) % SIZE
             b = (((row_position - row) * height * scale).astype(int) + shift[0]) % SIZE
             factor = factor - veins * np.maximum(canvas.noise.veins[b, a], 0) * 0.25
-            factor = factor + 0.25 * veins * canvas.noise.cloud[b, a]
+            factor = factor + 0.06 * veins * canvas.noise.cloud[b, a]
         across_px = (column_position - np.round(column_position)) * width * scale
         along_px = (row_position - np.round(row_position)) * height * scale
         gap = np.maximum(line(across_px, 0.004 * scale), line(along_px, 0.004 * scale))

@@ -31,7 +31,7 @@ class NoiseBank:
             return (values / values.std()).astype(np.float32)
 
         radius = np.maximum(np.hypot(fx, fy), 1.0)
-        stretched = np.maximum(np.hypot(14 * fx, fy), 3.0)
+        stretched = np.maximum(np.hypot(20 * fx, fy), 12.0)
         low_pass = np.exp(-((radius / 330) ** 2))
         self.cloud = field(radius**-1.6)
         self.fine = field(low_pass)

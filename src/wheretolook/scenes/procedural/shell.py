@@ -33,18 +33,18 @@ def choose_finish(style: Style, room: Room) -> Finish:
     paint = materials.plain(rng, colour)
     walls = [paint] * 4
     ceiling = materials.plain(rng, (0.92, 0.92, 0.91))
-    contrast = 0.3 + 0.9 * style.richness
+    contrast = 0.45 + 1.2 * style.richness
     floor = materials.planks(rng, style.floor_colour, width_m=float(rng.uniform(0.12, 0.2)), length_m=float(rng.uniform(1.1, 1.8)),
                              contrast=contrast, along_x=room.width > room.depth)  # fmt: skip
     if room.kind == "bathroom":
         size = style.pick([(0.3, 0.6), (0.2, 0.2), (0.3, 0.3), (0.15, 0.15)])
         tile = materials.vary(rng, style.pick([(0.90, 0.91, 0.90), (0.72, 0.80, 0.82), (0.84, 0.80, 0.72)]), 0.02)
-        wall = materials.tiles(rng, tile, (0.70, 0.70, 0.68), size_m=size, brick=style.chance(0.3), veins=0.15 * style.richness)
+        wall = materials.tiles(rng, tile, (0.62, 0.62, 0.60), size_m=size, brick=style.chance(0.3), veins=0.3 * style.richness)
         walls = [wall] * 4
-        floor = materials.tiles(rng, (0.62, 0.62, 0.60), (0.48, 0.48, 0.47), size_m=(0.3, 0.3), veins=0.4 * style.richness,
+        floor = materials.tiles(rng, (0.62, 0.62, 0.60), (0.48, 0.48, 0.47), size_m=(0.3, 0.3), veins=0.8 * style.richness,
                                 second=(0.38, 0.40, 0.42) if style.chance(0.4) else None)  # fmt: skip
     elif room.kind == "kitchen":
-        floor = materials.tiles(rng, materials.vary(rng, (0.70, 0.66, 0.60)), (0.52, 0.50, 0.47), size_m=(0.4, 0.4), veins=0.5 * style.richness,
+        floor = materials.tiles(rng, materials.vary(rng, (0.70, 0.66, 0.60)), (0.52, 0.50, 0.47), size_m=(0.4, 0.4), veins=0.9 * style.richness,
                                 second=(0.55, 0.48, 0.42) if style.chance(0.3) else None)  # fmt: skip
     elif room.kind == "bedroom":
         if style.chance(0.35 + 0.3 * style.richness):

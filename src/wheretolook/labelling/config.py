@@ -1,0 +1,54 @@
+"""Options of labelling."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from wheretolook.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class LocalizerConfig:
+    """Settings of matching and pose estimation.
+
+    Args:
+        max_ratio: Lowe's ratio: the nearest landmark's descriptor distance over the second nearest's must be below it.
+        min_matches: with fewer matches no pose is sought; four is the least that determines and checks one.
+        max_error_px: reprojection error under which RANSAC counts a match as an inlier.
+        min_inliers: poses with fewer inliers are taken for accidents: RANSAC finds some pose for almost any image.
+        seed: of RANSAC, the same for every image, so that a label depends on its viewpoint alone.
+    """
+
+    max_ratio: float = 0.85
+    min_matches: int = 4
+    max_error_px: float = 8.0
+    min_inliers: int = 10
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.max_ratio <= 1:
+            raise ConfigError("max_ratio must be in (0, 1]", value=self.max_ratio)
+        if self.min_matches < 4 or self.min_inliers < 4 or self.max_error_px <= 0:
+            raise ConfigError(
+                "the localizer needs min_matches >= 4, min_inliers >= 4 and max_error_px > 0",
+                value=(self.min_matches, self.min_inliers, self.max_error_px),
+            )
+
+
+@dataclass(frozen=True)
+class LabelConfig:
+    """Settings of the label stage.
+
+    Args:
+        localizer: matching and pose estimation.
+        workers: processes; 0 means one for each CPU core this process may use.
+        shard_size: viewpoints a shard, the unit of work and of what an interruption can lose.
+    """
+
+    localizer: LocalizerConfig = field(default_factory=LocalizerConfig)
+    workers: int = 0
+    shard_size: int = 16
+
+    def __post_init__(self) -> None:
+        if self.workers < 0 or self.shard_size < 1:
+            raise ConfigError("workers must be >= 0 and shard_size >= 1", value=(self.workers, self.shard_size))

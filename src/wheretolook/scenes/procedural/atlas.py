@@ -1,0 +1,150 @@
+"""One texture for everything: a place for every patch, painted albedo, light, and padding against bleeding."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from wheretolook.errors import SceneError
+from wheretolook.scenes.procedural.materials import Material
+from wheretolook.scenes.procedural.noise import Canvas, Image, NoiseBank
+from wheretolook.scenes.procedural.patches import Patch
+
+LEVELS = 14
+"""Brightness steps of materials that share one piece of texture."""
+SHARED_TEXELS = (24, 16)
+
+
+@dataclass(frozen=True, eq=False)
+class Chart:
+    """A rectangle of the atlas.
+
+    Attributes:
+        material: what is painted.
+        width: texels, without padding.
+        height: texels, without padding.
+        pad: texels of replicated border on each side.
+        texels_per_m: scale of the pattern.
+        offset_m: where the pattern starts.
+    """
+
+    material: Material
+    width: int
+    height: int
+    pad: int
+    texels_per_m: float
+    offset_m: tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class AtlasPlan:
+    """Charts, their corners and who uses which.
+
+    Attributes:
+        charts: all charts.
+        corners: (C, 2) x, y of the top-left texel inside the padding.
+        patch_chart: (P,) chart of each patch; for shared materials the darkest of LEVELS consecutive ones.
+        size: width and height of the texture.
+    """
+
+    charts: list[Chart]
+    corners: NDArray[np.int64]
+    patch_chart: NDArray[np.int64]
+    size: tuple[int, int]
+
+
+def _charts(patches: Sequence[Patch], texels_per_m: float) -> tuple[list[Chart], NDArray[np.int64]]:
+    charts: list[Chart] = []
+    index = np.empty(len(patches), np.int64)
+    shared: dict[int, int] = {}
+    for k, patch in enumerate(patches):
+        if patch.material.shared:
+            key = id(patch.material)
+            if key not in shared:
+                shared[key] = len(charts)
+                height, width = SHARED_TEXELS
+                charts += [Chart(patch.material, width, height, 4, 200.0, (0.0, 0.0))] * LEVELS
+            index[k] = shared[key]
+            continue
+        scale = texels_per_m * patch.density
+        width, height = (max(2, int(np.ceil(s * scale))) for s in patch.size_m)
+        pad = 8 if min(width, height) > 64 else 4
+        index[k] = len(charts)
+        charts.append(Chart(patch.material, width, height, pad, scale, patch.offset_m))
+    return charts, index
+
+
+def _pack(charts: Sequence[Chart], size: int) -> tuple[NDArray[np.int64], int] | None:
+    """Shelf packing, tallest first; None if it does not fit a square of `size`."""
+    outer = np.array([(c.width + 2 * c.pad, c.height + 2 * c.pad) for c in charts])
+    corners = np.empty((len(charts), 2), np.int64)
+    x = y = shelf = 0
+    for k in np.lexsort((np.arange(len(charts)), -outer[:, 0], -outer[:, 1])):
+        w, h = outer[k]
+        if w > size:
+            return None
+        if x + w > size:
+            x, y, shelf = 0, y + shelf, 0
+        shelf = max(shelf, int(h))
+        if y + shelf > size:
+            return None
+        corners[k] = x + charts[k].pad, y + charts[k].pad
+        x += int(w)
+    return corners, y + shelf
+
+
+def plan_atlas(patches: Sequence[Patch], texels_per_m: float, size: int) -> AtlasPlan:
+    """Place all patches; the density is lowered until they fit.
+
+    Raises:
+        SceneError: the texture is too small even for a quarter of the density.
+    """
+    density = texels_per_m
+    while density > texels_per_m / 4:
+        charts, index = _charts(patches, density)
+        packed = _pack(charts, size)
+        if packed is not None:
+            rows = min(size, -(-packed[1] // 256) * 256)
+            return AtlasPlan(charts, packed[0], index, (size, rows))
+        density *= 0.95
+    raise SceneError("texture is too small for the apartment", value=size, fix="Raise texture_size or lower texels_per_m")
+
+
+def paint_charts(plan: AtlasPlan, noise: NoiseBank) -> list[Image]:
+    """Albedo of every chart, (height, width, 3) float32 in display space."""
+    painted: list[Image] = []
+    previous: tuple[Chart, Image] | None = None
+    for chart in plan.charts:
+        if previous is not None and previous[0] is chart:  # the levels of a shared material
+            painted.append(previous[1])
+            continue
+        canvas = Canvas(chart.height, chart.width, chart.texels_per_m, *chart.offset_m, noise)
+        image = np.asarray(chart.material.paint(canvas), np.float32)
+        painted.append(image)
+        previous = (chart, image)
+    return painted
+
+
+def compose(plan: AtlasPlan, painted: Sequence[Image], light: Sequence[NDArray[np.floating[Any]] | None]) -> NDArray[np.uint8]:
+    """Albedo times light, padded, in one (H, W, 3) sRGB texture.
+
+    Args:
+        plan: from `plan_atlas`.
+        painted: from `paint_charts`.
+        light: per chart the factor on the albedo, (h, w, 3) on any coarser grid, or None for surfaces that glow.
+    """
+    width, height = plan.size
+    atlas = np.zeros((height, width, 3), np.uint8)
+    for chart, (x, y), albedo, factor in zip(plan.charts, plan.corners, painted, light, strict=True):
+        if factor is not None:
+            fine = cv2.resize(np.asarray(factor, np.float32), (chart.width, chart.height), interpolation=cv2.INTER_LINEAR)
+            albedo = albedo * fine
+        texels = np.clip(albedo * 255 + 0.5, 0, 255).astype(np.uint8)
+        p = chart.pad
+        atlas[y - p : y + chart.height + p, x - p : x + chart.width + p] = cv2.copyMakeBorder(texels, p, p, p, p, cv2.BORDER_REPLICATE)
+    return atlas

@@ -1,0 +1,184 @@
+"""The data module and the train stage on a tiny dataset whose labels follow a known rule."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from synthetic_dataset import make_dataset
+
+from wheretolook.dataset import Dataset
+from wheretolook.errors import ConfigError, TableError
+from wheretolook.learning.config import TrainConfig
+from wheretolook.learning.data import ViewpointDataModule, hold_out_locations
+from wheretolook.learning.training import train
+from wheretolook.table import NO_POSE, UNLABELLED, is_good, write_table
+from wheretolook.tracking import TrackingConfig, client
+
+SMALL = TrainConfig(variants=("2d",), epochs=3, hidden=(32,), accelerator="cpu")
+
+
+@pytest.fixture
+def dataset(tmp_path: Path) -> Dataset:
+    return make_dataset(tmp_path / "data" / "tiny")
+
+
+def test_held_out_locations_are_whole_and_the_same_for_the_same_seed() -> None:
+    scene = np.repeat([0, 0, 0, 0, 1, 1], 5)
+    location = np.repeat([3, 5, 7, 9, 3, 5], 5)
+    held_out = hold_out_locations(scene, location, 0.3, seed=4)
+    for number in (0, 1):
+        of_scene = scene == number
+        inside = {*location[of_scene & held_out]}
+        outside = {*location[of_scene & ~held_out]}
+        assert inside and outside and not inside & outside
+    assert len({*location[(scene == 0) & held_out]}) == 2  # 30 % of 4, rounded up
+    np.testing.assert_array_equal(held_out, hold_out_locations(scene, location, 0.3, seed=4))
+    assert any(np.any(held_out != hold_out_locations(scene, location, 0.3, seed=seed)) for seed in range(5, 10))
+    assert not hold_out_locations(scene[:5], location[:5], 0.3, seed=0).any()  # one location only: it stays
+
+
+def test_data_module_reads_labelled_train_views_only(dataset: Dataset) -> None:
+    scene = dataset.scenes[0]
+    table = scene.read_table()
+    table.loc[table.index[::3], "status"] = UNLABELLED
+    write_table(table, scene.table)
+    data = ViewpointDataModule(dataset, TrainConfig(accelerator="cpu"), progress=False)
+    data.setup()
+    kept = table[table["status"] != UNLABELLED]
+    other = dataset.scenes[1].read_table()
+    assert len(data.views) == len(kept) + len(other)
+    expected = np.concatenate([is_good(kept), is_good(other)])
+    np.testing.assert_array_equal(data.views.labels.numpy() > 0, expected)
+    np.testing.assert_array_equal(data.views.filled.sum((1, 2)) > 0, np.concatenate([kept, other])[:, 10] > 0)
+
+    sides = [{(data.views.scene[row], data.views.location[row]) for row in rows.tolist()}
+             for rows in (data.train_rows, data.val_rows)]  # fmt: skip
+    assert not sides[0] & sides[1]
+    assert len(data.train_rows) + len(data.val_rows) == len(data.views)
+    labels = data.views.labels[data.train_rows]
+    assert data.class_weights == pytest.approx(
+        (len(labels) / 2 / (len(labels) - labels.sum().item()), len(labels) / 2 / labels.sum().item())
+    )
+
+
+def test_validation_scenes_are_used_where_there_are_some(tmp_path: Path) -> None:
+    dataset = make_dataset(tmp_path / "tiny", ("train", "val", "test"), n_locations=6, n_directions=12)
+    data = ViewpointDataModule(dataset, SMALL, progress=False)
+    data.setup()
+    assert {*data.views.scene[data.train_rows]} == {0}
+    assert {*data.views.scene[data.val_rows]} == {1}
+
+
+def test_every_pass_visits_every_training_view_once_in_its_own_order(dataset: Dataset) -> None:
+    data = ViewpointDataModule(dataset, replace(SMALL, batch_size=100), progress=False)
+    data.setup()
+    loader, again = data.train_dataloader(), data.train_dataloader()
+    first, second = (torch.cat([labels for _, _, labels in loader]) for _ in range(2))
+    assert len(first) == len(data.train_rows)
+    assert first.sum() == data.views.labels[data.train_rows].sum()
+    assert not torch.equal(first, second)
+    assert torch.equal(first, torch.cat([labels for _, _, labels in again]))
+    assert len(loader) == len(list(loader))
+
+
+@pytest.mark.parametrize(("status", "counts"), [(NO_POSE, "0 of 960"), (None, "960 of 960")])
+def test_labels_of_one_class_are_refused(dataset: Dataset, status: str | None, counts: str) -> None:
+    for scene in dataset.split("train"):
+        table = scene.read_table()
+        table["status"], table["error_m"], table["error_deg"] = status or "localized", 0.001, 0.001
+        write_table(table, scene.table)
+    config = replace(SMALL, val_fraction=1e-9)
+    with pytest.raises(TableError, match="training labels are of one class") as caught:
+        train(dataset, config, TrackingConfig(str(dataset.root / "mlruns")), progress=False)
+    n_held_out = 2 * 20  # one location of each scene
+    total = 960 - n_held_out
+    assert f"{0 if status else total} of {total} viewpoints" in str(caught.value)
+    assert caught.value.fix
+    assert not (dataset.root / "weights").exists()
+
+
+def test_no_label_and_no_train_scene_are_refused(tmp_path: Path, dataset: Dataset) -> None:
+    only_test = make_dataset(tmp_path / "only-test", ("test",), n_locations=2, n_directions=4)
+    with pytest.raises(TableError, match="no train scene"):
+        ViewpointDataModule(only_test, SMALL, progress=False).setup()
+    scene = dataset.scenes[0]
+    write_table(scene.read_table().assign(status=UNLABELLED), scene.table)
+    with pytest.raises(TableError, match=r"scene-0.*no viewpoint has a label"):
+        ViewpointDataModule(dataset, SMALL, progress=False).setup()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"variants": ("2d", "5d")},
+        {"variants": ()},
+        {"epochs": 0},
+        {"dropout": 1.0},
+        {"val_fraction": 0.0},
+        {"layout": "sideways"},
+        {"learning_rate": float("nan")},
+        {"l2": -1.0},
+        {"patience": 0},
+    ],
+)
+def test_options_out_of_range_are_refused(options: dict) -> None:
+    with pytest.raises(ConfigError):
+        TrainConfig(**options)
+
+
+def test_training_learns_the_rule_logs_a_run_and_is_reused(
+    dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    empty = tmp_path / "cwd"
+    empty.mkdir()
+    monkeypatch.chdir(empty)
+    tracking = TrackingConfig(str(tmp_path / "mlruns"), "tiny")
+    config = replace(SMALL, variants=("2d", "2d+3d"), epochs=4, noise_px=0.5, noise_m=0.02, schedule="cosine")
+    models = train(dataset, config, tracking, progress=False)
+    assert [model.variant for model in models] == ["2d", "2d+3d"]
+    for model in models:
+        assert model.metrics["val_average_precision"] > 0.9
+        assert model.metrics["train_bce"] < 0.69
+        run = client(tracking).get_run(model.run_id)
+        assert run.info.status == "FINISHED"
+        assert run.data.params["variant"] == model.variant
+        assert run.data.params["epochs"] == "4"
+        assert len(run.data.params["dataset_fingerprint"]) == 16
+        assert run.data.tags["code_version"]
+        history = client(tracking).get_metric_history(model.run_id, "val_average_precision")
+        assert [metric.step for metric in history] == [0, 1, 2, 3]
+        assert max(metric.value for metric in history) == pytest.approx(model.metrics["val_average_precision"])
+        artifacts = Path(run.info.artifact_uri)
+        assert {file.name for file in artifacts.iterdir()} == {"curves.png", "history.csv", model.path.name}
+        assert artifacts.is_relative_to(tmp_path / "mlruns" / "artifacts")
+        assert len(pd.read_csv(artifacts / "history.csv")) == 4
+        assert (artifacts / model.path.name).read_bytes() == model.path.read_bytes()
+    assert not list(empty.iterdir())
+
+    before = {path: path.stat().st_mtime_ns for path in (dataset.root / "weights").iterdir()}
+    again = train(dataset, config, tracking, progress=False)
+    assert all(model.reused for model in again)
+    assert [model.run_id for model in again] == [model.run_id for model in models]
+    assert {path: path.stat().st_mtime_ns for path in (dataset.root / "weights").iterdir()} == before
+
+    models[0].path.write_bytes(b"changed")
+    scene = dataset.split("test")[0]
+    write_table(scene.read_table().iloc[:-1], scene.table)  # the test scene has no say in training
+    third = train(dataset, config, tracking, progress=False)
+    assert [model.reused for model in third] == [False, True]
+
+
+def test_the_same_seed_gives_the_same_weights(dataset: Dataset, tmp_path: Path) -> None:
+    config, tracking = replace(SMALL, noise_px=1.0), TrackingConfig(str(tmp_path / "mlruns"))
+    torch.manual_seed(123)
+    first = train(dataset, config, tracking, progress=False)[0].path.read_bytes()
+    torch.manual_seed(456)
+    state = torch.get_rng_state()
+    assert train(dataset, config, tracking, progress=False, force=True)[0].path.read_bytes() == first
+    assert torch.equal(torch.get_rng_state(), state)  # training leaves the caller's random numbers alone
+    assert train(dataset, replace(config, seed=1), tracking, progress=False)[0].path.read_bytes() != first

@@ -1,0 +1,203 @@
+"""A map of a small textured box, held against the box itself."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+from wheretolook.errors import ConfigError, MapError
+from wheretolook.geometry import PinholeCamera, poses_looking_along
+from wheretolook.mapping import Landmarks, MapConfig, WalkConfig, build_map, load_colmap_landmarks, plan_walk
+from wheretolook.rendering import WarpRenderer
+from wheretolook.scenes.mesh import TexturedMesh
+
+CAMERA = PinholeCamera(320, 240, 160.0)
+CONFIG = MapConfig(n_images=14, walk=WalkConfig(image_spacing_m=0.35), keep_database=True, keep_images=True)
+SEED = 2
+
+
+@pytest.fixture(scope="module")
+def renderer(room):
+    return WarpRenderer(room)
+
+
+@pytest.fixture(scope="module")
+def built(room, room_free_space, renderer, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("maps") / "scene" / "map"
+    report = build_map(room, renderer, room_free_space, CAMERA, CONFIG, SEED, folder, workers=1, progress=False)
+    return folder, report
+
+
+def distance_to_box_m(points: np.ndarray, mesh: TexturedMesh) -> np.ndarray:
+    """Distance from points to the surface of the box, in closed form."""
+    low, high = mesh.bounds
+    outside = np.linalg.norm(np.maximum(np.maximum(low - points, points - high), 0), axis=1)
+    inside = np.minimum(points - low, high - points).min(1)
+    return np.where(inside >= 0, inside, outside)
+
+
+def test_landmarks_lie_on_the_mesh(built, room):
+    folder, report = built
+    landmarks = Landmarks.load(folder / "landmarks.npz")
+    assert len(landmarks) == report.n_landmarks > 200
+    distance_cm = 100 * distance_to_box_m(landmarks.points, room)
+    assert np.median(distance_cm) < 1
+    assert report.median_distance_to_mesh_cm == pytest.approx(np.median(distance_cm), abs=1e-3)
+    assert report.p90_distance_to_mesh_cm == pytest.approx(np.quantile(distance_cm, 0.9), abs=1e-3)
+
+
+def test_model_reopens_with_the_poses_of_the_walk(built, room, room_free_space):
+    folder, report = built
+    model = pycolmap.Reconstruction(str(folder))
+    assert model.num_images() == CONFIG.n_images and model.num_points3D() == report.n_landmarks
+    (camera,) = model.cameras.values()
+    np.testing.assert_allclose(camera.calibration_matrix(), CAMERA.matrix)
+    walk = plan_walk(room_free_space, room.bounds, CONFIG.n_images, CONFIG.walk, SEED)
+    expected = poses_looking_along(walk.positions, walk.directions)
+    for index, pose in enumerate(expected):
+        image = model.images[index + 1]
+        assert image.name == f"{index:05d}.png" and image.has_pose
+        np.testing.assert_allclose(image.cam_from_world().matrix(), pose, atol=1e-9)
+
+
+def test_landmarks_project_to_their_keypoints(built):
+    folder, report = built
+    model = pycolmap.Reconstruction(str(folder))
+    seen = 0
+    for point in model.points3D.values():
+        errors = []
+        for element in point.track.elements:
+            image = model.images[element.image_id]
+            pixel = CAMERA.project(image.cam_from_world().matrix() @ [*point.xyz, 1.0])
+            errors.append(np.linalg.norm(pixel - image.points2D[element.point2D_idx].xy))
+            assert image.points2D[element.point2D_idx].point3D_id in model.points3D
+        assert np.mean(errors) == pytest.approx(point.error, abs=1e-6)
+        assert np.mean(errors) <= CONFIG.max_reprojection_error_px
+        seen += len(errors)
+    assert seen == model.compute_num_observations()
+    assert report.mean_reprojection_error_px == pytest.approx(
+        np.mean([p.error for p in model.points3D.values()]), rel=1e-5
+    )
+
+
+def test_keypoint_pixels_have_the_colour_of_the_landmark(built):
+    """The images, the keypoints and the points belong together, down to the pixel."""
+    import cv2
+
+    folder, _ = built
+    model = pycolmap.Reconstruction(str(folder))
+    images = {i: cv2.imread(str(folder / "images" / image.name))[..., ::-1] for i, image in model.images.items()}
+    for point in model.points3D.values():
+        colors = []
+        for element in point.track.elements:
+            x, y = model.images[element.image_id].points2D[element.point2D_idx].xy
+            colors.append(images[element.image_id][int(y), int(x)])
+        np.testing.assert_allclose(point.color, np.mean(colors, axis=0), atol=1)
+
+
+def test_stored_landmarks_are_those_of_the_model_and_its_database(built):
+    folder, _ = built
+    stored, read = Landmarks.load(folder / "landmarks.npz"), load_colmap_landmarks(folder, folder / "database.db")
+    for name, value in vars(stored).items():
+        np.testing.assert_array_equal(value, getattr(read, name))
+    assert (stored.track_length >= 2).all()
+    # The angle is held by COLMAP before the last adjustment of the points.
+    assert stored.triangulation_angle_deg.min() > 0.9 * CONFIG.min_triangulation_angle_deg
+
+
+def test_report_is_on_disk(built):
+    folder, report = built
+    assert json.loads((folder / "report.json").read_text()) == json.loads(json.dumps(asdict(report)))
+    assert report.n_images == 14 and 12 <= report.n_registered <= 14
+    assert report.coverage >= CONFIG.walk.coverage
+    assert report.config["extractor"]["method"] == "colmap"
+
+
+def test_same_seed_same_bytes_whatever_the_workers(built, room, room_free_space, renderer, tmp_path):
+    folder, _ = built
+    again = tmp_path / "again"
+    build_map(room, renderer, room_free_space, CAMERA, CONFIG, SEED, again, workers=2, progress=False)
+    names = sorted(p.relative_to(folder) for p in folder.rglob("*") if p.is_file())
+    assert names == sorted(p.relative_to(again) for p in again.rglob("*") if p.is_file())
+    assert Path("points3D.bin") in names and Path("landmarks.npz") in names
+    for name in names:
+        if name.name not in ("report.json", "database.db"):
+            assert (folder / name).read_bytes() == (again / name).read_bytes(), name
+
+
+def test_earlier_map_is_replaced_and_extras_are_optional(room, room_free_space, renderer, tmp_path):
+    folder = tmp_path / "map"
+    config = MapConfig(n_images=10, walk=WalkConfig(image_spacing_m=0.35))
+    build_map(room, renderer, room_free_space, CAMERA, config, 0, folder, workers=1, progress=False)
+    first = (folder / "landmarks.npz").read_bytes()
+    (folder / "stale.txt").write_text("of the earlier map")
+    build_map(room, renderer, room_free_space, CAMERA, config, 1, folder, workers=1, progress=False)
+    assert (folder / "landmarks.npz").read_bytes() != first
+    model_files = {"cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin"}
+    assert {p.name for p in folder.iterdir()} == model_files | {"landmarks.npz", "report.json"}
+    assert [p.name for p in tmp_path.iterdir()] == ["map"]
+
+
+class FailingRenderer:
+    """Renders the first batch and is then interrupted, as by Ctrl-C."""
+
+    def __init__(self, renderer: WarpRenderer, error: type[BaseException]) -> None:
+        self.renderer, self.error, self.calls = renderer, error, 0
+
+    def render(self, camera, cam_from_world):
+        self.calls += 1
+        if self.calls > 1:
+            raise self.error
+        return self.renderer.render(camera, cam_from_world)
+
+
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
+@pytest.mark.parametrize("workers", [1, 2])
+def test_failed_build_leaves_nothing_and_keeps_the_earlier_map(
+    room, room_free_space, renderer, tmp_path, error, workers
+):
+    failing = FailingRenderer(renderer, error)
+    folder = tmp_path / "map"
+    with pytest.raises(error):
+        build_map(room, failing, room_free_space, CAMERA, CONFIG, SEED, folder, workers=workers, progress=False)
+    assert list(tmp_path.iterdir()) == []
+    folder.mkdir()
+    (folder / "report.json").write_text("{}")
+    failing.calls = 0
+    with pytest.raises(error):
+        build_map(room, failing, room_free_space, CAMERA, CONFIG, SEED, folder, workers=1, progress=False)
+    assert [p.name for p in tmp_path.iterdir()] == ["map"]
+    assert (folder / "report.json").read_text() == "{}"
+
+
+def test_other_peoples_folders_are_not_replaced(room, room_free_space, renderer, tmp_path):
+    (tmp_path / "thesis.tex").write_text("precious")
+    with pytest.raises(MapError, match="not a map"):
+        build_map(room, renderer, room_free_space, CAMERA, CONFIG, SEED, tmp_path, progress=False)
+    assert (tmp_path / "thesis.tex").read_text() == "precious"
+
+
+def test_scene_without_texture_gives_no_map(room, room_free_space, tmp_path):
+    plain = TexturedMesh(
+        room.vertices,
+        room.triangles,
+        room.corner_uvs,
+        room.triangle_texture,
+        tuple(np.full((8, 8, 3), 30 * i + 60, np.uint8) for i in range(6)),
+    )
+    with pytest.raises(MapError, match="no landmark"):
+        build_map(
+            plain, WarpRenderer(plain), room_free_space, CAMERA, CONFIG, 0, tmp_path / "map", workers=1, progress=False
+        )
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_bad_settings():
+    for settings in ({"n_images": 1}, {"partners": 0}, {"max_reprojection_error_px": 0.0}):
+        with pytest.raises(ConfigError):
+            MapConfig(**settings)

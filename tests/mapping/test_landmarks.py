@@ -1,0 +1,310 @@
+"""Landmarks of COLMAP models written by hand with pycolmap, with attributes worked out by hand."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+from wheretolook.errors import MapError
+from wheretolook.geometry import poses_looking_along
+from wheretolook.mapping.extraction import quantize_descriptors, unit_descriptors
+from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks, nearest_other_cosine
+
+# Three cameras on a line, 2 m apart, that look along +y; two intrinsics. Points in front of them.
+CENTERS = np.array([[-2.0, 0.0, 1.0], [0.0, 0.0, 1.0], [2.0, 0.0, 1.0]])
+FOCAL_PX = {1: 300.0, 2: 400.0}
+CAMERA_OF = (1, 2, 1)
+POINTS = np.array([[0.0, 2.0, 1.0], [1.0, 4.0, 2.0], [0.5, 3.0, 0.5], [-2.0, 5.0, 1.0]])
+TRACKS = ([0, 1, 2], [1, 2], [0, 1, 2], [0, 2])
+OFFSETS_PX = (0.0, 0.3, 2.0, 0.0)  # each observation of the point is off by this much in x
+
+
+def project(point: np.ndarray, image: int) -> np.ndarray:
+    x, y, z = point - CENTERS[image]  # a camera that looks along +y has x to the right, z up, hence y down
+    return FOCAL_PX[CAMERA_OF[image]] * np.array([x / y, -z / y]) + (320, 240)
+
+
+def hand_written_model(offsets_px=OFFSETS_PX, tracks=TRACKS, points=POINTS) -> tuple[pycolmap.Reconstruction, list]:
+    """The model, with ids 10, 20, ... for the points, and the keypoints of its images, one unused at the front."""
+    model = pycolmap.Reconstruction()
+    for camera_id, focal_px in FOCAL_PX.items():
+        camera = pycolmap.Camera(
+            camera_id=camera_id, model="SIMPLE_PINHOLE", width=640, height=480, params=[focal_px, 320, 240]
+        )
+        model.add_camera_with_trivial_rig(camera)
+    keypoints: list[list[np.ndarray]] = [[np.array([1.0 + i, 2.0])] for i in range(3)]
+    elements = []
+    for point, track, offset in zip(points, tracks, offsets_px, strict=True):
+        for image in track:
+            elements.append((image + 1, len(keypoints[image])))
+            keypoints[image].append(project(point, image) + (offset, 0))
+    poses = poses_looking_along(CENTERS, np.tile([0.0, 1.0, 0.0], (3, 1)))
+    for i, pose in enumerate(poses):
+        image = pycolmap.Image(name=f"{i}.png", camera_id=CAMERA_OF[i], image_id=i + 1)
+        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(p) for p in keypoints[i]])
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:, :3]), pose[:, 3]))
+    used = 0
+    for index, (point, track) in enumerate(zip(points, tracks, strict=True)):
+        colmap_track = pycolmap.Track()
+        for image_id, keypoint in elements[used : used + len(track)]:
+            colmap_track.add_element(image_id, keypoint)
+        used += len(track)
+        model.add_point3D_with_id(10 * (index + 1), pycolmap.Point3D(xyz=point, track=colmap_track))
+    return model, [np.array(k, dtype=np.float32) for k in keypoints]
+
+
+def write_database(path: Path, model: pycolmap.Reconstruction, keypoints: list, descriptors: list) -> Path:
+    with pycolmap.Database.open(str(path)) as database:
+        for camera in model.cameras.values():
+            database.write_camera(camera, use_camera_id=True)
+        for image_id, name in ((7, "2.png"), (8, "0.png"), (9, "1.png")):  # other ids than the model's: joined by name
+            i = int(name[0])
+            image = pycolmap.Image(name=name, camera_id=CAMERA_OF[i], image_id=image_id)
+            database.write_image(image, use_image_id=True)
+            database.write_keypoints(image_id, keypoints[i])
+            data = pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, descriptors[i])
+            database.write_descriptors(image_id, data)
+    return path
+
+
+def random_descriptors(counts: list[int], seed: int = 0) -> list[np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return [quantize_descriptors(unit_descriptors(rng.gamma(0.5, size=(n, 128)))) for n in counts]
+
+
+@pytest.fixture
+def model_dir(tmp_path: Path) -> Path:
+    folder = tmp_path / "model"
+    folder.mkdir()
+    hand_written_model()[0].write_binary(str(folder))
+    return folder
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_attributes_of_a_hand_written_model(tmp_path, text):
+    model, _ = hand_written_model()
+    model.write_text(str(tmp_path)) if text else model.write_binary(str(tmp_path))
+    landmarks = load_colmap_landmarks(tmp_path)
+    # Point 30 is 2 px off in every image and so beyond 0.5 px.
+    np.testing.assert_array_equal(landmarks.ids, [10, 20, 40])
+    np.testing.assert_allclose(landmarks.points, POINTS[[0, 1, 3]], atol=1e-12)
+    np.testing.assert_array_equal(landmarks.track_length, [3, 2, 2])
+    np.testing.assert_allclose(landmarks.reprojection_error_px, [0, 0.3, 0], atol=1e-4)
+    # Point 10 is 2 m ahead of the middle camera, the outer ones stand 2 m to its sides: 45 degrees each way.
+    # Point 20 from (0, 0, 1) is (1, 4, 1) and from (2, 0, 1) is (-1, 4, 1): cos = 16 / 18.
+    # Point 40 from (-2, 0, 1) is (0, 5, 0) and from (2, 0, 1) is (-4, 5, 0): tan = 4 / 5.
+    angles = [90, np.degrees(np.arccos(16 / 18)), np.degrees(np.arctan(4 / 5))]
+    np.testing.assert_allclose(landmarks.triangulation_angle_deg, angles, rtol=1e-5)
+    mean_y = [(1 + 2 * np.sqrt(0.5)) / 3]  # the x parts of point 10's rays cancel
+    np.testing.assert_allclose(landmarks.mapping_direction[0], [0, 1, 0], atol=1e-6)
+    np.testing.assert_allclose(landmarks.mapping_direction[1], np.array([0, 4, 1]) / np.sqrt(17), atol=1e-6)
+    np.testing.assert_allclose(landmarks.mapping_direction_spread[0], 1 - mean_y[0], atol=1e-6)
+    np.testing.assert_allclose(landmarks.mapping_direction_spread[1], 1 - np.sqrt(17 / 18), atol=1e-6)
+    np.testing.assert_allclose(landmarks.mapping_distance_m[0], (2 + 2 * np.sqrt(8)) / 3, rtol=1e-6)
+    np.testing.assert_allclose(landmarks.mapping_distance_m[1:], [np.sqrt(18), (5 + np.sqrt(41)) / 2], rtol=1e-6)
+    assert landmarks.descriptors is None and np.isnan(landmarks.ambiguity).all()
+    kinds = [landmarks.ids, landmarks.points, landmarks.track_length, landmarks.mapping_direction]
+    assert [k.dtype for k in kinds] == [np.int64, np.float64, np.int32, np.float32]
+
+
+def test_filter_takes_the_mean_reprojection_error(model_dir):
+    assert list(load_colmap_landmarks(model_dir, max_reprojection_error_px=0.29).ids) == [10, 40]
+    assert list(load_colmap_landmarks(model_dir, max_reprojection_error_px=0.31).ids) == [10, 20, 40]
+    assert list(load_colmap_landmarks(model_dir, max_reprojection_error_px=3).ids) == [10, 20, 30, 40]
+
+
+def test_errors_written_by_colmap_are_taken_as_they_are(tmp_path):
+    model, _ = hand_written_model()
+    model.update_point_3d_errors()
+    model.points3D[10].error = 7.5
+    model.write_binary(str(tmp_path))
+    assert list(load_colmap_landmarks(tmp_path).ids) == [20, 40]
+
+
+def test_descriptors_are_means_over_the_track(tmp_path, model_dir):
+    model, keypoints = hand_written_model()
+    descriptors = random_descriptors([len(k) for k in keypoints])
+    database = write_database(tmp_path / "database.db", model, keypoints, descriptors)
+    landmarks = load_colmap_landmarks(model_dir, database)
+    # Keypoints in the order in which the points were added, after an unused one.
+    seen = {10: [(0, 1), (1, 1), (2, 1)], 20: [(1, 2), (2, 2)], 40: [(0, 3), (2, 4)]}
+    expected = []
+    for track in seen.values():
+        unit = [d / np.linalg.norm(d) for d in (descriptors[i][k].astype(np.float64) for i, k in track)]
+        mean = np.mean(unit, axis=0)
+        expected.append(np.minimum(np.rint(512 * mean / np.linalg.norm(mean)), 255))
+    np.testing.assert_array_equal(landmarks.descriptors, np.array(expected))
+    assert landmarks.descriptors.dtype == np.uint8
+    unit = np.array(expected) / np.linalg.norm(expected, axis=1, keepdims=True)
+    cosine = unit @ unit.T - 2 * np.eye(3)
+    np.testing.assert_allclose(landmarks.ambiguity, cosine.max(1), atol=1e-6)
+
+
+@pytest.mark.parametrize("n", [2, 500, 9001])
+def test_ambiguity_against_brute_force(n):
+    descriptors = random_descriptors([n])[0]
+    descriptors[-1] = descriptors[0]  # twins, in different blocks if there are several
+    unit = descriptors / np.linalg.norm(descriptors.astype(np.float64), axis=1, keepdims=True)
+    rows = np.unique(np.linspace(0, n - 1, 200).astype(int))
+    cosine = unit[rows] @ unit.T
+    cosine[np.arange(len(rows)), rows] = -1
+    ambiguity = nearest_other_cosine(descriptors)
+    np.testing.assert_allclose(ambiguity[rows], cosine.max(1), atol=1e-6)
+    assert ambiguity[0] == ambiguity[-1] == pytest.approx(1, abs=1e-6)
+
+
+def test_one_landmark_has_no_ambiguity():
+    assert np.isnan(nearest_other_cosine(random_descriptors([1])[0])).all()
+
+
+def test_long_and_short_tracks_against_a_plain_loop(tmp_path):
+    """Attributes of many random landmarks, one observation at a time."""
+    rng = np.random.default_rng(4)
+    n_images, n_points = 40, 300
+    centers = rng.uniform(-3, 3, (n_images, 3))
+    points = rng.uniform(-3, 3, (n_points, 3)) + (0, 12, 0)
+    tracks = [rng.choice(n_images, rng.integers(2, n_images), replace=False) for _ in range(n_points)]
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(camera_id=1, model="PINHOLE", width=640, height=480, params=[300, 300, 320, 240])
+    )
+    poses = poses_looking_along(centers, np.tile([0.0, 1.0, 0.0], (n_images, 1)))
+    for i, pose in enumerate(poses):
+        image = pycolmap.Image(name=f"{i}", camera_id=1, image_id=i + 1)
+        image.points2D = pycolmap.Point2DList([pycolmap.Point2D([0.0, 0.0]) for _ in range(n_points)])
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:, :3]), pose[:, 3]))
+    for p, (point, track) in enumerate(zip(points, tracks, strict=True)):
+        elements = pycolmap.Track()
+        for i in track:
+            elements.add_element(int(i) + 1, p)
+        model.add_point3D_with_id(p + 1, pycolmap.Point3D(xyz=point, track=elements, error=0.1))
+    model.write_binary(str(tmp_path))
+    landmarks = load_colmap_landmarks(tmp_path)
+    for p, track in enumerate(tracks):
+        rays = points[p] - centers[track]
+        unit = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+        angle = max(np.degrees(np.arccos(np.clip(a @ b, -1, 1))) for a in unit for b in unit)
+        mean = unit.mean(0)
+        assert landmarks.track_length[p] == len(track)
+        assert landmarks.triangulation_angle_deg[p] == pytest.approx(angle, rel=1e-4)
+        assert landmarks.mapping_distance_m[p] == pytest.approx(np.linalg.norm(rays, axis=1).mean(), rel=1e-5)
+        assert landmarks.mapping_direction_spread[p] == pytest.approx(1 - np.linalg.norm(mean), abs=1e-6)
+        np.testing.assert_allclose(landmarks.mapping_direction[p], mean / np.linalg.norm(mean), atol=1e-6)
+
+
+@pytest.mark.parametrize("with_descriptors", [False, True])
+def test_save_and_load(tmp_path, model_dir, with_descriptors):
+    database = None
+    if with_descriptors:
+        model, keypoints = hand_written_model()
+        database = write_database(
+            tmp_path / "database.db", model, keypoints, random_descriptors([len(k) for k in keypoints])
+        )
+    landmarks = load_colmap_landmarks(model_dir, database)
+    landmarks.save(tmp_path / "a.npz")
+    again = Landmarks.load(tmp_path / "a.npz")
+    for name, value in vars(landmarks).items():
+        other = getattr(again, name)
+        assert (value is None) == (other is None)
+        if value is not None:
+            assert value.dtype == other.dtype
+            np.testing.assert_array_equal(value, other)
+    again.save(tmp_path / "b.npz")
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+    assert not list(tmp_path.glob("*.partial"))
+
+
+def test_old_models_without_rigs_and_frames_are_read(model_dir):
+    before = load_colmap_landmarks(model_dir)
+    for name in ("rigs.bin", "frames.bin"):
+        (model_dir / name).unlink()
+    np.testing.assert_array_equal(load_colmap_landmarks(model_dir).points, before.points)
+
+
+def test_missing_folder_and_files(tmp_path, model_dir):
+    with pytest.raises(MapError, match="no such folder"):
+        load_colmap_landmarks(tmp_path / "nowhere")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(MapError, match="no COLMAP model"):
+        load_colmap_landmarks(tmp_path / "empty")
+    (model_dir / "images.bin").unlink()
+    with pytest.raises(MapError, match=r"images\.bin"):
+        load_colmap_landmarks(model_dir)
+
+
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D", "rigs", "frames"])
+@pytest.mark.parametrize("damage", ["empty", "half", "random"])
+def test_damaged_binary_files(model_dir, name, damage):
+    path = model_dir / f"{name}.bin"
+    data = path.read_bytes()
+    noise = np.random.default_rng(0).integers(0, 256, len(data), dtype=np.uint8).tobytes()
+    path.write_bytes({"empty": b"", "half": data[: len(data) // 2], "random": noise}[damage])
+    with pytest.raises(MapError) as error:
+        load_colmap_landmarks(model_dir)
+    assert str(model_dir) in str(error.value)
+
+
+@pytest.mark.parametrize("name", ["images", "points3D"])
+def test_damaged_text_files(tmp_path, name):
+    hand_written_model()[0].write_text(str(tmp_path))
+    path = tmp_path / f"{name}.txt"
+    path.write_text(path.read_text()[:-20] + " x y z\n1 2 three\n")
+    with pytest.raises(MapError):
+        load_colmap_landmarks(tmp_path)
+
+
+def test_models_without_usable_points(tmp_path, model_dir):
+    with pytest.raises(MapError, match="all 4 points"):
+        load_colmap_landmarks(model_dir, max_reprojection_error_px=-1)
+    empty = hand_written_model(offsets_px=(), tracks=(), points=np.zeros((0, 3)))[0]
+    (tmp_path / "no_points").mkdir()
+    empty.write_binary(str(tmp_path / "no_points"))
+    with pytest.raises(MapError, match="no points"):
+        load_colmap_landmarks(tmp_path / "no_points")
+    untracked = hand_written_model(offsets_px=(), tracks=(), points=np.zeros((0, 3)))[0]
+    untracked.add_point3D_with_id(1, pycolmap.Point3D(xyz=np.ones(3), track=pycolmap.Track()))
+    (tmp_path / "no_tracks").mkdir()
+    untracked.write_binary(str(tmp_path / "no_tracks"))
+    with pytest.raises(MapError, match="track"):
+        load_colmap_landmarks(tmp_path / "no_tracks")
+
+
+def test_databases_that_do_not_match(tmp_path, model_dir):
+    model, keypoints = hand_written_model()
+    counts = [len(k) for k in keypoints]
+    descriptors = random_descriptors(counts)
+    with pytest.raises(MapError, match="no such database"):
+        load_colmap_landmarks(model_dir, tmp_path / "nowhere.db")
+    (tmp_path / "garbage.db").write_bytes(b"not a database" * 100)
+    with pytest.raises(MapError, match="database"):
+        load_colmap_landmarks(model_dir, tmp_path / "garbage.db")
+    fewer = [k[:-1] for k in keypoints]
+    path = write_database(tmp_path / "fewer.db", model, fewer, [d[:-1] for d in descriptors])
+    with pytest.raises(MapError, match="number of keypoints"):
+        load_colmap_landmarks(model_dir, path)
+    path = write_database(tmp_path / "moved.db", model, [k + 3 for k in keypoints], descriptors)
+    with pytest.raises(MapError, match="other keypoints"):
+        load_colmap_landmarks(model_dir, path)
+    with pycolmap.Database.open(str(tmp_path / "no_images.db")):
+        pass
+    with pytest.raises(MapError, match="lacks an image"):
+        load_colmap_landmarks(model_dir, tmp_path / "no_images.db")
+
+
+def test_damaged_landmark_files(tmp_path, model_dir):
+    path = tmp_path / "landmarks.npz"
+    with pytest.raises(MapError, match="no file of landmarks"):
+        Landmarks.load(path)
+    load_colmap_landmarks(model_dir).save(path)
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+    with pytest.raises(MapError, match="NPZ"):
+        Landmarks.load(path)
+    np.savez(path, points=np.zeros((3, 3)))
+    with pytest.raises(MapError, match="not a file of landmarks"):
+        Landmarks.load(path)
+    shutil.rmtree(model_dir)

@@ -1,0 +1,146 @@
+"""Walks in rooms whose free space is known in closed form."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from wheretolook.errors import ConfigError, SceneError
+from wheretolook.mapping.walk import WalkConfig, plan_walk
+
+SIZE = (8.0, 6.0, 2.6)
+BOUNDS = np.array([(0, 0, 0), SIZE])
+
+
+class Room:
+    """A box with a wall across it at x = 4 m that has a door of a given width at its low end."""
+
+    def __init__(self, door_m: float, clearance_m: float = 0.2) -> None:
+        self.door_m, self.clearance_m = door_m, clearance_m
+
+    def is_free(self, points):
+        inside = ((points > self.clearance_m) & (points < np.array(SIZE) - self.clearance_m)).all(1)
+        in_wall = (np.abs(points[:, 0] - 4) < 0.05 + self.clearance_m) & (points[:, 1] > self.door_m - self.clearance_m)
+        return inside & ~in_wall
+
+    def segments_are_free(self, a, b):
+        t = np.linspace(0, 1, 41)[:, None, None]
+        points = a * (1 - t) + b * t
+        return self.is_free(points.reshape(-1, 3)).reshape(points.shape[:2]).all(0)
+
+    def floor_below(self, points):
+        inside = ((points[:, :2] > 0) & (points[:, :2] < SIZE[:2])).all(1) & (points[:, 2] >= 0)
+        return np.where(inside, 0.0, np.nan)
+
+
+class TwoStoreys(Room):
+    """The box again, twice as high, with a gallery 2.6 m up over x > 4 m and a ramp to it along y > 4.5 m."""
+
+    def __init__(self) -> None:
+        super().__init__(door_m=99)
+
+    def _floors(self, points):
+        x, y = points[:, 0], points[:, 1]
+        ramp = (y > 4.5) & (x > 1) & (x <= 4)
+        upper = np.where(ramp, 2.6 * (x - 1) / 3, np.where(x > 4, 2.6, 0.0))
+        return np.zeros(len(points)), upper
+
+    def is_free(self, points):
+        low = np.array([self.clearance_m] * 3)
+        high = np.array([SIZE[0], SIZE[1], 5.2]) - self.clearance_m
+        lower, upper = self._floors(points)
+        z = points[:, 2]
+        clear_of_upper = (z > upper + self.clearance_m) | (z < upper - 0.3 - self.clearance_m)
+        return ((points > low) & (points < high)).all(1) & (z > lower + self.clearance_m) & clear_of_upper
+
+    def floor_below(self, points):
+        lower, upper = self._floors(points)
+        inside = ((points[:, :2] > 0) & (points[:, :2] < SIZE[:2])).all(1) & (points[:, 2] >= 0)
+        return np.where(inside, np.where(points[:, 2] >= upper, upper, lower), np.nan)
+
+
+def walked_distance_m(places: np.ndarray, path: np.ndarray) -> np.ndarray:
+    """Straight distance from places to the nearest point of a path: a lower bound of the walking distance."""
+    dense = np.concatenate([np.linspace(a, b, 10) for a, b in zip(path[:-1], path[1:], strict=True)])
+    return np.linalg.norm(places[:, None, :2] - dense[None, :, :2], axis=-1).min(1)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("coverage", [0.4, 0.7, 1.0])
+def test_walk_is_free_and_covers_what_was_asked(seed, coverage):
+    room = Room(door_m=1.2)
+    walk = plan_walk(room, BOUNDS, 150, WalkConfig(coverage=coverage), seed)
+    assert room.segments_are_free(walk.path[:-1], walk.path[1:]).all()
+    assert room.is_free(walk.positions).all()
+    # One more place to visit adds at most the floor within the radius of it, here at most a tenth of all.
+    assert coverage <= walk.coverage < min(coverage + 0.12, 1.0001)
+    grid = np.stack(np.meshgrid(np.arange(0.15, 8, 0.3), np.arange(0.15, 6, 0.3), [1.45]), -1).reshape(-1, 3)
+    floor = grid[room.is_free(grid)]
+    near = (walked_distance_m(floor, walk.path) <= walk.visit_radius_m).mean()
+    # Round the wall's end the way to walk is longer than the straight line.
+    assert walk.coverage - 0.03 <= near <= walk.coverage + 0.15
+
+
+def test_poses_are_spaced_evenly_along_the_walk_and_look_ahead():
+    walk = plan_walk(Room(door_m=1.2), BOUNDS, 120, WalkConfig(swing_deg=30, pitch_deg=-4, pitch_variation_deg=8), 3)
+    assert walk.positions.shape == walk.directions.shape == (120, 3)
+    np.testing.assert_allclose(np.linalg.norm(walk.directions, axis=1), 1, atol=1e-9)
+    steps = np.linalg.norm(np.diff(walk.positions[:, :2], axis=0), axis=1)
+    assert steps.max() <= walk.length_m / 119 + 1e-9  # straight lines are no longer than the walk between
+    assert np.median(steps) > 0.85 * walk.length_m / 119
+    assert walk.length_m / 119 <= 0.6
+    pitch = np.degrees(np.arcsin(walk.directions[:, 2]))
+    assert pitch.min() >= -12 - 1e-9 and pitch.max() <= 4 + 1e-9 and np.ptp(pitch) > 8
+    moved = np.diff(walk.positions[:, :2], axis=0) / steps[:, None]
+    ahead = (moved * walk.directions[:-1, :2]).sum(1)
+    assert np.median(ahead) > np.cos(np.radians(45))
+    heights = walk.positions[:, 2]
+    assert heights.min() >= 1.25 and heights.max() <= 1.65 and np.ptp(heights) > 0.2
+
+
+def test_few_images_make_a_short_walk():
+    config = WalkConfig(image_spacing_m=0.5)
+    walk = plan_walk(Room(door_m=1.2), BOUNDS, 20, config, 0)
+    assert walk.length_m <= 19 * 0.5
+    assert walk.visit_radius_m > config.visit_radius_m
+    assert walk.coverage >= config.coverage
+
+
+def test_only_the_largest_reachable_part_is_walked():
+    walk = plan_walk(Room(door_m=0.0), BOUNDS, 60, WalkConfig(coverage=1.0), 0)  # no door
+    assert (walk.positions[:, 0] < 4).all() or (walk.positions[:, 0] > 4).all()
+
+
+def test_walk_climbs_to_another_storey():
+    scene = TwoStoreys()
+    bounds = np.array([(0, 0, 0), (8, 6, 5.2)])
+    walk = plan_walk(scene, bounds, 300, WalkConfig(coverage=0.95, eye_height_variation_m=0.1), 1)
+    assert scene.segments_are_free(walk.path[:-1], walk.path[1:]).all()
+    floor = scene.floor_below(walk.positions)
+    height = walk.positions[:, 2] - floor
+    assert height.min() > 1.2
+    assert (height < 1.7).mean() > 0.98  # beside the gallery's edge the straight way may hang over it a little
+    assert (floor == 0).sum() > 30 and (floor == 2.6).sum() > 30
+    assert ((floor > 0.3) & (floor < 2.3)).any()
+
+
+def test_seed_decides():
+    room = Room(door_m=1.2)
+    a, b, c = (plan_walk(room, BOUNDS, 40, WalkConfig(), seed) for seed in (5, 5, 6))
+    assert a.positions.tobytes() == b.positions.tobytes() and a.directions.tobytes() == b.directions.tobytes()
+    assert not np.allclose(a.positions, c.positions)
+
+
+def test_scenes_without_a_floor_and_bad_settings():
+    with pytest.raises(SceneError, match="no free floor"):
+        plan_walk(Room(door_m=1.2, clearance_m=3.1), BOUNDS, 10)
+    with pytest.raises(SceneError, match="no free floor"):
+        plan_walk(Room(door_m=1.2), BOUNDS, 10, WalkConfig(eye_height_m=5.0))
+    with pytest.raises(SceneError, match="free step"):
+        plan_walk(Room(door_m=1.2), BOUNDS, 10, WalkConfig(cell_m=5.5))
+    with pytest.raises(ConfigError):
+        plan_walk(Room(door_m=1.2), BOUNDS, 1)
+    bad = ({"coverage": 0.0}, {"coverage": 1.1}, {"cell_m": 0.0}, {"pitch_deg": 85.0}, {"eye_height_variation_m": 2.0})
+    for settings in bad:
+        with pytest.raises(ConfigError):
+            WalkConfig(**settings)

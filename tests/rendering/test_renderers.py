@@ -1,0 +1,178 @@
+"""The Warp renderer against Open3D, and both against images known in closed form."""
+
+from __future__ import annotations
+
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+
+import numpy as np
+import pytest
+from box_scenes import furnished_room, quads_mesh, random_texture, random_triangles
+
+from wheretolook.errors import ConfigError
+from wheretolook.geometry import PinholeCamera, poses_looking_along, transform
+from wheretolook.rendering import Open3DRenderer, WarpRenderer
+
+RENDERERS = pytest.mark.parametrize("renderer", [WarpRenderer, Open3DRenderer])
+LOOK_ALONG_Y = poses_looking_along([[0.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+
+
+def facing_wall(camera, texture, distance_m=2.0, texels_per_pixel=(1.0, 1.0), vertex_colors=None):
+    """A wall across the view of LOOK_ALONG_Y on which a pixel covers a whole number of texels."""
+    height, width = texture.shape[:2]
+    half_x = width / texels_per_pixel[0] / 2 * distance_m / camera.focal_px
+    half_z = height / texels_per_pixel[1] / 2 * distance_m / camera.focal_px
+    corners = [(-half_x, -half_z), (half_x, -half_z), (half_x, half_z), (-half_x, half_z)]
+    return quads_mesh([[(x, distance_m, z) for x, z in corners]], [texture], vertex_colors=vertex_colors)
+
+
+def assert_same_images(a, b):
+    hit_a, hit_b = a.depth_m > 0, b.depth_m > 0
+    # Rays through an edge may pass on either side of it.
+    assert np.mean(hit_a == hit_b) > 0.9999
+    both = hit_a & hit_b
+    relative = np.abs(a.depth_m - b.depth_m)[both] / b.depth_m[both]
+    assert np.mean(relative < 1e-4) > 0.9995
+    error = np.abs(a.rgb.astype(int) - b.rgb)[both].max(axis=-1)
+    assert np.mean(error <= 2) > 0.998
+    assert error.mean() < 0.1
+    assert (a.rgb[~hit_a] == 0).all() and (b.rgb[~hit_b] == 0).all()
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, 3])
+def test_warp_agrees_with_open3d_on_random_triangles(seed):
+    rng = np.random.default_rng(seed)
+    mesh, camera = random_triangles(seed), PinholeCamera(161, 120, 90.0)
+    poses = poses_looking_along(rng.uniform(-2, 2, (5, 3)), rng.normal(size=(5, 3)))
+    images = WarpRenderer(mesh).render(camera, poses)
+    assert images.rgb.shape == (5, 120, 161, 3) and images.rgb.dtype == np.uint8
+    assert images.depth_m.shape == (5, 120, 161) and images.depth_m.dtype == np.float32
+    assert 0.2 < np.mean(images.depth_m > 0) < 1
+    assert_same_images(images, Open3DRenderer(mesh).render(camera, poses))
+
+
+def test_warp_agrees_with_open3d_in_a_room():
+    rng = np.random.default_rng(5)
+    mesh, camera = furnished_room(), PinholeCamera(160, 120, 80.0)
+    poses = poses_looking_along(rng.uniform((0.5, 3.5, 0.5), (5.5, 4.5, 2.5), (6, 3)), rng.normal(size=(6, 3)))
+    images = WarpRenderer(mesh).render(camera, poses)
+    assert (images.depth_m > 0).all(), "a closed room has no misses"
+    assert_same_images(images, Open3DRenderer(mesh).render(camera, poses))
+
+
+@RENDERERS
+def test_one_texel_a_pixel_reproduces_the_texture(renderer):
+    # Holds only with pixel centres at + 0.5, texel centres at + 0.5, u to the right and v down.
+    camera = PinholeCamera(12, 10, 15.0)
+    texture = random_texture(np.random.default_rng(0), 10, 12)
+    images = renderer(facing_wall(camera, texture)).render(camera, LOOK_ALONG_Y)
+    np.testing.assert_allclose(images.depth_m, 2.0, rtol=1e-6)
+    np.testing.assert_array_equal(images.rgb[0], texture)
+
+
+@RENDERERS
+def test_texture_coordinates_repeat_and_interpolate(renderer):
+    # A texture of 2 x 1 texels over 8 pixels: texel centres fall between pixels 1|2 and 5|6.
+    camera = PinholeCamera(8, 4, 10.0)
+    texture = np.array([[[0] * 3, [240] * 3]], dtype=np.uint8)
+    image = renderer(facing_wall(camera, texture, texels_per_pixel=(0.25, 0.25))).render(camera, LOOK_ALONG_Y).rgb[0]
+    np.testing.assert_array_equal(image[1:3, :, 0], [[90, 30, 30, 90, 150, 210, 210, 150]] * 2)
+
+
+@RENDERERS
+def test_minified_texture_is_box_averaged(renderer):
+    # A pixel covers 4 x 4 texels: mip level 2 exactly, whose texels are the averages of 4 x 4.
+    camera = PinholeCamera(16, 12, 20.0)
+    texture = random_texture(np.random.default_rng(1), 48, 64)
+    wall = facing_wall(camera, texture, texels_per_pixel=(4, 4))
+    expected = texture.reshape(12, 4, 16, 4, 3).mean(axis=(1, 3))
+    image = renderer(wall).render(camera, LOOK_ALONG_Y).rgb[0]
+    assert np.abs(image - expected).max() <= 1.5  # two roundings to whole numbers
+
+
+@RENDERERS
+def test_stretched_footprint_is_averaged_along_its_long_side_only(renderer):
+    camera = PinholeCamera(16, 12, 20.0)
+    texture = random_texture(np.random.default_rng(2), 12, 64)
+    wall = facing_wall(camera, texture, texels_per_pixel=(4, 1))
+    expected = texture.reshape(12, 16, 4, 3).mean(axis=2)
+    image = renderer(wall).render(camera, LOOK_ALONG_Y).rgb[0]
+    assert np.abs(image - expected).max() <= 1
+
+
+@RENDERERS
+@pytest.mark.parametrize("direction", [(0, 1, 0), (0.6, 0.8, 0), (0.3, 0.4, 0.6)])
+def test_fine_checkerboard_far_away_is_grey(renderer, direction):
+    camera = PinholeCamera(40, 30, 20.0)
+    checker = np.repeat(np.indices((64, 64)).sum(0)[:, :, None] % 2 * 255, 3, axis=2).astype(np.uint8)
+    quad = [(-50, 4, -50), (50, 4, -50), (50, 4, 50), (-50, 4, 50)]
+    images = renderer(quads_mesh([quad], [checker], repeat=100.0)).render(
+        camera, poses_looking_along([[0, 0, 0]], [direction])
+    )
+    seen = images.rgb[images.depth_m > 0]
+    assert len(seen) > 500
+    assert np.abs(seen - 127.5).max() <= 2
+
+
+@RENDERERS
+def test_depth_of_a_tilted_view_is_along_the_optical_axis(renderer):
+    camera = PinholeCamera(30, 20, 15.0)
+    pose = poses_looking_along([[0.3, -0.2, 1.5]], [[0.5, 0.7, -1.0]])
+    floor = [(-50, -50, 0), (50, -50, 0), (50, 50, 0), (-50, 50, 0)]
+    depth_m = renderer(quads_mesh([floor], [np.full((1, 1, 3), 9, np.uint8)])).render(camera, pose).depth_m[0]
+    rows, columns = np.nonzero(depth_m)
+    assert len(rows) > 300
+    # Back-projected by K^-1 and the inverse pose, every pixel lies on the floor.
+    pixels = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))], axis=-1)
+    in_camera = pixels @ np.linalg.inv(camera.matrix).T * depth_m[rows, columns][:, None]
+    in_world = (in_camera - pose[0, :, 3]) @ pose[0, :, :3]
+    np.testing.assert_allclose(in_world[:, 2], 0, atol=1e-4)
+    np.testing.assert_allclose(transform(pose[0], in_world), in_camera, atol=1e-9)
+
+
+@RENDERERS
+def test_vertex_colors_multiply_and_both_sides_show(renderer):
+    camera = PinholeCamera(12, 10, 15.0)
+    texture = random_texture(np.random.default_rng(3), 10, 12)
+    tint = np.tile(np.array([255, 51, 0], dtype=np.uint8), (4, 1))
+    wall = facing_wall(camera, texture, vertex_colors=tint)
+    front = renderer(wall).render(camera, LOOK_ALONG_Y).rgb[0]
+    assert np.abs(front - texture * (1.0, 0.2, 0.0)).max() <= 0.5 + 1e-3
+    behind = renderer(wall).render(camera, poses_looking_along([[0, 4, 0]], [[0, -1, 0]])).rgb[0]
+    np.testing.assert_array_equal(behind, front[:, ::-1])
+
+
+def test_blocks_do_not_change_the_images():
+    mesh, camera = random_triangles(1), PinholeCamera(40, 30, 30.0)
+    poses = poses_looking_along(np.zeros((5, 3)), np.random.default_rng(0).normal(size=(5, 3)))
+    whole = WarpRenderer(mesh).render(camera, poses)
+    blocks = WarpRenderer(mesh, block_bytes=2 * 40 * 30 * 7).render(camera, poses)
+    np.testing.assert_array_equal(whole.rgb, blocks.rgb)
+    np.testing.assert_array_equal(whole.depth_m, blocks.depth_m)
+    assert WarpRenderer(mesh).render(camera, poses[:0]).rgb.shape == (0, 30, 40, 3)
+
+
+@RENDERERS
+def test_bad_poses_are_refused(renderer):
+    scene = renderer(random_triangles(0))
+    with pytest.raises(ValueError, match=r"\(B, 3, 4\)"):
+        scene.render(PinholeCamera(), np.eye(4)[None])
+    with pytest.raises(ValueError, match="NaN"):
+        scene.render(PinholeCamera(), np.full((1, 3, 4), np.nan))
+
+
+def test_unknown_device_is_refused():
+    with pytest.raises(ConfigError, match="no such device"):
+        WarpRenderer(random_triangles(0), device="cuda:99")
+
+
+def _render_in_worker(seed):
+    camera = PinholeCamera(20, 15, 12.0)
+    return WarpRenderer(random_triangles(seed)).render(camera, LOOK_ALONG_Y).rgb
+
+
+def test_renders_in_spawned_processes():
+    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
+        images = list(pool.map(_render_in_worker, [0, 1]))
+    for seed, image in enumerate(images):
+        np.testing.assert_array_equal(image, _render_in_worker(seed))

@@ -1,0 +1,83 @@
+"""A tiny dataset for tests: random landmarks, views in all directions, and labels that follow a known rule."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from wheretolook.dataset import Dataset, SceneFolder, Split
+from wheretolook.features import bin_views_plain
+from wheretolook.geometry import PinholeCamera, poses_looking_along
+from wheretolook.grid import fibonacci_sphere
+from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.table import LOCALIZED, NO_POSE, TOO_FEW_MATCHES, pose_columns, write_table
+from wheretolook.visibility import StoredOcclusion, VisibleSets
+
+CAMERA = PinholeCamera(160, 120, 80.0)
+BINS = 30
+
+
+def make_landmarks(rng: np.random.Generator, n: int) -> Landmarks:
+    """Landmarks on one half of a box's walls, so that some directions see many and others none."""
+    points = rng.uniform((-3, -3, 0), (3, 3, 2.5), (n, 3))
+    wall = rng.integers(0, 2, n)
+    points[np.arange(n), wall] = rng.choice([3.0, 2.9], n)
+    values = {
+        "track_length": rng.integers(2, 9, n).astype(np.int32),
+        "reprojection_error_px": rng.random(n).astype(np.float32) / 2,
+        "triangulation_angle_deg": rng.uniform(2, 40, n).astype(np.float32),
+        "mapping_direction": (points / np.linalg.norm(points, axis=1, keepdims=True)).astype(np.float32),
+        "mapping_direction_spread": rng.random(n).astype(np.float32),
+        "mapping_distance_m": rng.uniform(1, 4, n).astype(np.float32),
+        "ambiguity": rng.random(n).astype(np.float32),
+    }
+    return Landmarks(ids=np.arange(n, dtype=np.int64), points=points, descriptors=None, **values)
+
+
+def make_scene(
+    folder: Path, split: Split, seed: int, n_locations: int = 24, n_directions: int = 20, n_landmarks: int = 500
+) -> SceneFolder:
+    """Write one labelled scene. The errors fall with the number of filled bins, the median view just localizes."""
+    rng = np.random.default_rng(seed)
+    scene = SceneFolder(folder, split)
+    scene.map.mkdir(parents=True)
+    landmarks = make_landmarks(rng, n_landmarks)
+    landmarks.save(scene.landmarks)
+    locations = rng.uniform((-2, -2, 0.5), (2, 2, 2), (n_locations, 3))
+    mask = rng.random((n_locations, n_landmarks)) < 0.8
+    StoredOcclusion(locations, mask).save(scene.occlusion)
+
+    location_id = np.repeat(np.arange(n_locations), n_directions)
+    direction_id = np.tile(np.arange(n_directions), n_locations)
+    cam_from_world = poses_looking_along(locations[location_id], fibonacci_sphere(n_directions)[direction_id])
+    binned = bin_views_plain(CAMERA, cam_from_world, landmarks.points, VisibleSets.from_mask(mask), location_id, BINS)
+    filled = binned.n_filled
+    error_m = 0.05 * (np.median(filled) / np.maximum(filled, 1)) ** 4 * 0.999
+    status = np.where(filled == 0, TOO_FEW_MATCHES, np.where(error_m > 20, NO_POSE, LOCALIZED))
+    error_m = np.where(status == LOCALIZED, error_m, np.nan)
+    table = pd.DataFrame(
+        {
+            "viewpoint_id": 1000 + np.arange(len(location_id)),
+            "location_id": location_id,
+            "direction_id": direction_id,
+            **pose_columns(cam_from_world),
+            "n_visible": binned.n_visible,
+            "visibility_rank": 0,
+            "status": status,
+            "error_m": error_m,
+            "error_deg": error_m * 4,
+            "n_inliers": np.where(status == LOCALIZED, filled, 0),
+        }
+    )
+    write_table(table, scene.table)
+    return scene
+
+
+def make_dataset(root: Path, splits: tuple[Split, ...] = ("train", "train", "test"), **options: int) -> Dataset:
+    """Write a dataset with one scene for each split named."""
+    scenes = [make_scene(root / f"scene-{index}", split, seed=index, **options) for index, split in enumerate(splits)]
+    dataset = Dataset(root, CAMERA, tuple(scenes))
+    dataset.save()
+    return dataset

@@ -6,9 +6,18 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+import warp as wp
 
 from wheretolook.geometry import Float, PinholeCamera, poses_looking_along
 from wheretolook.visibility import VisibleSets
+from wheretolook.warp_setup import start_warp
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Tests that take a device run on the CPU, and on CUDA where there is one."""
+    if "device" in metafunc.fixturenames:
+        start_warp()
+        metafunc.parametrize("device", ["cpu", "cuda"] if wp.is_cuda_available() else ["cpu"])
 
 
 @dataclass(frozen=True)

@@ -40,10 +40,10 @@ def test_bins_counted_by_hand(bin_function) -> None:  # type: ignore[no-untyped-
     assert np.all(binned.means[:, :, binned.counts[0] == 0] == 0)
 
 
-def test_kernel_bins_as_its_plain_twin(random_views: RandomViews) -> None:
+def test_kernel_bins_as_its_plain_twin(random_views: RandomViews, device: str) -> None:
     v = random_views
     arguments = v.camera, v.cam_from_world, v.points, v.visible, v.location_rows
-    kernel, plain = bin_views(*arguments, bins=12), bin_views_plain(*arguments, bins=12)
+    kernel, plain = bin_views(*arguments, bins=12, device=device), bin_views_plain(*arguments, bins=12)
     same = kernel.counts == plain.counts  # single precision may move a landmark on a bin's edge to the next bin
     assert same.mean() > 0.999 and plain.counts.sum() > 500
     both = np.broadcast_to(same[:, None], plain.means.shape)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 
 from tqdm.auto import tqdm
 
@@ -32,14 +33,25 @@ def run_demo(experiment: Experiment) -> None:
         "train": stages.train,
         "evaluate": stages.evaluate,
     }
+    if config.train == 0 and not any(mesh.split == "train" for mesh in config.meshes):
+        del steps["train"], cost["train"]  # meshes of one's own, evaluated with weights from elsewhere
     start = time.monotonic()
     layout = "{desc}: {percentage:3.0f}%|{bar}| {elapsed} elapsed, about {remaining} remain"
     with tqdm(total=sum(cost.values()), desc="demo", bar_format=layout, smoothing=0) as bar:
         for number, (name, step) in enumerate(steps.items(), 1):
             bar.set_description_str(f"demo {number}/{len(steps)} {name}")
-            step(experiment, say=lambda text, name=name: tqdm.write(f"[{name}] {text}"), tick=lambda n, name=name: bar.update(n * SECONDS[name]))  # fmt: skip
+            say, tick = partial(_say, name), partial(_tick, bar, SECONDS[name])
+            step(experiment, say=say, tick=tick)
         bar.set_description_str("demo")
     _say_where(experiment, time.monotonic() - start)
+
+
+def _say(stage: str, text: str) -> None:
+    tqdm.write(f"[{stage}] {text}")
+
+
+def _tick(bar: tqdm, seconds: float, work: float) -> None:
+    bar.update(seconds * work)
 
 
 def _say_where(experiment: Experiment, seconds: float) -> None:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from wheretolook.errors import ConfigError
 from wheretolook.geometry import Float, PinholeCamera, transform
-from wheretolook.rendering.warp_setup import start_warp
+from wheretolook.warp_setup import start_warp
 from wheretolook.visibility.frustum import MIN_DEPTH_M, VisibleSets
 
 CHANNELS = ("u", "v", "x", "y", "z")

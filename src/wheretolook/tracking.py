@@ -62,9 +62,9 @@ def client(tracking: TrackingConfig) -> MlflowClient:
     """A client of the store, which is made if there is none and repaired if it was moved."""
     tracking.root.mkdir(parents=True, exist_ok=True)
     mlflow_client: MlflowClient = _mlflow().MlflowClient(tracking_uri=tracking.uri)
-    for experiment in mlflow_client.search_experiments(filter_string=f"name = '{tracking.experiment}'"):
-        if experiment.artifact_location != tracking.artifacts:
-            _relocate(tracking, experiment.artifact_location)
+    experiment = mlflow_client.get_experiment_by_name(tracking.experiment)
+    if experiment is not None and experiment.artifact_location != tracking.artifacts:
+        _relocate(tracking, experiment.artifact_location)
     return mlflow_client
 
 

@@ -30,7 +30,9 @@ def views() -> tuple[torch.Tensor, torch.Tensor]:
     return (values + 3) * scale * filled[:, None], filled
 
 
-def make_network(views: tuple[torch.Tensor, torch.Tensor], variant: str = "2d+z", **options: object) -> ViewpointNetwork:
+def make_network(
+    views: tuple[torch.Tensor, torch.Tensor], variant: str = "2d+z", **options: object
+) -> ViewpointNetwork:
     statistics = InputStatistics.of(*views, torch.arange(50)).select(INPUT_VARIANTS[variant])
     torch.manual_seed(1)
     spec = NetworkSpec(variant, PinholeCamera(64, 48, 32.0), statistics, bins=BINS, hidden=(8, 8), **options)  # type: ignore[arg-type]

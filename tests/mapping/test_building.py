@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -128,6 +128,16 @@ def test_same_seed_same_bytes_whatever_the_workers(built, room, room_free_space,
     for name in names:
         if name.name not in ("report.json", "database.db"):
             assert (folder / name).read_bytes() == (again / name).read_bytes(), name
+
+
+def test_two_view_landmarks_add_short_tracks(built, room, room_free_space, renderer, tmp_path):
+    _, few = built
+    config = replace(CONFIG, two_view_landmarks=True, keep_images=False, keep_database=False)
+    many = build_map(room, renderer, room_free_space, CAMERA, config, SEED, tmp_path / "map", workers=1, progress=False)
+    length = Landmarks.load(tmp_path / "map" / "landmarks.npz").track_length
+    assert (length == 2).sum() > 0.3 * len(length)
+    assert many.n_landmarks > 1.3 * few.n_landmarks
+    assert many.median_track_length < few.median_track_length
 
 
 def test_earlier_map_is_replaced_and_extras_are_optional(room, room_free_space, renderer, tmp_path):

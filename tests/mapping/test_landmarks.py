@@ -41,7 +41,7 @@ def hand_written_model(offsets_px=OFFSETS_PX, tracks=TRACKS, points=POINTS) -> t
     for point, track, offset in zip(points, tracks, offsets_px, strict=True):
         for image in track:
             elements.append((image + 1, len(keypoints[image])))
-            keypoints[image].append(project(point, image) + (offset, 0))
+            keypoints[image].append(project(point, image) + np.array([offset, 0]))
     poses = poses_looking_along(CENTERS, np.tile([0.0, 1.0, 0.0], (3, 1)))
     for i, pose in enumerate(poses):
         image = pycolmap.Image(name=f"{i}.png", camera_id=CAMERA_OF[i], image_id=i + 1)
@@ -144,7 +144,7 @@ def test_descriptors_are_means_over_the_track(tmp_path, model_dir):
     np.testing.assert_allclose(landmarks.ambiguity, cosine.max(1), atol=1e-6)
 
 
-@pytest.mark.parametrize("n", [2, 500, 9001])
+@pytest.mark.parametrize("n", [2, 500, 3001])
 def test_ambiguity_against_brute_force(n):
     descriptors = random_descriptors([n])[0]
     descriptors[-1] = descriptors[0]  # twins, in different blocks if there are several
@@ -166,7 +166,7 @@ def test_long_and_short_tracks_against_a_plain_loop(tmp_path):
     rng = np.random.default_rng(4)
     n_images, n_points = 40, 300
     centers = rng.uniform(-3, 3, (n_images, 3))
-    points = rng.uniform(-3, 3, (n_points, 3)) + (0, 12, 0)
+    points = rng.uniform(-3, 3, (n_points, 3)) + np.array([0, 12, 0])
     tracks = [rng.choice(n_images, rng.integers(2, n_images), replace=False) for _ in range(n_points)]
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(

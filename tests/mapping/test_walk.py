@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -61,7 +63,7 @@ class TwoStoreys(Room):
 
 def walked_distance_m(places: np.ndarray, path: np.ndarray) -> np.ndarray:
     """Straight distance from places to the nearest point of a path: a lower bound of the walking distance."""
-    dense = np.concatenate([np.linspace(a, b, 10) for a, b in zip(path[:-1], path[1:], strict=True)])
+    dense = np.concatenate([np.linspace(a, b, 10) for a, b in pairwise(path)])
     return np.linalg.norm(places[:, None, :2] - dense[None, :, :2], axis=-1).min(1)
 
 

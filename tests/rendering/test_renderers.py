@@ -7,8 +7,8 @@ from multiprocessing import get_context
 
 import numpy as np
 import pytest
-from box_scenes import furnished_room, quads_mesh, random_texture, random_triangles
 
+from box_scenes import furnished_room, quads_mesh, random_texture, random_triangles
 from wheretolook.errors import ConfigError
 from wheretolook.geometry import PinholeCamera, poses_looking_along, transform
 from wheretolook.rendering import Open3DRenderer, WarpRenderer
@@ -40,22 +40,22 @@ def assert_same_images(a, b):
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2, 3])
-def test_warp_agrees_with_open3d_on_random_triangles(seed):
+def test_warp_agrees_with_open3d_on_random_triangles(seed, device):
     rng = np.random.default_rng(seed)
     mesh, camera = random_triangles(seed), PinholeCamera(161, 120, 90.0)
     poses = poses_looking_along(rng.uniform(-2, 2, (5, 3)), rng.normal(size=(5, 3)))
-    images = WarpRenderer(mesh).render(camera, poses)
+    images = WarpRenderer(mesh, device).render(camera, poses)
     assert images.rgb.shape == (5, 120, 161, 3) and images.rgb.dtype == np.uint8
     assert images.depth_m.shape == (5, 120, 161) and images.depth_m.dtype == np.float32
     assert 0.2 < np.mean(images.depth_m > 0) < 1
     assert_same_images(images, Open3DRenderer(mesh).render(camera, poses))
 
 
-def test_warp_agrees_with_open3d_in_a_room():
+def test_warp_agrees_with_open3d_in_a_room(device):
     rng = np.random.default_rng(5)
     mesh, camera = furnished_room(), PinholeCamera(160, 120, 80.0)
     poses = poses_looking_along(rng.uniform((0.5, 3.5, 0.5), (5.5, 4.5, 2.5), (6, 3)), rng.normal(size=(6, 3)))
-    images = WarpRenderer(mesh).render(camera, poses)
+    images = WarpRenderer(mesh, device).render(camera, poses)
     assert (images.depth_m > 0).all(), "a closed room has no misses"
     assert_same_images(images, Open3DRenderer(mesh).render(camera, poses))
 
@@ -142,11 +142,11 @@ def test_vertex_colors_multiply_and_both_sides_show(renderer):
     np.testing.assert_array_equal(behind, front[:, ::-1])
 
 
-def test_blocks_do_not_change_the_images():
+def test_blocks_do_not_change_the_images(device):
     mesh, camera = random_triangles(1), PinholeCamera(40, 30, 30.0)
     poses = poses_looking_along(np.zeros((5, 3)), np.random.default_rng(0).normal(size=(5, 3)))
-    whole = WarpRenderer(mesh).render(camera, poses)
-    blocks = WarpRenderer(mesh, block_bytes=2 * 40 * 30 * 7).render(camera, poses)
+    whole = WarpRenderer(mesh, device).render(camera, poses)
+    blocks = WarpRenderer(mesh, device, block_bytes=2 * 40 * 30 * 7).render(camera, poses)
     np.testing.assert_array_equal(whole.rgb, blocks.rgb)
     np.testing.assert_array_equal(whole.depth_m, blocks.depth_m)
     assert WarpRenderer(mesh).render(camera, poses[:0]).rgb.shape == (0, 30, 40, 3)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from box_scenes import random_texture, random_triangles
 
+from box_scenes import random_texture, random_triangles
 from wheretolook.rendering.textures import build_pyramids, texel_gradients
 
 

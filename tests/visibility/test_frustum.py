@@ -17,11 +17,11 @@ def test_sparse_rows_of_a_mask() -> None:
     assert sets.indices.tolist() == [0, 2, 1, 2]
 
 
-def test_kernel_counts_as_its_plain_twin(random_views: RandomViews) -> None:
+def test_kernel_counts_as_its_plain_twin(random_views: RandomViews, device: str) -> None:
     v = random_views
     rotations = rotation_looking_along(v.directions)
     arguments = v.camera, rotations, v.locations, v.points, v.visible
-    counts, plain = count_in_frustum(*arguments), count_in_frustum_plain(*arguments)
+    counts, plain = count_in_frustum(*arguments, device), count_in_frustum_plain(*arguments)
     # Single precision may decide differently within this many pixels of the border: allow exactly those landmarks.
     border = np.zeros_like(plain)
     for row, location in enumerate(v.locations):
@@ -33,12 +33,12 @@ def test_kernel_counts_as_its_plain_twin(random_views: RandomViews) -> None:
     assert plain.sum() > 500 and (counts != plain).mean() < 0.05
 
 
-def test_counts_by_hand() -> None:
+def test_counts_by_hand(device: str) -> None:
     camera = PinholeCamera(100, 100, 50.0)  # sees 45 degrees to every side
     points = np.array([[1, 0, 0], [1, 0.9, 0], [1, 1.1, 0], [-1, 0, 0], [0, 1, 0], [0, 0, 0], [np.nan, 0, 0]])
     visible = VisibleSets.from_mask(np.ones((1, 7), dtype=bool))
     directions = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0]])
-    counts = count_in_frustum(camera, rotation_looking_along(directions), np.zeros((1, 3)), points, visible)
+    counts = count_in_frustum(camera, rotation_looking_along(directions), np.zeros((1, 3)), points, visible, device)
     assert counts.tolist() == [[2, 1, 2]]
 
 

@@ -7,7 +7,7 @@ import os
 import shutil
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -138,6 +138,7 @@ def build_map(
             clock,
             max_epipolar_error_px=config.max_epipolar_error_px,
             min_triangulation_angle_deg=config.min_triangulation_angle_deg,
+            two_view_landmarks=config.two_view_landmarks,
             seed=seed,
             workers=workers,
             progress=progress,
@@ -198,7 +199,7 @@ class _Clock:
 @contextmanager
 def _partial_folder(out_dir: Path) -> Iterator[Path]:
     """An empty folder beside `out_dir` that takes its place if the block succeeds and is removed if it does not."""
-    partial, old = (out_dir.with_name(f"{out_dir.name}.{suffix}") for suffix in ("partial", "old"))
+    partial, old = (out_dir.with_name(f".{out_dir.name}.{suffix}") for suffix in ("partial", "replaced"))
     for leftover in (partial, old):
         shutil.rmtree(leftover, ignore_errors=True)
     partial.mkdir(parents=True)
@@ -238,11 +239,12 @@ def _render_and_extract(
 
     extracted = KeypointExtractor(config.extractor).extract_many(images(), workers)
     keypoints, colors = [], []
-    for found in tqdm(extracted, "mapping: render, extract", total=len(poses), disable=not progress, unit="image"):
-        column, row = found.pixels.astype(np.int64).T
-        rgb = waiting.pop(0)
-        colors.append(rgb[np.clip(row, 0, camera.height - 1), np.clip(column, 0, camera.width - 1)])
-        keypoints.append(found)
+    with closing(extracted):
+        for found in tqdm(extracted, "map: render, extract", total=len(poses), disable=not progress, unit="image"):
+            column, row = found.pixels.astype(np.int64).T
+            rgb = waiting.pop(0)
+            colors.append(rgb[np.clip(row, 0, camera.height - 1), np.clip(column, 0, camera.width - 1)])
+            keypoints.append(found)
     return keypoints, colors, np.stack(depth)
 
 

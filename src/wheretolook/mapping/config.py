@@ -20,6 +20,8 @@ class MapConfig:
         partners: images that each image is matched with, those that share most surface with it.
         max_epipolar_error_px: matches farther from the epipolar line of the known poses are dropped.
         min_triangulation_angle_deg: landmarks whose rays meet at less are not made.
+        two_view_landmarks: whether two observations make a landmark. COLMAP's default is to ask for three, which gives
+            a third as many, and fewer viewpoints that localize.
         max_reprojection_error_px: landmarks with a larger mean reprojection error are removed from the map (the
             paper's 0.5 px).
         keep_images: keep the rendered images, as `images/` in the map's folder.
@@ -32,6 +34,7 @@ class MapConfig:
     partners: int = 10
     max_epipolar_error_px: float = 2.0
     min_triangulation_angle_deg: float = 1.5
+    two_view_landmarks: bool = True
     max_reprojection_error_px: float = 0.5
     keep_images: bool = False
     keep_database: bool = False

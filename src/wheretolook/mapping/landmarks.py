@@ -15,7 +15,7 @@ from wheretolook.errors import MapError
 from wheretolook.mapping.colmap_model import ModelArrays, model_arrays, read_descriptors, read_model
 from wheretolook.mapping.extraction import quantize_descriptors, unit_descriptors
 
-_BLOCK = 4096
+_BLOCK = 4096  # landmarks whose tracks are gathered at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,18 +139,30 @@ def nearest_other_cosine(descriptors: NDArray[np.uint8], device: str = "cpu") ->
 
     Sums of products of such integers are exact in float32, so the result does not depend on the machine.
     """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(
+        1
+    )  # the blocks are small: several threads spend more time waiting for each other than working
+    try:
+        return _nearest_other_cosine(descriptors, device)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _nearest_other_cosine(descriptors: NDArray[np.uint8], device: str) -> NDArray[np.float32]:
     n = len(descriptors)
     values = torch.as_tensor(descriptors, dtype=torch.float32, device=device)
     inverse = (
         1 / torch.as_tensor(np.linalg.norm(descriptors.astype(np.float64), axis=1), device=device).clamp(min=1).float()
     )
     best = torch.full((n,), -torch.inf, device=device)
-    for i in range(0, n, _BLOCK):
-        rows = slice(i, min(i + _BLOCK, n))
-        for j in range(i, n, _BLOCK):  # each pair of blocks once: the product serves rows and columns
-            columns = slice(j, min(j + _BLOCK, n))
-            cosine = (values[rows] @ values[columns].T) * inverse[columns]
-            cosine *= inverse[rows, None]
+    block = 512  # products of this size stay in the cache
+    for i in range(0, n, block):
+        rows = slice(i, min(i + block, n))
+        for j in range(i, n, block):  # each pair of blocks once: the product serves rows and columns
+            columns = slice(j, min(j + block, n))
+            cosine = values[rows] @ values[columns].T
+            cosine *= inverse[rows, None] * inverse[columns]
             if i == j:
                 cosine.fill_diagonal_(-torch.inf)
             best[rows] = torch.maximum(best[rows], cosine.amax(1))

@@ -41,8 +41,8 @@ def surface_overlap(
     """
     n, h, w = depth_m.shape
     step = max(1, w // _SAMPLES_ACROSS)
-    rows, columns = np.meshgrid(np.arange(step // 2, h, step), np.arange(step // 2, w, step), indexing="ij")
-    rows, columns = rows.ravel(), columns.ravel()
+    grid = np.meshgrid(np.arange(step // 2, h, step), np.arange(step // 2, w, step), indexing="ij")
+    rows, columns = (axis.ravel() for axis in grid)
     pixels = np.column_stack([columns, rows]) * DEPTH_STRIDE + DEPTH_STRIDE // 2 + 0.5
     rays = np.column_stack([(pixels - (camera.cx, camera.cy)) / camera.focal_px, np.ones(len(pixels))])
     depth = depth_m[:, rows, columns].astype(np.float64)

@@ -33,6 +33,7 @@ def triangulate_known_poses(
     clock: Callable[[str], AbstractContextManager[None]],
     max_epipolar_error_px: float = 2.0,
     min_triangulation_angle_deg: float = 1.5,
+    two_view_landmarks: bool = False,
     seed: int = 0,
     workers: int = 1,
     progress: bool = True,
@@ -49,6 +50,7 @@ def triangulate_known_poses(
         clock: times a step.
         max_epipolar_error_px: matches farther from the epipolar line are dropped.
         min_triangulation_angle_deg: points whose rays meet at less are not made.
+        two_view_landmarks: whether two observations make a point.
         seed: of COLMAP's sampling.
         workers: threads.
         progress: show a progress bar.
@@ -86,6 +88,7 @@ def triangulate_known_poses(
             random_seed=seed, num_threads=1, extract_colors=False, load_all_images=True
         )
         options.triangulation.random_seed = options.mapper.random_seed = seed
+        options.triangulation.ignore_two_view_tracks = not two_view_landmarks
         options.triangulation.min_angle = options.mapper.filter_min_tri_angle = min_triangulation_angle_deg
         folder = database.parent
         with quiet_colmap("ERROR"):  # it warns of every image it cannot read colours from

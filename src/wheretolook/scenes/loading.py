@@ -97,8 +97,13 @@ def save_glb(mesh: TexturedMesh, path: str | PathLike[str], jpeg_quality: int = 
     Args:
         mesh: what to write.
         path: file to write, ending in .glb.
-        jpeg_quality: 1 to 95.
+        jpeg_quality: 1 to 100.
+
+    Raises:
+        ConfigError: if the quality is out of range.
     """
+    if not 1 <= jpeg_quality <= 100:
+        raise ConfigError("JPEG quality is a number from 1 to 100", value=jpeg_quality)
     scene = trimesh.Scene()
     for index, texture in enumerate(mesh.textures):
         faces = np.flatnonzero(mesh.triangle_texture == index)
@@ -134,40 +139,43 @@ def _mesh_file(path: Path) -> Path:
 
 
 def _parts(scene: trimesh.Scene) -> Iterator[_Part]:
-    """The triangle meshes of a scene with their node transforms applied."""
-    for node in scene.graph.nodes_geometry:
+    """The triangle meshes of a scene with their node transforms applied, in the order of the file."""
+    order = {name: index for index, name in enumerate(scene.geometry)}
+    nodes = [(order[scene.graph[node][1]], node) for node in scene.graph.nodes_geometry]
+    for _, node in sorted(nodes):
         matrix, name = scene.graph[node]
-        geometry = scene.geometry[name]
-        if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces):
-            part: Any = geometry.copy()
-            if part.visual.kind == "face":  # colours by face become colours by vertex
-                part.unmerge_vertices()
-            part.apply_transform(matrix)
-            yield _part(part)
+        geometry: Any = scene.geometry[name]
+        if not isinstance(geometry, trimesh.Trimesh) or len(geometry.faces) == 0:
+            continue
+        part: Any = geometry
+        if part.visual.kind == "face":  # colours by face become colours by vertex
+            part = geometry.copy()
+            part.unmerge_vertices()
+        yield _part(part, np.asarray(matrix, dtype=np.float64))
 
 
-def _part(geometry: trimesh.Trimesh) -> _Part:
-    visual: Any = geometry.visual
+def _part(geometry: Any, matrix: NDArray[np.float64]) -> _Part:
+    with np.errstate(invalid="ignore"):  # vertices that are not finite are reported later
+        vertices = np.asarray(geometry.vertices, dtype=np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+    triangles = np.asarray(geometry.faces, dtype=np.int64)
+    if np.linalg.det(matrix[:3, :3]) < 0:  # a mirroring transform turns triangles inside out
+        triangles = triangles[:, ::-1]
+
+    visual = geometry.visual
     uvs, colors, texture, colored = None, None, _WHITE, False
     if visual.kind == "texture":
-        material = visual.material
         colors = visual.vertex_attributes.get("color")
-        image, factor = _material(material)
+        image, factor = _material(visual.material)
         if image is not None and visual.uv is not None:
             uvs = np.asarray(visual.uv, dtype=np.float64) * (1, -1) + (0, 1)
-            texture = _image_array(image)
+            texture = np.array(image.convert("RGB"), dtype=np.uint8)
         if factor is not None:
-            texture = _tinted(texture, factor)
+            texture = np.rint(texture * factor).astype(np.uint8)
         colored = uvs is not None or factor is not None or colors is not None
     elif visual.kind in ("vertex", "face"):
         colors, colored = visual.vertex_colors, True
     return _Part(
-        np.asarray(geometry.vertices, dtype=np.float64),
-        np.asarray(geometry.faces, dtype=np.int64),
-        uvs,
-        texture,
-        None if colors is None else _as_uint8(np.asarray(colors)[:, :3]),
-        colored,
+        vertices, triangles, uvs, texture, None if colors is None else _as_uint8(np.asarray(colors)[:, :3]), colored
     )
 
 
@@ -184,13 +192,16 @@ def _material(material: Any) -> tuple[Image.Image | None, NDArray[np.float64] | 
     diffuse = getattr(material, "diffuse", None)
     # trimesh's default is a grey that no file asked for; with an image, viewers of OBJ files disagree on Kd: ignore it.
     default = trimesh.visual.material.SimpleMaterial().diffuse
+    if (
+        isinstance(image, Image.Image)
+        and image.size == (2, 2)
+        and image.mode == "RGBA"
+        and not hasattr(image, "filename")
+    ):
+        image = None  # trimesh's placeholder for a PLY file with texture coordinates and no texture
     if image is not None or diffuse is None or np.array_equal(diffuse, default):
         return image, None
     return None, np.asarray(diffuse, dtype=np.float64)[:3] / 255
-
-
-def _image_array(image: Image.Image) -> NDArray[np.uint8]:
-    return np.array(image.convert("RGB"), dtype=np.uint8)
 
 
 def _as_uint8(colors: NDArray[Any]) -> NDArray[np.uint8]:
@@ -198,10 +209,6 @@ def _as_uint8(colors: NDArray[Any]) -> NDArray[np.uint8]:
         return colors
     scale = 255.0 / np.iinfo(colors.dtype).max if np.issubdtype(colors.dtype, np.integer) else 255.0
     return np.clip(np.rint(colors * scale), 0, 255).astype(np.uint8)
-
-
-def _tinted(texture: NDArray[np.uint8], color: NDArray[np.float64]) -> NDArray[np.uint8]:
-    return np.rint(texture * color).astype(np.uint8)
 
 
 def _merge(parts: list[_Part], rotation: NDArray[np.float64]) -> TexturedMesh:
@@ -224,8 +231,10 @@ def _merge(parts: list[_Part], rotation: NDArray[np.float64]) -> TexturedMesh:
     if any(part.colors is not None for part in parts):
         white = [np.full((len(p.vertices), 3), 255, np.uint8) if p.colors is None else p.colors for p in parts]
         colors = np.concatenate(white)
+    with np.errstate(invalid="ignore"):
+        vertices = (np.concatenate([part.vertices for part in parts]) @ rotation.T).astype(np.float32)
     return TexturedMesh(
-        (np.concatenate([part.vertices for part in parts]) @ rotation.T).astype(np.float32),
+        vertices,
         np.concatenate(triangles).astype(np.int32),
         np.concatenate(corner_uvs).astype(np.float32),
         np.concatenate(triangle_texture),

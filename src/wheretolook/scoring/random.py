@@ -33,7 +33,7 @@ class RandomScorer(Scorer):
         """(B,) in [0, 1)."""
         numbers = np.round(np.asarray(cam_from_world, dtype=np.float64) * 10**POSE_DECIMALS).astype(np.int64)
         state = np.full(len(numbers), self.seed, dtype=np.uint64)
-        for column in numbers.reshape(len(numbers), -1).T:
+        for column in numbers.reshape(len(numbers), 12).T:
             state = _splitmix64(state ^ column.astype(np.uint64))
         return (state >> np.uint64(11)).astype(np.float64) * 2.0**-53
 

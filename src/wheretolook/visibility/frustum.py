@@ -9,7 +9,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from wheretolook.geometry import Float, PinholeCamera
-from wheretolook.rendering.warp_setup import start_warp
+from wheretolook.warp_setup import start_warp
 
 MIN_DEPTH_M = 1e-3
 """Landmarks nearer to the image plane than this, or behind it, are not seen."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from wheretolook.scenes.procedural.materials import Colour, Material, mix, mix_images, vary
+from wheretolook.scenes.procedural.materials import Colour, Material, mix, vary
 from wheretolook.scenes.procedural.noise import SIZE, Canvas, Image
 
 PALETTES: tuple[tuple[Colour, ...], ...] = (
@@ -23,8 +23,9 @@ def palette(rng: np.random.Generator) -> list[Colour]:
     return [vary(rng, c, 0.03) for c in colours]
 
 
-def _ellipses(canvas: Canvas, image: Image, rng: np.random.Generator, colours: list[Colour], count: int,
-              size: tuple[float, float]) -> Image:  # fmt: skip
+def _ellipses(
+    canvas: Canvas, image: Image, rng: np.random.Generator, colours: list[Colour], count: int, size: tuple[float, float]
+) -> Image:
     x, y = canvas.unit_x, canvas.unit_y
     for _ in range(count):
         cx, cy = rng.random(2)
@@ -34,7 +35,7 @@ def _ellipses(canvas: Canvas, image: Image, rng: np.random.Generator, colours: l
         distance = np.abs(u) + np.abs(v) if rng.random() < 0.3 else np.hypot(u, v)
         inside = np.clip((1 - distance) * min(a, b) * canvas.width, 0, 1)
         colour = np.asarray(colours[int(rng.integers(len(colours)))], np.float32)
-        image = mix_images(image, colour, rng.uniform(0.6, 1.0) * inside)
+        image = mix(image, colour, rng.uniform(0.6, 1.0) * inside)
     return image
 
 
@@ -42,13 +43,14 @@ def _rectangles(image: Image, rng: np.random.Generator, colours: list[Colour], c
     height, width = image.shape[:2]
     for _ in range(count):
         x0, y0 = int(rng.uniform(-0.1, 0.9) * width), int(rng.uniform(-0.1, 0.9) * height)
-        x1, y1 = x0 + 2 + int(rng.uniform(0.05, 0.5) * width), y0 + 2 + int(rng.uniform(0.05, 0.5) * height)
+        x1, y1 = x0 + 2 + int(rng.uniform(0.04, 0.4) * width), y0 + 2 + int(rng.uniform(0.04, 0.4) * height)
         image[max(y0, 0) : y1, max(x0, 0) : x1] = colours[int(rng.integers(len(colours)))]
     return image
 
 
-def _text(image: Image, rng: np.random.Generator, ink: ArrayLike, box: tuple[float, float, float, float],
-          line_px: int) -> Image:  # fmt: skip
+def _text(
+    image: Image, rng: np.random.Generator, ink: ArrayLike, box: tuple[float, float, float, float], line_px: int
+) -> Image:
     """Lines of letter-like strokes inside a box (left, top, right, bottom as shares of the image)."""
     height, width = image.shape[:2]
     left, top, right, bottom = int(box[0] * width), int(box[1] * height), int(box[2] * width), int(box[3] * height)
@@ -70,7 +72,7 @@ def _landscape(canvas: Canvas, rng: np.random.Generator, colours: list[Colour]) 
     image = mix(sky, low, np.broadcast_to(canvas.unit_y**0.8, (canvas.height, canvas.width)))
     shift = (int(rng.integers(SIZE)), int(rng.integers(SIZE)))
     cloud = np.clip(0.3 * canvas.crop(canvas.noise.cloud, shift, step=3), 0, 0.6)
-    image = mix_images(image, np.float32(0.96), cloud)
+    image = mix(image, 0.96, cloud)
     if rng.random() < 0.6:
         image = _ellipses(canvas, image, rng, [(0.98, 0.9, 0.7)], 1, (0.05, 0.1))
     tint = np.asarray(vary(rng, (0.25, 0.38, 0.28), 0.08), np.float32)
@@ -82,8 +84,8 @@ def _landscape(canvas: Canvas, rng: np.random.Generator, colours: list[Colour]) 
         fade = (i + 1) / layers
         colour = np.asarray(low) * (1 - fade) + tint * fade
         detail = 1 + 0.14 * fade * canvas.crop(canvas.noise.fine, (shift[0] + 50 * i, shift[1]))
-        image = mix_images(image, (colour * detail[..., None]).astype(np.float32), inside)
-    return _ellipses(canvas, image, rng, colours[1:], int(rng.integers(3, 12)), (0.01, 0.035))
+        image = mix(image, (colour * detail[..., None]).astype(np.float32), inside)
+    return _ellipses(canvas, image, rng, colours[1:], int(rng.integers(8, 30)), (0.008, 0.03))
 
 
 def _abstract(canvas: Canvas, rng: np.random.Generator, colours: list[Colour]) -> Image:
@@ -92,18 +94,18 @@ def _abstract(canvas: Canvas, rng: np.random.Generator, colours: list[Colour]) -
     steps = np.digitize(value, np.sort(rng.uniform(-1.2, 1.2, 4)))
     image = np.asarray(colours, np.float32)[steps]
     image = image * (1 + 0.05 * canvas.crop(canvas.noise.fine, shift))[..., None]
-    return _ellipses(canvas, image, rng, colours, int(rng.integers(2, 14)), (0.02, 0.16))
+    return _ellipses(canvas, image, rng, colours, int(rng.integers(8, 30)), (0.012, 0.1))
 
 
 def _geometric(canvas: Canvas, rng: np.random.Generator, colours: list[Colour]) -> Image:
     image = np.broadcast_to(np.asarray(colours[0], np.float32), (canvas.height, canvas.width, 3)).copy()
-    image = _rectangles(image, rng, colours, int(rng.integers(8, 28)))
-    return _ellipses(canvas, image, rng, colours, int(rng.integers(0, 8)), (0.03, 0.2))
+    image = _rectangles(image, rng, colours, int(rng.integers(15, 60)))
+    return _ellipses(canvas, image, rng, colours, int(rng.integers(4, 24)), (0.015, 0.12))
 
 
 def _poster(canvas: Canvas, rng: np.random.Generator, colours: list[Colour]) -> Image:
     image = np.broadcast_to(np.asarray(colours[0], np.float32), (canvas.height, canvas.width, 3)).copy()
-    image = _ellipses(canvas, image, rng, colours[1:], int(rng.integers(2, 9)), (0.06, 0.3))
+    image = _ellipses(canvas, image, rng, colours[1:], int(rng.integers(6, 20)), (0.02, 0.22))
     bar = int(canvas.height * rng.uniform(0.62, 0.8))
     image[bar:] = colours[int(rng.integers(5))]
     ink = (0.06, 0.06, 0.08) if image[bar:].mean() > 0.45 else (0.95, 0.94, 0.9)
@@ -184,8 +186,13 @@ def book_spine(rng: np.random.Generator, colour: ArrayLike) -> Material:
             size = max(2, int(canvas.width * local.uniform(0.3, 0.6)))
             top = (canvas.width - size) // 2
             start = local.uniform(0.06, 0.25)
-            _text(title, local, ink, (start, top / canvas.width, local.uniform(0.6, 0.95), (top + size + 1) / canvas.width),
-                  size)  # fmt: skip
+            _text(
+                title,
+                local,
+                ink,
+                (start, top / canvas.width, local.uniform(0.6, 0.95), (top + size + 1) / canvas.width),
+                size,
+            )
         return image
 
     return Material(paint)
@@ -219,16 +226,19 @@ def view(rng: np.random.Generator) -> Material:
         shape = (canvas.height, canvas.width)
         image = mix((0.78, 0.88, 0.97), (0.96, 0.97, 0.97), np.broadcast_to(canvas.unit_y / horizon, shape).clip(0, 1))
         cloud = np.clip(0.25 * canvas.crop(canvas.noise.cloud, shift), 0, 0.5)
-        image = mix_images(image, np.float32(0.98), cloud)
+        image = mix(image, 0.98, cloud)
         for i, colour in enumerate(((0.70, 0.78, 0.82), (0.58, 0.68, 0.62), (0.47, 0.58, 0.42))):
             ridge = canvas.noise.cloud[int(local.integers(SIZE)), (np.arange(canvas.width) + shift[1]) % SIZE]
             level = horizon + 0.11 * i + 0.03 * ridge
             inside = np.clip((canvas.unit_y - level) * canvas.height / 2 + 0.5, 0, 1)
             detail = 1 + 0.025 * (i + 1) * canvas.crop(canvas.noise.fine, (shift[0] + 90 * i, shift[1]))
-            image = mix_images(image, (np.asarray(colour) * detail[..., None]).astype(np.float32), inside)
+            image = mix(image, (np.asarray(colour) * detail[..., None]).astype(np.float32), inside)
         if houses:
             for _ in range(int(local.integers(2, 6))):
-                width, top = int(local.uniform(0.06, 0.2) * shape[1]) + 2, int((horizon + local.uniform(-0.1, 0.1)) * shape[0])
+                width, top = (
+                    int(local.uniform(0.06, 0.2) * shape[1]) + 2,
+                    int((horizon + local.uniform(-0.1, 0.1)) * shape[0]),
+                )
                 left, bottom = int(local.uniform(0, 1) * shape[1]), top + int(0.3 * shape[0])
                 image[top:bottom, left : left + width] = vary(local, (0.80, 0.76, 0.70), 0.05)
                 image[max(top - 4, 0) : top, left : left + width] = vary(local, (0.62, 0.42, 0.36), 0.04)

@@ -112,7 +112,9 @@ def plan_atlas(patches: Sequence[Patch], texels_per_m: float, size: int) -> Atla
             rows = min(size, -(-packed[1] // 256) * 256)
             return AtlasPlan(charts, packed[0], index, (size, rows))
         density *= 0.95
-    raise SceneError("texture is too small for the apartment", value=size, fix="Raise texture_size or lower texels_per_m")
+    raise SceneError(
+        "texture is too small for the apartment", value=size, fix="Raise texture_size or lower texels_per_m"
+    )
 
 
 def paint_charts(plan: AtlasPlan, noise: NoiseBank) -> list[Image]:
@@ -130,7 +132,9 @@ def paint_charts(plan: AtlasPlan, noise: NoiseBank) -> list[Image]:
     return painted
 
 
-def compose(plan: AtlasPlan, painted: Sequence[Image], light: Sequence[NDArray[np.floating[Any]] | None]) -> NDArray[np.uint8]:
+def compose(
+    plan: AtlasPlan, painted: Sequence[Image], light: Sequence[NDArray[np.floating[Any]] | None]
+) -> NDArray[np.uint8]:
     """Albedo times light, padded, in one (H, W, 3) sRGB texture.
 
     Args:
@@ -142,9 +146,13 @@ def compose(plan: AtlasPlan, painted: Sequence[Image], light: Sequence[NDArray[n
     atlas = np.zeros((height, width, 3), np.uint8)
     for chart, (x, y), albedo, factor in zip(plan.charts, plan.corners, painted, light, strict=True):
         if factor is not None:
-            fine = cv2.resize(np.asarray(factor, np.float32), (chart.width, chart.height), interpolation=cv2.INTER_LINEAR)
+            fine = cv2.resize(
+                np.asarray(factor, np.float32), (chart.width, chart.height), interpolation=cv2.INTER_LINEAR
+            )
             albedo = albedo * fine
         texels = np.clip(albedo * 255 + 0.5, 0, 255).astype(np.uint8)
         p = chart.pad
-        atlas[y - p : y + chart.height + p, x - p : x + chart.width + p] = cv2.copyMakeBorder(texels, p, p, p, p, cv2.BORDER_REPLICATE)
+        atlas[y - p : y + chart.height + p, x - p : x + chart.width + p] = cv2.copyMakeBorder(
+            texels, p, p, p, p, cv2.BORDER_REPLICATE
+        )
     return atlas

@@ -14,7 +14,8 @@ from wheretolook.scenes.procedural.style import Style
 
 def books_in_row(style: Style, length: float, height: float, depth: float) -> list[Patch]:
     """Books side by side along x from 0 to `length`, backs to y = 0, spines to the front."""
-    rng, patches, x = style.rng, [], 0.0
+    rng, x = style.rng, 0.0
+    patches: list[Patch] = []
     while True:
         width, tall = float(rng.uniform(0.014, 0.05)), float(rng.uniform(0.62, 0.92) * height)
         deep = float(min(rng.uniform(0.13, 0.2), depth - 0.01))
@@ -24,7 +25,11 @@ def books_in_row(style: Style, length: float, height: float, depth: float) -> li
             x += width  # a gap
             continue
         colour = materials.vary(rng, style.pick(style.cover_colours), 0.06)
-        spine = artwork.book_spine(rng, colour) if style.chance(0.35 + 0.6 * style.richness) else materials.plain(rng, colour)
+        spine = (
+            artwork.book_spine(rng, colour)
+            if style.chance(0.35 + 0.6 * style.richness)
+            else materials.plain(rng, colour)
+        )
         cover = style.pick(style.covers)
         book = box((x, 0, 0), (x + width - 0.001, deep, tall), cover, faces={"front": spine, "top": style.paper})
         book[0] = replace(book[0], density=1.9)
@@ -34,10 +39,13 @@ def books_in_row(style: Style, length: float, height: float, depth: float) -> li
 
 def book_stack(style: Style, count: int) -> list[Patch]:
     """Books or magazines lying on each other, covers up."""
-    rng, patches, z = style.rng, [], 0.0
+    rng, z = style.rng, 0.0
+    patches: list[Patch] = []
     for _ in range(count):
         w, d, h = rng.uniform(0.19, 0.3), rng.uniform(0.14, 0.21), rng.uniform(0.01, 0.035)
-        book = box((-w / 2, -d / 2, 0), (w / 2, d / 2, h), style.paper, faces={"top": artwork.package(rng)}, density=1.6)
+        book = box(
+            (-w / 2, -d / 2, 0), (w / 2, d / 2, h), style.paper, faces={"top": artwork.package(rng)}, density=1.6
+        )
         patches += move(book, angle_rad=float(rng.normal(0, 0.25)), shift=(0, 0, z))
         z += h + 0.0005
     return patches
@@ -47,12 +55,18 @@ def bottle(style: Style, height: float) -> list[Patch]:
     """Bottle or jar with a label."""
     rng = style.rng
     r, neck = height * rng.uniform(0.13, 0.2), rng.uniform(0.3, 0.8)
-    colour = materials.vary(rng, style.pick([(0.22, 0.36, 0.24), (0.75, 0.75, 0.72), (0.45, 0.28, 0.15), (0.85, 0.82, 0.7)]), 0.05)
+    colour = materials.vary(
+        rng, style.pick([(0.22, 0.36, 0.24), (0.75, 0.75, 0.72), (0.45, 0.28, 0.15), (0.85, 0.82, 0.7)]), 0.05
+    )
     body = materials.plain(rng, colour, shared=True)
     h = height
     out = lathe([(0, h), (r * neck, h), (r * neck, 0.8 * h), (r, 0.62 * h), (r, 0.02 * h), (0, 0)], body, sides=14)
-    label = lathe([(r, 0.5 * h), (r * 1.03, 0.5 * h), (r * 1.03, 0.18 * h), (r, 0.18 * h)], artwork.package(rng), sides=14,
-                  density=2.0)  # fmt: skip
+    label = lathe(
+        [(r * 0.98, 0.5 * h), (r * 1.03, 0.5 * h), (r * 1.03, 0.18 * h), (r * 0.98, 0.18 * h), (r * 0.98, 0.5 * h)],
+        artwork.package(rng),
+        sides=14,
+        density=2.0,
+    )
     return out + label
 
 
@@ -60,27 +74,48 @@ def package(style: Style, low: float = 0.1, high: float = 0.26) -> list[Patch]:
     """Cardboard box with a printed front."""
     rng = style.rng
     w, d, h = rng.uniform(0.07, 0.18), rng.uniform(0.04, 0.09), rng.uniform(low, high)
-    return box((-w / 2, -d / 2, 0), (w / 2, d / 2, h), style.pick(style.covers), faces={"front": artwork.package(rng)}, density=1.8)
+    return box(
+        (-w / 2, -d / 2, 0),
+        (w / 2, d / 2, h),
+        style.pick(style.covers),
+        faces={"front": artwork.package(rng)},
+        density=1.8,
+    )
 
 
 def bowl(style: Style, radius: float, fruit: bool) -> list[Patch]:
     """Open bowl, with oranges or apples if asked for."""
     rng, h = style.rng, radius * 0.5
     material = materials.plain(rng, materials.vary(rng, style.pick(style.cover_colours), 0.05), shared=True)
-    profile = [(0, 0.02), (0.6 * radius, 0.1 * h), (radius * 0.96, h), (radius, h), (0.7 * radius, 0.06 * h), (0.4 * radius, 0), (0, 0)]
+    profile = [
+        (0, 0.02),
+        (0.6 * radius, 0.1 * h),
+        (radius * 0.96, h),
+        (radius, h),
+        (0.7 * radius, 0.06 * h),
+        (0.4 * radius, 0),
+        (0, 0),
+    ]
     patches = lathe(profile, material, sides=24)
     if fruit:
         skin = materials.plain(rng, style.pick([(0.86, 0.5, 0.14), (0.72, 0.2, 0.14), (0.6, 0.7, 0.25)]), shared=True)
         for k in range(6):
             a, r = 2 * np.pi * k / 5, 0.45 * radius if k < 5 else 0.0
-            patches += sphere((r * np.cos(a), r * np.sin(a), 0.6 * h + (0.25 * h if k == 5 else 0)), 0.24 * radius, skin)
+            patches += sphere(
+                (r * np.cos(a), r * np.sin(a), 0.6 * h + (0.25 * h if k == 5 else 0)), 0.24 * radius, skin
+            )
     return patches
 
 
 def sphere(centre: tuple[float, float, float], radius: float, material: Material, sides: int = 14) -> list[Patch]:
     """Closed sphere."""
     angle = np.linspace(0, np.pi, sides // 2 + 1)
-    return lathe([(radius * np.sin(a) if 0 < a < np.pi else 0.0, radius * np.cos(a)) for a in angle], material, sides=sides, centre=centre)
+    return lathe(
+        [(radius * np.sin(a) if 0 < a < np.pi else 0.0, radius * np.cos(a)) for a in angle],
+        material,
+        sides=sides,
+        centre=centre,
+    )
 
 
 def vase(style: Style, height: float) -> list[Patch]:
@@ -89,37 +124,72 @@ def vase(style: Style, height: float) -> list[Patch]:
     z = np.linspace(1, 0, 12)
     r = height * (0.16 + 0.13 * np.sin(np.pi * (1 - z) ** rng.uniform(0.7, 1.6)))
     kind = style.pick(["plain", "stripes", "zigzag"])
-    body = materials.fabric(rng, materials.vary(rng, style.pick(style.cover_colours)), second=style.pick(style.cover_colours), pattern=kind,
-                            weave=0.01, period_m=0.06)  # fmt: skip
-    return lathe([(0, 0.97 * height), *[(float(a), float(b) * height) for a, b in zip(r, z, strict=True)], (0, 0)], body, sides=20, density=1.4)
+    body = materials.fabric(
+        rng,
+        materials.vary(rng, style.pick(style.cover_colours)),
+        second=style.pick(style.cover_colours),
+        pattern=kind,
+        weave=0.01,
+        period_m=0.06,
+    )
+    return lathe(
+        [(0, 0.97 * height), *[(float(a), float(b) * height) for a, b in zip(r, z, strict=True)], (0, 0)],
+        body,
+        sides=20,
+        density=1.4,
+    )
 
 
-def plant(style: Style, height: float, leaves: int) -> list[Patch]:
-    """Potted plant: stems with curved, two-sided leaves."""
+def plant(style: Style, height: float, leaves: int, reach_m: float) -> list[Patch]:
+    """Potted plant: stems with curved, two-sided leaves, none of which reaches further than `reach_m` to the side."""
     rng, pot_h = style.rng, 0.3 * height
     pot_r = 0.55 * pot_h
-    pot = materials.plain(rng, materials.vary(rng, style.pick([(0.72, 0.42, 0.28), (0.85, 0.84, 0.8), (0.3, 0.32, 0.34)]), 0.03))
+    pot = materials.plain(
+        rng, materials.vary(rng, style.pick([(0.72, 0.42, 0.28), (0.85, 0.84, 0.8), (0.3, 0.32, 0.34)]), 0.03)
+    )
     earth = materials.plain(rng, (0.22, 0.16, 0.11), speckle=0.15)
-    patches = lathe([(pot_r * 0.9, 0.92 * pot_h), (pot_r * 0.92, pot_h), (pot_r, pot_h), (0.75 * pot_r, 0), (0, 0)], pot, sides=20)
+    patches = lathe(
+        [
+            (0, 0.88 * pot_h),
+            (pot_r * 0.9, 0.88 * pot_h),
+            (pot_r * 0.92, pot_h),
+            (pot_r, pot_h),
+            (0.75 * pot_r, 0),
+            (0, 0),
+        ],
+        pot,
+        sides=20,
+    )
     patches += lathe([(0, 0.92 * pot_h), (pot_r * 0.91, 0.92 * pot_h), (0, 0.9 * pot_h)], earth, sides=20)
     stem = materials.plain(rng, (0.3, 0.36, 0.18), shared=True)
     wide = style.chance(0.5)
     for _ in range(leaves):
         turn, lean = rng.uniform(0, 2 * np.pi), rng.uniform(0.1, 0.75)
-        length = height * rng.uniform(0.2, 0.34)
+        length = height * rng.uniform(0.18, 0.3)
         width = length * (0.55 if wide else 0.22) * rng.uniform(0.8, 1.1)
-        reach = (height - pot_h) * rng.uniform(0.35, 0.8)
+        rise = (height - pot_h) * rng.uniform(0.35, 0.8)
         u = np.linspace(0, 1, 6)
-        path = np.stack([0.35 * reach * lean * u**1.6, 0 * u, 0.9 * pot_h + reach * u * (1 - 0.25 * lean * u)], -1)
+        path = np.stack([0.35 * rise * lean * u**1.6, 0 * u, 0.9 * pot_h + rise * u * (1 - 0.25 * lean * u)], -1)
+        shrink = min(1.0, (reach_m - 0.01) / (path[-1, 0] + length * (np.sin(0.9 * lean) + 0.25 * lean)))
+        path[:, 0] *= shrink
         grow = move(tube(path, np.linspace(0.006, 0.003, 6) * (0.4 + height), stem, sides=5), angle_rad=turn)
         v = np.linspace(1, 0, 9)
         half = 0.5 * width * np.sin(np.pi * v**0.8) ** 0.8 + 0.001
         along = lean * 0.9
-        x = path[-1, 0] + length * (v * np.sin(along) + 0.25 * v**2 * lean)
+        x = path[-1, 0] + shrink * length * (v * np.sin(along) + 0.25 * v**2 * lean)
         z = path[-1, 2] + length * (v * np.cos(along) - 0.45 * v**2 * lean)
-        across = np.linspace(-1, 1, 5)
-        grid = np.stack([np.repeat(x[:, None], 5, 1), half[:, None] * across[None], z[:, None] + 0.35 * half[:, None] * across[None] ** 2], -1)
-        blade = slab_between(grid, grid - np.array([0.002, 0, 0.002]), style.pick(style.leaves), (width, length))
+        across = np.linspace(1, -1, 5)
+        grid = np.stack(
+            [
+                np.repeat(x[:, None], 5, 1),
+                half[:, None] * across[None],
+                z[:, None] + 0.35 * half[:, None] * across[None] ** 2,
+            ],
+            -1,
+        )
+        under = along + 0.45 * lean
+        thickness = 0.003 * np.array([-np.cos(under), 0, np.sin(under)])
+        blade = slab_between(grid, grid - thickness, style.pick(style.leaves), (width, length))
         patches += grow + move(blade, angle_rad=turn)
     return patches
 
@@ -133,7 +203,15 @@ def picture_frame(style: Style, width: float, height: float, material: Material 
     patches += box((-w, 0, border - h), (border - w, depth, h - border), frame)
     patches += box((w - border, 0, border - h), (w, depth, h - border), frame)
     art = material if material is not None else style.print()
-    patches.append(plane((w - border, 0.6 * depth, h - border), (2 * border - width, 0, 0), (0, 0, 2 * border - height), art, density=1.7))
+    patches.append(
+        plane(
+            (w - border, 0.6 * depth, h - border),
+            (2 * border - width, 0, 0),
+            (0, 0, 2 * border - height),
+            art,
+            density=1.7,
+        )
+    )
     return patches
 
 
@@ -141,8 +219,17 @@ def shade(style: Style, radius: float, height: float, z: float, lit: bool) -> li
     """Cloth lamp shade, open below and above, glowing if lit."""
     colour = (1.0, 0.93, 0.80) if lit else (0.80, 0.77, 0.70)
     material = materials.glow(colour) if lit else materials.plain(style.rng, colour)
-    return lathe([(0.68 * radius, z + height), (0.7 * radius, z + height), (radius, z), (0.98 * radius, z), (0.68 * radius, z + height)],
-                 material, sides=24)  # fmt: skip
+    return lathe(
+        [
+            (0.68 * radius, z + height),
+            (0.7 * radius, z + height),
+            (radius, z),
+            (0.98 * radius, z),
+            (0.68 * radius, z + height),
+        ],
+        material,
+        sides=24,
+    )
 
 
 def table_lamp(style: Style, lit: bool) -> list[Patch]:
@@ -154,13 +241,19 @@ def table_lamp(style: Style, lit: bool) -> list[Patch]:
 
 def floor_lamp(style: Style, lit: bool) -> list[Patch]:
     """Standard lamp; its bulb is at z = 1.5."""
-    return cylinder(0.14, 0, 0.025, style.metal, sides=20) + cylinder(0.012, 0.025, 1.45, style.metal, sides=8) + shade(style, 0.22, 0.28, 1.38, lit)
+    return (
+        cylinder(0.14, 0, 0.025, style.metal, sides=20)
+        + cylinder(0.012, 0.025, 1.45, style.metal, sides=8)
+        + shade(style, 0.22, 0.28, 1.38, lit)
+    )
 
 
 def pillow(style: Style, material: Material, size: float = 0.44, thick: float = 0.14) -> list[Patch]:
     """Square pillow standing on its edge, front to +y."""
     half = size / 2
-    return cushion((-half, 0, 0), (half, thick * 0.45, size), material, radius_m=0.03, puff=(0, 0.3 * thick, 0), span=6, hidden=())
+    return cushion(
+        (-half, 0, 0), (half, thick * 0.45, size), material, radius_m=0.03, puff=(0, 0.3 * thick, 0), span=6, hidden=()
+    )
 
 
 def coat(style: Style) -> list[Patch]:

@@ -11,8 +11,15 @@ from wheretolook.scenes.procedural.patches import Patch, box, cushion, cylinder,
 from wheretolook.scenes.procedural.style import Style
 
 
-def trough(low: tuple[float, float, float], high: tuple[float, float, float], rim: float, floor: float, material: Material,
-           *, hidden: tuple[str, ...] = WALL_SIDE) -> list[Patch]:  # fmt: skip
+def trough(
+    low: tuple[float, float, float],
+    high: tuple[float, float, float],
+    rim: float,
+    floor: float,
+    material: Material,
+    *,
+    hidden: tuple[str, ...] = WALL_SIDE,
+) -> list[Patch]:
     """Basin: four walls of thickness `rim` around a bottom of thickness `floor`."""
     (x0, y0, z0), (x1, y1, z1) = low, high
     patches = box((x0, y0, z0), (x1, y0 + rim, z1), material, hidden=hidden)
@@ -34,18 +41,36 @@ def kitchen_run(style: Style, width: float, height: float, window: bool) -> list
     """Base units with worktop, sink, hob and oven; wall units above unless a window is there; things on the worktop."""
     rng, depth, top, w = style.rng, 0.6, 0.9, width / 2
     columns = max(2, round(width / 0.6))
-    stone = materials.marble(rng, materials.vary(rng, style.pick([(0.32, 0.32, 0.33), (0.78, 0.75, 0.70), (0.60, 0.46, 0.34)]), 0.03), (0.9, 0.88, 0.84),
-                             0.25 + 0.5 * style.richness)  # fmt: skip
+    stone = materials.marble(
+        rng,
+        materials.vary(rng, style.pick([(0.32, 0.32, 0.33), (0.78, 0.75, 0.70), (0.60, 0.46, 0.34)]), 0.03),
+        (0.9, 0.88, 0.84),
+        0.25 + 0.5 * style.richness,
+    )
     hob, sink = int(rng.integers(columns)), 0
     sink = (hob + max(1, columns // 2)) % columns
     cell = width / columns
     oven_face = artwork.screen(rng)
-    patches = cabinet(style, width, depth, top - 0.04, columns=columns, rows=1, carcass=style.front, front=style.front, plinth=0.1,
-                      faces={(hob, 0): oven_face})  # fmt: skip
+    patches = cabinet(
+        style,
+        width,
+        depth,
+        top - 0.04,
+        columns=columns,
+        rows=1,
+        carcass=style.front,
+        front=style.front,
+        plinth=0.1,
+        faces={(hob, 0): oven_face},
+    )
     sx = -w + (sink + 0.5) * cell
     basin_w, y0, y1 = min(0.5, cell - 0.06), 0.12, 0.5
-    for low, high in (((-w, 0), (sx - basin_w / 2, depth + 0.02)), ((sx + basin_w / 2, 0), (w, depth + 0.02)),
-                      ((sx - basin_w / 2, 0), (sx + basin_w / 2, y0)), ((sx - basin_w / 2, y1), (sx + basin_w / 2, depth + 0.02))):  # fmt: skip
+    for low, high in (
+        ((-w, 0), (sx - basin_w / 2, depth + 0.02)),
+        ((sx + basin_w / 2, 0), (w, depth + 0.02)),
+        ((sx - basin_w / 2, 0), (sx + basin_w / 2, y0)),
+        ((sx - basin_w / 2, y1), (sx + basin_w / 2, depth + 0.02)),
+    ):
         patches += box((*low, top - 0.04), (*high, top), stone, hidden=WALL_SIDE, offset_m=(low[0], 0))
     patches += box((sx - basin_w / 2, y0, top - 0.04), (sx + basin_w / 2, y1, top - 0.03), style.metal)
     patches += move(tap(style, 0.3), shift=(sx, 0.06, top))
@@ -55,20 +80,36 @@ def kitchen_run(style: Style, width: float, height: float, window: bool) -> list
         patches += move(cylinder(r, 0.008, 0.011, style.metal, sides=20), shift=(hx + dx, dy, top))
     if style.chance(0.6):
         pot = materials.plain(rng, style.pick([(0.7, 0.7, 0.72), (0.6, 0.16, 0.14), (0.2, 0.28, 0.36)]), shared=True)
-        patches += move(lathe([(0, 0.135), (0.02, 0.135), (0.02, 0.12), (0.1, 0.11), (0.1, 0), (0, 0)], pot, sides=24), shift=(hx + 0.13, 0.42, top + 0.0115))
+        patches += move(
+            lathe([(0, 0.135), (0.02, 0.135), (0.02, 0.12), (0.1, 0.11), (0.1, 0), (0, 0)], pot, sides=24),
+            shift=(hx + 0.13, 0.42, top + 0.0115),
+        )
     if not window:
         z0 = 1.45
-        above = cabinet(style, width, 0.34, min(height - 0.15, 2.2) - z0, columns=columns, rows=1, carcass=style.front, front=style.front, plinth=0.0)
+        above = cabinet(
+            style,
+            width,
+            0.34,
+            min(height - 0.15, 2.2) - z0,
+            columns=columns,
+            rows=1,
+            carcass=style.front,
+            front=style.front,
+            plinth=0.0,
+        )
         patches += move(above, shift=(0, 0, z0))
     spots = [c for c in np.arange(-w + 0.12, w - 0.1, 0.2) if abs(c - sx) > basin_w / 2 + 0.1 and abs(c - hx) > 0.4]
     for x in spots:
         if not style.chance(0.25 + 0.6 * style.clutter):
             continue
-        kind = rng.integers(5)
+        kind = rng.integers(5 if abs(x) < w - 0.3 else 4)  # leaves must not reach past the end
         item = [
-            lambda: decor.bottle(style, float(rng.uniform(0.16, 0.3))), lambda: decor.package(style), lambda: decor.bowl(style, 0.09, False),
-            lambda: decor.vase(style, 0.2), lambda: decor.plant(style, 0.3, 14),
-        ][int(kind)]()  # fmt: skip
+            lambda: decor.bottle(style, float(rng.uniform(0.16, 0.3))),
+            lambda: decor.package(style),
+            lambda: decor.bowl(style, 0.09, False),
+            lambda: decor.vase(style, 0.2),
+            lambda: decor.plant(style, 0.3, 14, 0.2),
+        ][int(kind)]()
         patches += move(item, shift=(x + rng.uniform(-0.02, 0.02), rng.uniform(0.14, 0.3), top))
     return patches
 
@@ -83,7 +124,13 @@ def fridge(style: Style) -> list[Patch]:
     for _ in range(round(5 * style.clutter)):
         x, z = style.rng.uniform(-0.2, 0.12), style.rng.uniform(0.85, 1.65)
         size = style.rng.uniform(0.05, 0.12, 2)
-        patches += box((x, 0.64, z), (x + size[0], 0.642, z + size[1]), style.paper, faces={"front": artwork.package(style.rng)}, density=1.6)
+        patches += box(
+            (x, 0.64, z),
+            (x + size[0], 0.642, z + size[1]),
+            style.paper,
+            faces={"front": artwork.package(style.rng)},
+            density=1.6,
+        )
     return patches
 
 
@@ -101,7 +148,9 @@ def toilet(style: Style) -> list[Patch]:
     """Toilet with cistern."""
     white = style.ceramic
     patches = cushion((-0.19, 0.02, 0.38), (0.19, 0.2, 0.8), white, radius_m=0.025, hidden=("back",))
-    bowl = lathe([(0, 0.44), (0.19, 0.44), (0.2, 0.41), (0.19, 0.34), (0.12, 0.14), (0.13, 0.0), (0, 0.0)], white, sides=28)
+    bowl = lathe(
+        [(0, 0.44), (0.19, 0.44), (0.2, 0.41), (0.19, 0.34), (0.12, 0.14), (0.13, 0.0), (0, 0.0)], white, sides=28
+    )
     stretch = np.diag([1.0, 1.25, 1.0])
     patches += move(move(bowl, rotation=stretch), shift=(0, 0.42, 0))
     return patches + box((-0.11, 0.02, 0), (0.11, 0.3, 0.379), white, hidden=WALL_SIDE)
@@ -123,9 +172,18 @@ def basin(style: Style) -> list[Patch]:
 def washing_machine(style: Style) -> list[Patch]:
     """Washing machine with its door."""
     patches = box((-0.3, 0.02, 0), (0.3, 0.58, 0.85), style.white, hidden=WALL_SIDE)
-    ring = move(cylinder(0.19, 0, 0.03, style.metal, sides=32) + cylinder(0.14, 0.03, 0.04, style.black, sides=32),
-                rotation=[[1, 0, 0], [0, 0, 1], [0, -1, 0]], shift=(0, 0.58, 0.42))  # fmt: skip
-    panel = box((-0.29, 0.58, 0.73), (0.29, 0.585, 0.83), style.white, faces={"front": artwork.package(style.rng)}, hidden=("back",))
+    ring = move(
+        cylinder(0.19, 0, 0.03, style.metal, sides=32) + cylinder(0.14, 0.03, 0.04, style.black, sides=32),
+        rotation=[[1, 0, 0], [0, 0, 1], [0, -1, 0]],
+        shift=(0, 0.58, 0.42),
+    )
+    panel = box(
+        (-0.29, 0.58, 0.73),
+        (0.29, 0.585, 0.83),
+        style.white,
+        faces={"front": artwork.package(style.rng)},
+        hidden=("back",),
+    )
     return patches + ring + panel
 
 
@@ -148,7 +206,14 @@ def radiator(style: Style, width: float, height: float) -> list[Patch]:
     count = max(4, round(width / 0.06))
     patches: list[Patch] = []
     for x in (np.arange(count) - (count - 1) / 2) * 0.06:
-        patches += cushion((x - 0.022, 0.04, 0.12), (x + 0.022, 0.14, 0.12 + height), style.small_white, radius_m=0.02, rounding=2, span=1)
+        patches += cushion(
+            (x - 0.022, 0.04, 0.12),
+            (x + 0.022, 0.14, 0.12 + height),
+            style.small_white,
+            radius_m=0.02,
+            rounding=2,
+            span=1,
+        )
     half = count * 0.03
     for z in (0.18, 0.06 + height):
         patches += tube([(-half, 0.09, z), (half, 0.09, z)], 0.016, style.small_white, sides=8)
@@ -177,7 +242,9 @@ def front_door(style: Style, width: float, height: float) -> list[Patch]:
     for x0, x1 in ((-w - 0.08, -w), (w, w + 0.08)):
         patches += box((x0, 0, 0), (x1, 0.045, height + 0.08), style.trim, hidden=WALL_SIDE)
     patches += box((-w, 0, height), (w, 0.045, height + 0.08), style.trim, hidden=("back",))
-    return patches + tube([(w - 0.06, 0.04, 1.02), (w - 0.06, 0.08, 1.02), (w - 0.17, 0.08, 1.02)], 0.01, style.metal, sides=8)
+    return patches + tube(
+        [(w - 0.06, 0.04, 1.02), (w - 0.06, 0.08, 1.02), (w - 0.17, 0.08, 1.02)], 0.01, style.metal, sides=8
+    )
 
 
 def coat_rack(style: Style, count: int) -> list[Patch]:

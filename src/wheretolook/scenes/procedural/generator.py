@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from wheretolook.errors import ConfigError
 from wheretolook.scenes.mesh import TexturedMesh
 from wheretolook.scenes.procedural import atlas, lighting
-from wheretolook.scenes.procedural.furnishing import Furnisher
+from wheretolook.scenes.procedural.furnishing import furnish
+from wheretolook.scenes.procedural.layout import Lamp
 from wheretolook.scenes.procedural.noise import NoiseBank
-from wheretolook.scenes.procedural.patches import Patch
+from wheretolook.scenes.procedural.patches import Patch, Surface, join
 from wheretolook.scenes.procedural.plan import Plan, draw_plan
 from wheretolook.scenes.procedural.shell import build_shell
 from wheretolook.scenes.procedural.style import Style
@@ -59,17 +60,16 @@ class ApartmentConfig:
                 raise ConfigError(f"{name} must be positive", value=getattr(self, name))
 
 
-def furnish_apartment(config: ApartmentConfig, seed: int) -> tuple[Plan, list[Patch], Furnisher, np.random.Generator]:
-    """Plan and surfaces of an apartment before painting and light; the generator continues with the painting."""
+def furnish_apartment(config: ApartmentConfig, seed: int) -> tuple[Plan, list[Patch], list[Lamp], np.random.Generator]:
+    """Plan, surfaces and lamps of an apartment before paint and light; the random generator goes on with the paint."""
     rng = np.random.default_rng(seed)
     n_rooms = int(rng.integers(4, 7)) if config.n_rooms is None else config.n_rooms
     area = 13.0 * n_rooms * rng.uniform(0.9, 1.15) if config.area_m2 is None else config.area_m2
     plan = draw_plan(rng, n_rooms, float(area), config.dark_rooms)
     style = Style(rng, config.texture_richness, config.clutter)
-    shell, _ = build_shell(style, plan)
-    furnisher = Furnisher(style, plan)
-    furnisher.furnish()
-    return plan, shell + furnisher.patches, furnisher, rng
+    patches = build_shell(style, plan)
+    furniture, lamps = furnish(style, plan)
+    return plan, patches + furniture, lamps, rng
 
 
 def generate_apartment(config: ApartmentConfig, seed: int, device: str = "cpu") -> TexturedMesh:
@@ -80,76 +80,67 @@ def generate_apartment(config: ApartmentConfig, seed: int, device: str = "cpu") 
     Args:
         config: size, number of rooms and how hard it is to localize in.
         seed: seed of every random choice.
-        device: Warp device that casts the light rays.
+        device: Warp device that casts the light rays, "cpu" or a CUDA device.
 
     Returns:
         Mesh in metres, z up, floor at z = 0, centred on the origin.
 
     Raises:
+        ConfigError: there is no such device.
         SceneError: the texture is too small for the apartment.
     """
-    floor_plan, patches, furnisher, rng = furnish_apartment(config, seed)
-    vertices, triangles, triangle_patch, triangle_st = _assemble(patches)
-
+    floor_plan, patches, lamps, rng = furnish_apartment(config, seed)
+    surface = join(patches)
     plan = atlas.plan_atlas(patches, config.texels_per_m, config.texture_size)
     painted = atlas.paint_charts(plan, NoiseBank(rng))
-    chart_albedo = np.array([image[::2, ::2].mean((0, 1)) for image in painted])
-    albedo = np.clip(chart_albedo[plan.patch_chart], 0, 1) ** 2.2
+    mean_colour = np.array([image[::2, ::2].mean((0, 1)) for image in painted])
+    albedo = np.clip(mean_colour[plan.patch_chart], 0, 1) ** 2.2
 
     samples = lighting.place_samples(patches, config.light_spacing_m)
-    lamps = np.array([(*lamp.position, *lamp.colour) for lamp in furnisher.lamps], float).reshape(-1, 6)
-    lamp_room = np.array([lamp.room for lamp in furnisher.lamps], np.int32)
-    panes = [p for p in patches if p.material.emissive and p.material.casts_shadow]
-    covered = np.array([floor_plan.rooms[p.room].curtains_closed for p in panes])
-    direct, indirect, valid = lighting.bake(patches, samples, vertices, triangles, triangle_patch, triangle_st, albedo, panes, covered, lamps, lamp_room,
-                                 device=device, rays=config.light_rays)  # fmt: skip
-    luminance = (direct + indirect)[valid] @ np.array([0.2126, 0.7152, 0.0722])
-    reference = float(np.quantile(luminance, 0.7))
-
-    levels = np.geomspace(0.12, 1.12, atlas.LEVELS)
-    factors: list[Any] = [np.full((1, 1, 3), levels[0])] * len(plan.charts)
-    chart = plan.patch_chart.copy()
-    for k, grid in enumerate(lighting.light_grids(samples, direct, indirect, valid)):
-        if grid is None:
-            factors[chart[k]] = None
-        elif patches[k].material.shared:
-            tone = float(lighting.to_display(grid, reference).mean())
-            chart[k] += int(np.abs(levels - tone).argmin())
-        else:
-            factors[chart[k]] = lighting.to_display(grid, reference)
-    for k, patch in enumerate(patches):
-        if patch.material.shared:
-            first = plan.patch_chart[k]
-            for j in range(atlas.LEVELS):
-                factors[first + j] = np.full((1, 1, 3), levels[j])
-    texture = atlas.compose(plan, painted, factors)
-
+    windows = [
+        (p, floor_plan.rooms[p.room].curtains_closed)
+        for p in patches
+        if p.material.emissive and p.material.casts_shadow
+    ]
+    light = lighting.bake(patches, surface, samples, albedo, windows, lamps, device=device, rays=config.light_rays)
+    chart, factors = _light_charts(plan, patches, samples, light)
     return TexturedMesh(
-        vertices=vertices.astype(np.float32),
-        triangles=triangles.astype(np.int32),
-        corner_uvs=_uvs(plan, chart, triangle_patch, triangle_st),
-        triangle_texture=np.zeros(len(triangles), np.int32),
-        textures=(texture,),
+        vertices=surface.vertices.astype(np.float32),
+        triangles=surface.triangles.astype(np.int32),
+        corner_uvs=_uvs(plan, chart, surface),
+        triangle_texture=np.zeros(len(surface.triangles), np.int32),
+        textures=(atlas.compose(plan, painted, factors),),
     )
 
 
-def _assemble(patches: list[Patch]) -> tuple[NDArray[np.floating[Any]], NDArray[np.int64], NDArray[np.int64], NDArray[np.floating[Any]]]:
-    """Vertices (V, 3), triangles (T, 3), patch of each triangle (T,), corner coordinates (T, 3, 2)."""
-    vertices, triangles, owner, corners, total = [], [], [], [], 0
-    for k, patch in enumerate(patches):
-        t, st = patch.triangles()
-        vertices.append(patch.positions.reshape(-1, 3))
-        triangles.append(t + total)
-        owner.append(np.full(len(t), k))
-        corners.append(st)
-        total += len(vertices[-1])
-    return np.concatenate(vertices), np.concatenate(triangles), np.concatenate(owner), np.concatenate(corners)
+def _light_charts(
+    plan: atlas.AtlasPlan, patches: list[Patch], samples: lighting.Samples, light: lighting.Light
+) -> tuple[NDArray[np.int64], list[Any]]:
+    """The chart each patch uses, and the factor on each chart's albedo.
+
+    A patch of a shared material takes the chart whose brightness is nearest to its light.
+    """
+    reference = float(np.quantile(light.luminance, 0.7))
+    chart = plan.patch_chart.copy()
+    factors: list[Any] = [None] * len(plan.charts)
+    for k, (patch, grid) in enumerate(zip(patches, lighting.light_grids(samples, light), strict=True)):
+        if grid is None:
+            continue
+        factor = lighting.to_display(grid, reference)
+        if patch.material.shared:
+            first = chart[k]
+            factors[first : first + atlas.LEVELS] = [np.full((1, 1, 3), level) for level in BRIGHTNESS]
+            chart[k] = first + int(np.abs(BRIGHTNESS - factor.mean()).argmin())
+        else:
+            factors[chart[k]] = factor
+    return chart, factors
 
 
-def _uvs(plan: atlas.AtlasPlan, chart: NDArray[np.int64], triangle_patch: NDArray[np.int64], triangle_st: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
+BRIGHTNESS = np.geomspace(0.12, 1.06, atlas.LEVELS)
+"""Factors on the albedo of shared materials."""
+
+
+def _uvs(plan: atlas.AtlasPlan, chart: NDArray[np.int64], surface: Surface) -> NDArray[np.float32]:
     size = np.array([(c.width, c.height) for c in plan.charts], float)[chart]
-    corner = plan.corners[chart].astype(float)
-    texel = corner[triangle_patch][:, None] + triangle_st * size[triangle_patch][:, None]
+    texel = plan.corners[chart].astype(float)[surface.patch][:, None] + surface.st * size[surface.patch][:, None]
     return (texel / np.array(plan.size, float)).astype(np.float32)
-
-

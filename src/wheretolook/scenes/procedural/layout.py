@@ -18,6 +18,23 @@ DOOR_ZONE_M = 0.95
 Rectangle = tuple[float, float, float, float]
 
 
+WARM = (1.0, 0.80, 0.58)
+
+
+@dataclass(frozen=True)
+class Lamp:
+    """A small light: where it is (metres), the index of its room, its strength per colour."""
+
+    position: tuple[float, float, float]
+    room: int
+    colour: tuple[float, float, float]
+
+
+def warm_lamp(position: tuple[float, float, float], room: int, strength: float) -> Lamp:
+    """Lamp of the colour of a light bulb."""
+    return Lamp(position, room, (strength * WARM[0], strength * WARM[1], strength * WARM[2]))
+
+
 def overlap(a: Rectangle, b: Rectangle, gap: float = 0.0) -> bool:
     """Whether two rectangles (x0, y0, x1, y1) come closer than `gap`."""
     return a[0] < b[2] + gap and b[0] < a[2] + gap and a[1] < b[3] + gap and b[1] < a[3] + gap
@@ -43,6 +60,8 @@ class Layout:
         keep_free: floor that nothing may stand on (before doors, wardrobes, the sofa).
         on_wall: per wall what it is covered by, as (a0, a1, z0, z1).
         patches: all that was put into the room.
+        doors: for each door, a point 0.4 m before it.
+        lamps: the lamps that are lit.
     """
 
     room: Room
@@ -54,6 +73,7 @@ class Layout:
     )
     patches: list[Patch] = field(default_factory=list)
     doors: list[tuple[float, float]] = field(default_factory=list)
+    lamps: list[Lamp] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         for side in range(4):
@@ -100,13 +120,19 @@ class Layout:
         main = found.pop() if found else int(sizes.argmax()) + 1
         return bool(sizes[main - 1] > 0.8 * sizes.sum())
 
-    def is_clear(self, footprint: Rectangle, gap: float = 0.02) -> bool:
-        """Whether a footprint lies in the room, touches nothing and blocks no way."""
+    def contains(self, footprint: Rectangle) -> bool:
+        """Whether a footprint lies in the room."""
         x0, y0, x1, y1 = footprint
         room = self.room
-        if x0 < room.x0 - 1e-6 or y0 < room.y0 - 1e-6 or x1 > room.x1 + 1e-6 or y1 > room.y1 + 1e-6:
+        return x0 > room.x0 - 1e-6 and y0 > room.y0 - 1e-6 and x1 < room.x1 + 1e-6 and y1 < room.y1 + 1e-6
+
+    def is_clear(self, footprint: Rectangle, gap: float = 0.02) -> bool:
+        """Whether a footprint lies in the room, touches nothing and blocks no way."""
+        if not self.contains(footprint):
             return False
-        if any(overlap(footprint, f, gap) for f in self.footprints) or any(overlap(footprint, f) for f in self.keep_free):
+        if any(overlap(footprint, f, gap) for f in self.footprints) or any(
+            overlap(footprint, f) for f in self.keep_free
+        ):
             return False
         return self.passable(footprint)
 
@@ -116,8 +142,16 @@ class Layout:
             return False
         return not any(a0 < b1 + gap and b0 < a1 + gap and z0 < h1 and h0 < z1 for b0, b1, h0, h1 in self.on_wall[side])
 
-    def find_by_wall(self, width: float, depth: float, height: float, *, place: str = "any", front: float = 0.5,
-                     sides: list[int] | None = None) -> Spot | None:  # fmt: skip
+    def find_by_wall(
+        self,
+        width: float,
+        depth: float,
+        height: float,
+        *,
+        place: str = "any",
+        front: float = 0.5,
+        sides: list[int] | None = None,
+    ) -> Spot | None:
         """Spot along a wall for a piece of furniture, or None.
 
         Args:
@@ -153,7 +187,9 @@ class Layout:
                     return Spot(side, float(at), footprint)
         return None
 
-    def put_by_wall(self, patches: list[Patch], spot: Spot, width: float, height: float, depth: float, front: float = 0.5) -> None:
+    def put_by_wall(
+        self, patches: list[Patch], spot: Spot, width: float, height: float, depth: float, front: float = 0.5
+    ) -> None:
         """Stand patches at a spot found before, and keep the floor before them free."""
         self.patches += wall_items(self.room, spot.side, spot.at, patches)
         self.footprints.append(spot.footprint)
@@ -161,6 +197,12 @@ class Layout:
         self.on_wall[spot.side].append((a0, a1, 0.0, height))
         if front:
             self.keep_free.append(self.rectangle(spot.side, a0, a1, depth, depth + front))
+
+    def add_lamp(self, spot: Spot, off_wall: float, height: float, strength: float, along: float = 0.0) -> None:
+        """Light a lamp of a piece of furniture; `along` and `off_wall` are its x and y in the furniture frame."""
+        corner, right, normal = self.room.wall_frame(spot.side)
+        x, y, _ = corner + (spot.at - along) * right + off_wall * normal
+        self.lamps.append(warm_lamp((float(x), float(y), height), self.room.index, strength))
 
     def find_on_floor(self, width: float, depth: float, margin: float) -> tuple[float, float] | None:
         """Centre of a free rectangle (width in x, depth in y) with `margin` around it, or None."""
@@ -173,14 +215,20 @@ class Layout:
                 return float(x), float(y)
         return None
 
-    def hang(self, width: float, z0: float, z1: float, side: int) -> float | None:
-        """Wall coordinate for something that hangs between two heights, or None; the place is then taken."""
+    def hang(self, width: float, z0: float, z1: float, side: int, depth: float = 0.0) -> float | None:
+        """Wall coordinate for something that hangs between two heights, or None; the place is then taken.
+
+        What stands out by `depth` metres does not hang into the way through a door.
+        """
+        doorways = self.keep_free[: len(self.doors)]
         length = self.room.wall_length(side)
         if length < width + 0.3:
             return None
         for at in self.rng.uniform(width / 2 + 0.12, length - width / 2 - 0.12, 6):
             a0, a1 = float(at) - width / 2, float(at) + width / 2
-            if self.wall_is_clear(side, a0, a1, z0, z1, gap=0.08):
+            below = self.rectangle(side, a0, a1, 0.0, depth)
+            in_the_way = depth > 0 and any(overlap(below, d) for d in doorways)
+            if not in_the_way and self.wall_is_clear(side, a0, a1, z0, z1, gap=0.08):
                 self.on_wall[side].append((a0, a1, z0, z1))
                 return float(at)
         return None

@@ -36,7 +36,7 @@ class Material:
 
 
 def mix(a: ArrayLike, b: ArrayLike, amount: Image) -> Image:
-    """Colours (3,) blended by amount (H, W), 0 for `a` and 1 for `b`."""
+    """Colours (3,), or images (H, W, 3), blended by amount (H, W): 0 for `a`, 1 for `b`."""
     first, second = np.asarray(a, np.float32), np.asarray(b, np.float32)
     return first + (second - first) * np.asarray(amount, np.float32)[..., None]
 
@@ -63,8 +63,9 @@ def line(distance_px: Image, width_px: float) -> Image:
     return np.clip(width_px / 2 + 0.5 - np.abs(distance_px), 0, min(1.0, width_px))
 
 
-def plain(rng: np.random.Generator, colour: ArrayLike, *, mottle: float = 0.003, speckle: float = 0.0,
-          shared: bool = False) -> Material:  # fmt: skip
+def plain(
+    rng: np.random.Generator, colour: ArrayLike, *, mottle: float = 0.003, speckle: float = 0.0, shared: bool = False
+) -> Material:
     """Paint, plaster, plastic, ceramic: one colour with faint broad clouds and, if asked for, fine speckle."""
     base, first, second = np.asarray(colour, np.float32), _shift(rng), _shift(rng)
 
@@ -90,8 +91,15 @@ def wood(rng: np.random.Generator, colour: ArrayLike, contrast: float = 1.0, *, 
     return Material(paint, shared=shared)
 
 
-def planks(rng: np.random.Generator, colour: ArrayLike, *, width_m: float = 0.16, length_m: float = 1.4,
-           contrast: float = 1.0, along_x: bool = True) -> Material:  # fmt: skip
+def planks(
+    rng: np.random.Generator,
+    colour: ArrayLike,
+    *,
+    width_m: float = 0.16,
+    length_m: float = 1.4,
+    contrast: float = 1.0,
+    along_x: bool = True,
+) -> Material:
     """Floor of boards, each with its own tone and its own piece of grain, staggered from row to row."""
     dark = np.asarray(colour, float) * np.array([0.6, 0.53, 0.47])
     tone = rng.normal(0, 1, (64, 64)).astype(np.float32)
@@ -116,10 +124,20 @@ def planks(rng: np.random.Generator, colour: ArrayLike, *, width_m: float = 0.16
     return Material(paint)
 
 
-def tiles(rng: np.random.Generator, colour: ArrayLike, grout: ArrayLike, *, size_m: tuple[float, float],
-          second: ArrayLike | None = None, veins: float = 0.0, variation: float = 0.004,
-          brick: bool = False) -> Material:  # fmt: skip
-    """Tiles with grout. Every tile carries the same print; `second` makes a chequerboard."""
+def tiles(
+    rng: np.random.Generator,
+    colour: ArrayLike,
+    grout: ArrayLike,
+    *,
+    size_m: tuple[float, float],
+    second: ArrayLike | None = None,
+    veins: float = 0.0,
+    variation: float = 0.004,
+    brick: bool = False,
+    decor_every: int = 0,
+) -> Material:
+    """Tiles with grout. Every tile has the same veins; `second` makes a chequerboard; each n-th may carry a print."""
+    petals, ink = int(rng.integers(4, 9)), vary(rng, (0.35, 0.42, 0.50), 0.12)
     shift = _shift(rng)
     tone = rng.normal(0, variation, (16, 16)).astype(np.float32)
     width, height = size_m
@@ -137,23 +155,28 @@ def tiles(rng: np.random.Generator, colour: ArrayLike, grout: ArrayLike, *, size
         if veins:
             a = (((column_position - column) * width * scale).astype(int) + shift[1]) % SIZE
             b = (((row_position - row) * height * scale).astype(int) + shift[0]) % SIZE
-            factor = factor - veins * np.maximum(canvas.noise.veins[b, a], 0) * 0.25
+            factor = factor - 0.09 * veins * np.clip(canvas.noise.veins[b, a], 0, 2.5)
             factor = factor + 0.06 * veins * canvas.noise.cloud[b, a]
+        if decor_every:
+            u, v = column_position - column - 0.5, row_position - row - 0.5
+            radius = np.hypot(u, v)
+            flower = 0.33 + 0.1 * np.cos(petals * np.arctan2(v, u))
+            print_edge = np.abs(np.abs(radius - 0.6 * flower) - 0.35 * flower)
+            stroke = np.clip(1.5 - print_edge * min(width, height) * scale, 0, 1) * (
+                (3 * row + column) % decor_every == 0
+            )
+            albedo = mix(albedo, ink, 0.8 * stroke)
         across_px = (column_position - np.round(column_position)) * width * scale
         along_px = (row_position - np.round(row_position)) * height * scale
         gap = np.maximum(line(across_px, 0.004 * scale), line(along_px, 0.004 * scale))
-        return mix_images(albedo * factor[..., None], np.asarray(grout, np.float32), gap)
+        return mix(albedo * factor[..., None], grout, gap)
 
     return Material(paint)
 
 
-def mix_images(a: Image, b: Image, amount: Image) -> Image:
-    """Images (H, W, 3) or colours (3,) blended by amount (H, W)."""
-    return a + (b - a) * amount[..., None]
-
-
-def wallpaper(rng: np.random.Generator, colour: ArrayLike, second: ArrayLike, *, period_m: float = 0.16,
-              motif: bool = True) -> Material:  # fmt: skip
+def wallpaper(
+    rng: np.random.Generator, colour: ArrayLike, second: ArrayLike, *, period_m: float = 0.16, motif: bool = True
+) -> Material:
     """Vertical stripes with, if asked for, the same small flower on each, over and over."""
     petals = int(rng.integers(4, 8))
     phase = float(rng.uniform(0, 6))
@@ -169,14 +192,22 @@ def wallpaper(rng: np.random.Generator, colour: ArrayLike, second: ArrayLike, *,
             radius = np.hypot(cell_x, cell_y) / period_m
             lobes = 0.2 * (0.75 + 0.25 * np.cos(petals * np.arctan2(cell_y, cell_x) + phase))
             inside = np.clip((lobes - radius) * period_m * canvas.texels_per_m + 0.5, 0, 1)
-            albedo = mix_images(albedo, np.asarray(second, np.float32), 0.8 * inside)
+            albedo = mix(albedo, second, 0.8 * inside)
         return albedo
 
     return Material(paint)
 
 
-def fabric(rng: np.random.Generator, colour: ArrayLike, *, weave: float = 0.02, second: ArrayLike | None = None,
-           pattern: str = "plain", period_m: float = 0.12, shared: bool = False) -> Material:  # fmt: skip
+def fabric(
+    rng: np.random.Generator,
+    colour: ArrayLike,
+    *,
+    weave: float = 0.02,
+    second: ArrayLike | None = None,
+    pattern: str = "plain",
+    period_m: float = 0.12,
+    shared: bool = False,
+) -> Material:
     """Cloth: `plain`, `stripes`, `checks`, `dots` or `zigzag` in a second colour."""
     shift = _shift(rng)
     other = np.asarray(colour if second is None else second, np.float32)

@@ -82,8 +82,8 @@ class Canvas:
 
     def crop(self, field: Image, shift: tuple[int, int] = (0, 0), step: int = 1, upright: bool = False) -> Image:
         """Window (height, width) on a field of the bank; `step` skips texels (finer), `upright` turns it by 90 deg."""
-        row = int(round(self.y_m * self.texels_per_m)) + shift[0]
-        column = int(round(self.x_m * self.texels_per_m)) + shift[1]
+        row = round(self.y_m * self.texels_per_m) + shift[0]
+        column = round(self.x_m * self.texels_per_m) + shift[1]
         rows = ((np.arange(self.height) + row) * step) % SIZE
         columns = ((np.arange(self.width) + column) * step) % SIZE
         return field[np.ix_(columns, rows)].T if upright else field[np.ix_(rows, columns)]

@@ -81,6 +81,36 @@ def plane(origin: ArrayLike, right: ArrayLike, down: ArrayLike, material: Materi
     return grid_patch(positions, material, size, **options)
 
 
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Triangles of many patches.
+
+    Attributes:
+        vertices: (V, 3) metres.
+        triangles: (T, 3) vertex indices.
+        patch: (T,) the patch each triangle belongs to.
+        st: (T, 3, 2) patch coordinates of the corners.
+    """
+
+    vertices: Float
+    triangles: NDArray[np.int64]
+    patch: NDArray[np.int64]
+    st: Float
+
+
+def join(patches: Sequence[Patch]) -> Surface:
+    """All patches as one set of triangles."""
+    parts = [p.triangles() for p in patches]
+    counts = [p.positions.shape[0] * p.positions.shape[1] for p in patches]
+    first = np.concatenate([[0], np.cumsum(counts)[:-1]])
+    return Surface(
+        np.concatenate([p.positions.reshape(-1, 3) for p in patches]),
+        np.concatenate([triangles + start for (triangles, _), start in zip(parts, first, strict=True)]),
+        np.repeat(np.arange(len(patches)), [len(triangles) for triangles, _ in parts]),
+        np.concatenate([st for _, st in parts]),
+    )
+
+
 FACES: dict[str, tuple[tuple[int, int, int], tuple[int, int, int], tuple[int, int, int]]] = {
     # face: (corner it starts at, right, down), as signs on the half extents
     "front": ((1, 1, 1), (-1, 0, 0), (0, 0, -1)),
@@ -176,10 +206,14 @@ def cushion(
 
 
 def lathe(
-    profile: Sequence[tuple[float, float]], material: Material, *, sides: int = 16, centre: ArrayLike = (0, 0, 0),
+    profile: Sequence[tuple[float, float]],
+    material: Material,
+    *,
+    sides: int = 16,
+    centre: ArrayLike = (0, 0, 0),
     density: float = 1.0,
 ) -> list[Patch]:
-    """Surface of revolution about z; `profile` lists (radius, z) from top to bottom, radius 0 at both ends closes it."""
+    """Surface of revolution about z; `profile` lists (radius, z) downwards, radius 0 at both ends closes it."""
     rz = np.asarray(profile, float)
     angle = np.linspace(0, 2 * np.pi, sides + 1)
     angle[-1] = 0.0
@@ -190,9 +224,15 @@ def lathe(
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(rz, axis=0), axis=1))])
     size = (2 * np.pi * float(rz[:, 0].max()), float(arc[-1]))
     return [
-        Patch(positions + np.asarray(centre, float), np.linspace(0, 1, sides + 1), arc / arc[-1], size, material,
-              density=density)
-    ]  # fmt: skip
+        Patch(
+            positions + np.asarray(centre, float),
+            np.linspace(0, 1, sides + 1),
+            arc / arc[-1],
+            size,
+            material,
+            density=density,
+        )
+    ]
 
 
 def cylinder(radius_m: float, z0: float, z1: float, material: Material, **options: Any) -> list[Patch]:
@@ -200,7 +240,9 @@ def cylinder(radius_m: float, z0: float, z1: float, material: Material, **option
     return lathe([(0, z1), (radius_m, z1), (radius_m, z0), (0, z0)], material, **options)
 
 
-def tube(path: ArrayLike, radius_m: ArrayLike, material: Material, *, sides: int = 8, density: float = 1.0) -> list[Patch]:
+def tube(
+    path: ArrayLike, radius_m: ArrayLike, material: Material, *, sides: int = 8, density: float = 1.0
+) -> list[Patch]:
     """Closed tube along a polyline (K, 3), with one radius or one per point."""
     points = np.asarray(path, float)
     tangent = np.gradient(points, axis=0)
@@ -221,7 +263,9 @@ def tube(path: ArrayLike, radius_m: ArrayLike, material: Material, *, sides: int
     return [grid_patch(positions, material, (2 * np.pi * float(radii.max()), length), density=density)]
 
 
-def slab_between(front: Float, back: Float, material: Material, size_m: tuple[float, float], **options: Any) -> list[Patch]:
+def slab_between(
+    front: Float, back: Float, material: Material, size_m: tuple[float, float], **options: Any
+) -> list[Patch]:
     """Closed sheet from two grids (m + 1, n + 1, 3) of equal shape, both indexed as seen from the front."""
     edges = (
         np.stack([back[0], front[0]]),  # top
@@ -237,8 +281,9 @@ def slab_between(front: Float, back: Float, material: Material, size_m: tuple[fl
     return patches
 
 
-def move(patches: Iterable[Patch], *, rotation: ArrayLike | None = None, angle_rad: float = 0.0,
-         shift: ArrayLike = (0, 0, 0)) -> list[Patch]:  # fmt: skip
+def move(
+    patches: Iterable[Patch], *, rotation: ArrayLike | None = None, angle_rad: float = 0.0, shift: ArrayLike = (0, 0, 0)
+) -> list[Patch]:
     """Patches rotated (a (3, 3) matrix, or an angle about z) and then shifted."""
     if rotation is None:
         c, s = np.cos(angle_rad), np.sin(angle_rad)

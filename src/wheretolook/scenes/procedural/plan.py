@@ -83,7 +83,9 @@ class Room:
         """Length of a wall."""
         return self.width if side % 2 == 0 else self.depth
 
-    def wall_frame(self, side: int) -> tuple[NDArray[np.floating[Any]], NDArray[np.floating[Any]], NDArray[np.floating[Any]]]:
+    def wall_frame(
+        self, side: int
+    ) -> tuple[NDArray[np.floating[Any]], NDArray[np.floating[Any]], NDArray[np.floating[Any]]]:
         """Left end on the floor, direction to the right, and normal into the room, seen from inside; each (3,)."""
         corner = [(self.x1, self.y0), (self.x1, self.y1), (self.x0, self.y1), (self.x0, self.y0)][side]
         right = [(-1, 0), (0, -1), (1, 0), (0, 1)][side]
@@ -175,7 +177,9 @@ def _spanning_doors(rooms: list[Room]) -> list[tuple[int, int]] | None:
         for b in rooms[a.index + 1 :]:
             wall = shared_wall(a, b)
             if wall is not None and wall[2] - wall[1] > 1.35:
-                edges.append((min(_COST[a.kind], _COST[b.kind]) * 10 + max(_COST[a.kind], _COST[b.kind]), a.index, b.index))
+                edges.append(
+                    (min(_COST[a.kind], _COST[b.kind]) * 10 + max(_COST[a.kind], _COST[b.kind]), a.index, b.index)
+                )
     group = list(range(len(rooms)))
     doors = []
     for _, i, j in sorted(edges):
@@ -203,9 +207,15 @@ def _add_doors(rng: np.random.Generator, rooms: list[Room], doors: list[tuple[in
         wall = shared_wall(a, b)
         assert wall is not None
         side, low, high = wall
-        open_plan = {a.kind, b.kind} == {"living", "kitchen"} or ({a.kind, b.kind} == {"living", "hall"} and rng.random() < 0.4)
+        open_plan = {a.kind, b.kind} == {"living", "kitchen"} or (
+            {a.kind, b.kind} == {"living", "hall"} and rng.random() < 0.4
+        )
         room_for = high - low - 0.3
-        width = float(min(rng.uniform(1.3, 2.0), room_for)) if open_plan and room_for > 1.3 else float(rng.uniform(0.86, 0.95))
+        width = (
+            float(min(rng.uniform(1.3, 2.0), room_for))
+            if open_plan and room_for > 1.3
+            else float(rng.uniform(0.86, 0.95))
+        )
         kind, top = ("wide", min(2.25, height - 0.2)) if width > 1.2 else ("door", DOOR_HEIGHT_M)
         slack = high - low - width
         start = low + float(rng.choice([0.15, slack - 0.15, rng.uniform(0.15, max(slack - 0.15, 0.16))]))
@@ -221,7 +231,7 @@ def outside_spans(room: Room, rooms: list[Room], side: int) -> list[tuple[float,
     for other in rooms:
         wall = shared_wall(room, other) if other is not room else None
         if wall is not None and wall[0] == side:
-            taken.append(sorted((room.along(side, wall[1]) , room.along(side, wall[2]))))
+            taken.append(sorted((room.along(side, wall[1]), room.along(side, wall[2]))))
     free, at = [], 0.0
     for low, high in sorted(taken):
         free.append((at, low - INNER_WALL_M))
@@ -272,9 +282,8 @@ def draw_plan(rng: np.random.Generator, n_rooms: int, area_m2: float, dark_rooms
             continue
         _add_doors(rng, rooms, doors, height)
         _add_windows(rng, rooms)
-        for room in rooms:
-            dark = rng.random() < dark_rooms
-            room.lamp_on = not dark
-            room.curtains_closed = bool(dark and room.kind != "kitchen" and rng.random() < 0.6)
+        for index in rng.permutation(n_rooms)[: round(dark_rooms * n_rooms)]:
+            rooms[index].lamp_on = False
+            rooms[index].curtains_closed = bool(rooms[index].kind != "kitchen" and rng.random() < 0.5)
         return Plan(rooms, doors, height)
     raise RuntimeError("no floor plan found in 5000 attempts")  # pragma: no cover - the area grows until one fits

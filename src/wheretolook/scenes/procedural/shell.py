@@ -33,28 +33,65 @@ def choose_finish(style: Style, room: Room) -> Finish:
     paint = materials.plain(rng, colour)
     walls = [paint] * 4
     ceiling = materials.plain(rng, (0.92, 0.92, 0.91))
-    contrast = 0.45 + 1.2 * style.richness
-    floor = materials.planks(rng, style.floor_colour, width_m=float(rng.uniform(0.12, 0.2)), length_m=float(rng.uniform(1.1, 1.8)),
-                             contrast=contrast, along_x=room.width > room.depth)  # fmt: skip
+    contrast = 0.6 + 1.6 * style.richness
+    floor = materials.planks(
+        rng,
+        style.floor_colour,
+        width_m=float(rng.uniform(0.12, 0.2)),
+        length_m=float(rng.uniform(1.1, 1.8)),
+        contrast=contrast,
+        along_x=room.width > room.depth,
+    )
     if room.kind == "bathroom":
         size = style.pick([(0.3, 0.6), (0.2, 0.2), (0.3, 0.3), (0.15, 0.15)])
         tile = materials.vary(rng, style.pick([(0.90, 0.91, 0.90), (0.72, 0.80, 0.82), (0.84, 0.80, 0.72)]), 0.02)
-        wall = materials.tiles(rng, tile, (0.62, 0.62, 0.60), size_m=size, brick=style.chance(0.3), veins=0.3 * style.richness)
+        wall = materials.tiles(
+            rng,
+            tile,
+            (0.62, 0.62, 0.60),
+            size_m=size,
+            brick=style.chance(0.3),
+            veins=0.5 * style.richness,
+            decor_every=int(rng.integers(3, 8)) if style.chance(0.3 + 0.6 * style.richness) else 0,
+        )
         walls = [wall] * 4
-        floor = materials.tiles(rng, (0.62, 0.62, 0.60), (0.48, 0.48, 0.47), size_m=(0.3, 0.3), veins=0.8 * style.richness,
-                                second=(0.38, 0.40, 0.42) if style.chance(0.4) else None)  # fmt: skip
+        floor = materials.tiles(
+            rng,
+            (0.62, 0.62, 0.60),
+            (0.48, 0.48, 0.47),
+            size_m=(0.3, 0.3),
+            veins=0.8 * style.richness,
+            second=(0.38, 0.40, 0.42) if style.chance(0.4) else None,
+        )
     elif room.kind == "kitchen":
-        floor = materials.tiles(rng, materials.vary(rng, (0.70, 0.66, 0.60)), (0.52, 0.50, 0.47), size_m=(0.4, 0.4), veins=0.9 * style.richness,
-                                second=(0.55, 0.48, 0.42) if style.chance(0.3) else None)  # fmt: skip
-    elif room.kind == "bedroom":
-        if style.chance(0.35 + 0.3 * style.richness):
-            paper = materials.wallpaper(rng, colour, materials.vary(rng, style.pick(ACCENTS), 0.03), period_m=float(rng.uniform(0.12, 0.24)),
-                                        motif=style.chance(0.6))  # fmt: skip
-            walls = [paper] * 4 if style.chance(0.4) else [*walls[:2], paper, walls[3]]
-        if style.chance(0.4):
-            floor = materials.plain(rng, materials.vary(rng, (0.62, 0.57, 0.50)), speckle=0.02 + 0.03 * style.richness)
+        floor = materials.tiles(
+            rng,
+            materials.vary(rng, (0.70, 0.66, 0.60)),
+            (0.52, 0.50, 0.47),
+            size_m=(0.4, 0.4),
+            veins=0.9 * style.richness,
+            second=(0.55, 0.48, 0.42) if style.chance(0.3) else None,
+        )
     if room.kind in ("living", "study") and style.chance(0.6):
         walls[int(rng.integers(4))] = materials.plain(rng, materials.vary(rng, style.pick(ACCENTS), 0.02))
+    if style.chance(
+        {"bedroom": 0.4, "hall": 0.2, "living": 0.15, "study": 0.15}.get(room.kind, 0.0) + 0.3 * style.richness
+    ) and room.kind not in ("bathroom", "kitchen"):
+        paper = materials.wallpaper(
+            rng,
+            colour,
+            materials.vary(rng, style.pick(ACCENTS), 0.03),
+            period_m=float(rng.uniform(0.12, 0.24)),
+            motif=style.chance(0.6),
+        )
+        papered = int(rng.integers(4))
+        walls = (
+            [paper] * 4
+            if style.chance(0.3)
+            else [paper if side == papered else wall for side, wall in enumerate(walls)]
+        )
+    if room.kind == "bedroom" and style.chance(0.4):
+        floor = materials.plain(rng, materials.vary(rng, (0.62, 0.57, 0.50)), speckle=0.03 + 0.07 * style.richness)
     return Finish((walls[0], walls[1], walls[2], walls[3]), floor, ceiling)
 
 
@@ -70,8 +107,16 @@ def _wall(room: Room, side: int, height: float, material: Material) -> Patch:
         rows = (z[1:] > o.z0 - 1e-9) & (z[:-1] < o.z1 + 1e-9)
         mask[np.ix_(rows, columns)] = False
     positions = corner + a[None, :, None] * right + z[:, None, None] * np.array([0, 0, 1.0])
-    return Patch(positions, a / length, 1 - z / height, (length, height), material, room=room.index, mask=mask,
-                 offset_m=(3.1 * side, 0.0))  # fmt: skip
+    return Patch(
+        positions,
+        a / length,
+        1 - z / height,
+        (length, height),
+        material,
+        room=room.index,
+        mask=mask,
+        offset_m=(3.1 * side, 0.0),
+    )
 
 
 def wall_items(room: Room, side: int, at: float, patches: list[Patch]) -> list[Patch]:
@@ -112,7 +157,9 @@ def _window(style: Style, room: Room, o: Opening, height: float, cloth: Material
         patches += box((-w, y + 0.004, z0), (w, y + thick, z1), frame, hidden=("back",))
     posts = 2 if w < 0.45 else 3
     for x in np.linspace(-w + bar / 2, w - bar / 2, posts):
-        patches += box((x - bar / 2, y + 0.004, o.z0 + bar), (x + bar / 2, y + thick, o.z1 - bar), frame, hidden=("back",))
+        patches += box(
+            (x - bar / 2, y + 0.004, o.z0 + bar), (x + bar / 2, y + thick, o.z1 - bar), frame, hidden=("back",)
+        )
     patches += box((-w - 0.04, -0.02, o.z0 - 0.03), (w + 0.04, 0.05, o.z0 + 0.004), style.trim, hidden=("back",))
     if room.kind in ("bathroom", "kitchen"):
         return patches
@@ -126,16 +173,31 @@ def _window(style: Style, room: Room, o: Opening, height: float, cloth: Material
     return patches
 
 
-def build_shell(style: Style, plan: Plan) -> tuple[list[Patch], list[Finish]]:
-    """All surfaces of the empty apartment, and the finish of each room."""
+def build_shell(style: Style, plan: Plan) -> list[Patch]:
+    """All surfaces of the empty apartment."""
     finishes = [choose_finish(style, room) for room in plan.rooms]
     patches: list[Patch] = []
-    cloth = style.patterned() if style.chance(0.3) else materials.fabric(style.rng, materials.vary(style.rng, (0.80, 0.76, 0.68), 0.05), weave=0.02)
+    cloth = (
+        style.patterned()
+        if style.chance(0.25 + 0.4 * style.richness)
+        else materials.fabric(style.rng, materials.vary(style.rng, (0.80, 0.76, 0.68), 0.05), weave=0.02)
+    )
     for room, finish in zip(plan.rooms, finishes, strict=True):
-        x0, y0, x1, y1 = room.x0, room.y0, room.x1, room.y1
+        x0, y0, y1 = room.x0, room.y0, room.y1
         size = (room.width, room.depth)
-        patches.append(plane((x0, y1, 0), (size[0], 0, 0), (0, -size[1], 0), finish.floor, room=room.index, offset_m=(x0 + 20, 20 - y1)))
-        patches.append(plane((x0, y0, plan.height), (size[0], 0, 0), (0, size[1], 0), finish.ceiling, room=room.index, density=0.7))
+        patches.append(
+            plane(
+                (x0, y1, 0),
+                (size[0], 0, 0),
+                (0, -size[1], 0),
+                finish.floor,
+                room=room.index,
+                offset_m=(x0 + 20, 20 - y1),
+            )
+        )
+        patches.append(
+            plane((x0, y0, plan.height), (size[0], 0, 0), (0, size[1], 0), finish.ceiling, room=room.index, density=0.7)
+        )
         for side in range(4):
             patches.append(_wall(room, side, plan.height, finish.walls[side]))
             gaps = sorted((o.a0 - 0.07, o.a1 + 0.07) for o in room.openings[side] if o.z0 == 0)
@@ -156,6 +218,4 @@ def build_shell(style: Style, plan: Plan) -> tuple[list[Patch], list[Finish]]:
                 if o.owner:
                     jamb = style.trim if o.kind == "door" else finish.walls[side]
                     patches += wall_items(room, side, middle, _reveal(INNER_WALL_M, o, jamb, style.second_wood))
-    return patches, finishes
-
-
+    return patches

@@ -12,12 +12,35 @@ from wheretolook.scenes.procedural.materials import Colour, Material
 
 T = TypeVar("T")
 
-WALLS: Sequence[Colour] = ((0.90, 0.88, 0.84), (0.87, 0.87, 0.86), (0.88, 0.84, 0.76), (0.80, 0.84, 0.82), (0.82, 0.85, 0.89))
-ACCENTS: Sequence[Colour] = ((0.45, 0.55, 0.52), (0.36, 0.45, 0.56), (0.72, 0.52, 0.42), (0.62, 0.60, 0.54), (0.75, 0.67, 0.50))
-WOODS: Sequence[Colour] = ((0.78, 0.62, 0.44), (0.68, 0.49, 0.32), (0.50, 0.34, 0.23), (0.84, 0.74, 0.60), (0.58, 0.44, 0.33))
+WALLS: Sequence[Colour] = (
+    (0.90, 0.88, 0.84),
+    (0.87, 0.87, 0.86),
+    (0.88, 0.84, 0.76),
+    (0.80, 0.84, 0.82),
+    (0.82, 0.85, 0.89),
+)
+ACCENTS: Sequence[Colour] = (
+    (0.45, 0.55, 0.52),
+    (0.36, 0.45, 0.56),
+    (0.72, 0.52, 0.42),
+    (0.62, 0.60, 0.54),
+    (0.75, 0.67, 0.50),
+)
+WOODS: Sequence[Colour] = (
+    (0.78, 0.62, 0.44),
+    (0.68, 0.49, 0.32),
+    (0.50, 0.34, 0.23),
+    (0.84, 0.74, 0.60),
+    (0.58, 0.44, 0.33),
+)
 TEXTILES: Sequence[Colour] = (
-    (0.48, 0.52, 0.56), (0.62, 0.56, 0.48), (0.30, 0.40, 0.46), (0.70, 0.64, 0.55), (0.46, 0.50, 0.40), (0.58, 0.36, 0.32),
-)  # fmt: skip
+    (0.48, 0.52, 0.56),
+    (0.62, 0.56, 0.48),
+    (0.30, 0.40, 0.46),
+    (0.70, 0.64, 0.55),
+    (0.46, 0.50, 0.40),
+    (0.58, 0.36, 0.32),
+)
 
 
 class Style:
@@ -32,7 +55,7 @@ class Style:
     def __init__(self, rng: np.random.Generator, richness: float, clutter: float) -> None:
         self.rng, self.richness, self.clutter = rng, richness, clutter
         order = rng.permutation(len(WOODS))
-        contrast = 0.35 + 0.9 * richness
+        contrast = 0.5 + 1.3 * richness
         self.floor_colour = WOODS[order[0]]
         self.wood_colour, self.dark_wood_colour = WOODS[order[1]], WOODS[order[2]]
         self.wood = materials.wood(rng, self.wood_colour, 0.8 * contrast)
@@ -45,11 +68,13 @@ class Style:
         self.black = materials.plain(rng, (0.10, 0.10, 0.11), shared=True)
         self.paper = materials.plain(rng, (0.88, 0.85, 0.76), shared=True)
         self.screen = artwork.screen(rng)
-        self.front_colour = materials.vary(rng, self.pick([(0.88, 0.88, 0.85), (0.52, 0.58, 0.55), (0.80, 0.76, 0.68), (0.42, 0.48, 0.56)]), 0.03)
+        self.front_colour = materials.vary(
+            rng, self.pick([(0.88, 0.88, 0.85), (0.52, 0.58, 0.55), (0.80, 0.76, 0.68), (0.42, 0.48, 0.56)]), 0.03
+        )
         self.front = materials.plain(rng, self.front_colour)
         self.trim = materials.plain(rng, (0.93, 0.92, 0.90))
         self.textile = self.pick(TEXTILES)
-        self.upholstery = materials.fabric(rng, self.textile, weave=0.02 + 0.03 * richness)
+        self.upholstery = materials.fabric(rng, self.textile, weave=0.03 + 0.07 * richness)
         self.metal_legs = bool(rng.random() < 0.4)
         self.covers = [materials.plain(rng, c, shared=True) for p in artwork.PALETTES for c in p[1:4]]
         self.cover_colours = [c for p in artwork.PALETTES for c in p]
@@ -66,12 +91,21 @@ class Style:
 
     def patterned(self) -> Material:
         """Cloth with a pattern, for pillows, throws and bed covers."""
-        kind = self.pick(["plain", "stripes", "checks", "dots", "zigzag"]) if self.chance(self.richness + 0.2) else "plain"
+        kind = (
+            self.pick(["plain", "stripes", "checks", "dots", "zigzag"])
+            if self.chance(self.richness + 0.35)
+            else "plain"
+        )
         colours = self.pick(artwork.PALETTES)
         first, second = self.rng.permutation(5)[:2]
         return materials.fabric(
-            self.rng, colours[first], second=colours[second], pattern=kind, period_m=float(self.rng.uniform(0.05, 0.14)), weave=0.03
-        )  # fmt: skip
+            self.rng,
+            colours[first],
+            second=colours[second],
+            pattern=kind,
+            period_m=float(self.rng.uniform(0.05, 0.14)),
+            weave=0.03,
+        )
 
     def leg(self) -> Material:
         """Metal or wood, the same everywhere."""

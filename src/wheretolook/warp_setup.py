@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from ctypes.util import find_library
+
 import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
@@ -25,12 +31,30 @@ def start_warp(device: str = "cpu") -> str:
         ConfigError: if this machine has no such device.
     """
     wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
-    wp.init()
+    with _without_driver_warning():
+        wp.init()
     try:
         return str(wp.get_device(device))
     except (ValueError, RuntimeError) as error:
         available = ", ".join(str(found) for found in wp.get_devices())
         raise ConfigError("no such device", value=device, fix=f"Use one of: {available}") from error
+
+
+@contextmanager
+def _without_driver_warning() -> Iterator[None]:
+    """On a machine without a GPU, keep Warp's native library from writing so into every worker's progress bar."""
+    if find_library("cuda") is not None:
+        yield
+        return
+    sys.stderr.flush()
+    stderr, null = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, 2)
+    try:
+        yield
+    finally:
+        os.dup2(stderr, 2)
+        os.close(stderr)
+        os.close(null)
 
 
 def warp_mesh(mesh: TexturedMesh, device: str) -> wp.Mesh:

@@ -1,0 +1,129 @@
+"""Every method against hand-counted views, and the contract that all of them keep."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from synthetic_dataset import CAMERA, make_landmarks
+from wheretolook.errors import ConfigError, WeightsError
+from wheretolook.features import CHANNELS, INPUT_VARIANTS, BinnedViews
+from wheretolook.geometry import Float, PinholeCamera, poses_looking_along
+from wheretolook.learning.network import InputStatistics, NetworkSpec, ViewpointNetwork
+from wheretolook.learning.weights import save_classifier
+from wheretolook.localization_map import LocalizationMap
+from wheretolook.scoring import SCORERS, BinsScorer, Scorer, VisibleScorer, load_scorer, make_scorer
+
+
+@pytest.fixture
+def localization_map() -> LocalizationMap:
+    return LocalizationMap(make_landmarks(np.random.default_rng(0), 200), CAMERA)
+
+
+@pytest.fixture
+def views() -> Float:
+    rng = np.random.default_rng(1)
+    return poses_looking_along(rng.uniform((-1, -1, 1), (1, 1, 2), (40, 3)), rng.normal(size=(40, 3)))
+
+
+@pytest.fixture
+def weights(tmp_path: Path) -> Path:
+    """An untrained network whose scores differ from view to view."""
+    torch.manual_seed(0)
+    channels = INPUT_VARIANTS["2d+3d"]
+    statistics = InputStatistics(channels, (80.0, 60.0, 0.0, 0.0, 2.0), (40.0, 30.0, 1.0, 1.0, 1.0))
+    path = tmp_path / "mlp.safetensors"
+    save_classifier(ViewpointNetwork(NetworkSpec("2d+3d", CAMERA, statistics, hidden=(16,))), path)
+    return path
+
+
+@pytest.mark.parametrize("name", SCORERS)
+def test_scorers_keep_their_contract(
+    name: str, localization_map: LocalizationMap, views: Float, weights: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scorer = make_scorer(name, localization_map, seed=3, weights=weights)
+    assert isinstance(scorer, Scorer)
+    assert scorer.name == name
+    scores = scorer.score(views)
+    assert scores.shape == (40,)
+    assert scores.dtype == np.float64
+    assert np.all((scores >= 0) & (scores <= 1))
+    assert len(np.unique(scores)) > 20
+    order = np.random.default_rng(0).permutation(40)
+    np.testing.assert_allclose(scorer.score(views[order]), scores[order], rtol=1e-6)  # a pose's score is its own
+    np.testing.assert_allclose(scorer.score(views[7:8]), scores[7:8], rtol=1e-6)
+    np.testing.assert_array_equal(scorer.score_binned(views, localization_map.bin_views(views)), scores)
+    monkeypatch.setattr("wheretolook.scoring.base.BLOCK", 7)
+    np.testing.assert_allclose(scorer.score(views), scores, rtol=1e-6)
+    assert scorer.score(views[:0]).shape == (0,)
+
+
+def _binned(counts: list[list[int]]) -> BinnedViews:
+    """Views of 2 x 2 bins with so many landmarks each."""
+    array = np.array(counts, dtype=np.int32).reshape(-1, 2, 2)
+    return BinnedViews(np.zeros((len(array), len(CHANNELS), 2, 2), dtype=np.float32), array, CHANNELS)
+
+
+def test_counting_scorers_on_hand_counted_bins(localization_map: LocalizationMap) -> None:
+    binned = _binned([[0, 0, 0, 0], [9, 0, 0, 0], [1, 1, 0, 0], [1, 2, 0, 0], [1, 1, 1, 1], [50, 50, 50, 50]])
+    np.testing.assert_allclose(
+        VisibleScorer(localization_map, bins=2).score_bins(binned) * 200, [0, 9, 2, 3, 4, 200], rtol=1e-12
+    )
+    by_bins = BinsScorer(localization_map, bins=2).score_bins(binned)
+    # one bin with nine landmarks loses to two bins with one each; equal bins are told apart by their landmarks
+    np.testing.assert_array_equal(np.argsort(by_bins), [0, 1, 2, 3, 4, 5])
+    np.testing.assert_array_equal(np.floor(by_bins * 5), [0, 1, 2, 2, 4, 4])
+    assert by_bins.max() < 1
+
+
+def test_random_scores_are_uniform_and_depend_on_the_seed(localization_map: LocalizationMap) -> None:
+    rng = np.random.default_rng(0)
+    views = poses_looking_along(np.zeros((20000, 3)), rng.normal(size=(20000, 3)))
+    a, b = (make_scorer("random", localization_map, seed=seed).score(views) for seed in (0, 1))
+    assert np.abs(np.histogram(a, 20, (0, 1))[0] - 1000).max() < 6 * np.sqrt(1000)
+    assert abs(np.corrcoef(a, b)[0, 1]) < 0.03
+    assert abs(np.corrcoef(a[1:], a[:-1])[0, 1]) < 0.03
+    # a pose that went to disk and back is the same pose
+    np.testing.assert_array_equal(make_scorer("random", localization_map).score(views[:100] * (1 + 1e-16)), a[:100])
+
+
+def test_learned_scores_equal_the_network_by_hand(
+    localization_map: LocalizationMap, views: Float, weights: Path
+) -> None:
+    scorer = load_scorer(weights, localization_map)
+    assert (scorer.name, scorer.inputs) == ("mlp", "2d+3d")
+    binned = localization_map.bin_views(views)
+    network = scorer.network
+    mean = np.array(network.spec.statistics.mean, dtype=np.float32)[:, None, None]
+    std = np.array(network.spec.statistics.std, dtype=np.float32)[:, None, None]
+    values = np.where(binned.counts[:, None] > 0, (binned.means - mean) / std, 0).reshape(40, -1)
+    first, last = network.layers[0], network.layers[-1]
+    hidden = np.maximum(values @ first.weight.numpy().T + first.bias.numpy(), 0)
+    logits = hidden @ last.weight.numpy().T + last.bias.numpy()
+    np.testing.assert_allclose(scorer.score(views), 1 / (1 + np.exp(-logits[:, 0])), rtol=1e-5)
+
+
+def test_another_resolution_of_the_same_field_of_view_scores_the_same(
+    localization_map: LocalizationMap, views: Float, weights: Path
+) -> None:
+    double = PinholeCamera(2 * CAMERA.width, 2 * CAMERA.height, 2 * CAMERA.focal_px)
+    scores = load_scorer(weights, LocalizationMap(localization_map.landmarks, double)).score(views)
+    np.testing.assert_allclose(scores, load_scorer(weights, localization_map).score(views), rtol=1e-5)
+
+
+def test_another_field_of_view_is_refused(localization_map: LocalizationMap, weights: Path) -> None:
+    narrow = PinholeCamera(CAMERA.width, CAMERA.height, 2 * CAMERA.focal_px)
+    with pytest.raises(WeightsError, match=r"mlp\.safetensors.*trained for a camera of 160 x 120 px, 90\.0"):
+        load_scorer(weights, LocalizationMap(localization_map.landmarks, narrow))
+
+
+def test_unknown_methods_and_missing_weights_are_refused(localization_map: LocalizationMap, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"unknown method.*random, visible, bins, mlp"):
+        make_scorer("oracle", localization_map)
+    with pytest.raises(ConfigError, match="needs weights"):
+        make_scorer("mlp", localization_map)
+    with pytest.raises(WeightsError, match="there are no weights"):
+        make_scorer("mlp", localization_map, weights=tmp_path / "none.safetensors")

@@ -1,0 +1,176 @@
+"""The whole line on two tiny apartments: from the command line, again, from the same seed, and after damage."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pycolmap
+import pytest
+
+from wheretolook import stages
+from wheretolook.cli import main
+from wheretolook.dataset import Dataset
+from wheretolook.geometry import PinholeCamera
+from wheretolook.learning.weights import load_classifier
+from wheretolook.localization_map import LocalizationMap
+from wheretolook.scoring import load_scorer
+from wheretolook.table import fingerprint, is_good, poses, read_table, write_table
+from wheretolook.tracking import TrackingConfig, newest_run
+
+EXPERIMENT = """\
+name: tiny
+camera: {width: 320, height: 240, focal_px: 160}
+scenes:
+  train: 1
+  test: 1
+  apartment: {n_rooms: 3, area_m2: 26, texture_size: 2048}
+map: {n_images: 30}
+sample: {grid: [6, 6, 4], directions: 100, keep: 50, max_locations: 8, max_directions: 5}
+label: {workers: 2, shard_size: 8}
+train: {epochs: 2, val_fraction: 0.3}
+evaluate: {resamples: 50}
+"""
+
+
+def run(stage: str, folder: Path, *options: str) -> int:
+    return main(
+        [stage, "--config", str(folder / "tiny.yaml"), "--data", str(folder / "data"),
+         "--tracking.folder", str(folder / "mlruns"), "--device", "cpu", *options]
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("demo")
+    (folder / "tiny.yaml").write_text(EXPERIMENT)
+    assert run("demo", folder) == 0
+    return folder
+
+
+@pytest.fixture
+def copy(demo: Path, tmp_path: Path) -> Path:
+    """A copy that may be damaged."""
+    shutil.copytree(demo, tmp_path / "copy")
+    return tmp_path / "copy"
+
+
+def results(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.glob("data/tiny/*/**/*") if path.is_file() and path.name != "stages.json")
+
+
+def test_every_stage_leaves_its_result(demo: Path) -> None:
+    dataset = Dataset.load(demo / "data" / "tiny")
+    assert [scene.split for scene in dataset.scenes] == ["train", "test"]
+    for scene in dataset.scenes:
+        table = scene.read_table()
+        assert 0 < len(table) <= 40 and not table.isna()["status"].any()
+        assert 0 < is_good(table, 0.25, 2.0).mean() < 1
+        assert len(pycolmap.Reconstruction(scene.map).points3D) > 100
+        assert not (scene.folder / "shards").exists()
+    scores = pd.read_csv(dataset.root / "results" / "scores.csv")
+    assert {"random", "bins", "mlp", "oracle"} <= set(scores["method"])
+    assert (dataset.root / "results" / "scores.png").stat().st_size > 10_000
+    run_of_evaluation = newest_run(TrackingConfig(str(demo / "mlruns")), "evaluate")
+    assert run_of_evaluation is not None and run_of_evaluation.info.status == "FINISHED"
+
+
+def test_run_again_it_reuses_what_is_there(demo: Path) -> None:
+    before = {path: path.stat().st_mtime_ns for path in results(demo) if path.parent.name != "results"}
+    assert run("demo", demo) == 0
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+
+
+def test_the_same_seed_gives_the_same_bytes(demo: Path, tmp_path: Path) -> None:
+    (tmp_path / "tiny.yaml").write_text(EXPERIMENT)
+    for stage in ("scenes", "map", "sample", "label"):
+        assert run(stage, tmp_path, "--scenes.test", "0", "--label.workers", "1", "--label.shard_size", "64") == 0
+    for name in ("mesh.glb", "map/points3D.bin", "map/landmarks.npz", "occlusion.npz", "viewpoints.parquet"):
+        ours, theirs = (folder / "data" / "tiny" / "apartment-000" / name for folder in (tmp_path, demo))
+        assert fingerprint(ours) == fingerprint(theirs), name
+
+
+def test_a_changed_setting_remakes_what_depends_on_it(copy: Path) -> None:
+    scene = Dataset.load(copy / "data" / "tiny").scenes[0]
+    mesh, table = fingerprint(scene.mesh), scene.read_table()
+    assert run("sample", copy, "--sample.seed", "5") == 0
+    assert fingerprint(scene.mesh) == mesh
+    assert (scene.read_table()["status"] == "unlabelled").all()
+    assert run("sample", copy) == 0 and run("label", copy) == 0
+    pd.testing.assert_frame_equal(scene.read_table(), table)
+
+
+def test_three_lines_score_viewpoints_of_a_colmap_model(demo: Path) -> None:
+    scene = Dataset.load(demo / "data" / "tiny").scenes[1]
+    table = scene.read_table()
+    localization_map = LocalizationMap.from_colmap(scene.map, PinholeCamera(320, 240, 160), mesh=scene.mesh)
+    weights = demo / "data" / "tiny" / "weights" / "mlp-2d+3d.safetensors"
+    scores = load_scorer(weights, localization_map).score(poses(table))
+    assert scores.shape == (len(table),) and np.all((scores > 0) & (scores < 1)) and np.ptp(scores) > 0
+    assert load_classifier(weights).spec.variant == "2d+3d"
+    # the mesh's rays and the occlusion stored by the sample stage agree
+    binned = scene.localization_map(PinholeCamera(320, 240, 160)).bin_views(poses(table))
+    np.testing.assert_array_equal(localization_map.bin_views(poses(table)).counts, binned.counts)
+
+
+def test_what_a_table_says_is_what_its_features_hold(demo: Path) -> None:
+    dataset = Dataset.load(demo / "data" / "tiny")
+    for scene in dataset.scenes:
+        table = scene.read_table()
+        binned = scene.localization_map(dataset.camera).bin_views(poses(table))
+        assert np.abs(binned.n_visible - table["n_visible"]).max() <= 1  # single precision at the border
+
+
+@pytest.mark.parametrize(
+    ("damage", "stage", "said"),
+    [
+        (lambda scene: scene.mesh.unlink(), "map", "mesh.glb"),
+        (lambda scene: scene.mesh.write_bytes(b""), "map", "mesh.glb"),
+        (lambda scene: scene.landmarks.unlink(), "sample", "landmarks.npz"),
+        (lambda scene: scene.landmarks.write_bytes(b"zip?"), "evaluate", "landmarks.npz"),
+        (lambda scene: scene.table.write_bytes(scene.table.read_bytes()[:500]), "evaluate", "viewpoints.parquet"),
+        (lambda scene: scene.occlusion.unlink(), "evaluate", "occlusion.npz"),
+        (lambda scene: (scene.folder.parent / "dataset.json").write_text("{"), "map", "dataset.json"),
+    ],
+)
+def test_damage_is_named_and_the_rest_left_alone(
+    damage: object, stage: str, said: str, copy: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = Dataset.load(copy / "data" / "tiny").scenes[1]
+    damage(scene)  # type: ignore[operator]
+    before = {path: fingerprint(path) for path in results(copy)}
+    capsys.readouterr()
+    assert run(stage, copy) == 2
+    errors = capsys.readouterr().err
+    assert said in errors and "Traceback" not in errors
+    assert {path: fingerprint(path) for path in results(copy)} == before
+
+
+def test_labels_of_one_class_are_named(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = Dataset.load(copy / "data" / "tiny").scenes[0]
+    write_table(read_table(scene.table).assign(status="no_pose", error_m=np.nan, error_deg=np.nan), scene.table)
+    assert run("train", copy) == 2
+    assert "one class" in capsys.readouterr().err
+
+
+def test_a_scene_without_free_space_is_named(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("sample", copy, "--scenes.free_space.clearance_m", "5") == 2
+    assert "free space" in capsys.readouterr().err
+
+
+def test_another_camera_is_refused(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("map", copy, "--camera.focal_px", "200") == 2
+    assert "another camera" in capsys.readouterr().err
+
+
+def test_stages_are_plain_functions(demo: Path) -> None:
+    from wheretolook.cli import parse_experiment
+
+    experiment = parse_experiment("sample", ["--config", str(demo / "tiny.yaml"), "--data", str(demo / "data")])
+    assert experiment is not None
+    said: list[str] = []
+    dataset = stages.sample(experiment, say=said.append)
+    assert len(said) == 2 and all("reusing" in line for line in said)
+    assert dataset.name == "tiny"

@@ -43,6 +43,4 @@ def random_views(request: pytest.FixtureRequest) -> RandomViews:
     mask = rng.random((len(locations), len(points))) < 0.6
     location_rows = rng.integers(0, len(locations), 40)
     poses = poses_looking_along(locations[location_rows], rng.normal(size=(40, 3)))
-    return RandomViews(
-        camera, points, locations, directions, mask, VisibleSets.from_mask(mask), location_rows, poses
-    )
+    return RandomViews(camera, points, locations, directions, mask, VisibleSets.from_mask(mask), location_rows, poses)

@@ -51,9 +51,13 @@ def test_quaternions_agree_with_pycolmap_and_scipy() -> None:
 def test_looking_along_keeps_the_horizon_level_and_down_down() -> None:
     directions = np.random.default_rng(2).normal(size=(200, 3))
     rotation = geo.rotation_looking_along(directions)
-    np.testing.assert_allclose(rotation @ np.swapaxes(rotation, 1, 2), np.broadcast_to(np.eye(3), rotation.shape), atol=1e-12)
+    np.testing.assert_allclose(
+        rotation @ np.swapaxes(rotation, 1, 2), np.broadcast_to(np.eye(3), rotation.shape), atol=1e-12
+    )
     np.testing.assert_allclose(np.linalg.det(rotation), 1)
-    np.testing.assert_allclose(rotation[:, 2], directions / np.linalg.norm(directions, axis=1, keepdims=True), atol=1e-12)
+    np.testing.assert_allclose(
+        rotation[:, 2], directions / np.linalg.norm(directions, axis=1, keepdims=True), atol=1e-12
+    )
     np.testing.assert_allclose(rotation[:, 0, 2], 0, atol=1e-12)
     assert (rotation[:, 1, 2] < 0).all()
 
@@ -86,7 +90,7 @@ def test_pose_error_is_between_centres_not_translations() -> None:
     center = np.array([10.0, -20, 3])
     true = np.concatenate([rotation, -rotation @ center[:, None]], axis=1)
     turned = Rotation.from_euler("z", 5, degrees=True).as_matrix() @ rotation
-    moved = center + [0.03, 0.04, 0]
+    moved = center + np.array([0.03, 0.04, 0])
     estimate = np.concatenate([turned, -turned @ moved[:, None]], axis=1)
     error_m, error_deg = geo.pose_error(estimate, true)
     assert (error_m, error_deg) == (pytest.approx(0.05), pytest.approx(5))

@@ -59,7 +59,9 @@ def test_the_best_directions_are_kept_and_ranked(landmarks: Landmarks) -> None:
         counts = everything[everything["location_id"] == location].sort_values(
             ["n_visible", "direction_id"], ascending=[False, True]
         )
-        assert rows.sort_values("visibility_rank")["direction_id"].tolist() == counts["direction_id"].tolist()[: len(rows)]
+        assert (
+            rows.sort_values("visibility_rank")["direction_id"].tolist() == counts["direction_id"].tolist()[: len(rows)]
+        )
         assert sorted(rows["visibility_rank"]) == list(range(len(rows))) and len(rows) <= 7
         assert (rows["n_visible"] >= 1).all()
 

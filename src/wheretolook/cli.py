@@ -50,7 +50,9 @@ stages, in order; each reads what the one before it left in <data>/<name>/
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line. Returns the exit code: 0, 2 for bad input, 130 when interrupted."""
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # idle threads must not spin while other processes want the core
+    os.environ.setdefault(
+        "OMP_WAIT_POLICY", "PASSIVE"
+    )  # idle threads must not spin while other processes want the core
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in arguments
     arguments = [argument for argument in arguments if argument != "--debug"]
@@ -149,7 +151,7 @@ def _help(parser: ArgumentParser, command: str) -> str:
     groups = tuple(f"{group}." for group in STAGES[command][2]) if command in STAGES else ()
 
     def belongs(dest: str) -> bool:
-        return not groups or dest.startswith((*groups, "camera.")) or "." not in dest and dest not in _GROUPS
+        return not groups or dest.startswith((*groups, "camera.")) or ("." not in dest and dest not in _GROUPS)
 
     for group in parser._action_groups:
         group._group_actions = [action for action in group._group_actions if belongs(action.dest)]
@@ -169,7 +171,9 @@ def _causes(error: BaseException) -> Iterator[BaseException]:
 def _default_config() -> Path:
     path = Path("configs/demo.yaml")
     if not path.is_file():
-        raise ConfigError("the demo's configuration is not here", path=path, fix="Run in the project's folder, or give --config.")
+        raise ConfigError(
+            "the demo's configuration is not here", path=path, fix="Run in the project's folder, or give --config."
+        )
     return path
 
 

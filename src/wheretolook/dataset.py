@@ -126,7 +126,9 @@ class Dataset:
         except FileNotFoundError as error:
             raise TableError("this folder is no dataset", path=path, fix="Run the scenes stage first.") from error
         except (ValueError, KeyError, TypeError) as error:
-            raise TableError(f"damaged dataset description: {error}", path=path, fix="Run the scenes stage again.") from error
+            raise TableError(
+                f"damaged dataset description: {error}", path=path, fix="Run the scenes stage again."
+            ) from error
 
 
 def write_json(path: Path, content: Any) -> None:

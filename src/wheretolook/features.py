@@ -15,9 +15,10 @@ import warp as wp
 from numpy.typing import NDArray
 
 from wheretolook.errors import ConfigError
+from wheretolook.features_kernel import bin_kernel
 from wheretolook.geometry import Float, PinholeCamera, transform
-from wheretolook.warp_setup import start_warp
 from wheretolook.visibility.frustum import MIN_DEPTH_M, VisibleSets
+from wheretolook.warp_setup import start_warp
 
 CHANNELS = ("u", "v", "x", "y", "z")
 """Channels of every landmark: pixel (u, v) and position (x, y, z) in the camera frame in metres."""
@@ -93,51 +94,6 @@ def arrange(means: NDArray[np.float32], filled: NDArray[np.bool_], layout: Layou
     return np.take_along_axis(flat, order[:, None, :], axis=2).reshape(means.shape)
 
 
-@wp.kernel
-def _bin_kernel(
-    rotations: wp.array[wp.mat33],
-    translations: wp.array[wp.vec3],
-    location_rows: wp.array[wp.int32],
-    points: wp.array[wp.vec3],
-    starts: wp.array[wp.int32],
-    indices: wp.array[wp.int32],
-    focal: float,
-    cx: float,
-    cy: float,
-    width: float,
-    height: float,
-    min_depth: float,
-    bins: int,
-    means: wp.array3d[wp.float32],
-    counts: wp.array2d[wp.int32],
-) -> None:
-    view = wp.tid()
-    rotation = rotations[view]
-    translation = translations[view]
-    location = location_rows[view]
-    for entry in range(starts[location], starts[location + 1]):
-        p = rotation * points[indices[entry]] + translation
-        x = focal * p[0] + cx * p[2]
-        y = focal * p[1] + cy * p[2]
-        if p[2] > min_depth and x >= 0.0 and x < width * p[2] and y >= 0.0 and y < height * p[2]:
-            u = x / p[2]
-            v = y / p[2]
-            column = wp.min(int(u * float(bins) / width), bins - 1)
-            row = wp.min(int(v * float(bins) / height), bins - 1)
-            cell = row * bins + column
-            counts[view, cell] = counts[view, cell] + 1
-            means[view, 0, cell] = means[view, 0, cell] + u
-            means[view, 1, cell] = means[view, 1, cell] + v
-            means[view, 2, cell] = means[view, 2, cell] + p[0]
-            means[view, 3, cell] = means[view, 3, cell] + p[1]
-            means[view, 4, cell] = means[view, 4, cell] + p[2]
-    for cell in range(bins * bins):
-        if counts[view, cell] > 1:
-            scale = 1.0 / float(counts[view, cell])
-            for channel in range(5):
-                means[view, channel, cell] = means[view, channel, cell] * scale
-
-
 def bin_views(
     camera: PinholeCamera,
     cam_from_world: Float,
@@ -165,8 +121,9 @@ def bin_views(
     means = np.empty((n_views, n_channels, bins, bins), dtype=np.float32)
     counts = np.empty((n_views, bins, bins), dtype=np.int32)
     block = max(1, block_bytes // (bins * bins * (n_channels + 1) * 4))
-    points_on_device = wp.array(np.asarray(points, dtype=np.float32), dtype=wp.vec3, device=device)
-    starts, indices = (wp.array(part, dtype=wp.int32, device=device) for part in (visible.starts, visible.indices))
+    points_on_device: Any = wp.array(np.asarray(points, dtype=np.float32), dtype=wp.vec3, device=device)
+    starts: Any = wp.array(visible.starts, dtype=wp.int32, device=device)
+    indices: Any = wp.array(visible.indices, dtype=wp.int32, device=device)
     for begin in range(0, n_views, block):
         rows = slice(begin, min(begin + block, n_views))
         poses = np.asarray(cam_from_world[rows], dtype=np.float64)
@@ -174,7 +131,7 @@ def bin_views(
         block_means = wp.zeros((shape[0], n_channels, shape[1]), dtype=wp.float32, device=device)
         block_counts = wp.zeros(shape, dtype=wp.int32, device=device)
         wp.launch(
-            _bin_kernel,
+            bin_kernel,
             dim=len(poses),
             inputs=[
                 wp.array(poses[..., :3].astype(np.float32), dtype=wp.mat33, device=device),

@@ -34,7 +34,9 @@ class PinholeCamera:
 
     def __post_init__(self) -> None:
         if self.width < 1 or self.height < 1 or not self.focal_px > 0:
-            raise ConfigError("camera needs a positive width, height and focal_px", value=(self.width, self.height, self.focal_px))
+            raise ConfigError(
+                "camera needs a positive width, height and focal_px", value=(self.width, self.height, self.focal_px)
+            )
 
     @property
     def cx(self) -> float:

@@ -43,8 +43,8 @@ class VoxelGrid:
     @classmethod
     def over(cls, bounds: ArrayLike, shape: tuple[int, int, int] = (8, 8, 8)) -> VoxelGrid:
         """A grid over bounds (2, 3): lowest and highest corner in metres."""
-        lower, upper = np.asarray(bounds, dtype=np.float64).tolist()
-        return cls(tuple(lower), tuple(upper), tuple(shape))
+        (x0, y0, z0), (x1, y1, z1) = np.asarray(bounds, dtype=np.float64).tolist()
+        return cls((x0, y0, z0), (x1, y1, z1), shape)
 
     def __len__(self) -> int:
         return int(np.prod(self.shape))
@@ -102,7 +102,9 @@ def azimuth_elevation_lattice(n: int) -> Float:
     """
     rows = max(1, round(np.sqrt(_positive(n) / 2)))
     columns = max(1, round(n / rows))
-    polar, azimuth = np.meshgrid((np.arange(rows) + 0.5) * np.pi / rows, np.arange(columns) * 2 * np.pi / columns, indexing="ij")
+    polar, azimuth = np.meshgrid(
+        (np.arange(rows) + 0.5) * np.pi / rows, np.arange(columns) * 2 * np.pi / columns, indexing="ij"
+    )
     lattice = np.stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], axis=-1)
     return lattice.reshape(-1, 3)
 
@@ -116,12 +118,18 @@ def released_lattice(n: int) -> Float:
     """
     index = np.arange(_positive(n)) + 0.5
     azimuth, elevation = np.arccos(1 - 2 * index / n), GOLDEN_ANGLE * index
-    return np.stack([np.sin(azimuth) * np.sin(elevation), -np.cos(azimuth) * np.sin(elevation), np.cos(elevation)], axis=-1)
+    return np.stack(
+        [np.sin(azimuth) * np.sin(elevation), -np.cos(azimuth) * np.sin(elevation), np.cos(elevation)], axis=-1
+    )
 
 
 def direction_lattice(n: int, lattice: Lattice = "fibonacci") -> Float:
     """Directions (m, 3) of the named lattice; m = n except for "azimuth-elevation", where it is the nearest product."""
-    lattices = {"fibonacci": fibonacci_sphere, "azimuth-elevation": azimuth_elevation_lattice, "released": released_lattice}
+    lattices = {
+        "fibonacci": fibonacci_sphere,
+        "azimuth-elevation": azimuth_elevation_lattice,
+        "released": released_lattice,
+    }
     if lattice not in lattices:
         raise ConfigError("unknown lattice", value=lattice, fix=f"Use one of {', '.join(lattices)}.")
     return lattices[lattice](n)

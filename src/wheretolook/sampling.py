@@ -13,7 +13,7 @@ from wheretolook.errors import ConfigError, SceneError
 from wheretolook.geometry import PinholeCamera, poses_looking_along, rotation_looking_along
 from wheretolook.grid import Lattice, VoxelGrid, direction_lattice
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.table import LABEL_COLUMNS, UNLABELLED, pose_columns
+from wheretolook.table import UNLABELLED, pose_columns
 from wheretolook.visibility import OcclusionModel, StoredOcclusion, VisibleSets, count_in_frustum
 
 if TYPE_CHECKING:
@@ -125,8 +125,8 @@ def sample_viewpoints(
             "visibility_rank": rank[row_index, direction],
         }
     )
-    unlabelled = dict(zip(LABEL_COLUMNS, (UNLABELLED, np.float32(np.nan), np.float32(np.nan), 0), strict=True))
-    return table.assign(**unlabelled), StoredOcclusion(locations, mask)
+    unlabelled = table.assign(status=UNLABELLED, error_m=np.float32(np.nan), error_deg=np.float32(np.nan), n_inliers=0)
+    return unlabelled, StoredOcclusion(locations, mask)
 
 
 def _subset(values: NDArray[np.int64], at_most: int, rng: np.random.Generator) -> NDArray[np.int64]:

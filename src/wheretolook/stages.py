@@ -11,6 +11,7 @@ import json
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,19 +42,20 @@ def make_scenes(experiment: Experiment, say: Say = print, tick: Tick = lambda wo
     from wheretolook.scenes.procedural import generate_apartment
 
     config, root = experiment.scenes, experiment.root
-    splits: list[Split] = ["train"] * config.train + ["val"] * config.val + ["test"] * config.test  # type: ignore[list-item]
+    numbers: dict[Split, int] = {"train": config.train, "val": config.val, "test": config.test}
+    splits = [split for split, number in numbers.items() for _ in range(number)]
     sources: dict[SceneFolder, Callable[[], Any]] = {}
     keys: dict[SceneFolder, Any] = {}
     for index, split in enumerate(splits):
         seed = config.seed + index
         scene = SceneFolder(root / f"apartment-{seed:03d}", split)
-        sources[scene] = lambda seed=seed: generate_apartment(config.apartment, seed, device=experiment.warp_device)
+        sources[scene] = partial(generate_apartment, config.apartment, seed, device=experiment.warp_device)
         keys[scene] = [asdict(config.apartment), seed]
     for source in config.meshes:
         scene = SceneFolder(root / source.scene_name, source.split)
         if scene.name in {other.name for other in sources}:
             raise SceneError("two scenes have the same name", path=source.path, value=scene.name, fix="Give it a name.")
-        sources[scene] = lambda source=source: load_mesh(source.path, up=source.up)
+        sources[scene] = partial(load_mesh, source.path, up=source.up)
         keys[scene] = [_mesh_fingerprint(source.path), source.up]
 
     for scene, make in sources.items():

@@ -83,7 +83,9 @@ def read_table(path: Path) -> pd.DataFrame:
         table = pq.read_table(path)
     except (pa.ArrowException, OSError) as error:
         raise TableError(
-            f"not a readable Parquet file: {error}", path=path, fix="It may be truncated: delete it and run the stage that writes it."
+            f"not a readable Parquet file: {error}",
+            path=path,
+            fix="It may be truncated: delete it and run the stage that writes it.",
         ) from error
     missing = [name for name in SCHEMA.names if name not in table.column_names]
     if missing:

@@ -1,4 +1,4 @@
-"""Labels of a room whose answers are known: a plain wall never localizes, a poster wall the map has seen always does."""
+"""Labels of a room whose answers are known: a plain wall never localizes, a poster wall in the map always does."""
 
 from __future__ import annotations
 
@@ -119,11 +119,13 @@ def test_killed_at_any_moment_it_resumes_to_the_same_table(room: MappedRoom, tmp
     script = tmp_path / "run.py"
     script.write_text(
         "import sys, pandas as pd\nfrom pathlib import Path\n"
-        "from wheretolook.labelling import LabelConfig, label_viewpoints\nfrom wheretolook.geometry import PinholeCamera\n"
+        "from wheretolook.geometry import PinholeCamera\n"
+        "from wheretolook.labelling import LabelConfig, label_viewpoints\n"
         "if __name__ == '__main__':\n"
         "    folder, mesh, landmarks = map(Path, sys.argv[1:])\n"
-        "    label_viewpoints(pd.read_parquet(folder / 'table.parquet'), mesh, landmarks, PinholeCamera(320, 240, 160.0),\n"
-        "                     folder / 'shards', LabelConfig(workers=2, shard_size=2), progress=False)\n"
+        "    table, camera = pd.read_parquet(folder / 'table.parquet'), PinholeCamera(320, 240, 160.0)\n"
+        "    config = LabelConfig(workers=2, shard_size=2)\n"
+        "    label_viewpoints(table, mesh, landmarks, camera, folder / 'shards', config, progress=False)\n"
     )
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     run = subprocess.Popen(

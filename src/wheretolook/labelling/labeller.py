@@ -9,6 +9,7 @@ import os
 import threading
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,7 +23,7 @@ from wheretolook.labelling.config import LabelConfig, LocalizerConfig
 from wheretolook.labelling.localizer import Localizer
 from wheretolook.mapping.extraction import ExtractorConfig
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.table import LABEL_COLUMNS, fingerprint, poses, read_table, write_table
+from wheretolook.table import fingerprint, poses, read_table, write_table
 
 if TYPE_CHECKING:
     from wheretolook.rendering import Renderer
@@ -99,16 +100,17 @@ def label_viewpoints(
 def label_rows(table: pd.DataFrame, renderer: Renderer, localizer: Localizer, camera: PinholeCamera) -> pd.DataFrame:
     """Label the rows of a table in this process; `label_viewpoints` is this over many processes and shards."""
     true_poses = poses(table)
-    columns: dict[str, list[object]] = {name: [] for name in LABEL_COLUMNS}
-    for true_pose in true_poses:
-        found = localizer.localize(renderer.render(camera, true_pose[None]).rgb[0])
-        error_m = error_deg = np.float64(np.nan)
-        if found.cam_from_world is not None:
-            error_m, error_deg = pose_error(found.cam_from_world, true_pose)
-        values = (found.status, np.float32(error_m), np.float32(error_deg), len(found.inlier_rows))
-        for name, value in zip(LABEL_COLUMNS, values, strict=True):
-            columns[name].append(value)
-    return table.assign(**columns)
+    found = [localizer.localize(renderer.render(camera, pose[None]).rgb[0]) for pose in true_poses]
+    estimates = np.stack(
+        [np.full((3, 4), np.nan) if one.cam_from_world is None else one.cam_from_world for one in found]
+    )
+    error_m, error_deg = pose_error(estimates, true_poses)
+    return table.assign(
+        status=[one.status for one in found],
+        error_m=error_m.astype(np.float32),
+        error_deg=error_deg.astype(np.float32),
+        n_inliers=np.array([len(one.inlier_rows) for one in found], dtype=np.int32),
+    )
 
 
 @dataclass(frozen=True)
@@ -145,10 +147,15 @@ def _start_worker(job: _Job) -> tuple[Renderer, Localizer]:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     parent = multiprocessing.parent_process()
     if parent is not None:  # a parent that was killed cannot end its workers
-        threading.Thread(target=lambda: (parent.join(), os._exit(1)), daemon=True).start()
+        threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
     torch.set_num_threads(1)
     renderer = WarpRenderer(load_mesh(job.mesh), job.device)
     return renderer, Localizer(Landmarks.load(job.landmarks), job.camera, job.localizer, job.extractor, job.device)
+
+
+def _end_with(parent: BaseProcess) -> None:
+    parent.join()
+    os._exit(1)
 
 
 def _is_finished(path: Path, chunk: pd.DataFrame) -> bool:

@@ -35,8 +35,10 @@ class Localization:
 
 
 class Localizer:
-    """Localizes images against landmarks: SIFT, one matrix product against the landmarks' mean descriptors, Lowe's ratio
-    test, then PnP in LO-RANSAC and refinement by pycolmap (paper, Sec. 3.3 "Self-supervision").
+    """Localizes images against landmarks (paper, Sec. 3.3 "Self-supervision").
+
+    SIFT, one matrix product against the landmarks' mean descriptors, Lowe's ratio test, then PnP in LO-RANSAC and
+    refinement by pycolmap.
 
     Args:
         landmarks: with descriptors.

@@ -9,8 +9,8 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.rendering.ray_kernels import cast_kernel, clear_kernel, distance_kernel, occluded_kernel
-from wheretolook.warp_setup import start_warp, vec3_array, warp_mesh
 from wheretolook.scenes.mesh import TexturedMesh
+from wheretolook.warp_setup import start_warp, vec3_array, warp_mesh
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,8 +12,8 @@ from wheretolook.geometry import PinholeCamera
 from wheretolook.rendering.render_kernel import TILE, Appearance, render_kernel
 from wheretolook.rendering.textures import build_pyramids, texel_gradients
 from wheretolook.rendering.types import Rendering, camera_rays, check_poses
-from wheretolook.warp_setup import start_warp, vec3_array, warp_mesh
 from wheretolook.scenes.mesh import TexturedMesh
+from wheretolook.warp_setup import start_warp, vec3_array, warp_mesh
 
 
 class WarpRenderer:

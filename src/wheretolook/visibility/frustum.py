@@ -9,6 +9,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from wheretolook.geometry import Float, PinholeCamera
+from wheretolook.visibility.frustum_kernel import count_kernel
 from wheretolook.warp_setup import start_warp
 
 MIN_DEPTH_M = 1e-3
@@ -33,35 +34,6 @@ class VisibleSets:
         starts = np.zeros(len(mask) + 1, dtype=np.int32)
         np.cumsum(mask.sum(1), out=starts[1:])
         return cls(starts, np.nonzero(mask)[1].astype(np.int32))
-
-
-@wp.kernel
-def _count_kernel(
-    rotations: wp.array[wp.mat33],
-    locations: wp.array[wp.vec3],
-    points: wp.array[wp.vec3],
-    starts: wp.array[wp.int32],
-    indices: wp.array[wp.int32],
-    focal: float,
-    cx: float,
-    cy: float,
-    width: float,
-    height: float,
-    min_depth: float,
-    counts: wp.array2d[wp.int32],
-) -> None:
-    location, direction = wp.tid()
-    rotation = rotations[direction]
-    center = locations[location]
-    count = int(0)
-    for entry in range(starts[location], starts[location + 1]):
-        p = rotation * (points[indices[entry]] - center)
-        # pixel bounds multiplied by the depth: no division
-        x = focal * p[0] + cx * p[2]
-        y = focal * p[1] + cy * p[2]
-        if p[2] > min_depth and x >= 0.0 and x < width * p[2] and y >= 0.0 and y < height * p[2]:
-            count += 1
-    counts[location, direction] = count
 
 
 def count_in_frustum(
@@ -89,7 +61,7 @@ def count_in_frustum(
     shape = (len(locations), len(rotations))
     counts = wp.zeros(shape, dtype=wp.int32, device=device)
     wp.launch(
-        _count_kernel,
+        count_kernel,
         dim=shape,
         inputs=[
             wp.array(np.asarray(rotations, dtype=np.float32), dtype=wp.mat33, device=device),

@@ -109,4 +109,6 @@ class StoredOcclusion:
             with np.load(path) as data:
                 return cls(data["locations"], np.unpackbits(data["mask"], axis=1, count=int(data["n_landmarks"])))
         except Exception as error:  # a damaged zip raises many kinds of errors
-            raise TableError(f"cannot read stored occlusion: {error}", path=path, fix="Run the sample stage again.") from error
+            raise TableError(
+                f"cannot read stored occlusion: {error}", path=path, fix="Run the sample stage again."
+            ) from error

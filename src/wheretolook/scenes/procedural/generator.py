@@ -39,9 +39,9 @@ class ApartmentConfig:
 
     n_rooms: int | None = None
     area_m2: float | None = None
-    texture_richness: float = 0.5
-    clutter: float = 0.5
-    dark_rooms: float = 0.3
+    texture_richness: float = 0.85
+    clutter: float = 0.85
+    dark_rooms: float = 0.2
     texels_per_m: float = 125.0
     texture_size: int = 4096
     light_spacing_m: float = 0.1

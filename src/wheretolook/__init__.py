@@ -1,3 +1,32 @@
-"""wheretolook: where to point a camera so that it knows where it is."""
+"""wheretolook: where to point a camera so that it knows where it is.
+
+`LocalizationMap.from_colmap`, `load_scorer` and `poses_looking_along` score viewpoints of any COLMAP model.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from wheretolook.geometry import PinholeCamera, poses_looking_along
+    from wheretolook.localization_map import LocalizationMap
+    from wheretolook.scoring import load_scorer
+
+__all__ = ["LocalizationMap", "PinholeCamera", "__version__", "load_scorer", "poses_looking_along"]
+
+_HOMES = {
+    "LocalizationMap": "wheretolook.localization_map",
+    "PinholeCamera": "wheretolook.geometry",
+    "load_scorer": "wheretolook.scoring",
+    "poses_looking_along": "wheretolook.geometry",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOMES:  # loads PyTorch and Warp
+        from importlib import import_module
+
+        return getattr(import_module(_HOMES[name]), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

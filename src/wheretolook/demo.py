@@ -5,16 +5,27 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 
+import numpy as np
 from tqdm.auto import tqdm
 
 from wheretolook import stages
 from wheretolook.config import Experiment
 from wheretolook.dataset import Dataset
+from wheretolook.geometry import camera_centers, poses_looking_along
+from wheretolook.grid import direction_lattice
+from wheretolook.rendering import WarpRenderer
+from wheretolook.scenes.loading import load_mesh
+from wheretolook.scoring import load_scorer
+from wheretolook.table import LOCALIZED, is_good, poses
 from wheretolook.tracking import ui_command
 
-SECONDS = {"scenes": 10.0, "map": 25.0, "sample": 3.0, "label": 60.0, "train": 60.0, "evaluate": 15.0}
+SECONDS = {"scenes": 5.0, "map": 15.0, "sample": 1.0, "label": 75.0, "train": 25.0, "evaluate": 6.0}
 """Rough cost of a stage on two cores (the first four for each scene), from which the share done is estimated."""
+
+
+OVERVIEW = "overview.png"
 
 
 def run_demo(experiment: Experiment) -> None:
@@ -42,8 +53,61 @@ def run_demo(experiment: Experiment) -> None:
             bar.set_description_str(f"demo {number}/{len(steps)} {name}")
             say, tick = partial(_say, name), partial(_tick, bar, SECONDS[name])
             step(experiment, say=say, tick=tick)
+        if list((experiment.root / "weights").glob("*.safetensors")):
+            draw_overview(experiment)
         bar.set_description_str("demo")
     _say_where(experiment, time.monotonic() - start)
+
+
+def draw_overview(experiment: Experiment) -> Path:
+    """Draw `<dataset>/results/overview.png`: the last scene's map, and what the last network thinks of one place in it.
+
+    The place is the labelled location where the share of viewpoints that localize is nearest to one half, so that
+    there is something to choose.
+    """
+    from wheretolook.figures.overview import View, overview_figure
+    from wheretolook.figures.style import save_figure
+
+    dataset = Dataset.load(experiment.root)
+    scene = dataset.scenes[-1]
+    table = scene.read_table()
+    localization_map = scene.localization_map(dataset.camera, experiment.warp_device)
+    scorer = load_scorer(sorted((dataset.root / "weights").glob("*.safetensors"))[-1], localization_map)
+
+    centers, good = camera_centers(poses(table)), is_good(table)
+    ids, first, rows = np.unique(table["location_id"], return_index=True, return_inverse=True)
+    share = np.bincount(rows, weights=good) / np.bincount(rows)
+    chosen = int(np.argmin(np.abs(share - 0.5)))
+    place = centers[first[chosen]]
+    candidates = table[table["location_id"] == ids[chosen]]
+    candidate_scores = scorer.score(poses(candidates))
+    renderer = WarpRenderer(load_mesh(scene.mesh), experiment.warp_device)
+
+    def view(row: int) -> View:
+        pose = poses(candidates.iloc[[row]])
+        label = candidates.iloc[row]
+        outcome = str(label["status"]).replace("_", " ")
+        if label["status"] == LOCALIZED and label["error_m"] < 1:
+            outcome = f"pose found, {100 * label['error_m']:.1f} cm and {label['error_deg']:.2f}° off"
+        elif label["status"] == LOCALIZED:
+            outcome = f"wrong pose found, {label['error_m']:.1f} m and {label['error_deg']:.0f}° off"
+        rgb = renderer.render(dataset.camera, pose).rgb[0]
+        return View(rgb, pose[0, 2, :3], float(candidate_scores[row]), outcome)
+
+    directions = direction_lattice(experiment.sample.directions, experiment.sample.lattice)
+    figure = overview_figure(
+        localization_map.landmarks.points,
+        centers[first],
+        share,
+        place,
+        directions,
+        scorer.score(poses_looking_along(np.tile(place, (len(directions), 1)), directions)),
+        view(int(np.argmax(candidate_scores))),
+        view(int(np.argmin(candidate_scores))),
+    )
+    path = dataset.root / "results" / OVERVIEW
+    save_figure(figure, path)
+    return path
 
 
 def _say(stage: str, text: str) -> None:
@@ -60,6 +124,7 @@ def _say_where(experiment: Experiment, seconds: float) -> None:
     rows = [
         ("score table", dataset.root / "results" / "scores.md"),
         ("score figure", dataset.root / "results" / "scores.png"),
+        ("overview", dataset.root / "results" / OVERVIEW),
         ("trained weights", dataset.root / "weights"),
         ("a scene", scene.mesh),
         ("its COLMAP map", scene.map),

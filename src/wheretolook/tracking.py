@@ -11,6 +11,7 @@ import os
 import shlex
 import sqlite3
 import subprocess
+import sys
 from collections.abc import Mapping
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -166,7 +167,15 @@ def artifact(tracking: TrackingConfig, run_id: str, path: str) -> Path:
 
 def ui_command(tracking: TrackingConfig) -> str:
     """The shell line that opens MLflow's UI on the store."""
-    return f"mlflow ui --backend-store-uri {shlex.quote(tracking.uri)}"
+    program = Path(sys.executable).with_name("mlflow")
+    if not program.exists():
+        program = Path("mlflow")
+    elif program.is_relative_to(Path.cwd()):
+        program = program.relative_to(Path.cwd())
+    store = tracking.root / "mlflow.db"
+    if store.is_relative_to(Path.cwd()):  # three slashes and a relative path
+        store = store.relative_to(Path.cwd())
+    return f"{program} ui --backend-store-uri {shlex.quote(f'sqlite:///{store}')}"
 
 
 @cache

@@ -72,7 +72,8 @@ def test_every_stage_leaves_its_result(demo: Path) -> None:
         assert not (scene.folder / "shards").exists()
     scores = pd.read_csv(dataset.root / "results" / "scores.csv")
     assert {"random", "bins", "mlp", "oracle"} <= set(scores["method"])
-    assert (dataset.root / "results" / "scores.png").stat().st_size > 10_000
+    for picture in ("scores.png", "overview.png"):
+        assert (dataset.root / "results" / picture).stat().st_size > 10_000
     run_of_evaluation = newest_run(TrackingConfig(str(demo / "mlruns")), "evaluate")
     assert run_of_evaluation is not None and run_of_evaluation.info.status == "FINISHED"
 

@@ -1,4 +1,4 @@
-"""The whole idea in one picture: map, what the network thinks of every direction at a place, its best and worst view."""
+"""The whole idea in one picture: a map, the score of every direction at a place, its best and its worst view."""
 
 from __future__ import annotations
 

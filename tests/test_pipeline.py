@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -149,11 +150,45 @@ def test_damage_is_named_and_the_rest_left_alone(
     assert {path: fingerprint(path) for path in results(copy)} == before
 
 
-def test_labels_of_one_class_are_named(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    scene = Dataset.load(copy / "data" / "tiny").scenes[0]
+@pytest.mark.parametrize(("stage", "index"), [("train", 0), ("evaluate", 1)])
+def test_labels_of_one_class_are_named(stage: str, index: int, copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = Dataset.load(copy / "data" / "tiny").scenes[index]
     write_table(read_table(scene.table).assign(status="no_pose", error_m=np.nan, error_deg=np.nan), scene.table)
-    assert run("train", copy) == 2
+    assert run(stage, copy) == 2
     assert "one class" in capsys.readouterr().err
+
+
+def test_a_stage_refuses_what_an_earlier_one_has_remade(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("scenes", copy, "--scenes.apartment.texture_richness", "0.3") == 0
+    for stage, needed in (("label", "sample"), ("sample", "map"), ("evaluate", "label")):
+        assert run(stage, copy) == 2
+        assert f"Run `wheretolook {needed}`" in capsys.readouterr().err
+
+
+def test_another_camera_makes_all_but_the_meshes_anew(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    mesh = Dataset.load(copy / "data" / "tiny").scenes[0].mesh
+    before = mesh.stat().st_mtime_ns
+    assert run("scenes", copy, "--camera.focal_px", "200") == 0
+    assert mesh.stat().st_mtime_ns == before
+    assert run("label", copy, "--camera.focal_px", "200") == 2
+    assert "Run `wheretolook sample`" in capsys.readouterr().err
+
+
+def test_weights_are_not_tested_on_what_they_learnt_from(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    root = copy / "data" / "tiny"
+    dataset = Dataset.load(root)
+    replace(dataset, scenes=tuple(replace(scene, split="test") for scene in dataset.scenes)).save()
+    weights = root / "weights" / "mlp-2d.safetensors"
+    assert run("evaluate", copy, "--evaluate.weights", f"[{weights}]") == 2
+    assert "learnt from a scene of the test split (got 'apartment-000')" in capsys.readouterr().err
+    assert run("evaluate", copy) == 2
+    assert "trained on other data" in capsys.readouterr().err
+
+
+def test_nothing_to_see_is_named(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("sample", copy, "--sample.min_visible", "1000000") == 2
+    errors = capsys.readouterr().err
+    assert "sample.min_visible" in errors and "mesh.glb" in errors
 
 
 def test_a_scene_without_free_space_is_named(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -61,6 +61,12 @@ def test_missing_truncated_and_foreign_files(table: pd.DataFrame, tmp_path: Path
     path.write_bytes(path.read_bytes()[:-50])
     with pytest.raises(TableError, match=r"viewpoints\.parquet.*truncated"):
         read_table(path)
+    write_table(table.assign(qw=0.0, qx=0.0, qy=0.0, qz=0.0), path)
+    with pytest.raises(TableError, match="no rigid transform"):
+        read_table(path)
+    table.assign(error_m="near").to_parquet(path)
+    with pytest.raises(TableError, match="another type"):
+        read_table(path)
     table.drop(columns="error_m").to_parquet(path)
     with pytest.raises(TableError, match="error_m"):
         read_table(path)

@@ -9,6 +9,7 @@ import time
 import traceback
 import warnings
 from collections.abc import Iterator
+from dataclasses import is_dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,8 +24,12 @@ if TYPE_CHECKING:
 
 STAGES = {
     "scenes": ("make_scenes", "Make or load the textured meshes.", ("scenes",)),
-    "map": ("make_maps", "Build a COLMAP map of every scene from renders along a walk.", ("map",)),
-    "sample": ("sample", "Choose viewpoints by the landmarks they see.", ("sample",)),
+    "map": (
+        "make_maps",
+        "Build a COLMAP map of every scene from renders along a walk.",
+        ("map", "scenes.free_space", "label.workers"),
+    ),
+    "sample": ("sample", "Choose viewpoints by the landmarks they see.", ("sample", "scenes.free_space")),
     "label": ("label", "Render and localize every viewpoint, measure the pose error. Resumes.", ("label",)),
     "train": ("train", "Train one network for each input variant.", ("train", "tracking")),
     "evaluate": ("evaluate", "Score all methods on the test scenes.", ("evaluate", "tracking")),
@@ -71,6 +76,11 @@ def main(arguments: list[str] | None = None) -> int:
             traceback.print_exc()
         print(f"wheretolook: error: {error}", file=sys.stderr)
         return 2
+    except OSError as error:
+        if debug:
+            traceback.print_exc()
+        print(f"wheretolook: error: {error.filename or 'a file'}: {error.strerror or error}", file=sys.stderr)
+        return 2
     except KeyboardInterrupt:
         print("\nwheretolook: interrupted; what is finished is kept, run the same command to go on", file=sys.stderr)
         return 130
@@ -116,17 +126,42 @@ def parse_experiment(command: str, arguments: list[str]) -> Experiment | None:
         return None
     from jsonargparse import ArgumentError
 
+    files = [value for flag, value in pairwise(arguments) if flag == "--config"]
+    files += [argument.removeprefix("--config=") for argument in arguments if argument.startswith("--config=")]
+    file = ", ".join(files) or None
+    for name in files:
+        _check_groups(Path(name))
     try:
         settings = vars(parser.instantiate(parser.parse_args(arguments)))
-        return Experiment(**{name: value for name, value in settings.items() if name != "config"})
+        settings.pop("config")
+        return Experiment(**settings)
     except (ArgumentError, WhereToLookError) as error:
         for cause in _causes(error):
             if isinstance(cause, WhereToLookError):
-                raise cause from error
+                fix = (
+                    cause.fix or f"Correct it there or on the command line; `wheretolook {command} --help` explains it."
+                )
+                path = cause.path or file
+                raise type(cause)(cause.problem, path=path, value=cause.value, fix=fix) from error
         problem = " ".join(str(error).split())
-        file = next((value for flag, value in pairwise(arguments) if flag == "--config"), None)
         path = None if problem.startswith("unrecognized arguments") else file
         raise ConfigError(problem, path=path, fix=f"`wheretolook {command} --help` lists the settings.") from error
+
+
+def _check_groups(path: Path) -> None:
+    """A group of settings that is no mapping would be passed over in silence, and the defaults used."""
+    import yaml
+
+    from wheretolook.config import Experiment
+
+    try:
+        content = yaml.safe_load(path.read_text())
+    except (OSError, UnicodeDecodeError, yaml.YAMLError):
+        return  # the parser says what is wrong
+    for name, default in vars(Experiment()).items():
+        if is_dataclass(default) and isinstance(content, dict) and not isinstance(content.get(name, {}), dict):
+            fix = f"Write its settings as `{name}: {{setting: value}}`."
+            raise ConfigError(f"{name} is a group of settings", path=path, value=content[name], fix=fix)
 
 
 def _parser(command: str) -> ArgumentParser:
@@ -148,17 +183,19 @@ def _parser(command: str) -> ArgumentParser:
 
 def _help(parser: ArgumentParser, command: str) -> str:
     """The settings this stage reads; the file may hold those of every other stage too."""
-    groups = tuple(f"{group}." for group in STAGES[command][2]) if command in STAGES else ()
+    groups = STAGES[command][2] if command in STAGES else ()
 
     def belongs(dest: str) -> bool:
-        return not groups or dest.startswith((*groups, "camera.")) or ("." not in dest and dest not in _GROUPS)
+        if not groups or ("." not in dest and dest not in _GROUPS):
+            return True
+        return any(dest == group or dest.startswith(f"{group}.") for group in (*groups, "camera"))
 
     for group in parser._action_groups:
         group._group_actions = [action for action in group._group_actions if belongs(action.dest)]
     return str(parser.format_help())
 
 
-_GROUPS = {group for _, _, groups in STAGES.values() for group in groups}
+_GROUPS = {group.partition(".")[0] for _, _, groups in STAGES.values() for group in groups}
 
 
 def _causes(error: BaseException) -> Iterator[BaseException]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -35,6 +36,15 @@ class MeshSource:
     name: str = ""
     up: str = "z"
 
+    def __post_init__(self) -> None:
+        name = self.scene_name
+        if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9._-]*", name) or name in ("weights", "results"):
+            raise ConfigError(
+                "a scene's name becomes a folder's",
+                value=name,
+                fix="Give it a name of letters, digits, '.', '_' and '-'.",
+            )
+
     @property
     def scene_name(self) -> str:
         """Name of the scene's folder."""
@@ -65,7 +75,11 @@ class ScenesConfig:
 
     def __post_init__(self) -> None:
         if min(self.train, self.val, self.test) < 0 or self.train + self.val + self.test + len(self.meshes) == 0:
-            raise ConfigError("an experiment needs scenes", value=(self.train, self.val, self.test, self.meshes))
+            raise ConfigError(
+                "an experiment needs scenes",
+                value=(self.train, self.val, self.test, self.meshes),
+                fix="Set scenes.train and scenes.test, or name meshes in scenes.meshes.",
+            )
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from tqdm.auto import tqdm
 from wheretolook import stages
 from wheretolook.config import Experiment
 from wheretolook.dataset import Dataset
+from wheretolook.errors import ConfigError
 from wheretolook.geometry import camera_centers, poses_looking_along
 from wheretolook.grid import direction_lattice
 from wheretolook.rendering import WarpRenderer
@@ -46,6 +47,11 @@ def run_demo(experiment: Experiment) -> None:
     }
     if config.train == 0 and not any(mesh.split == "train" for mesh in config.meshes):
         del steps["train"], cost["train"]  # meshes of one's own, evaluated with weights from elsewhere
+        if "mlp" in experiment.evaluate.methods and not experiment.evaluate.weights:
+            raise ConfigError(
+                "no scene to learn from, and no weights to evaluate",
+                fix="Name weights in evaluate.weights, or leave mlp out of evaluate.methods.",
+            )
     start = time.monotonic()
     layout = "{desc}: {percentage:3.0f}%|{bar}| {elapsed} elapsed, about {remaining} remain"
     with tqdm(total=sum(cost.values()), desc="demo", bar_format=layout, smoothing=0) as bar:

@@ -43,5 +43,9 @@ class TableError(WhereToLookError):
     """A table of viewpoints is missing, truncated or lacks columns or labels."""
 
 
+class WorkerError(WhereToLookError):
+    """A worker process ended before its work was done."""
+
+
 class WeightsError(WhereToLookError):
     """Trained weights are missing or do not fit the network or the inputs asked for."""

@@ -90,6 +90,9 @@ def sample_viewpoints(
         config: how many of what.
         device: where visibility is counted.
 
+    Raises:
+        SceneError: no viewpoint sees enough landmarks.
+
     Returns:
         The table of viewpoints, unlabelled, in the order of their ids; a viewpoint's id is its location's times the
         number of directions plus its direction's. And the occlusion of the table's locations, for later stages.
@@ -115,6 +118,12 @@ def sample_viewpoints(
         rows.append(np.full(len(kept), row))
         columns.append(kept)
     row_index, direction = np.concatenate(rows), np.concatenate(columns)
+    if len(direction) == 0:
+        raise SceneError(
+            f"from no location does a viewpoint see {config.min_visible} of the {len(landmarks.points)} landmarks",
+            value=int(counts.max(initial=0)),
+            fix="Lower sample.min_visible, or map the scene with more images.",
+        )
     table = pd.DataFrame(
         {
             "viewpoint_id": ids[row_index] * len(directions) + direction,

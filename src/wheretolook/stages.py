@@ -9,21 +9,24 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-from collections.abc import Callable, Sequence
-from dataclasses import asdict
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from wheretolook.config import Experiment
 from wheretolook.dataset import Dataset, SceneFolder, Split, write_json
-from wheretolook.errors import ConfigError, MapError, SceneError
+from wheretolook.errors import ConfigError, MapError, SceneError, TableError
 from wheretolook.table import fingerprint, write_table
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from wheretolook.learning.training import TrainedModel
+    from wheretolook.mapping.extraction import ExtractorConfig
 
 STAGES = ("scenes", "map", "sample", "label")
 """Stages that work scene by scene, in order."""
@@ -70,6 +73,9 @@ def make_scenes(experiment: Experiment, say: Say = print, tick: Tick = lambda wo
             say(f"{scene.name}: reusing {scene.mesh}")
         tick(1)
     dataset = Dataset(root, experiment.camera, tuple(sources))
+    if (root / "dataset.json").is_file() and Dataset.load(root).camera != experiment.camera:
+        for scene in dataset.scenes:  # what was made with another camera is no longer valid
+            _stamp(scene, "scenes", _read_stamps(scene)["scenes"])
     dataset.save()
     return dataset
 
@@ -85,24 +91,27 @@ def make_maps(experiment: Experiment, say: Say = print, tick: Tick = lambda work
     from wheretolook.scenes.free_space import FreeSpace
     from wheretolook.scenes.loading import load_mesh
 
-    dataset, device = _dataset(experiment), experiment.warp_device
-    for index, scene in enumerate(dataset.scenes):
-        key = _key("map", [asdict(experiment.map), asdict(experiment.scenes.free_space), asdict(dataset.camera), index,
+    dataset, device = _dataset(experiment, "scenes"), experiment.warp_device
+    for scene in dataset.scenes:
+        seed = zlib.crc32(scene.name.encode())  # the scene's own, whichever scenes are beside it
+        key = _key("map", [asdict(experiment.map), asdict(experiment.scenes.free_space), asdict(dataset.camera), seed,
                            _existing(scene.mesh, SceneError, "scenes")])  # fmt: skip
-        if not _is_done(scene, "map", key, scene.landmarks):
+        model = [scene.map / name for name in ("cameras.bin", "images.bin", "points3D.bin")]
+        if not _is_done(scene, "map", key, scene.landmarks, *model):
             mesh = load_mesh(scene.mesh)
             raycaster = MeshRaycaster(mesh, device)
-            report = build_map(
-                mesh,
-                WarpRenderer(mesh, device),
-                FreeSpace(mesh, experiment.scenes.free_space, device),
-                dataset.camera,
-                experiment.map,
-                seed=index,
-                out_dir=scene.map,
-                workers=experiment.n_workers,
-                raycaster=raycaster,
-            )
+            with _naming(scene.mesh):
+                report = build_map(
+                    mesh,
+                    WarpRenderer(mesh, device),
+                    FreeSpace(mesh, experiment.scenes.free_space, device),
+                    dataset.camera,
+                    experiment.map,
+                    seed=seed,
+                    out_dir=scene.map,
+                    workers=experiment.n_workers,
+                    raycaster=raycaster,
+                )
             _stamp(scene, "map", key)
             say(f"{scene.name}: {report.n_landmarks:,} landmarks from {report.n_registered} images, median "
                 f"{report.median_distance_to_mesh_cm:.2f} cm from the mesh -> {scene.map}")  # fmt: skip
@@ -126,7 +135,7 @@ def sample(experiment: Experiment, say: Say = print, tick: Tick = lambda work: N
     from wheretolook.scenes.loading import load_mesh
     from wheretolook.visibility import MeshOcclusion
 
-    dataset, device = _dataset(experiment), experiment.warp_device
+    dataset, device = _dataset(experiment, "map"), experiment.warp_device
     for scene in dataset.scenes:
         key = _key("sample", [asdict(experiment.sample), asdict(experiment.scenes.free_space), asdict(dataset.camera),
                               _existing(scene.mesh, SceneError, "scenes"),
@@ -134,11 +143,12 @@ def sample(experiment: Experiment, say: Say = print, tick: Tick = lambda work: N
         if not _is_done(scene, "sample", key, scene.table, scene.occlusion):
             mesh, landmarks = load_mesh(scene.mesh), Landmarks.load(scene.landmarks)
             grid = VoxelGrid.over(mesh.bounds, experiment.sample.grid)
-            free = free_locations(grid, FreeSpace(mesh, experiment.scenes.free_space, device))
             occlusion = MeshOcclusion(MeshRaycaster(mesh, device))
-            table, stored = sample_viewpoints(
-                grid, free, landmarks, dataset.camera, occlusion, experiment.sample, device
-            )
+            with _naming(scene.mesh):
+                free = free_locations(grid, FreeSpace(mesh, experiment.scenes.free_space, device))
+                table, stored = sample_viewpoints(
+                    grid, free, landmarks, dataset.camera, occlusion, experiment.sample, device
+                )
             stored.save(scene.occlusion)
             write_table(table, scene.table)
             _stamp(scene, "sample", key)
@@ -158,16 +168,16 @@ def label(experiment: Experiment, say: Say = print, tick: Tick = lambda work: No
     from wheretolook.labelling import label_viewpoints
     from wheretolook.table import is_good
 
-    dataset = _dataset(experiment)
+    dataset = _dataset(experiment, "sample")
     for scene in dataset.scenes:
-        table = scene.read_table()
-        key = _key("label", [asdict(experiment.label.localizer), asdict(experiment.map.extractor),
+        table, extractor = scene.read_table(), _extractor_of(scene)
+        key = _key("label", [asdict(experiment.label.localizer), asdict(extractor), asdict(dataset.camera),
                              _existing(scene.mesh, SceneError, "scenes"),
                              _existing(scene.landmarks, MapError, "map"), _read_stamp(scene, "sample")])  # fmt: skip
         if not _is_done(scene, "label", key, scene.table):
             shards = scene.folder / "shards"
             table = label_viewpoints(
-                table, scene.mesh, scene.landmarks, dataset.camera, shards, experiment.label, experiment.map.extractor,
+                table, scene.mesh, scene.landmarks, dataset.camera, shards, experiment.label, extractor,
                 experiment.warp_device, description=f"label {scene.name}",
             )  # fmt: skip
             write_table(table, scene.table)
@@ -183,9 +193,12 @@ def train(experiment: Experiment, say: Say = print, tick: Tick = lambda work: No
     """Stage 5: one network for each input variant, `<dataset>/weights/`, and an MLflow run for each."""
     from wheretolook.learning.training import train as train_variants
 
-    models = train_variants(_dataset(experiment), experiment.train, experiment.tracking)
+    config = experiment.train
+    if experiment.warp_device == "cpu":
+        config = replace(config, accelerator="cpu")
+    models = train_variants(_dataset(experiment, "label"), config, experiment.tracking)
     for model in models:
-        say(f"{model.variant}: -> {model.path}")
+        say(f"{model.variant}: reusing {model.path}" if model.reused else f"{model.variant}: -> {model.path}")
     tick(1)
     return models
 
@@ -194,20 +207,49 @@ def evaluate(experiment: Experiment, say: Say = print, tick: Tick = lambda work:
     """Stage 6: the score table of all methods on the test scenes, `<dataset>/results/`, and nested MLflow runs."""
     from wheretolook.evaluation import evaluate as evaluate_methods
 
-    dataset = _dataset(experiment)
+    dataset = _dataset(experiment, "label")
     scores = evaluate_methods(dataset, experiment.evaluate, experiment.tracking, device=experiment.warp_device)
     tick(1)
     return scores
 
 
-def _dataset(experiment: Experiment) -> Dataset:
+def _dataset(experiment: Experiment, needs: str) -> Dataset:
+    """The dataset, once the stage that is needed has been through all of its scenes with what they now hold."""
     dataset = Dataset.load(experiment.root)
     if dataset.camera != experiment.camera:
         raise ConfigError(
             "the dataset was made with another camera", path=experiment.root, value=dataset.camera,
             fix="Run the scenes stage with this configuration, or give the experiment another name.",
         )  # fmt: skip
+    for scene in dataset.scenes:
+        if _read_stamp(scene, needs) is None:
+            raise TableError(
+                f"the {needs} stage has not been run for this scene, or not since an earlier stage remade its input",
+                path=scene.folder, fix=f"Run `wheretolook {needs}`.",
+            )  # fmt: skip
     return dataset
+
+
+@contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Add the scene's file to errors of those who know only its content."""
+    try:
+        yield
+    except (SceneError, MapError) as error:
+        if error.path is not None:
+            raise
+        raise type(error)(error.problem, path=path, value=error.value, fix=error.fix) from error
+
+
+def _extractor_of(scene: SceneFolder) -> ExtractorConfig:
+    """The keypoint extractor the map was made with: queries must use the same."""
+    from wheretolook.mapping.extraction import ExtractorConfig
+
+    path = scene.map / "report.json"
+    try:
+        return ExtractorConfig(**json.loads(path.read_text())["config"]["extractor"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise MapError("the map's report is missing or damaged", path=path, fix="Run the map stage again.") from error
 
 
 def _key(stage: str, parts: list[Any]) -> str:
@@ -226,8 +268,12 @@ def _mesh_fingerprint(path: Path) -> str:
     """A mesh file changes when its size or date does; it may be gigabytes."""
     if not path.exists():
         raise SceneError("there is no such mesh", path=path, fix="Check the path.")
-    status = path.stat()
-    return f"{path.resolve()}:{status.st_size}:{status.st_mtime_ns}"
+    files = [path]
+    if path.is_dir():
+        files = sorted(file for file in path.iterdir() if file.is_file())
+    elif path.suffix.lower() != ".glb":  # materials and textures lie beside it
+        files = sorted(file for file in path.parent.iterdir() if file.is_file())
+    return " ".join(f"{file.resolve()}:{file.stat().st_size}:{file.stat().st_mtime_ns}" for file in files)
 
 
 def _stamp_path(scene: SceneFolder) -> Path:

@@ -15,7 +15,6 @@ from wheretolook.errors import TableError
 from wheretolook.geometry import Float, quaternion_from_rotation, rotation_from_quaternion
 
 POSE_COLUMNS = ("qw", "qx", "qy", "qz", "tx", "ty", "tz")
-LABEL_COLUMNS = ("status", "error_m", "error_deg", "n_inliers")
 
 SCHEMA = pa.schema(
     [
@@ -33,7 +32,8 @@ SCHEMA = pa.schema(
 )
 """Columns of `viewpoints.parquet`. The pose is cam_from_world (quaternion wxyz, translation in metres), rank 0 is the
 direction that sees most landmarks at its location. Until a viewpoint is labelled its status is "unlabelled"; afterwards
-it is "localized", "too_few_matches" or "no_pose", and both errors are NaN unless there is a pose to compare."""
+it is "localized", "too_few_matches" or "no_pose". Errors are of the pose RANSAC found, if it found one, even if it had
+too few inliers to be believed ("no_pose"); otherwise they are NaN."""
 
 UNLABELLED, LOCALIZED, TOO_FEW_MATCHES, NO_POSE = "unlabelled", "localized", "too_few_matches", "no_pose"
 
@@ -90,7 +90,21 @@ def read_table(path: Path) -> pd.DataFrame:
     missing = [name for name in SCHEMA.names if name not in table.column_names]
     if missing:
         raise TableError("columns are missing", path=path, value=missing, fix="Run the sample stage again.")
-    return table.select(SCHEMA.names).cast(SCHEMA).to_pandas()
+    try:
+        frame: pd.DataFrame = table.select(SCHEMA.names).cast(SCHEMA).to_pandas()
+    except pa.ArrowException as error:
+        raise TableError(f"columns of another type: {error}", path=path, fix="Run the sample stage again.") from error
+    length = np.linalg.norm(frame[list(POSE_COLUMNS[:4])].to_numpy(), axis=1)
+    bad = ~(np.abs(length - 1) < 1e-6) | ~np.isfinite(frame[list(POSE_COLUMNS[4:])].to_numpy()).all(1)
+    if bad.any():
+        row = int(np.argmax(bad))
+        raise TableError(
+            "a pose is no rigid transform",
+            path=path,
+            value=[float(frame[name].iloc[row]) for name in POSE_COLUMNS],
+            fix="The file is damaged: run the sample stage again.",
+        )
+    return frame
 
 
 def fingerprint(path: Path) -> str:

@@ -115,7 +115,7 @@ def test_report_is_on_disk(built):
     assert json.loads((folder / "report.json").read_text()) == json.loads(json.dumps(asdict(report)))
     assert report.n_images == 14 and 12 <= report.n_registered <= 14
     assert report.coverage >= CONFIG.walk.coverage
-    assert report.config["extractor"]["method"] == "colmap"
+    assert report.config["extractor"]["method"] == "opencv"
 
 
 def test_same_seed_same_bytes_whatever_the_workers(built, room, room_free_space, renderer, tmp_path):
@@ -131,10 +131,10 @@ def test_same_seed_same_bytes_whatever_the_workers(built, room, room_free_space,
 
 
 def test_two_view_landmarks_add_short_tracks(built, room, room_free_space, renderer, tmp_path):
-    _, few = built
-    config = replace(CONFIG, two_view_landmarks=True, keep_images=False, keep_database=False)
-    many = build_map(room, renderer, room_free_space, CAMERA, config, SEED, tmp_path / "map", workers=1, progress=False)
-    length = Landmarks.load(tmp_path / "map" / "landmarks.npz").track_length
+    folder, many = built
+    config = replace(CONFIG, two_view_landmarks=False, keep_images=False, keep_database=False)
+    few = build_map(room, renderer, room_free_space, CAMERA, config, SEED, tmp_path / "map", workers=1, progress=False)
+    length = Landmarks.load(folder / "landmarks.npz").track_length
     assert (length == 2).sum() > 0.3 * len(length)
     assert many.n_landmarks > 1.3 * few.n_landmarks
     assert many.median_track_length < few.median_track_length

@@ -80,7 +80,8 @@ def test_colmap_method_gives_the_keypoints_of_colmaps_own_feature_extraction(tmp
     with pycolmap.Database.open(str(tmp_path / "database.db")) as database:
         pixels = np.asarray(database.read_keypoints(1))[:, :2]
         descriptors = database.read_descriptors(1).data
-    ours = KeypointExtractor(ExtractorConfig(max_keypoints=100_000)).extract(image)
+    config = ExtractorConfig(method="colmap", first_octave=0, max_keypoints=100_000)
+    ours = KeypointExtractor(config).extract(image)
     mine = np.column_stack([ours.pixels, quantize_descriptors(ours.descriptors)])
     theirs = np.column_stack([pixels.astype(np.float32), descriptors])
     assert len(mine) == len(theirs)

@@ -70,6 +70,8 @@ def evaluate(
         fix = "Make one, or choose another split."
         raise TableError(f"the dataset has no {config.split} scene", path=dataset.root, fix=fix)
     weights = _weights(dataset, config, models)
+    if config.split == "test":
+        _check_unseen(scenes, weights)
     tables = [scene.read_table() for scene in scenes]
     views = _test_views(scenes, tables, config)
     scores = _score_scenes(dataset, scenes, tables, config, weights, device, progress)
@@ -87,14 +89,44 @@ def _weights(dataset: Dataset, config: EvaluateConfig, models: Sequence[TrainedM
     if models is not None:
         weights = [model if isinstance(model, Path) else model.path for model in models]
     else:
-        trained = (dataset.root / "weights" / f"mlp-{variant}.safetensors" for variant in INPUT_VARIANTS)
-        weights = list(config.weights) or [path for path in trained if path.is_file()]
+        weights = list(config.weights) or _own_weights(dataset)
     if not weights:
         raise WeightsError(
             "there are no weights to evaluate", path=dataset.root / "weights",
             fix="Run the train stage first, name weights, or leave mlp out of the methods.",
         )  # fmt: skip
     return weights
+
+
+def _own_weights(dataset: Dataset) -> list[Path]:
+    """The weights in the dataset's folder, which must be trained on what the dataset now holds."""
+    from wheretolook.learning.training import training_fingerprint
+    from wheretolook.learning.weights import read_training
+
+    named = (dataset.root / "weights" / f"mlp-{variant}.safetensors" for variant in INPUT_VARIANTS)
+    weights = [path for path in named if path.is_file()]
+    now = training_fingerprint(dataset)
+    for path in weights:
+        if read_training(path).get("dataset_fingerprint") != now:
+            raise WeightsError(
+                "these weights were trained on other data than the dataset now holds", path=path,
+                fix="Run the train stage again, remove the file, or name weights in evaluate.weights.",
+            )  # fmt: skip
+    return weights
+
+
+def _check_unseen(scenes: Sequence[SceneFolder], weights: Sequence[Path]) -> None:
+    """Weights must not be tested on a scene they have learnt from."""
+    from wheretolook.learning.weights import read_training
+
+    landmarks = {fingerprint(scene.landmarks): scene.name for scene in scenes if scene.landmarks.is_file()}
+    for path in weights:
+        for seen in read_training(path).get("landmarks", {}).values():
+            if seen in landmarks:
+                raise WeightsError(
+                    "these weights have learnt from a scene of the test split", path=path, value=landmarks[seen],
+                    fix="Train again without that scene, or evaluate on others.",
+                )  # fmt: skip
 
 
 def _test_views(scenes: Sequence[SceneFolder], tables: Sequence[pd.DataFrame], config: EvaluateConfig) -> TestViews:
@@ -111,6 +143,13 @@ def _test_views(scenes: Sequence[SceneFolder], tables: Sequence[pd.DataFrame], c
         names, rows = np.unique(table["location_id"].to_numpy(np.int64), return_inverse=True)
         location.append(rows + sum(len(part) for part in location_scene))
         location_scene.append(np.full(len(names), number))
+    if len(np.unique(np.concatenate(good)[:, 0])) < 2:
+        metres, degrees = config.thresholds[0]
+        raise TableError(
+            f"labels of one class only: of {sum(map(len, good))} viewpoints all or none are within {metres:g} m and "
+            f"{degrees:g} degrees", path=scenes[0].table, value=bool(good[0][0, 0]),
+            fix="Label more viewpoints, or give other evaluate.thresholds.",
+        )  # fmt: skip
     ids = np.concatenate([table["viewpoint_id"].to_numpy(np.int64) for table in tables])
     return TestViews(np.concatenate(location), ids, np.concatenate(good), np.concatenate(location_scene))
 

@@ -6,10 +6,9 @@ import hashlib
 import json
 import multiprocessing
 import os
-import threading
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
-from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,13 +16,14 @@ import numpy as np
 import pandas as pd
 from tqdm.auto import tqdm
 
-from wheretolook.errors import MapError
+from wheretolook.errors import MapError, TableError, WorkerError
 from wheretolook.geometry import PinholeCamera, pose_error
 from wheretolook.labelling.config import LabelConfig, LocalizerConfig
 from wheretolook.labelling.localizer import Localizer
 from wheretolook.mapping.extraction import ExtractorConfig
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.table import fingerprint, poses, read_table, write_table
+from wheretolook.table import POSE_COLUMNS, fingerprint, poses, read_table, write_table
+from wheretolook.worker_processes import end_with_parent, spawning
 
 if TYPE_CHECKING:
     from wheretolook.rendering import Renderer
@@ -64,13 +64,17 @@ def label_viewpoints(
 
     Raises:
         SceneError, MapError: the mesh or the landmarks cannot be used.
+        TableError: the table is empty.
+        WorkerError: a worker process was killed.
     """
     config, extractor = config or LabelConfig(), extractor or ExtractorConfig()
+    if table.empty:
+        raise TableError("no viewpoints to label", fix="Run the sample stage with other settings.")
     if Landmarks.load(landmarks).descriptors is None:
         raise MapError("landmarks without descriptors cannot be matched", path=landmarks, fix="Build the map again.")
     settings = [asdict(config.localizer), asdict(extractor), asdict(camera), fingerprint(mesh), fingerprint(landmarks)]
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
-    digest.update(pd.util.hash_pandas_object(table, index=False).to_numpy().tobytes())
+    digest.update(pd.util.hash_pandas_object(table[["viewpoint_id", *POSE_COLUMNS]], index=False).to_numpy().tobytes())
     folder = shards / f"{digest.hexdigest()[:16]}-{config.shard_size}"
     folder.mkdir(parents=True, exist_ok=True)
 
@@ -88,10 +92,17 @@ def label_viewpoints(
             context = multiprocessing.get_context("spawn")
             pool = ProcessPoolExecutor(n_workers, context)
             try:
-                futures = {pool.submit(_label_shard, job, path, chunk): chunk for path, chunk in missing.items()}
+                with spawning():
+                    futures = {pool.submit(_label_shard, job, path, chunk): chunk for path, chunk in missing.items()}
                 for future in as_completed(futures):
                     future.result()
                     bar.update(len(futures[future]))
+            except BrokenProcessPool as error:
+                raise WorkerError(
+                    "a labelling process was killed, probably for lack of memory",
+                    value=f"{n_workers} workers",
+                    fix="Lower label.workers and run again: finished shards are kept.",
+                ) from error
             finally:
                 pool.shutdown(wait=True, cancel_futures=True)
     return pd.concat([read_table(path) for path in chunks], ignore_index=True)
@@ -137,31 +148,19 @@ def _label_shard(job: _Job, path: Path, chunk: pd.DataFrame) -> None:
 
 
 def _start_worker(job: _Job) -> tuple[Renderer, Localizer]:
-    import signal
-
     import torch
 
     from wheretolook.rendering import WarpRenderer
     from wheretolook.scenes.loading import load_mesh
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
-    parent = multiprocessing.parent_process()
-    if parent is not None:  # a parent that was killed cannot end its workers
-        threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+    end_with_parent()
     torch.set_num_threads(1)
     renderer = WarpRenderer(load_mesh(job.mesh), job.device)
     return renderer, Localizer(Landmarks.load(job.landmarks), job.camera, job.localizer, job.extractor, job.device)
 
 
-def _end_with(parent: BaseProcess) -> None:
-    parent.join()
-    os._exit(1)
-
-
 def _is_finished(path: Path, chunk: pd.DataFrame) -> bool:
     """Whether a shard is whole; a damaged one is removed and made again."""
-    from wheretolook.errors import TableError
-
     if not path.exists():
         return False
     try:

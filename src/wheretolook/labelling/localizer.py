@@ -23,7 +23,8 @@ class Localization:
 
     Attributes:
         status: "localized", "too_few_matches" or "no_pose".
-        cam_from_world: (3, 4) estimated pose, None unless localized.
+        cam_from_world: (3, 4) estimated pose, None if RANSAC found none. A pose with too few inliers is kept for the
+            record, but its status is "no_pose".
         n_matches: 2D-3D matches.
         inlier_rows: rows of the landmarks that were matched and agree with the pose.
     """
@@ -90,10 +91,11 @@ class Localizer:
             self._estimation,
             self._refinement,
         )
-        if estimate is None or estimate["num_inliers"] < self.config.min_inliers:
+        if estimate is None:
             return Localization(NO_POSE, None, n_matches)
         pose = np.asarray(estimate["cam_from_world"].matrix())
-        return Localization(LOCALIZED, pose, n_matches, landmark_rows[np.asarray(estimate["inlier_mask"], dtype=bool)])
+        status = LOCALIZED if estimate["num_inliers"] >= self.config.min_inliers else NO_POSE
+        return Localization(status, pose, n_matches, landmark_rows[np.asarray(estimate["inlier_mask"], dtype=bool)])
 
     def match(self, descriptors: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Match unit descriptors (K, 128) against the landmarks'.

@@ -30,6 +30,7 @@ from wheretolook.learning.config import TrainConfig
 from wheretolook.learning.data import ViewpointDataModule
 from wheretolook.learning.network import NetworkSpec, ViewpointNetwork
 from wheretolook.learning.weights import save_classifier
+from wheretolook.table import fingerprint as file_fingerprint
 from wheretolook.tracking import TrackingConfig, log, start_run
 
 if TYPE_CHECKING:
@@ -89,8 +90,7 @@ def train(
         TableError: no train scene, no labels, or labels of one class only.
         MapError: a scene has no landmarks.
     """
-    learnt_from = Dataset(dataset.root, dataset.camera, (*dataset.split("train"), *dataset.split("val")))
-    fingerprint = learnt_from.fingerprint()
+    fingerprint = training_fingerprint(dataset)
     use_gpu = config.accelerator != "cpu" and torch.cuda.is_available()
     data = ViewpointDataModule(dataset, config, "cuda:0" if use_gpu else "cpu", progress)
     models = []
@@ -105,12 +105,20 @@ def train(
     return models
 
 
+def training_fingerprint(dataset: Dataset) -> str:
+    """16 hexadecimal digits that change with anything a network learns from: the train and val scenes."""
+    return Dataset(dataset.root, dataset.camera, (*dataset.split("train"), *dataset.split("val"))).fingerprint()
+
+
 def _about(dataset: Dataset, config: TrainConfig, fingerprint: str, variant: str) -> dict[str, Any]:
     """What decides which weights come out, as JSON values."""
     options = {name: value for name, value in asdict(config).items() if name not in ("variants", "accelerator")}
     about = {
         "dataset": dataset.name,
         "dataset_fingerprint": fingerprint,
+        "landmarks": {
+            scene.name: file_fingerprint(scene.landmarks) for scene in dataset.scenes if scene.split != "test"
+        },
         "code_version": wheretolook.__version__,
         "variant": variant,
         "camera": asdict(dataset.camera),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import signal
 from collections.abc import Generator, Iterable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 
 from wheretolook.errors import ConfigError
 from wheretolook.mapping.colmap_model import quiet_colmap
+from wheretolook.worker_processes import end_with_parent, spawning
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,10 @@ class KeypointExtractor:
         context = multiprocessing.get_context("spawn")
         with ProcessPoolExecutor(workers, context, initializer=_start_worker, initargs=(self.config,)) as pool:
             source = iter(images)
-            pending = [pool.submit(_extract_in_worker, rgb) for rgb in islice(source, 4 * workers)]
+            pending = []
+            for rgb in islice(source, 4 * workers):
+                with spawning():
+                    pending.append(pool.submit(_extract_in_worker, rgb))
             while pending:
                 yield pending.pop(0).result()
                 pending += [pool.submit(_extract_in_worker, rgb) for rgb in islice(source, 1)]
@@ -188,7 +191,7 @@ _worker: KeypointExtractor | None = None
 
 def _start_worker(config: ExtractorConfig) -> None:
     global _worker
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's business
+    end_with_parent()
     _worker = KeypointExtractor(config)
 
 

@@ -59,14 +59,15 @@ def run_demo(experiment: Experiment) -> None:
             bar.set_description_str(f"demo {number}/{len(steps)} {name}")
             say, tick = partial(_say, name), partial(_tick, bar, SECONDS[name])
             step(experiment, say=say, tick=tick)
-        if list((experiment.root / "weights").glob("*.safetensors")):
-            draw_overview(experiment)
+        weights = experiment.evaluate.weights or sorted((experiment.root / "weights").glob("*.safetensors"))
+        if weights:
+            draw_overview(experiment, weights[-1])
         bar.set_description_str("demo")
     _say_where(experiment, time.monotonic() - start)
 
 
-def draw_overview(experiment: Experiment) -> Path:
-    """Draw `<dataset>/results/overview.png`: the last scene's map, and what the last network thinks of one place in it.
+def draw_overview(experiment: Experiment, weights: Path) -> Path:
+    """Draw `<dataset>/results/overview.png`: the last scene's map, and what a network thinks of one place in it.
 
     The place is the labelled location where the share of viewpoints that localize is nearest to one half, so that
     there is something to choose.
@@ -78,7 +79,7 @@ def draw_overview(experiment: Experiment) -> Path:
     scene = dataset.scenes[-1]
     table = scene.read_table()
     localization_map = scene.localization_map(dataset.camera, experiment.warp_device)
-    scorer = load_scorer(sorted((dataset.root / "weights").glob("*.safetensors"))[-1], localization_map)
+    scorer = load_scorer(weights, localization_map)
 
     centers, good = camera_centers(poses(table)), is_good(table)
     ids, first, rows = np.unique(table["location_id"], return_index=True, return_inverse=True)

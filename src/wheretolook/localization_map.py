@@ -10,6 +10,7 @@ import numpy as np
 from wheretolook.features import BinnedViews, bin_views
 from wheretolook.geometry import Float, PinholeCamera, camera_centers
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
+from wheretolook.rendering.types import check_poses
 from wheretolook.visibility import NoOcclusion, OcclusionModel, VisibleSets
 
 SAME_LOCATION_DECIMALS = 6
@@ -65,7 +66,12 @@ class LocalizationMap:
         return cls(landmarks, camera, occlusion, device)
 
     def bin_views(self, cam_from_world: Float, bins: int = 30) -> BinnedViews:
-        """Bin the landmarks that views (B, 3, 4) see. Views that share a location share its occlusion test."""
+        """Bin the landmarks that views (B, 3, 4) see. Views that share a location share its occlusion test.
+
+        Raises:
+            ValueError: the poses have another shape, or entries that are not finite.
+        """
+        cam_from_world = check_poses(cam_from_world)
         centers = np.round(camera_centers(cam_from_world), SAME_LOCATION_DECIMALS)
         locations, rows = np.unique(centers, axis=0, return_inverse=True)
         visible = VisibleSets.from_mask(self.occlusion.unoccluded(locations, self.landmarks.points))

@@ -93,7 +93,7 @@ def make_maps(experiment: Experiment, say: Say = print, tick: Tick = lambda work
 
     dataset, device = _dataset(experiment, "scenes"), experiment.warp_device
     for scene in dataset.scenes:
-        seed = zlib.crc32(scene.name.encode())  # the scene's own, whichever scenes are beside it
+        seed = zlib.crc32(scene.name.encode()) % 2**31  # the scene's own, whichever scenes are beside it
         key = _key("map", [asdict(experiment.map), asdict(experiment.scenes.free_space), asdict(dataset.camera), seed,
                            _existing(scene.mesh, SceneError, "scenes")])  # fmt: skip
         model = [scene.map / name for name in ("cameras.bin", "images.bin", "points3D.bin")]

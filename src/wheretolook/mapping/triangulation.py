@@ -60,6 +60,7 @@ def triangulate_known_poses(
     """
     import pycolmap
 
+    seed %= 2**31  # COLMAP keeps it in an int
     pycolmap.set_random_seed(seed)
     with clock("database"):
         model = _posed_model(camera, cam_from_world, keypoints)

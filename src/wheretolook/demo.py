@@ -71,6 +71,17 @@ def draw_overview(experiment: Experiment, weights: Path) -> Path:
 
     The place is the labelled location where the share of viewpoints that localize is nearest to one half, so that
     there is something to choose.
+
+    Args:
+        experiment: all stages up to label have been run.
+        weights: file of a trained network; its camera must have the dataset's field of view.
+
+    Returns:
+        The picture's path.
+
+    Raises:
+        TableError: there is no dataset, or its last scene is not labelled.
+        WeightsError: the weights cannot be used.
     """
     from wheretolook.figures.overview import View, overview_figure
     from wheretolook.figures.style import save_figure

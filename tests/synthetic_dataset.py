@@ -47,7 +47,7 @@ def make_scene(
     landmarks.save(scene.landmarks)
     locations = rng.uniform((-2, -2, 0.5), (2, 2, 2), (n_locations, 3))
     mask = rng.random((n_locations, n_landmarks)) < 0.8
-    StoredOcclusion(locations, mask).save(scene.occlusion)
+    StoredOcclusion.from_mask(locations, mask).save(scene.occlusion)
 
     location_id = np.repeat(np.arange(n_locations), n_directions)
     direction_id = np.tile(np.arange(n_directions), n_locations)

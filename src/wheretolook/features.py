@@ -14,10 +14,20 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from wheretolook.camera_models import Camera, ColmapCamera
 from wheretolook.errors import ConfigError
 from wheretolook.features_kernel import bin_kernel
-from wheretolook.geometry import Float, PinholeCamera, transform
-from wheretolook.visibility.frustum import MIN_DEPTH_M, VisibleSets
+from wheretolook.geometry import Float
+from wheretolook.visibility.frustum import (
+    MIN_DEPTH_M,
+    VisibleSets,
+    frustum_sides,
+    in_view,
+    offsets_from,
+    pixels_of,
+    rotate,
+    split_poses,
+)
 from wheretolook.warp_setup import start_warp
 
 CHANNELS = ("u", "v", "x", "y", "z")
@@ -95,7 +105,7 @@ def arrange(means: NDArray[np.float32], filled: NDArray[np.bool_], layout: Layou
 
 
 def bin_views(
-    camera: PinholeCamera,
+    camera: Camera,
     cam_from_world: Float,
     points: Float,
     visible: VisibleSets,
@@ -107,7 +117,7 @@ def bin_views(
     """Bin the visible landmarks of every view, with all of `CHANNELS`.
 
     Args:
-        camera: pinhole intrinsics.
+        camera: pinhole, or any COLMAP model (which is projected by COLMAP on the CPU).
         cam_from_world: (B, 3, 4).
         points: (N, 3) landmarks in metres.
         visible: landmarks not occluded from each of L locations.
@@ -116,30 +126,33 @@ def bin_views(
         device: "cpu" or a CUDA device; one thread a view, so that sums do not depend on the order of threads.
         block_bytes: views are worked through in blocks of about this many bytes.
     """
+    if isinstance(camera, ColmapCamera):
+        return bin_views_plain(camera, cam_from_world, points, visible, location_rows, bins)
     device = start_warp(device)
     n_views, n_channels = len(cam_from_world), len(CHANNELS)
     means = np.empty((n_views, n_channels, bins, bins), dtype=np.float32)
     counts = np.empty((n_views, bins, bins), dtype=np.int32)
     block = max(1, block_bytes // (bins * bins * (n_channels + 1) * 4))
-    points_on_device: Any = wp.array(np.asarray(points, dtype=np.float32), dtype=wp.vec3, device=device)
+    points_on_device: Any = wp.array(np.asarray(points, dtype=np.float64), dtype=wp.vec3d, device=device)
     starts: Any = wp.array(visible.starts, dtype=wp.int32, device=device)
     indices: Any = wp.array(visible.indices, dtype=wp.int32, device=device)
     for begin in range(0, n_views, block):
         rows = slice(begin, min(begin + block, n_views))
-        poses = np.asarray(cam_from_world[rows], dtype=np.float64)
-        shape = (len(poses), bins * bins)
+        rotations, centers = split_poses(cam_from_world[rows])
+        shape = (len(centers), bins * bins)
         block_means = wp.zeros((shape[0], n_channels, shape[1]), dtype=wp.float32, device=device)
         block_counts = wp.zeros(shape, dtype=wp.int32, device=device)
         wp.launch(
             bin_kernel,
-            dim=len(poses),
+            dim=len(centers),
             inputs=[
-                wp.array(poses[..., :3].astype(np.float32), dtype=wp.mat33, device=device),
-                wp.array(poses[..., 3].astype(np.float32), dtype=wp.vec3, device=device),
+                wp.array(frustum_sides(camera, rotations), dtype=wp.vec3, device=device),
+                wp.array(rotations.astype(np.float32), dtype=wp.mat33, device=device),
+                wp.array(centers, dtype=wp.vec3d, device=device),
                 wp.array(np.asarray(location_rows[rows], dtype=np.int32), dtype=wp.int32, device=device),
                 points_on_device, starts, indices,
-                float(camera.focal_px), float(camera.cx), float(camera.cy), float(camera.width), float(camera.height),
-                MIN_DEPTH_M, bins,
+                wp.float64(camera.focal_px), wp.float64(camera.cx), wp.float64(camera.cy),
+                wp.float64(bins / camera.width), wp.float64(bins / camera.height), wp.float64(MIN_DEPTH_M), bins,
             ],
             outputs=[block_means, block_counts],
             device=device,
@@ -150,7 +163,7 @@ def bin_views(
 
 
 def bin_views_plain(
-    camera: PinholeCamera,
+    camera: Camera,
     cam_from_world: Float,
     points: Float,
     visible: VisibleSets,
@@ -161,13 +174,15 @@ def bin_views_plain(
     n_views, n_cells = len(cam_from_world), bins * bins
     means = np.zeros((n_views, len(CHANNELS), n_cells), dtype=np.float32)
     counts = np.zeros((n_views, n_cells), dtype=np.int32)
-    for view, (pose, location) in enumerate(zip(cam_from_world, location_rows, strict=True)):
-        seen = transform(pose, points[visible.indices[visible.starts[location] : visible.starts[location + 1]]])
-        pixels = camera.project(seen)
-        inside = (seen[:, 2] > MIN_DEPTH_M) & camera.in_image(pixels)
-        seen, pixels = seen[inside], pixels[inside]
-        column, row = (pixels * bins / (camera.width, camera.height)).astype(int).T
-        cell = np.minimum(row, bins - 1) * bins + np.minimum(column, bins - 1)
+    rows = zip(*split_poses(cam_from_world), location_rows, strict=True)
+    for view, (rotation, center, location) in enumerate(rows):
+        offsets = offsets_from(center, points[visible[int(location)]])
+        offsets = offsets[in_view(camera, rotation[None], offsets)[0]]
+        seen = rotate(rotation.astype(np.float32), offsets)
+        pixels = pixels_of(camera, seen)
+        scale = np.array([bins / camera.width, bins / camera.height])
+        column, row = np.clip((pixels * scale).astype(int), 0, bins - 1).T
+        cell = row * bins + column
         counts[view] = np.bincount(cell, minlength=n_cells)
         for channel, values in enumerate([*pixels.T, *seen.T]):
             total = np.bincount(cell, weights=values, minlength=n_cells)

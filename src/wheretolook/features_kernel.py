@@ -7,47 +7,54 @@ from __future__ import annotations
 
 import warp as wp
 
+from wheretolook.visibility.frustum_kernel import dot, in_view, offset_from
+
+# A fused multiply-add rounds once where NumPy rounds twice, which moves a landmark on a bin's edge to the next bin.
+wp.set_module_options({"fuse_fp": False})
+
 
 @wp.kernel
 def bin_kernel(
+    sides: wp.array2d[wp.vec3],
     rotations: wp.array[wp.mat33],
-    translations: wp.array[wp.vec3],
+    centers: wp.array[wp.vec3d],
     location_rows: wp.array[wp.int32],
-    points: wp.array[wp.vec3],
+    points: wp.array[wp.vec3d],
     starts: wp.array[wp.int32],
     indices: wp.array[wp.int32],
-    focal: float,
-    cx: float,
-    cy: float,
-    width: float,
-    height: float,
-    min_depth: float,
-    bins: int,
+    focal: wp.float64,
+    cx: wp.float64,
+    cy: wp.float64,
+    columns_per_pixel: wp.float64,
+    rows_per_pixel: wp.float64,
+    min_depth: wp.float64,
+    bins: wp.int32,
     means: wp.array3d[wp.float32],
     counts: wp.array2d[wp.int32],
 ):
     view = wp.tid()
     rotation = rotations[view]
-    translation = translations[view]
+    center = centers[view]
     location = location_rows[view]
     for entry in range(starts[location], starts[location + 1]):
-        p = rotation * points[indices[entry]] + translation
-        x = focal * p[0] + cx * p[2]
-        y = focal * p[1] + cy * p[2]
-        if p[2] > min_depth and x >= 0.0 and x < width * p[2] and y >= 0.0 and y < height * p[2]:
-            u = x / p[2]
-            v = y / p[2]
-            column = wp.min(int(u * float(bins) / width), bins - 1)
-            row = wp.min(int(v * float(bins) / height), bins - 1)
+        offset = offset_from(center, points[indices[entry]])
+        if in_view(sides, view, offset, min_depth):
+            x = dot(rotation[0], offset)
+            y = dot(rotation[1], offset)
+            z = dot(rotation[2], offset)
+            u = focal * (x / z) + cx
+            v = focal * (y / z) + cy
+            column = wp.clamp(wp.int32(u * columns_per_pixel), 0, bins - 1)
+            row = wp.clamp(wp.int32(v * rows_per_pixel), 0, bins - 1)
             cell = row * bins + column
             counts[view, cell] = counts[view, cell] + 1
-            means[view, 0, cell] = means[view, 0, cell] + u
-            means[view, 1, cell] = means[view, 1, cell] + v
-            means[view, 2, cell] = means[view, 2, cell] + p[0]
-            means[view, 3, cell] = means[view, 3, cell] + p[1]
-            means[view, 4, cell] = means[view, 4, cell] + p[2]
+            means[view, 0, cell] = means[view, 0, cell] + wp.float32(u)
+            means[view, 1, cell] = means[view, 1, cell] + wp.float32(v)
+            means[view, 2, cell] = means[view, 2, cell] + wp.float32(x)
+            means[view, 3, cell] = means[view, 3, cell] + wp.float32(y)
+            means[view, 4, cell] = means[view, 4, cell] + wp.float32(z)
     for cell in range(bins * bins):
         if counts[view, cell] > 1:
-            scale = 1.0 / float(counts[view, cell])
+            scale = 1.0 / wp.float32(counts[view, cell])
             for channel in range(5):
                 means[view, channel, cell] = means[view, channel, cell] * scale

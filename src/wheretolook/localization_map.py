@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from wheretolook.camera_models import Camera
 from wheretolook.features import BinnedViews, bin_views
 from wheretolook.geometry import Float, PinholeCamera, camera_centers
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
@@ -23,13 +24,13 @@ class LocalizationMap:
 
     Attributes:
         landmarks: what a camera may recognize.
-        camera: the camera that will look.
+        camera: the camera that will look: a pinhole, or any COLMAP model.
         occlusion: which landmarks have a free line of sight from a location.
         device: where kernels run, "cpu" or a CUDA device.
     """
 
     landmarks: Landmarks
-    camera: PinholeCamera = PinholeCamera()
+    camera: Camera = PinholeCamera()
     occlusion: OcclusionModel = NoOcclusion()
     device: str = "cpu"
 
@@ -37,7 +38,7 @@ class LocalizationMap:
     def from_colmap(
         cls,
         model: str | Path,
-        camera: PinholeCamera = PinholeCamera(),
+        camera: Camera = PinholeCamera(),
         mesh: str | Path | None = None,
         max_reprojection_error_px: float = 0.5,
         device: str = "cpu",
@@ -46,7 +47,8 @@ class LocalizationMap:
 
         Args:
             model: folder of the model.
-            camera: the camera that will look, which need not be the one that mapped.
+            camera: the camera that will look, which need not be the one that mapped; `ColmapCamera.of_map(model)` is
+                the latter, with its distortion.
             mesh: a mesh of the scene, for true occlusion; without one, landmarks are seen through walls.
             max_reprojection_error_px: landmarks with a larger mean error are left out.
             device: where kernels run.
@@ -59,10 +61,13 @@ class LocalizationMap:
         occlusion: OcclusionModel = NoOcclusion()
         if mesh is not None:
             from wheretolook.rendering import MeshRaycaster
+            from wheretolook.scenes.free_space import FreeSpace
             from wheretolook.scenes.loading import load_mesh
             from wheretolook.visibility import MeshOcclusion
 
-            occlusion = MeshOcclusion(MeshRaycaster(load_mesh(Path(mesh)), device))
+            loaded = load_mesh(Path(mesh))
+            two_sided = FreeSpace(loaded, device=device).two_sided
+            occlusion = MeshOcclusion(MeshRaycaster(loaded, device), two_sided=two_sided)
         return cls(landmarks, camera, occlusion, device)
 
     def bin_views(self, cam_from_world: Float, bins: int = 30) -> BinnedViews:

@@ -14,7 +14,7 @@ from wheretolook.geometry import PinholeCamera, poses_looking_along, rotation_lo
 from wheretolook.grid import Lattice, VoxelGrid, direction_lattice
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.table import UNLABELLED, pose_columns
-from wheretolook.visibility import OcclusionModel, StoredOcclusion, VisibleSets, count_in_frustum
+from wheretolook.visibility import OcclusionModel, StoredOcclusion, survey
 
 if TYPE_CHECKING:
     from wheretolook.scenes.free_space import FreeSpace
@@ -34,6 +34,9 @@ class SampleConfig:
         max_locations: a random subset of the free locations, 0 for all.
         max_directions: a random subset of the kept directions of each location, 0 for all.
         seed: of those subsets.
+        distinct_pixels: rank by the number of distinct pixels with a landmark, as the released code counts, instead of
+            the number of landmarks.
+        memory_gb: bound on the memory that counting takes on its device, in 10^9 bytes.
     """
 
     grid: tuple[int, int, int] = (8, 8, 8)
@@ -44,11 +47,15 @@ class SampleConfig:
     max_locations: int = 0
     max_directions: int = 0
     seed: int = 0
+    distinct_pixels: bool = False
+    memory_gb: float = 2.0
 
     def __post_init__(self) -> None:
         for name in ("keep", "min_visible", "max_locations", "max_directions"):
             if getattr(self, name) < 0:
                 raise ConfigError(f"sample.{name} must not be negative", value=getattr(self, name))
+        if not self.memory_gb > 0:
+            raise ConfigError("sample.memory_gb must be positive", value=self.memory_gb)
 
 
 def free_locations(grid: VoxelGrid, free_space: FreeSpace) -> NDArray[np.int64]:
@@ -75,6 +82,7 @@ def sample_viewpoints(
     occlusion: OcclusionModel,
     config: SampleConfig | None = None,
     device: str = "cpu",
+    progress: str | None = None,
 ) -> tuple[pd.DataFrame, StoredOcclusion]:
     """Choose viewpoints by what they see.
 
@@ -89,9 +97,10 @@ def sample_viewpoints(
         occlusion: which landmarks have a free line of sight.
         config: how many of what.
         device: where visibility is counted.
+        progress: text of a progress bar; None shows none.
 
     Raises:
-        SceneError: no viewpoint sees enough landmarks.
+        SceneError: no viewpoint sees enough landmarks, or a location lies inside geometry. MapError: no landmarks.
 
     Returns:
         The table of viewpoints, unlabelled, in the order of their ids; a viewpoint's id is its location's times the
@@ -102,17 +111,17 @@ def sample_viewpoints(
     ids = np.sort(_subset(np.asarray(location_ids, dtype=np.int64), config.max_locations, rng))
     locations = grid.centers()[ids]
     directions = direction_lattice(config.directions, config.lattice)
-    mask = occlusion.unoccluded(locations, landmarks.points)
-    counts = count_in_frustum(
-        camera, rotation_looking_along(directions), locations, landmarks.points, VisibleSets.from_mask(mask), device
-    )
-    order = np.argsort(-counts, axis=1, kind="stable")
-    rank = np.empty_like(order)
-    np.put_along_axis(rank, order, np.arange(order.shape[1])[None], axis=1)
+    seen = survey(
+        camera, rotation_looking_along(directions), locations, landmarks.points, occlusion, keep=config.keep,
+        distinct_pixels=config.distinct_pixels, device=device, memory_bytes=round(config.memory_gb * 1e9),
+        progress=progress,
+    )  # fmt: skip
+    counts, rank = seen.counts, np.full(seen.counts.shape, -1)
+    np.put_along_axis(rank, seen.best, np.arange(seen.best.shape[1])[None], axis=1)
 
     rows, columns = [], []
     for row in range(len(ids)):
-        kept = order[row, : config.keep or None]
+        kept = seen.best[row]
         kept = kept[counts[row, kept] >= config.min_visible]
         kept = np.sort(_subset(kept, config.max_directions, rng))
         rows.append(np.full(len(kept), row))
@@ -135,7 +144,8 @@ def sample_viewpoints(
         }
     )
     unlabelled = table.assign(status=UNLABELLED, error_m=np.float32(np.nan), error_deg=np.float32(np.nan), n_inliers=0)
-    return unlabelled, StoredOcclusion(locations, mask)
+    assert seen.occlusion is not None
+    return unlabelled, seen.occlusion
 
 
 def _subset(values: NDArray[np.int64], at_most: int, rng: np.random.Generator) -> NDArray[np.int64]:

@@ -1,63 +1,109 @@
-"""The counting kernel against its plain twin and by hand."""
+"""What is in view: by hand, at the border, and the kernel that collects it against its plain twin."""
 
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from conftest import RandomViews
+from wheretolook.camera_models import ColmapCamera
+from wheretolook.errors import ConfigError
 from wheretolook.geometry import PinholeCamera, rotation_looking_along, transform
-from wheretolook.visibility import VisibleSets, count_in_frustum
-from wheretolook.visibility.frustum import count_in_frustum_plain
+from wheretolook.visibility import VisibleSets, visible_landmarks
+from wheretolook.visibility.frustum import MIN_DEPTH_M, _starts, in_view, visible_landmarks_plain
+
+IDENTITY = np.eye(3)[None]
+CAMERA = PinholeCamera(640, 480, 320.0)  # in single precision its sides pass exactly through x = -z, x = z, y = -0.75 z
 
 
 def test_sparse_rows_of_a_mask() -> None:
     mask = np.array([[1, 0, 1], [0, 0, 0], [0, 1, 1]], dtype=bool)
     sets = VisibleSets.from_mask(mask)
     assert sets.starts.tolist() == [0, 2, 2, 4]
-    assert sets.indices.tolist() == [0, 2, 1, 2]
+    assert [sets[row].tolist() for row in range(len(sets))] == [[0, 2], [], [1, 2]]
 
 
-def test_kernel_counts_as_its_plain_twin(random_views: RandomViews, device: str) -> None:
+def test_more_entries_than_an_int32_counts_are_refused() -> None:
+    with pytest.raises(ConfigError, match="4294967294"):
+        _starts(np.array([2**31 - 1, 2**31 - 1]))
+
+
+@pytest.mark.parametrize(
+    ("point", "seen"),
+    [
+        ((0, 0, 1), True),
+        ((0, 0, -1), False),  # behind
+        ((-1, 0, 1), True),  # on the left border: pixel 0 is in the image
+        ((1, 0, 1), False),  # on the right border: pixel 640 is not
+        ((0, -0.75, 1), True),  # top
+        ((0, 0.75, 1), False),  # bottom
+        ((np.nextafter(np.float32(-1), np.float32(-2)), 0, 1), False),
+        ((np.nextafter(np.float32(1), np.float32(0)), 0, 1), True),
+        ((0, 0, 0), False),  # at the camera centre
+        ((0, 0, MIN_DEPTH_M), False),
+        ((0, 0, 1.001 * MIN_DEPTH_M), True),
+        ((0.5, 0, 0), False),  # zero depth, to the side
+        ((np.nan, 0, 1), False),
+        ((0, 0, np.nan), False),
+        ((0, 0, np.inf), False),
+        ((1e300, 0, 1e300), False),
+    ],
+)
+def test_behind_on_the_border_at_zero_depth_not_a_number(
+    point: tuple[float, ...], seen: bool, device: str, count_everything
+) -> None:  # type: ignore[no-untyped-def]
+    points = np.array([point], dtype=np.float64)
+    with np.errstate(over="ignore"):
+        assert in_view(CAMERA, IDENTITY, points.astype(np.float32)).tolist() == [[seen]]
+    everything = VisibleSets.from_mask(np.ones((1, 1), bool))
+    found = visible_landmarks(CAMERA, np.eye(3, 4)[None], points, everything, np.zeros(1, int), device)
+    assert found.indices.tolist() == ([0] if seen else [])
+    assert count_everything(CAMERA, IDENTITY, np.zeros((1, 3)), points, device).tolist() == [[int(seen)]]
+
+
+@pytest.fixture
+def count_everything():  # type: ignore[no-untyped-def]
+    from wheretolook.visibility import DevicePoints, FrustumCounter
+
+    def count(camera, rotations, locations, points, device):  # type: ignore[no-untyped-def]
+        on_device = DevicePoints(points, device)
+        return FrustumCounter(camera, rotations, len(points), device).count(locations, on_device.double).numpy()
+
+    return count
+
+
+def test_the_test_is_the_projection(random_views: RandomViews) -> None:
+    """Against `PinholeCamera.project` in double precision, but for landmarks within 1e-3 pixels of the border."""
     v = random_views
     rotations = rotation_looking_along(v.directions)
-    arguments = v.camera, rotations, v.locations, v.points, v.visible
-    counts, plain = count_in_frustum(*arguments, device), count_in_frustum_plain(*arguments)
-    # Single precision may decide differently within this many pixels of the border: allow exactly those landmarks.
-    border = np.zeros_like(plain)
-    for row, location in enumerate(v.locations):
-        seen = (v.points[v.mask[row]] - location) @ np.swapaxes(rotations, 1, 2)
-        pixels = v.camera.project(seen)
-        gap = np.minimum(np.abs(pixels), np.abs(pixels - [v.camera.width, v.camera.height])).min(-1)
-        border[row] = (gap < 1e-2).sum(-1)
-    assert np.all(np.abs(counts - plain) <= border)
-    assert plain.sum() > 500 and (counts != plain).mean() < 0.05
+    for location in v.locations:
+        seen = in_view(v.camera, rotations, (v.points - location).astype(np.float32))
+        in_camera = (v.points - location) @ np.swapaxes(rotations, 1, 2)
+        pixels = v.camera.project(in_camera)
+        gap = np.minimum(np.abs(pixels), np.abs(pixels - (v.camera.width, v.camera.height))).min(-1)
+        clear = (gap > 1e-3) & (np.abs(in_camera[..., 2] - MIN_DEPTH_M) > 1e-6)
+        truth = (in_camera[..., 2] > MIN_DEPTH_M) & v.camera.in_image(pixels)
+        assert clear.mean() > 0.999 and truth.any()
+        np.testing.assert_array_equal(seen[clear], truth[clear])
 
 
-def test_counts_by_hand(device: str) -> None:
-    camera = PinholeCamera(100, 100, 50.0)  # sees 45 degrees to every side
-    points = np.array([[1, 0, 0], [1, 0.9, 0], [1, 1.1, 0], [-1, 0, 0], [0, 1, 0], [0, 0, 0], [np.nan, 0, 0]])
-    visible = VisibleSets.from_mask(np.ones((1, 7), dtype=bool))
-    directions = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0]])
-    counts = count_in_frustum(camera, rotation_looking_along(directions), np.zeros((1, 3)), points, visible, device)
-    assert counts.tolist() == [[2, 1, 2]]
-
-
-def test_occluded_landmarks_do_not_count() -> None:
-    camera, points = PinholeCamera(100, 100, 50.0), np.array([[1.0, 0, 0], [2, 0, 0], [3, 0, 0]])
-    visible = VisibleSets.from_mask(np.array([[True, False, False], [True, False, True]]))
-    rotation = rotation_looking_along(np.array([[1.0, 0, 0]]))
-    assert count_in_frustum(camera, rotation, np.zeros((2, 3)), points, visible).tolist() == [[1], [2]]
-
-
-def test_moving_map_and_camera_together_changes_nothing(random_views: RandomViews) -> None:
-    from scipy.spatial.transform import Rotation
-
+def test_collected_landmarks_are_those_of_the_plain_twin(random_views: RandomViews, device: str) -> None:
     v = random_views
-    turn = Rotation.from_rotvec([0.3, -0.5, 1.1]).as_matrix()
-    rotations = rotation_looking_along(v.directions)
-    moved = np.concatenate([turn, [[3.0], [-1.0], [2.0]]], axis=1)
-    before = count_in_frustum_plain(v.camera, rotations, v.locations, v.points, v.visible)
-    after = count_in_frustum(
-        v.camera, rotations @ turn.T, transform(moved, v.locations), transform(moved, v.points), v.visible
-    )
-    assert np.abs(before - after).max() <= 1
+    arguments = v.camera, v.cam_from_world, v.points, v.visible, v.location_rows
+    kernel, plain = visible_landmarks(*arguments, device=device), visible_landmarks_plain(*arguments)
+    np.testing.assert_array_equal(kernel.starts, plain.starts)
+    np.testing.assert_array_equal(kernel.indices, plain.indices)
+    assert len(plain.indices) > 500 and len(plain) == len(v.cam_from_world)
+    for view in range(len(plain)):
+        assert v.mask[v.location_rows[view], plain[view]].all()
+
+
+def test_a_distorted_camera_collects_what_it_projects_into_its_image(random_views: RandomViews) -> None:
+    v = random_views
+    camera = ColmapCamera("OPENCV", 640, 480, (300.0, 300.0, 330.0, 235.0, -0.2, 0.05, 1e-3, -1e-3))
+    found = visible_landmarks(camera, v.cam_from_world, v.points, v.visible, v.location_rows)
+    for view, pose in enumerate(v.cam_from_world):
+        candidates = v.visible[v.location_rows[view]]
+        inside = camera.sees(transform(pose, v.points[candidates]))
+        assert set(found[view]) == set(candidates[inside])
+    assert len(found.indices) > 500

@@ -52,7 +52,7 @@ def test_stored_occlusion_comes_back_by_location(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     locations, mask, points = rng.normal(size=(6, 3)), rng.random((6, 21)) < 0.5, np.zeros((21, 3))
     path = tmp_path / "occlusion.npz"
-    StoredOcclusion(locations, mask).save(path)
+    StoredOcclusion.from_mask(locations, mask).save(path)
     stored = StoredOcclusion.load(path)
     order = np.array([4, 0, 4, 2])
     np.testing.assert_array_equal(stored.unoccluded(locations[order] + 1e-7, points), mask[order])

@@ -9,12 +9,12 @@ import warp as wp
 
 
 @wp.kernel
-def occluded_kernel(
+def unoccluded_kernel(
     mesh: wp.uint64,
     origins: wp.array[wp.vec3],
     points: wp.array[wp.vec3],
     margin_m: wp.float32,
-    occluded: wp.array2d[wp.bool],
+    free: wp.array2d[wp.bool],
 ):
     i, j = wp.tid()
     ray = points[j] - origins[i]
@@ -23,7 +23,7 @@ def occluded_kernel(
     blocked = wp.bool(False)
     if reach > 0.0:
         blocked = wp.mesh_query_ray_anyhit(mesh, origins[i], ray / distance, reach)
-    occluded[i, j] = blocked
+    free[i, j] = not blocked
 
 
 @wp.kernel

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.rendering.ray_kernels import cast_kernel, clear_kernel, distance_kernel, occluded_kernel
+from wheretolook.rendering.ray_kernels import cast_kernel, clear_kernel, distance_kernel, unoccluded_kernel
 from wheretolook.scenes.mesh import TexturedMesh
 from wheretolook.warp_setup import start_warp, vec3_array, warp_mesh
 
@@ -58,25 +59,40 @@ class MeshRaycaster:
             (L, N) bool, True where the open segment from the origin to `margin_m` before the point meets a triangle.
             Segments shorter than the margin are never occluded.
         """
-        origins_at = np.asarray(origins, dtype=np.float32).reshape(-1, 3)
-        points_at = np.asarray(points, dtype=np.float32).reshape(-1, 3)
-        occluded = np.zeros((len(origins_at), len(points_at)), dtype=np.bool_)
+        origins_at = np.asarray(origins, dtype=np.float64).reshape(-1, 3)
+        points_on_device = vec3_array(points, self.device)
+        n_points = points_on_device.shape[0]
+        occluded = np.zeros((len(origins_at), n_points), dtype=np.bool_)
         if occluded.size == 0:
             return occluded
-        points_on_device = vec3_array(points_at, self.device)
-        block = max(1, self.block_rays // len(points_at))
+        block = max(1, self.block_rays // n_points)
         for start in range(0, len(origins_at), block):
-            stop = min(start + block, len(origins_at))
-            result = wp.empty((stop - start, len(points_at)), dtype=wp.bool, device=self.device)
-            wp.launch(
-                occluded_kernel,
-                dim=result.shape,
-                inputs=[self.warp_mesh.id, vec3_array(origins_at[start:stop], self.device), points_on_device, margin_m],
-                outputs=[result],
-                device=self.device,
-            )
-            occluded[start:stop] = result.numpy()
+            rows = slice(start, start + block)
+            free = self.unoccluded_on_device(origins_at[rows], points_on_device, margin_m)
+            occluded[rows] = ~free.numpy().astype(np.bool_)
         return occluded
+
+    def unoccluded_on_device(self, origins: ArrayLike, points: Any, margin_m: float = 0.02) -> Any:
+        """The negation of `occluded`, on the device, in one piece.
+
+        Args:
+            origins: (L, 3) metres.
+            points: (N,) Warp array of vec3 on this raycaster's device.
+            margin_m: as in `occluded`.
+
+        Returns:
+            (L, N) Warp array of bool, True where the line of sight is free.
+        """
+        origins_on_device = vec3_array(origins, self.device)
+        free: Any = wp.empty((origins_on_device.shape[0], points.shape[0]), dtype=wp.bool, device=self.device)
+        wp.launch(
+            unoccluded_kernel,
+            dim=free.shape,
+            inputs=[self.warp_mesh.id, origins_on_device, points, margin_m],
+            outputs=[free],
+            device=self.device,
+        )
+        return free
 
     def cast(self, origins: ArrayLike, directions: ArrayLike) -> RayHits:
         """First hit of each ray.

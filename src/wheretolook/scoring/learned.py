@@ -8,6 +8,7 @@ from typing import ClassVar
 import numpy as np
 import torch
 
+from wheretolook.camera_models import Camera, ColmapCamera
 from wheretolook.errors import WeightsError
 from wheretolook.features import CHANNELS, BinnedViews
 from wheretolook.geometry import Float, PinholeCamera
@@ -43,7 +44,7 @@ class LearnedScorer(BinnedScorer):
             raise WeightsError(
                 f"the network was trained for a camera of {_describe(trained)}",
                 value=_describe(camera),
-                fix="Use a camera with that field of view, or train with this one.",
+                fix="Use a pinhole camera with that field of view, or train with this one.",
             )
         scale = {"u": trained.width / camera.width, "v": trained.height / camera.height}
         self._scale = torch.tensor([scale.get(name, 1.0) for name in CHANNELS], device=self.device)[:, None, None]
@@ -84,11 +85,15 @@ def load_scorer(weights: str | Path, localization_map: LocalizationMap) -> Learn
     return LearnedScorer.load(weights, localization_map)
 
 
-def _same_field_of_view(a: PinholeCamera, b: PinholeCamera) -> bool:
-    spans = np.array([(camera.width / camera.focal_px, camera.height / camera.focal_px) for camera in (a, b)])
+def _same_field_of_view(trained: PinholeCamera, camera: Camera) -> bool:
+    if isinstance(camera, ColmapCamera):
+        return False
+    spans = np.array([(one.width / one.focal_px, one.height / one.focal_px) for one in (trained, camera)])
     return bool(np.allclose(spans[0], spans[1], rtol=FIELD_OF_VIEW_TOLERANCE, atol=0))
 
 
-def _describe(camera: PinholeCamera) -> str:
+def _describe(camera: Camera) -> str:
+    if isinstance(camera, ColmapCamera):
+        return f"{camera.width} x {camera.height} px, {camera.model}"
     across, down = (2 * np.degrees(np.arctan(side / 2 / camera.focal_px)) for side in (camera.width, camera.height))
     return f"{camera.width} x {camera.height} px, {across:.1f} x {down:.1f} degrees"

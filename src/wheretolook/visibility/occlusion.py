@@ -6,15 +6,19 @@ Occlusion depends on the location only, so one answer serves every direction a c
 from __future__ import annotations
 
 import os
+from abc import ABC, abstractmethod
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import warp as wp
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from wheretolook.errors import TableError
+from wheretolook.errors import SceneError, TableError
 from wheretolook.geometry import Float
+from wheretolook.grid import fibonacci_sphere
+from wheretolook.visibility.device_points import DevicePoints
 
 if TYPE_CHECKING:
     from wheretolook.rendering.raycasting import MeshRaycaster
@@ -23,50 +27,118 @@ MATCH_M = 1e-4
 """Locations closer than this are taken for the same stored location."""
 
 
-class OcclusionModel(Protocol):
-    """Tells which landmarks nothing stands in front of."""
+ON_SURFACE_M = 1e-3
+"""A location this close to a triangle is on it."""
 
+
+class OcclusionModel(ABC):
+    """Tells which landmarks nothing stands in front of.
+
+    Callers ask for as many locations at once as their memory allows, so a model need not divide its work.
+    """
+
+    @abstractmethod
     def unoccluded(self, locations: Float, points: Float) -> NDArray[np.bool_]:
         """Lines of sight from locations (L, 3) m to points (N, 3) m; (L, N), True where free."""
-        ...
+
+    def unoccluded_on_device(self, locations: Float, points: DevicePoints) -> Any | None:
+        """The same, (L, N) of bool, as a Warp array on the device of the points and in their order.
+
+        Models that work on a device answer there; None stands for a mask that is True everywhere.
+        """
+        mask = self.unoccluded(locations, points.positions)
+        return wp.array(np.ascontiguousarray(mask[:, points.order]), dtype=wp.bool, device=points.device)
+
+    def check_locations(self, locations: Float) -> None:  # noqa: B027 (nothing to refuse unless a model knows better)
+        """Refuse locations (L, 3) m where no camera can be, before any long work.
+
+        Raises:
+            SceneError: a location lies inside geometry, as far as the model can tell; names the location.
+        """
 
 
-class NoOcclusion:
+class NoOcclusion(OcclusionModel):
     """Sees through walls: every landmark has a free line of sight, as in the paper's released code."""
 
     def unoccluded(self, locations: Float, points: Float) -> NDArray[np.bool_]:
         """All True, (L, N)."""
         return np.ones((len(locations), len(points)), dtype=bool)
 
+    def unoccluded_on_device(self, locations: Float, points: DevicePoints) -> None:
+        """None: nothing is hidden."""
 
-class MeshOcclusion:
+
+class MeshOcclusion(OcclusionModel):
     """Exact occlusion by the scene's mesh: one ray for each location and landmark.
 
     Args:
         raycaster: the mesh.
         margin_m: a surface this close in front of a landmark is the landmark's own.
+        two_sided: whether the backs of triangles are surfaces too. If not, a location that sees mostly backs lies
+            inside geometry (`FreeSpace` finds out which it is).
     """
 
-    def __init__(self, raycaster: MeshRaycaster, margin_m: float = 0.05) -> None:
-        self.raycaster, self.margin_m = raycaster, margin_m
+    def __init__(self, raycaster: MeshRaycaster, margin_m: float = 0.05, two_sided: bool = True) -> None:
+        self.raycaster, self.margin_m, self.two_sided = raycaster, margin_m, two_sided
 
     def unoccluded(self, locations: Float, points: Float) -> NDArray[np.bool_]:
         """(L, N), True where no triangle stands between location and landmark."""
         return ~self.raycaster.occluded(locations, points, margin_m=self.margin_m)
 
+    def unoccluded_on_device(self, locations: Float, points: DevicePoints) -> Any | None:
+        """The same on the raycaster's device."""
+        if points.device != self.raycaster.device:
+            return super().unoccluded_on_device(locations, points)
+        return self.raycaster.unoccluded_on_device(locations, points.single, self.margin_m)
 
-class StoredOcclusion:
+    def check_locations(self, locations: Float) -> None:
+        """Refuse locations (L, 3) m on a surface or, in a one-sided mesh, where most of what is around is a back.
+
+        Raises:
+            SceneError: names the first such location.
+        """
+        at = np.asarray(locations, dtype=np.float64).reshape(-1, 3)
+        bad = np.asarray(~np.isfinite(at).all(1))
+        bad[~bad] = self.raycaster.distance_to_surface(at[~bad], ON_SURFACE_M) <= ON_SURFACE_M
+        if not self.two_sided and not bad.all():
+            around = fibonacci_sphere(32)
+            rays = np.repeat(at[~bad], len(around), axis=0), np.tile(around, (int((~bad).sum()), 1))
+            hits = self.raycaster.cast(*rays)
+            backs = (np.isfinite(hits.distance_m) & ~hits.front).reshape(-1, len(around))
+            bad[~bad] = backs.mean(1) > 0.5
+        if bad.any():
+            raise SceneError(
+                "this location lies inside geometry", value=tuple(np.round(at[bad][0], 3).tolist()),
+                fix="Give locations in free space, as `FreeSpace.is_free` finds them.",
+            )  # fmt: skip
+
+
+class StoredOcclusion(OcclusionModel):
     """Occlusion computed once for the locations of a dataset and read back, so that no mesh is needed any more.
 
     Args:
         locations: (L, 3) metres.
-        mask: (L, N), True where the line of sight is free; columns follow the map's landmarks.
+        packed: (L, ceil(N / 8)) uint8, bits as `numpy.packbits` packs them: set where the line of sight is free.
+            Columns follow the map's landmarks.
+        n_landmarks: N.
     """
 
-    def __init__(self, locations: ArrayLike, mask: ArrayLike) -> None:
+    def __init__(self, locations: ArrayLike, packed: NDArray[np.uint8], n_landmarks: int) -> None:
         self.locations = np.asarray(locations, dtype=np.float64)
-        self.mask = np.asarray(mask, dtype=bool)
+        self.packed, self.n_landmarks = packed, n_landmarks
+        if packed.shape != (len(self.locations), (n_landmarks + 7) // 8):
+            raise ValueError(f"{packed.shape} bytes for {len(self.locations)} locations and {n_landmarks} landmarks")
         self._tree = cKDTree(self.locations)
+
+    @classmethod
+    def from_mask(cls, locations: ArrayLike, mask: NDArray[np.bool_]) -> StoredOcclusion:
+        """From a dense mask (L, N), True where the line of sight is free."""
+        return cls(locations, np.packbits(mask, axis=1), mask.shape[1])
+
+    @property
+    def mask(self) -> NDArray[np.bool_]:
+        """The whole mask, (L, N)."""
+        return self._unpack(slice(None))
 
     def unoccluded(self, locations: Float, points: Float) -> NDArray[np.bool_]:
         """(L, N) rows of the stored mask.
@@ -74,9 +146,9 @@ class StoredOcclusion:
         Raises:
             TableError: a location was not stored, or the mask belongs to a map with another number of landmarks.
         """
-        if len(points) != self.mask.shape[1]:
+        if len(points) != self.n_landmarks:
             raise TableError(
-                f"stored occlusion is of {self.mask.shape[1]} landmarks, the map has {len(points)}",
+                f"stored occlusion is of {self.n_landmarks} landmarks, the map has {len(points)}",
                 fix="Run the sample stage again: the map has changed since.",
             )
         distance, row = self._tree.query(np.asarray(locations), distance_upper_bound=MATCH_M)
@@ -87,15 +159,16 @@ class StoredOcclusion:
                 value=tuple(np.round(unknown, 3).tolist()),
                 fix="Use a mesh for free locations, or sample this location first.",
             )
-        return self.mask[row]
+        return self._unpack(row)
+
+    def _unpack(self, rows: NDArray[np.integer[Any]] | slice) -> NDArray[np.bool_]:
+        return np.unpackbits(self.packed[rows], axis=1, count=self.n_landmarks).view(bool)
 
     def save(self, path: Path) -> None:
         """Write locations and the bit-packed mask as a compressed NPZ, atomically."""
         partial = path.with_name(path.name + ".partial")
         with open(partial, "wb") as file:
-            np.savez_compressed(
-                file, locations=self.locations, mask=np.packbits(self.mask, axis=1), n_landmarks=self.mask.shape[1]
-            )
+            np.savez_compressed(file, locations=self.locations, mask=self.packed, n_landmarks=self.n_landmarks)
         os.replace(partial, path)
 
     @classmethod
@@ -107,7 +180,7 @@ class StoredOcclusion:
         """
         try:
             with np.load(path) as data:
-                return cls(data["locations"], np.unpackbits(data["mask"], axis=1, count=int(data["n_landmarks"])))
+                return cls(data["locations"], data["mask"], int(data["n_landmarks"]))
         except Exception as error:  # a damaged zip raises many kinds of errors
             raise TableError(
                 f"cannot read stored occlusion: {error}", path=path, fix="Run the sample stage again."

@@ -1,0 +1,201 @@
+"""How many landmarks every location sees in every direction (paper, Sec. 3.2), exactly and fast."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike, NDArray
+
+from wheretolook.camera_models import Camera, ColmapCamera
+from wheretolook.geometry import Float, PinholeCamera
+from wheretolook.visibility.counting_kernel import cell_kernel, count_field_kernel, count_kernel, sort_kernel
+from wheretolook.visibility.field_of_view import FieldOfView
+from wheretolook.visibility.frustum import (
+    MIN_DEPTH_M,
+    frustum_sides,
+    in_view,
+    near_radius_m,
+    offsets_from,
+    pixels_of,
+    rotate,
+)
+from wheretolook.visibility.pixel_kernel import count_pixels_kernel
+from wheretolook.visibility.sphere_cells import SphereCells, choose_size
+from wheretolook.warp_setup import start_warp
+
+SINGLE_ROUNDING = 5e-7
+"""Bound on the relative error of a product of two vectors of three float32, with room to spare (3 * 2^-24)."""
+
+GPU_LANES = 16
+"""Threads that share a location and an orientation on a GPU."""
+
+BITMAP_BYTES = 1 << 28
+"""Memory for the bitmaps of distinct pixels."""
+
+
+class FrustumCounter:
+    """Counts the landmarks in view of a fixed set of orientations from any location.
+
+    The landmarks around a location are sorted into cells of the sphere of directions (`SphereCells`); cells wholly in
+    view are counted by their number of landmarks and only landmarks of cells on the border are tested.
+
+    Args:
+        camera: pinhole, or any COLMAP model.
+        rotations: (D, 3, 3) cam_from_world.
+        n_points: about how many landmarks will be counted, which sets the number of cells.
+        device: "cpu" or a CUDA device.
+        distinct_pixels: count pixels that see a landmark instead of landmarks, the released code's rule; it says to
+            take the first landmark that falls on a pixel and leave out the others.
+        size: cells along a side of the sphere's map (even), instead of what suits `n_points`.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        rotations: Float,
+        n_points: int,
+        device: str = "cpu",
+        distinct_pixels: bool = False,
+        size: int | None = None,
+    ) -> None:
+        self.camera, self.distinct_pixels = camera, distinct_pixels
+        self.rotations = np.asarray(rotations, dtype=np.float32)
+        self.device = start_warp(device)
+        self.lanes = GPU_LANES if wp.get_device(self.device).is_cuda else 1
+        self._field = FieldOfView.of(camera) if isinstance(camera, ColmapCamera) else None
+        self.cells = SphereCells.of(camera, rotations, size or choose_size(n_points), self.device, self._field)
+        self._axes: Any = wp.array(self.rotations, dtype=wp.mat33, device=self.device)
+        self._near = 0.0
+        if isinstance(camera, PinholeCamera):
+            sides = frustum_sides(camera, rotations)
+            self._sides: Any = wp.array(sides, dtype=wp.vec3, device=self.device)
+            self._rounding = float(SINGLE_ROUNDING * np.linalg.norm(sides[:, :4], axis=-1).max(initial=0))
+            self._near = near_radius_m(camera)
+        elif self._field is not None:
+            self._depth: Any = wp.array(self._field.depth_rad, dtype=wp.float32, device=self.device)
+
+    def bytes_per_location(self, n_points: int) -> int:
+        """Device memory that `count` takes for each location, results included."""
+        return n_points * (8 + 12) + (self.cells.size**2 + 1) * 8 + len(self.rotations) * 4
+
+    def count(self, locations: ArrayLike, points: Any, unoccluded: Any | None = None) -> Any:
+        """Count from locations (L, 3) m.
+
+        Args:
+            locations: camera centres in the world, metres.
+            points: (N,) landmarks, a Warp array of vec3d on the device.
+            unoccluded: (L, N) Warp array of bool on the device; None where every line of sight is free.
+
+        Returns:
+            (L, D) counts, a Warp array of int32 on the device.
+        """
+        at = np.asarray(locations, dtype=np.float64).reshape(-1, 3)
+        if isinstance(self.camera, ColmapCamera) and self.distinct_pixels:
+            return self._count_on_host(at, points, unoccluded)
+        device, n_cells, shape = self.device, self.cells.size**2 + 1, (len(at), points.shape[0])
+        counts: Any = wp.zeros((len(at), len(self.rotations)), dtype=wp.int32, device=device)
+        centers: Any = wp.array(at, dtype=wp.vec3d, device=device)
+        places: Any = wp.empty(shape, dtype=wp.vec2i, device=device)
+        numbers: Any = wp.zeros(len(at) * n_cells + 1, dtype=wp.int32, device=device)
+        mask = wp.empty((0, 0), dtype=wp.bool, device=device) if unoccluded is None else unoccluded
+        wp.launch(cell_kernel, shape, [centers, points, unoccluded is not None, mask, self.cells.size, self._near],
+                  [places, numbers], device=device)  # fmt: skip
+        starts: Any = wp.empty_like(numbers)
+        wp.utils.array_scan(numbers, starts, inclusive=False)
+        offsets: Any = wp.empty(max(1, shape[0] * shape[1]), dtype=wp.vec3, device=device)
+        wp.launch(sort_kernel, shape, [centers, points, places, starts, self.cells.size], [offsets], device=device)
+        if isinstance(self.camera, ColmapCamera):
+            return self._count_by_field(starts, offsets, counts)
+        if self.distinct_pixels:
+            return self._count_pixels(starts, offsets, counts)
+        inputs = [self._sides, *self._runs, starts, offsets, self.cells.size, self._rounding, wp.float64(MIN_DEPTH_M)]
+        wp.launch(count_kernel, (*counts.shape, self.lanes), [*inputs, self.lanes], [counts], device=device)
+        return counts
+
+    @property
+    def _runs(self) -> tuple[Any, Any, Any, Any]:
+        inside, border = self.cells.inside, self.cells.border
+        return inside.starts, inside.cells, border.starts, border.cells
+
+    def _count_pixels(self, starts: Any, offsets: Any, counts: Any) -> Any:
+        assert isinstance(self.camera, PinholeCamera)
+        camera, n_orientations = self.camera, len(self.rotations)
+        words = (camera.width * camera.height + 31) // 32
+        block = max(1, BITMAP_BYTES // (words * 4 * n_orientations))
+        inputs = [
+            self._sides, self._axes, *self._runs, starts, offsets, self.cells.size, wp.float64(camera.focal_px),
+            wp.float64(camera.cx), wp.float64(camera.cy), camera.width, camera.height, wp.float64(MIN_DEPTH_M),
+        ]  # fmt: skip
+        for first in range(0, counts.shape[0], block):
+            n_locations = min(block, counts.shape[0] - first)
+            bits = wp.zeros((n_locations * n_orientations, words), dtype=wp.uint32, device=self.device)
+            shape = (n_locations, n_orientations, self.lanes)
+            wp.launch(count_pixels_kernel, shape, [*inputs, first, self.lanes], [bits, counts], device=self.device)
+        return counts
+
+    def _count_by_field(self, starts: Any, offsets: Any, counts: Any) -> Any:
+        assert self._field is not None and isinstance(self.camera, ColmapCamera)
+        inputs = [
+            self._axes, self._depth, self._field.size, *self._runs, starts, offsets,
+            self.cells.size, self.lanes,
+        ]  # fmt: skip
+        n_unsure: Any = wp.zeros(1, dtype=wp.int32, device=self.device)
+        capacity = 1 << 20
+        while True:  # once more if the list was too short
+            unsure: Any = wp.empty(capacity, dtype=wp.vec3i, device=self.device)
+            outputs = [counts, n_unsure, unsure]
+            wp.launch(count_field_kernel, (*counts.shape, self.lanes), inputs, outputs, device=self.device)
+            number = int(n_unsure.numpy()[0])
+            if number <= capacity:
+                break
+            capacity = number
+            counts.zero_()
+            n_unsure.zero_()
+        location, orientation, entry = unsure.numpy()[:number].T
+        seen = self.camera.sees(rotate(self.rotations[orientation], offsets.numpy()[entry]))
+        exact = counts.numpy()
+        np.add.at(exact, (location[seen], orientation[seen]), 1)
+        return wp.array(exact, dtype=wp.int32, device=self.device)
+
+    def _count_on_host(self, locations: Float, points: Any, unoccluded: Any | None) -> Any:
+        mask = np.ones((len(locations), points.shape[0]), bool) if unoccluded is None else unoccluded.numpy()
+        counts = count_plain(self.camera, self.rotations, locations, points.numpy(), mask, self.distinct_pixels)
+        return wp.array(counts, dtype=wp.int32, device=self.device)
+
+
+def count_plain(
+    camera: Camera,
+    rotations: ArrayLike,
+    locations: ArrayLike,
+    points: ArrayLike,
+    unoccluded: NDArray[np.bool_],
+    distinct_pixels: bool = False,
+) -> NDArray[np.int32]:
+    """What `FrustumCounter.count` computes, in NumPy: every landmark against every orientation.
+
+    Args:
+        camera: pinhole, or any COLMAP model.
+        rotations: (D, 3, 3) cam_from_world.
+        locations: (L, 3) camera centres in the world, metres.
+        points: (N, 3) landmarks in metres.
+        unoccluded: (L, N), True where the line of sight is free.
+        distinct_pixels: count pixels that see a landmark instead of landmarks.
+
+    Returns:
+        (L, D).
+    """
+    rotations, points = np.asarray(rotations), np.asarray(points)
+    counts = np.zeros((len(unoccluded), len(rotations)), dtype=np.int32)
+    for row, location in enumerate(np.asarray(locations)):
+        offsets = offsets_from(location, points[unoccluded[row]])
+        seen = in_view(camera, rotations, offsets)
+        if not distinct_pixels:
+            counts[row] = seen.sum(-1)
+            continue
+        for orientation, rotation in enumerate(rotations.astype(np.float32)):
+            pixels = np.floor(pixels_of(camera, rotate(rotation, offsets[seen[orientation]])))
+            column, line = np.clip(pixels, 0, (camera.width - 1, camera.height - 1)).T
+            counts[row, orientation] = len(np.unique(line * camera.width + column))
+    return counts

@@ -1,0 +1,66 @@
+"""The landmarks of a map on a device, in an order that keeps neighbours together."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike, NDArray
+
+from wheretolook.warp_setup import start_warp, vec3_array
+
+MORTON_BITS = 10
+"""Bits along each axis of the curve that landmarks are ordered by."""
+
+
+class DevicePoints:
+    """Landmarks on a device, along a Morton curve: threads side by side then work on landmarks side by side.
+
+    Args:
+        positions: (N, 3) metres, in the map's order.
+        device: "cpu" or a CUDA device.
+
+    Attributes:
+        positions: (N, 3) float64, in the map's order.
+        order: (N,) rows of the map in the order of the device's arrays.
+        double: (N,) Warp array of vec3d.
+        device: its full name.
+    """
+
+    def __init__(self, positions: ArrayLike, device: str = "cpu") -> None:
+        self.positions = np.asarray(positions, dtype=np.float64).reshape(-1, 3)
+        self.device = start_warp(device)
+        self.order = np.argsort(morton_codes(self.positions), kind="stable")
+        self.double: Any = wp.array(self.positions[self.order], dtype=wp.vec3d, device=self.device)
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    @cached_property
+    def single(self) -> Any:
+        """(N,) Warp array of vec3."""
+        return vec3_array(self.positions[self.order], self.device)
+
+    @cached_property
+    def rank(self) -> Any:
+        """(N,) Warp array of int32: where the map's landmarks lie in the device's arrays, the inverse of `order`."""
+        rank = np.empty(len(self.order), dtype=np.int32)
+        rank[self.order] = np.arange(len(rank))
+        return wp.array(rank, dtype=wp.int32, device=self.device)
+
+
+def morton_codes(positions: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Place (N,) of points (N, 3) along a Morton curve through their bounding box; points not finite come first."""
+    finite = np.isfinite(positions).all(1)
+    codes = np.zeros(len(positions), dtype=np.int64)
+    if not finite.any():
+        return codes
+    low, high = positions[finite].min(0), positions[finite].max(0)
+    scale = ((1 << MORTON_BITS) - 1) / np.maximum(high - low, 1e-12)
+    cells = ((positions[finite] - low) * scale).astype(np.int64)
+    for bit in range(MORTON_BITS):
+        for axis in range(3):
+            codes[finite] |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
+    return codes

@@ -1,0 +1,82 @@
+"""The field of view of a camera of any model, tabulated over the sphere of directions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from wheretolook.camera_models import ColmapCamera
+from wheretolook.geometry import Float
+
+TABLE_SIZE = 1024
+"""Cells along a side of the table: 0.06 to 0.19 degrees from a cell's centre to its farthest corner."""
+
+MAX_DEPTH_RAD = 0.25
+"""Deeper than this is not told apart: cells of the sphere that need more are small in number."""
+
+BISECTIONS = 20
+"""Halvings of the gap between neighbouring centres, of which one is seen: the border is found to 1e-8 rad."""
+
+
+@dataclass(frozen=True, eq=False)
+class FieldOfView:
+    """How deep inside the field of view every direction of the camera frame lies at least.
+
+    Where the table says zero the camera itself must be asked. So one table serves every camera model, and the answer
+    stays that of the model. (A hole in the field of view smaller than a cell of the table would be missed.)
+
+    Attributes:
+        size: cells along a side of the octahedral map.
+        depth_rad: (size * size,) float32. Positive: every direction of the cell is in view and at least this angle from
+            the border of the field of view; negative: likewise out of view; zero: the border may pass through the cell.
+    """
+
+    size: int
+    depth_rad: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, camera: ColmapCamera, size: int = TABLE_SIZE) -> FieldOfView:
+        """Tabulate a camera. Takes about a second; the latest cameras are remembered."""
+        return _tabulate(camera, size)
+
+
+@lru_cache(maxsize=4)
+def _tabulate(camera: ColmapCamera, size: int) -> FieldOfView:
+    from wheretolook.visibility.sphere_cells import cell_centers
+
+    centers, radii = cell_centers(size)
+    grid = np.arange(size * size).reshape(size, size)
+    # The map's edge folds onto itself, mirrored: beyond (row, size - 1) lies (size - 1 - row, size - 1).
+    right = np.concatenate([grid[:, 1:], grid[::-1, -1:]], axis=1)
+    below = np.concatenate([grid[1:], grid[-1:, ::-1]], axis=0)
+    first_column, first_row = np.stack([grid[:, 0], grid[::-1, 0]], 1), np.stack([grid[0], grid[0, ::-1]], 1)
+    pairs = [np.stack([grid.ravel(), right.ravel()], 1), np.stack([grid.ravel(), below.ravel()], 1)]
+    neighbours = np.concatenate([*pairs, first_column, first_row])
+    seen = camera.sees(centers)
+    a, b = neighbours[seen[neighbours[:, 0]] != seen[neighbours[:, 1]]].T
+    sign = np.where(seen, 1.0, -1.0)
+    if len(a) == 0:
+        return FieldOfView(size, (sign * MAX_DEPTH_RAD).astype(np.float32))
+    first_is_seen = seen[a]
+    a, b = np.where(first_is_seen, a, b), np.where(first_is_seen, b, a)
+    border = _border_between(camera, centers[a], centers[b])
+    reach = 2 * np.sin(MAX_DEPTH_RAD / 2)
+    chord, _ = cKDTree(border).query(centers, distance_upper_bound=reach, workers=-1)
+    angle = 2 * np.arcsin(np.minimum(chord, reach) / 2)
+    # A cell's points are within its radius of its centre. Points found on the border are at most a cell apart.
+    certain = np.maximum(angle - radii - radii.max(), 0)
+    return FieldOfView(size, (sign * certain).astype(np.float32))
+
+
+def _border_between(camera: ColmapCamera, seen: Float, unseen: Float) -> Float:
+    """Points (n, 3) on the border of the field of view between unit directions (n, 3) in and out of view."""
+    for _ in range(BISECTIONS):
+        middle = seen + unseen
+        middle /= np.linalg.norm(middle, axis=1, keepdims=True)
+        is_seen = camera.sees(middle)[:, None]
+        seen, unseen = np.where(is_seen, middle, seen), np.where(is_seen, unseen, middle)
+    return seen

@@ -1,0 +1,84 @@
+"""Warp kernel that counts the distinct pixels landmarks fall on, the released code's rule."""
+
+# mypy: ignore-errors
+# Warp's kernel language is not Python's type system.
+
+from __future__ import annotations
+
+import warp as wp
+
+from wheretolook.visibility.frustum_kernel import dot, in_view
+
+# A fused multiply-add rounds once where NumPy rounds twice, which moves a landmark on a pixel's edge to the next pixel.
+wp.set_module_options({"fuse_fp": False})
+
+
+@wp.func
+def pixel_of(
+    axes: wp.mat33,
+    offset: wp.vec3,
+    focal: wp.float64,
+    cx: wp.float64,
+    cy: wp.float64,
+    width: wp.int32,
+    height: wp.int32,
+) -> wp.int32:
+    depth = dot(axes[2], offset)
+    u = focal * (dot(axes[0], offset) / depth) + cx
+    v = focal * (dot(axes[1], offset) / depth) + cy
+    column = wp.clamp(wp.int32(wp.floor(u)), 0, width - 1)
+    row = wp.clamp(wp.int32(wp.floor(v)), 0, height - 1)
+    return row * width + column
+
+
+@wp.func
+def mark(bits: wp.array2d[wp.uint32], view: wp.int32, pixel: wp.int32) -> wp.int32:
+    """1 if nothing was at this pixel yet."""
+    word = pixel >> 5
+    bit = wp.uint32(1) << wp.uint32(pixel & 31)
+    before = wp.atomic_or(bits, view, word, bit)
+    return wp.where((before & bit) == wp.uint32(0), 1, 0)
+
+
+@wp.kernel
+def count_pixels_kernel(
+    sides: wp.array2d[wp.vec3],
+    axes: wp.array[wp.mat33],
+    inside_starts: wp.array[wp.int32],
+    inside: wp.array[wp.vec2i],
+    border_starts: wp.array[wp.int32],
+    border: wp.array[wp.vec2i],
+    starts: wp.array[wp.int32],
+    offsets: wp.array[wp.vec3],
+    size: wp.int32,
+    focal: wp.float64,
+    cx: wp.float64,
+    cy: wp.float64,
+    width: wp.int32,
+    height: wp.int32,
+    min_depth: wp.float64,
+    first: wp.int32,
+    lanes: wp.int32,
+    bits: wp.array2d[wp.uint32],
+    counts: wp.array2d[wp.int32],
+):
+    """As `count_kernel`, but a landmark counts only if it is the first to reach its pixel."""
+    block_location, orientation, lane = wp.tid()
+    location = first + block_location
+    view = block_location * axes.shape[0] + orientation
+    base = location * (size * size + 1)
+    axis = axes[orientation]
+    count = wp.int32(0)
+    for run in range(inside_starts[orientation * size], inside_starts[(orientation + 1) * size]):
+        for entry in range(starts[base + inside[run][0]] + lane, starts[base + inside[run][1]], lanes):
+            count += mark(bits, view, pixel_of(axis, offsets[entry], focal, cx, cy, width, height))
+    for run in range(border_starts[orientation * size], border_starts[(orientation + 1) * size]):
+        for entry in range(starts[base + border[run][0]] + lane, starts[base + border[run][1]], lanes):
+            if in_view(sides, orientation, offsets[entry], min_depth):
+                count += mark(bits, view, pixel_of(axis, offsets[entry], focal, cx, cy, width, height))
+    near = base + size * size
+    for entry in range(starts[near] + lane, starts[near + 1], lanes):
+        if in_view(sides, orientation, offsets[entry], min_depth):
+            count += mark(bits, view, pixel_of(axis, offsets[entry], focal, cx, cy, width, height))
+    if count > 0:
+        wp.atomic_add(counts, location, orientation, count)

@@ -1,0 +1,168 @@
+"""From a map and an occlusion model to what every location sees in every direction, in bounded memory."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike, NDArray
+from tqdm.auto import tqdm
+
+from wheretolook.camera_models import Camera
+from wheretolook.errors import ConfigError, MapError, SceneError
+from wheretolook.geometry import Float
+from wheretolook.visibility.counting import FrustumCounter
+from wheretolook.visibility.counting_kernel import pack_kernel
+from wheretolook.visibility.device_points import DevicePoints
+from wheretolook.visibility.occlusion import OcclusionModel, StoredOcclusion
+
+CPU_BLOCK_BYTES = 1 << 24
+"""On a CPU a block of locations should fit into the cache."""
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """What L locations see in D directions.
+
+    Attributes:
+        counts: (L, D) int32, landmarks in view (or distinct pixels, if so asked).
+        best: (L, K) int32, the K directions that see most: by falling count, then by rising direction.
+        occlusion: which landmarks each location has a free line of sight to; None if it was not to be kept.
+    """
+
+    counts: NDArray[np.int32]
+    best: NDArray[np.int32]
+    occlusion: StoredOcclusion | None
+
+
+def survey(
+    camera: Camera,
+    rotations: ArrayLike,
+    locations: ArrayLike,
+    points: ArrayLike | DevicePoints,
+    occlusion: OcclusionModel,
+    *,
+    keep: int = 0,
+    distinct_pixels: bool = False,
+    keep_occlusion: bool = True,
+    device: str = "cpu",
+    threads: int = 0,
+    memory_bytes: int = 2 << 30,
+    counter: FrustumCounter | None = None,
+    progress: str | None = None,
+) -> Survey:
+    """Find the landmarks every location has a free line of sight to and count those in view (paper, Sec. 3.2).
+
+    Works through the locations in blocks, so that memory does not grow with their number (but for the result: a bit for
+    each location and landmark, if occlusion is kept).
+
+    Args:
+        camera: pinhole, or any COLMAP model.
+        rotations: (D, 3, 3) cam_from_world.
+        locations: (L, 3) camera centres in the world, metres.
+        points: (N, 3) landmarks in metres, or the same on the device already.
+        occlusion: which landmarks have a free line of sight from a location.
+        keep: K, how many of the best directions to return for each location; 0 for all.
+        distinct_pixels: count pixels that see a landmark instead of landmarks.
+        keep_occlusion: whether to return the masks.
+        device: "cpu" or a CUDA device.
+        threads: threads on a CPU, 0 for all cores.
+        memory_bytes: bound on what the blocks in work take on the device.
+        counter: of the same camera and rotations, to use again; it may stand for these and `distinct_pixels`.
+        progress: text of a progress bar; None shows none.
+
+    Raises:
+        MapError: there are no landmarks.
+        SceneError: there are no locations, one is not finite, or lies inside geometry as far as the occlusion model can
+            tell.
+        ConfigError: a single location takes more memory than allowed.
+    """
+    at = np.asarray(locations, dtype=np.float64).reshape(-1, 3)
+    n_points = len(points) if isinstance(points, DevicePoints) else len(np.asarray(points).reshape(-1, 3))
+    if n_points == 0:
+        raise MapError("the map has no landmarks", value=0, fix="Map the scene with more or sharper images.")
+    _check_locations(at, occlusion)
+    landmarks = points if isinstance(points, DevicePoints) else DevicePoints(points, device)
+    counter = counter or FrustumCounter(
+        camera, np.asarray(rotations), n_points, landmarks.device, distinct_pixels=distinct_pixels
+    )
+    n_directions = len(counter.rotations)
+    keep = min(keep or n_directions, n_directions)
+    on_gpu = wp.get_device(landmarks.device).is_cuda
+    workers = 1 if on_gpu else (threads or len(os.sched_getaffinity(0)))
+    per_location = counter.bytes_per_location(n_points) + n_points  # and its mask
+    if per_location > memory_bytes:
+        raise ConfigError(
+            f"one location with {n_points:,} landmarks takes {per_location / 1e9:.1f} GB",
+            value=memory_bytes, fix=f"Allow at least {per_location} bytes.",
+        )  # fmt: skip
+    block = max(1, min(memory_bytes if on_gpu else CPU_BLOCK_BYTES, memory_bytes // workers) // per_location)
+    workers = min(workers, memory_bytes // per_location, -(-len(at) // block))
+
+    counts = np.empty((len(at), n_directions), dtype=np.int32)
+    best = np.empty((len(at), keep), dtype=np.int32)
+    packed = np.empty((len(at) if keep_occlusion else 0, (n_points + 7) // 8), dtype=np.uint8)
+
+    def work(rows: slice) -> int:
+        mask = occlusion.unoccluded_on_device(at[rows], landmarks)
+        counted = counter.count(at[rows], landmarks.double, mask)
+        best[rows] = _best(counted, keep, on_gpu)
+        counts[rows] = counted.numpy()
+        if keep_occlusion:
+            packed[rows] = 255 if mask is None else _pack(mask, landmarks)
+        return rows.stop - rows.start
+
+    blocks = [slice(start, min(start + block, len(at))) for start in range(0, len(at), block)]
+    with tqdm(total=len(at), desc=progress, unit="location", disable=progress is None) as bar:
+        for done in _in_threads(work, blocks, workers):
+            bar.update(done)
+    if keep_occlusion and n_points % 8:
+        packed[:, -1] &= np.uint8((0xFF00 >> (n_points % 8)) & 0xFF)
+    return Survey(counts, best, StoredOcclusion(at, packed, n_points) if keep_occlusion else None)
+
+
+def _check_locations(locations: Float, occlusion: OcclusionModel) -> None:
+    if len(locations) == 0:
+        raise SceneError("there are no locations to look from", value=0, fix="Refine the grid or check the bounds.")
+    finite = np.isfinite(locations).all(1)
+    if not finite.all():
+        value = tuple(locations[~finite][0].tolist())
+        raise SceneError("a location is not finite", value=value, fix="Give locations in metres.")
+    occlusion.check_locations(locations)
+
+
+def _in_threads(work: Any, blocks: list[slice], workers: int) -> Iterator[int]:
+    """Warp lets go of Python's lock while a kernel runs, so that threads run kernels on several cores."""
+    yield work(blocks[0])  # loads the kernels, which only one thread may do
+    if workers == 1:
+        yield from map(work, blocks[1:])
+        return
+    with ThreadPoolExecutor(workers) as pool:
+        try:
+            yield from pool.map(work, blocks[1:])
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+
+
+def _best(counts: Any, keep: int, on_gpu: bool) -> NDArray[np.int32]:
+    """The directions (L, K) with the highest of the counts (L, D), ties by direction."""
+    if not on_gpu:
+        return np.argsort(-counts.numpy(), axis=1, kind="stable")[:, :keep].astype(np.int32)
+    import torch
+
+    wp.synchronize_device(counts.device)  # Torch works on a stream of its own
+    order = torch.sort(wp.to_torch(counts), dim=1, descending=True, stable=True).indices
+    return np.asarray(order[:, :keep].to(torch.int32).cpu().numpy())
+
+
+def _pack(mask: Any, landmarks: DevicePoints) -> NDArray[np.uint8]:
+    """A mask (L, N) in the device's order as bits (L, ceil(N / 8)) in the map's order, as `numpy.packbits` has them."""
+    packed: Any = wp.empty((mask.shape[0], (mask.shape[1] + 7) // 8), dtype=wp.uint8, device=mask.device)
+    wp.launch(pack_kernel, packed.shape, [mask, landmarks.rank], [packed], device=mask.device)
+    return np.asarray(packed.numpy())

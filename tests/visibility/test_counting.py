@@ -1,0 +1,146 @@
+"""Counts by cells of the sphere against the plain twin, exactly; and what must not change them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import warp as wp
+from scipy.spatial.transform import Rotation
+
+from conftest import RandomViews
+from wheretolook.camera_models import Camera, ColmapCamera
+from wheretolook.geometry import Float, PinholeCamera, rotation_looking_along, transform
+from wheretolook.grid import fibonacci_sphere
+from wheretolook.visibility import DevicePoints, FrustumCounter, count_plain
+from wheretolook.visibility.field_of_view import FieldOfView
+from wheretolook.visibility.sphere_cells import cell_centers, octahedral_directions
+
+DISTORTED = ColmapCamera("OPENCV", 640, 480, (300.0, 310.0, 330.0, 235.0, -0.2, 0.05, 1e-3, -1e-3))
+FISHEYE = ColmapCamera("OPENCV_FISHEYE", 640, 480, (200.0, 200.0, 320.0, 240.0, 0.01, 0.0, 0.0, 0.0))
+PANORAMA = ColmapCamera("EQUIRECTANGULAR", 640, 320, (640.0, 320.0))
+CAMERAS: dict[str, Camera] = {
+    "wide": PinholeCamera(640, 480, 320.0),
+    "narrow": PinholeCamera(100, 300, 800.0),
+    "very wide": PinholeCamera(640, 480, 30.0),
+    "distorted": DISTORTED,
+    "fisheye": FISHEYE,
+    "panorama": PANORAMA,
+}
+
+
+def count(
+    camera: Camera, rotations: Float, locations: Float, points: Float, mask: np.ndarray | None = None,
+    device: str = "cpu", **options: object,
+) -> np.ndarray:  # fmt: skip
+    on_device = DevicePoints(points, device)
+    free = None if mask is None else wp.array(mask[:, on_device.order], dtype=wp.bool, device=device)
+    counter = FrustumCounter(camera, rotations, len(points), device, **options)  # type: ignore[arg-type]
+    return counter.count(locations, on_device.double, free).numpy()  # type: ignore[no-any-return]
+
+
+@pytest.mark.parametrize("distinct_pixels", [False, True])
+@pytest.mark.parametrize("name", CAMERAS)
+def test_counts_are_those_of_the_plain_twin(
+    name: str, distinct_pixels: bool, random_views: RandomViews, device: str
+) -> None:
+    v, camera = random_views, CAMERAS[name]
+    rng = np.random.default_rng(5)
+    # twins of landmarks share pixels; some landmarks lie around a location closer than the least depth, some at it
+    points = np.concatenate(
+        [v.points, v.points[:200], v.locations[0] + rng.normal(size=(60, 3)) * 10.0 ** rng.uniform(-5, -2, (60, 1)),
+         v.locations[:2], [[np.nan, 0, 0], [np.inf, 0, 0]]]
+    )  # fmt: skip
+    mask = rng.random((len(v.locations), len(points))) < 0.7
+    rotations = rotation_looking_along(v.directions)
+    counts = count(camera, rotations, v.locations, points, mask, device, distinct_pixels=distinct_pixels)
+    plain = count_plain(camera, rotations, v.locations, points, mask, distinct_pixels)
+    np.testing.assert_array_equal(counts, plain)
+    assert plain.max() > 5 and (name == "panorama" or plain.min() < plain.max())
+
+
+def test_the_number_of_cells_changes_nothing(random_views: RandomViews, device: str) -> None:
+    v = random_views
+    rotations = rotation_looking_along(v.directions)
+    expected = count_plain(v.camera, rotations, v.locations, v.points, v.mask)
+    for size in (2, 8, 30, 64, 256):
+        found = count(v.camera, rotations, v.locations, v.points, v.mask, device, size=size)
+        np.testing.assert_array_equal(found, expected)
+
+
+def test_a_hundred_thousand_landmarks_on_the_very_border(device: str) -> None:
+    """Landmarks made to lie within single precision's error of the sides of some view: each must be decided alike."""
+    camera, rotations = PinholeCamera(), rotation_looking_along(fibonacci_sphere(40))
+    rng = np.random.default_rng(0)
+    pixels = np.stack([rng.choice([0.0, 640.0], 100_000), rng.uniform(0, 480, 100_000)], 1)
+    pixels[::2] = np.stack([rng.uniform(0, 640, 50_000), rng.choice([0.0, 480.0], 50_000)], 1)
+    rays = np.concatenate([(pixels - (320, 240)) / 320, np.ones((100_000, 1))], 1) * rng.uniform(0.5, 8, (100_000, 1))
+    points = np.einsum("nji,nj->ni", rotations[rng.integers(0, 40, 100_000)], rays)
+    mask = np.ones((1, len(points)), bool)
+    counts = count(camera, rotations, np.zeros((1, 3)), points, device=device)
+    np.testing.assert_array_equal(counts, count_plain(camera, rotations, np.zeros((1, 3)), points, mask))
+
+
+def test_counts_by_hand(device: str) -> None:
+    camera = PinholeCamera(100, 100, 50.0)  # sees 45 degrees to every side
+    points = np.array([[1, 0, 0], [1, 0.9, 0], [1, 1.1, 0], [-1, 0, 0], [0, 1, 0], [0, 0, 0], [np.nan, 0, 0]])
+    rotations = rotation_looking_along(np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0]]))
+    assert count(camera, rotations, np.zeros((1, 3)), points, device=device).tolist() == [[2, 1, 2]]
+    hidden = np.array([[True, False, True, True, True, True, True]])
+    assert count(camera, rotations, np.zeros((1, 3)), points, hidden, device).tolist() == [[1, 1, 2]]
+
+
+def test_distinct_pixels_by_hand(device: str) -> None:
+    camera = PinholeCamera(4, 2, 2.0)
+    # pixels (3, 1), (3, 1) from twice as far, (2, 1), (0, 0), out of view
+    points = np.array([[0.6, 0.1, 1], [1.2, 0.2, 2], [0.1, 0.1, 1], [-0.9, -0.4, 1], [2, 0, 1.0]])
+    counts = count(camera, np.eye(3)[None], np.zeros((1, 3)), points, device=device, distinct_pixels=True)
+    assert counts.tolist() == [[3]]
+    assert count(camera, np.eye(3)[None], np.zeros((1, 3)), points, device=device).tolist() == [[4]]
+
+
+@pytest.mark.parametrize("name", ["wide", "distorted", "fisheye"])
+def test_moving_map_and_camera_together_changes_nothing(name: str, random_views: RandomViews, device: str) -> None:
+    v, camera = random_views, CAMERAS[name]
+    rotations = rotation_looking_along(v.directions)
+    turn = Rotation.from_rotvec([0.3, -0.5, 1.1]).as_matrix()
+    moved = np.concatenate([turn, [[3.0], [-1.0], [2.0]]], axis=1)
+    before = count(camera, rotations, v.locations, v.points, v.mask, device)
+    after = count(camera, rotations @ turn.T, transform(moved, v.locations), transform(moved, v.points), v.mask, device)
+    assert (before != after).mean() < 0.02 and np.abs(before - after).max() <= 1  # rounding at the border
+    assert before.sum() > 1000
+
+
+def test_a_map_far_from_the_origin_is_counted_alike(device: str) -> None:
+    """Coordinates as of a national grid: offsets are taken in double precision."""
+    rng = np.random.default_rng(1)
+    points, locations = rng.integers(-4096, 4096, (500, 3)) / 1024, rng.integers(-1024, 1024, (3, 3)) / 1024
+    rotations, far = rotation_looking_along(fibonacci_sphere(20)), np.array([2.0**22, -(2.0**21), 512.0])
+    near_counts = count(PinholeCamera(), rotations, locations, points, device=device)
+    np.testing.assert_array_equal(
+        near_counts, count(PinholeCamera(), rotations, locations + far, points + far, device=device)
+    )
+
+
+def test_cells_cover_the_sphere_once() -> None:
+    centers, radii = cell_centers(16)
+    np.testing.assert_allclose(np.linalg.norm(centers, axis=1), 1)
+    directions = fibonacci_sphere(20_000)
+    assert np.all(np.min(2 - 2 * directions @ centers.T, axis=1) <= (2 * np.sin(radii.max() / 2)) ** 2 + 1e-12)
+    for face in ((1, 1, 1), (-1, 1, -1), (1, -1, -1)):  # the map and its inverse agree on each face
+        u, v = np.random.default_rng(0).uniform(0, 0.5, (2, 100))
+        xyz = octahedral_directions(u * face[0], v * face[1])
+        assert np.all(xyz[:, 2] >= 0) and np.allclose(np.abs(xyz).sum(1), 1)
+
+
+@pytest.mark.parametrize("camera", [DISTORTED, FISHEYE, PANORAMA])
+def test_the_table_of_a_field_of_view_is_never_wrong(camera: ColmapCamera) -> None:
+    from wheretolook.visibility.sphere_cells import octahedral_directions
+
+    table = FieldOfView.of(camera)
+    rng = np.random.default_rng(0)
+    u, v = rng.uniform(-1, 1, (2, 300_000))
+    directions = octahedral_directions(u, v)
+    row, column = ((np.stack([v, u]) + 1) / 2 * table.size).astype(int)
+    depth, seen = table.depth_rad[row * table.size + column], camera.sees(directions)
+    assert seen[depth > 0].all() and not seen[depth < 0].any()
+    assert np.mean(depth == 0) < 0.01

@@ -1,0 +1,201 @@
+"""Hidden-point removal against closed forms, a linear program, an independent library and a mesh."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import linprog
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
+
+from box_scenes import ROOM, furnished_room
+from wheretolook.errors import ConfigError, MapError, SceneError
+from wheretolook.grid import fibonacci_sphere
+from wheretolook.rendering import MeshRaycaster
+from wheretolook.visibility import MeshOcclusion
+from wheretolook.visibility.agreement import MaskAgreement
+from wheretolook.visibility.hidden_points import HiddenPointRemoval, hull_length
+
+ORIGIN = np.zeros((1, 3))
+
+
+def hull_length_plain(points: np.ndarray, direction: np.ndarray) -> float:
+    """Largest t with t * direction = sum of w_i points_i, w_i >= 0, sum of w_i <= 1 (the rest is the origin's)."""
+    equations = np.column_stack([points.T, -direction])
+    shares = np.append(np.ones(len(points)), 0)[None]
+    found = linprog(np.append(np.zeros(len(points)), -1), shares, [1], equations, np.zeros(3))
+    assert found.success
+    return float(found.x[-1])
+
+
+def free_plain(location: np.ndarray, points: np.ndarray, radius: float, margin_m: float) -> np.ndarray:
+    """The definition: no mix of flipped landmarks and the location reaches farther out than the landmark's own."""
+    lines = points - location
+    distance = np.linalg.norm(lines, axis=1)
+    big = radius * distance.max()
+    flipped = lines * ((2 * big - distance) / distance)[:, None]
+    reach = np.array([hull_length_plain(flipped, line) for line in lines / distance[:, None]])
+    return reach <= 2 * big - distance + margin_m + 1e-9 * big
+
+
+def surfaces(seed: int, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points on the furnished room's surfaces, 5 mm off, and locations inside it."""
+    rng = np.random.default_rng(seed)
+    mesh = furnished_room()
+    corners = mesh.vertices[mesh.triangles].astype(float)
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    weights = rng.dirichlet([1, 1, 1], n)
+    points = np.einsum("nij,ni->nj", corners[rng.choice(len(area), n, p=area / area.sum())], weights)
+    locations = rng.uniform((0.5, 2.2, 1.0), (3.5, 4.5, 2.5), (8, 3))
+    return points + rng.normal(scale=0.005, size=(n, 3)), locations
+
+
+@pytest.mark.parametrize("radius", [1.0, 10.0, 1e3, 1e6])
+def test_a_sphere_is_seen_from_its_centre(radius: float) -> None:
+    points = 3 * fibonacci_sphere(500)
+    assert HiddenPointRemoval(radius).unoccluded(ORIGIN, points).all()
+
+
+@pytest.mark.parametrize("radius", [2.0, 20.0])
+def test_a_dense_wall_hides_what_is_behind_it(radius: float) -> None:
+    """From the middle of a box of 4 m, of which one side stands out, to points 2 m behind, beside and before it."""
+    step = np.linspace(-2, 2, 81)
+    y, z = (values.ravel() for values in np.meshgrid(step, step))
+    wall = np.column_stack([np.full(y.size, 2.0), y, z])
+    y, z = (values.ravel() for values in np.meshgrid(step[::8], step[::8]))
+    behind = np.column_stack([np.full(y.size, 4.0), y, z])
+    beside = np.column_stack([y, np.full(y.size, 4.0), z])
+    before = np.column_stack([np.full(y.size, -1.0), y / 4, z / 4])
+    seen = HiddenPointRemoval(radius).unoccluded(ORIGIN, np.concatenate([wall, behind, beside, before]))[0]
+    wall_seen, behind_seen, beside_seen, before_seen = np.split(seen, np.cumsum([len(wall), len(y), len(y)]))
+    assert not behind_seen.any()
+    assert before_seen.all()
+    assert beside_seen.mean() > 0.3  # seen at a slant at its ends
+    assert wall_seen[np.abs(wall[:, 1:]).max(axis=1) < 0.5].all()
+
+
+def test_few_landmarks() -> None:
+    model = HiddenPointRemoval(margin_m=0)
+    assert model.unoccluded(ORIGIN, np.array([[1.0, 2, 3]])).tolist() == [[True]]
+    ray = np.array([[2.0, 0, 0], [1, 0, 0], [-3, 0, 0], [-2, 0, 0]])
+    assert model.unoccluded(ORIGIN, ray).tolist() == [[False, True, False, True]]
+    assert model.unoccluded(ORIGIN, np.array([[1.0, 0, 0], [0, 1, 0]])).all()
+    assert model.unoccluded(ORIGIN, np.eye(3)).all()
+    assert model.unoccluded(np.zeros((0, 3)), np.eye(3)).shape == (0, 3)
+
+
+def test_landmarks_in_one_plane_with_the_location() -> None:
+    """A ring in a tilted plane hides a ring outside it, and a third one is nearer than the margin behind the first."""
+    turn = np.linspace(0, 2 * np.pi, 60, endpoint=False)
+    ring = np.column_stack([np.cos(turn), np.sin(turn), 0 * turn]) @ Rotation.from_rotvec([0.4, 1.1, 0.2]).as_matrix()
+    points = np.concatenate([ring, 2 * ring, 1.03 * ring])
+    for margin_m, third in ((0.05, True), (0.02, False)):
+        seen = HiddenPointRemoval(10, margin_m).unoccluded(ORIGIN, points)[0]
+        assert seen.tolist() == [True] * 60 + [False] * 60 + [third] * 60
+
+
+def test_a_margin_frees_what_stands_behind_its_own_surface() -> None:
+    sphere = fibonacci_sphere(400)
+    points = np.concatenate([2 * sphere, 2.03 * sphere[:50], 2.5 * sphere[50:100]])
+    expected = np.arange(500) < 400
+    np.testing.assert_array_equal(HiddenPointRemoval(5, margin_m=0).unoccluded(ORIGIN, points)[0], expected)
+    expected[400:450] = True
+    np.testing.assert_array_equal(HiddenPointRemoval(5, margin_m=0.05).unoccluded(ORIGIN, points)[0], expected)
+
+
+@pytest.mark.parametrize("radius, margin_m", [(1.0, 0.0), (3.0, 0.05), (100.0, 0.0), (100.0, 0.05)])
+def test_agrees_with_the_definition(radius: float, margin_m: float) -> None:
+    points = surfaces(1, 45)[0]
+    locations = np.array([[2.0, 3, 1.5], [0.5, 4, 2.2], [9, 2, 1], [40, 50, -30]])  # the last two see it from outside
+    seen = HiddenPointRemoval(radius, margin_m).unoccluded(locations, points)
+    expected = np.stack([free_plain(location, points, radius, margin_m) for location in locations])
+    np.testing.assert_array_equal(seen, expected)
+    assert 0.05 < seen.mean() < 0.95 or radius == 100
+
+
+def test_agrees_with_open3d() -> None:
+    open3d = pytest.importorskip("open3d")
+    points, locations = surfaces(2, 6000)
+    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
+    for radius in (2.0, 50.0, 1000.0):
+        seen = HiddenPointRemoval(radius, margin_m=0).unoccluded(locations[:2], points)
+        for row, location in zip(seen, locations[:2], strict=True):
+            farthest = np.linalg.norm(points - location, axis=1).max()
+            rows = cloud.hidden_point_removal(location, radius * farthest)[1]
+            np.testing.assert_array_equal(np.flatnonzero(row), np.unique(rows))
+
+
+def test_climbing_finds_the_facet_that_a_search_of_all_finds() -> None:
+    """Also where many facets lie in one plane: the points of a lattice in a cube, from its middle."""
+    lattice = np.stack(np.meshgrid(*[np.arange(-2.0, 3)] * 3), axis=-1).reshape(-1, 3)
+    for points in (surfaces(3, 3000)[0] - np.array(ROOM) / 2, lattice[np.any(lattice != 0, axis=1)]):
+        hull = ConvexHull(points)
+        directions = np.random.default_rng(0).normal(size=(2000, 3))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        along = directions @ hull.equations[:, :3].T
+        expected = 1 / (along / -hull.equations[:, 3]).max(axis=1)
+        np.testing.assert_allclose(hull_length(hull, directions), expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("margin_m", [0.0, 0.05])
+def test_landmarks_in_one_place_get_one_answer(margin_m: float) -> None:
+    points, locations = surfaces(4, 1500)
+    again = np.random.default_rng(0).permutation(np.tile(np.arange(len(points)), 3))
+    model = HiddenPointRemoval(20, margin_m)
+    once, thrice = model.unoccluded(locations, points), model.unoccluded(locations, points[again])
+    np.testing.assert_array_equal(thrice, once[:, again])
+    assert 0.1 < once.mean() < 0.9
+
+
+def test_scale_turn_shift_and_number_of_threads_change_nothing() -> None:
+    points, locations = surfaces(5, 2000)
+    seen = HiddenPointRemoval(20, 0.05, threads=1).unoccluded(locations, points)
+    turn, shift = Rotation.from_rotvec([0.3, -2.0, 1.0]).as_matrix(), np.array([30.0, -7, 2])
+    for scale in (1e-2, 1.0, 1e3):
+        moved = [scale * (at @ turn.T + shift) for at in (locations, points)]
+        np.testing.assert_array_equal(HiddenPointRemoval(20, 0.05 * scale).unoccluded(*moved), seen)
+    for threads in (2, 5):
+        np.testing.assert_array_equal(HiddenPointRemoval(20, 0.05, threads).unoccluded(locations, points), seen)
+
+
+def test_against_the_mesh_a_larger_radius_finds_more_and_errs_more() -> None:
+    """In the furnished room, with as many landmarks again behind its walls."""
+    points, locations = surfaces(6, 2000)
+    points = np.concatenate([points, points + 0.4 * (points - np.array(ROOM) / 2)])
+    truth = MeshOcclusion(MeshRaycaster(furnished_room())).unoccluded(locations, points)
+    found = [MaskAgreement.between(HiddenPointRemoval(radius).unoccluded(locations, points), truth)
+             for radius in (2, 20, 200, 2000)]  # fmt: skip
+    precision, recall = [a.precision for a in found], [a.recall for a in found]
+    assert precision == sorted(precision, reverse=True) and precision[0] > 0.9 and precision[-1] < 0.6
+    assert recall == sorted(recall) and recall[0] < 0.7 and recall[-1] > 0.98
+    assert max(a.f1 for a in found) > 0.85
+
+
+def test_a_huge_radius_hides_only_what_lies_on_one_ray() -> None:
+    rng = np.random.default_rng(7)
+    points = rng.uniform(1, 5, (3000, 1)) * fibonacci_sphere(3000)
+    points = np.concatenate([points, 1.5 * points[:10]])
+    seen = HiddenPointRemoval(1e8, margin_m=0).unoccluded(ORIGIN, points)[0]
+    np.testing.assert_array_equal(seen, np.arange(len(points)) < 3000)
+
+
+def test_what_cannot_be_answered_is_refused_by_name() -> None:
+    model, points = HiddenPointRemoval(), np.eye(3)
+    with pytest.raises(MapError, match=r"no landmarks.*got 0"):
+        model.unoccluded(ORIGIN, np.zeros((0, 3)))
+    with pytest.raises(MapError, match=r"1 of 2 landmarks are not finite, the first in row 1 \(got \(1.0, nan, 2.0\)"):
+        model.unoccluded(ORIGIN, np.array([[0, 0, 1.0], [1, np.nan, 2]]))
+    with pytest.raises(SceneError, match=r"landmark lies at the location.*got \(0.0, 1.0, 0.0\)"):
+        model.unoccluded(np.array([[0.0, 0, 2], [0, 1, 0]]), points)
+    for refuse in (model.check_locations, lambda at: model.unoccluded(at, points)):
+        with pytest.raises(SceneError, match=r"not finite.*got \(0.0, inf, 0.0\)"):
+            refuse(np.array([[5.0, 5, 5], [0, np.inf, 0]]))
+
+
+@pytest.mark.parametrize(
+    "arguments", [{"radius": 0.9}, {"radius": np.nan}, {"radius": np.inf}, {"margin_m": -0.1}, {"margin_m": np.nan},
+                  {"threads": -1}]
+)  # fmt: skip
+def test_bad_settings_are_refused_by_value(arguments: dict[str, float]) -> None:
+    with pytest.raises(ConfigError, match=f"got {next(iter(arguments.values()))}"):
+        HiddenPointRemoval(**arguments)  # type: ignore[arg-type]

@@ -1,0 +1,134 @@
+"""The survey of all locations: blocks, threads, the best K, stored occlusion and what it refuses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from box_scenes import box_quads, quads_mesh, random_texture
+from conftest import RandomViews
+from wheretolook.camera_models import ColmapCamera
+from wheretolook.errors import ConfigError, MapError, SceneError
+from wheretolook.geometry import Float, PinholeCamera, rotation_looking_along
+from wheretolook.grid import fibonacci_sphere
+from wheretolook.rendering import MeshRaycaster
+from wheretolook.scenes.mesh import TexturedMesh
+from wheretolook.visibility import (
+    DevicePoints,
+    FrustumCounter,
+    MeshOcclusion,
+    NoOcclusion,
+    OcclusionModel,
+    count_plain,
+    survey,
+)
+
+
+def boxes(*quads: np.ndarray) -> TexturedMesh:
+    return quads_mesh(np.concatenate(quads), [random_texture(np.random.default_rng(0), 4, 4)])
+
+
+class Given(OcclusionModel):
+    """A mask that is known."""
+
+    def __init__(self, locations: Float, mask: np.ndarray) -> None:
+        self.locations, self.mask = locations, mask
+
+    def unoccluded(self, locations: Float, points: Float) -> np.ndarray:
+        rows = [int(np.flatnonzero((self.locations == location).all(1))[0]) for location in locations]
+        return self.mask[rows]
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_a_survey_is_what_its_plain_parts_say(random_views: RandomViews, threads: int, device: str) -> None:
+    v = random_views
+    rotations = rotation_looking_along(v.directions)
+    seen = survey(v.camera, rotations, v.locations, v.points, Given(v.locations, v.mask), keep=6, device=device,
+                  threads=threads, memory_bytes=200_000)  # a block or two of locations at a time  # fmt: skip
+    plain = count_plain(v.camera, rotations, v.locations, v.points, v.mask)
+    np.testing.assert_array_equal(seen.counts, plain)
+    for row in range(len(v.locations)):
+        ranked = sorted(range(len(rotations)), key=lambda direction: (-plain[row, direction], direction))
+        assert seen.best[row].tolist() == ranked[:6]
+    assert seen.occlusion is not None
+    np.testing.assert_array_equal(seen.occlusion.mask, v.mask)
+    np.testing.assert_array_equal(seen.occlusion.unoccluded(v.locations[2:4], v.points), v.mask[2:4])
+
+
+@pytest.mark.parametrize("n_points", [1, 7, 8, 9, 800])
+def test_masks_of_every_length_are_packed_as_numpy_packs_them(
+    n_points: int, random_views: RandomViews, device: str
+) -> None:
+    v = random_views
+    mask, points = v.mask[:, :n_points], v.points[:n_points]
+    rotations = rotation_looking_along(v.directions)
+    for occlusion, expected in ((Given(v.locations, mask), mask), (NoOcclusion(), np.ones_like(mask))):
+        seen = survey(v.camera, rotations, v.locations, points, occlusion, device=device)
+        assert seen.occlusion is not None
+        np.testing.assert_array_equal(seen.occlusion.packed, np.packbits(expected, axis=1))
+    without = survey(v.camera, rotations, v.locations, points, NoOcclusion(), keep_occlusion=False, device=device)
+    assert without.occlusion is None
+
+
+def test_a_mesh_hides_what_is_behind_it_on_the_device_too(device: str) -> None:
+    raycaster = MeshRaycaster(boxes(box_quads((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))), device)
+    rng = np.random.default_rng(0)
+    points, locations = rng.uniform(-4, 4, (600, 3)), rng.uniform(2, 4, (20, 3))
+    occlusion, rotations = MeshOcclusion(raycaster), rotation_looking_along(fibonacci_sphere(30))
+    seen = survey(PinholeCamera(), rotations, locations, points, occlusion, device=device)
+    mask = occlusion.unoccluded(locations, points)
+    assert 0 < (~mask).sum() < mask.size / 2 and seen.occlusion is not None
+    np.testing.assert_array_equal(seen.occlusion.mask, mask)
+    np.testing.assert_array_equal(seen.counts, count_plain(PinholeCamera(), rotations, locations, points, mask))
+
+
+def test_a_counter_and_points_on_the_device_can_be_used_again(random_views: RandomViews, device: str) -> None:
+    v = random_views
+    rotations, points = rotation_looking_along(v.directions), DevicePoints(v.points, device)
+    counter = FrustumCounter(v.camera, rotations, len(points), device, distinct_pixels=True)
+    for rows in (slice(0, 3), slice(3, 5)):
+        seen = survey(v.camera, rotations, v.locations[rows], points, NoOcclusion(), counter=counter)
+        everything = np.ones((len(v.locations[rows]), len(points)), bool)
+        plain = count_plain(v.camera, rotations, v.locations[rows], v.points, everything, distinct_pixels=True)
+        np.testing.assert_array_equal(seen.counts, plain)
+
+
+def test_a_distorted_camera_surveys(random_views: RandomViews, device: str) -> None:
+    v = random_views
+    camera = ColmapCamera("RADIAL", 640, 480, (300.0, 320.0, 240.0, -0.2, 0.03))
+    rotations = rotation_looking_along(v.directions)
+    seen = survey(camera, rotations, v.locations, v.points, Given(v.locations, v.mask), device=device)
+    np.testing.assert_array_equal(seen.counts, count_plain(camera, rotations, v.locations, v.points, v.mask))
+
+
+def test_bad_input_is_refused_before_any_work(random_views: RandomViews) -> None:
+    v = random_views
+    rotations = rotation_looking_along(v.directions)
+
+    class Untouchable(NoOcclusion):
+        def unoccluded_on_device(self, locations: Float, points: DevicePoints) -> None:
+            raise AssertionError("long work")
+
+    with pytest.raises(MapError, match=r"no landmarks.*0"):
+        survey(v.camera, rotations, v.locations, np.empty((0, 3)), Untouchable())
+    with pytest.raises(SceneError, match="no locations"):
+        survey(v.camera, rotations, np.empty((0, 3)), v.points, Untouchable())
+    with pytest.raises(SceneError, match=r"not finite.*nan"):
+        survey(v.camera, rotations, [[0, np.nan, 0]], v.points, Untouchable())
+    with pytest.raises(ConfigError, match="one location with 800 landmarks"):
+        survey(v.camera, rotations, v.locations, v.points, Untouchable(), memory_bytes=1000)
+
+
+@pytest.mark.parametrize("two_sided", [False, True])
+def test_a_location_inside_geometry_is_named(two_sided: bool, device: str) -> None:
+    room, block = box_quads((-3, -3, -3), (3, 3, 3), inward=True), box_quads((0, 0, 0), (1, 1, 1))
+    occlusion = MeshOcclusion(MeshRaycaster(boxes(room, block), device), two_sided=two_sided)
+    occlusion.check_locations(np.array([[-1.0, -1, -1], [2, 2, 2]]))
+    with pytest.raises(SceneError, match=r"inside geometry.*1\.0, 0\.5, 0\.5"):
+        occlusion.check_locations(np.array([[-1.0, -1, -1], [1, 0.5, 0.5]]))  # on a face
+    inside = np.array([[-1.0, -1, -1], [0.4, 0.5, 0.6]])
+    if two_sided:
+        occlusion.check_locations(inside)  # might be a room
+    else:
+        with pytest.raises(SceneError, match=r"inside geometry.*0\.4, 0\.5, 0\.6"):
+            survey(PinholeCamera(), np.eye(3)[None], inside, np.ones((5, 3)), occlusion, device=device)

@@ -19,7 +19,9 @@ from wheretolook.learning.weights import load_classifier
 from wheretolook.localization_map import LocalizationMap
 from wheretolook.scoring import load_scorer
 from wheretolook.table import fingerprint, is_good, poses, read_table, write_table
-from wheretolook.tracking import TrackingConfig, newest_run
+from wheretolook.tracking import TrackingConfig, client, newest_run
+from wheretolook.visibility import StoredOcclusion
+from wheretolook.visibility.agreement import MaskAgreement
 
 EXPERIMENT = """\
 name: tiny
@@ -123,6 +125,47 @@ def test_what_a_table_says_is_what_its_features_hold(demo: Path) -> None:
         table = scene.read_table()
         binned = scene.localization_map(dataset.camera).bin_views(poses(table))
         assert np.abs(binned.n_visible - table["n_visible"]).max() <= 1  # single precision at the border
+
+
+def test_every_occlusion_model_scores_the_same_viewpoints(copy: Path) -> None:
+    root = copy / "data" / "tiny"
+    stored = pd.read_csv(root / "results" / "scores.csv")
+    assert set(stored["occlusion"]) == {"mesh"}
+    assert run("evaluate", copy, "--evaluate.occlusions", "[mesh,tsdf,hidden-points,none]") == 0
+    scores = pd.read_csv(root / "results" / "scores.csv")
+    assert list(scores["occlusion"].unique()) == ["mesh", "tsdf", "hidden-points", "none"]
+    # rays cast anew and those that the sample stage stored are the same
+    pd.testing.assert_frame_equal(scores[scores["occlusion"] == "mesh"].reset_index(drop=True), stored)
+    visible = scores[(scores["method"] == "visible") & (scores["scene"] == "all") & (scores["top_n"] == 1)]
+    assert visible["average_precision"].nunique() > 1
+    assert (root / "results" / "occlusion.png").stat().st_size > 10_000
+    assert "By occlusion model" in (root / "results" / "scores.md").read_text()
+    tracking = TrackingConfig(str(copy / "mlruns"))
+    parent = newest_run(tracking, "evaluate")
+    assert parent is not None
+    runs = client(tracking).search_runs(
+        [parent.info.experiment_id], f"tags.mlflow.parentRunId = '{parent.info.run_id}'"
+    )
+    assert {one.data.params["occlusion"] for one in runs} == set(scores["occlusion"])
+
+
+@pytest.mark.parametrize("model", ["tsdf", "hidden-points", "none"])
+def test_viewpoints_can_be_sampled_with_every_occlusion_model(copy: Path, model: str) -> None:
+    scene = Dataset.load(copy / "data" / "tiny").scenes[0]
+    by_mesh = StoredOcclusion.load(scene.occlusion)
+    assert by_mesh.model == "mesh"
+    assert run("sample", copy, "--occlusion.model", model, "--occlusion.voxel_m", "0.04") == 0
+    stored = StoredOcclusion.load(scene.occlusion)
+    assert stored.model == model
+    if model == "none":
+        assert stored.mask.all() and not by_mesh.mask.all()
+    same = [row for row in stored.locations if (by_mesh.locations == row).all(1).any()]
+    assert len(same) >= 3
+    points = np.empty((by_mesh.n_landmarks, 3))
+    agreement = MaskAgreement.between(
+        stored.unoccluded(np.array(same), points), by_mesh.unoccluded(np.array(same), points)
+    )
+    assert agreement.recall > {"tsdf": 0.9, "hidden-points": 0.6, "none": 0.999}[model]
 
 
 @pytest.mark.parametrize(

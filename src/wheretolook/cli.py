@@ -29,10 +29,10 @@ STAGES = {
         "Build a COLMAP map of every scene from renders along a walk.",
         ("map", "scenes.free_space", "label.workers"),
     ),
-    "sample": ("sample", "Choose viewpoints by the landmarks they see.", ("sample", "scenes.free_space")),
+    "sample": ("sample", "Choose viewpoints by the landmarks they see.", ("sample", "occlusion", "scenes.free_space")),
     "label": ("label", "Render and localize every viewpoint, measure the pose error. Resumes.", ("label",)),
     "train": ("train", "Train one network for each input variant.", ("train", "tracking")),
-    "evaluate": ("evaluate", "Score all methods on the test scenes.", ("evaluate", "tracking")),
+    "evaluate": ("evaluate", "Score all methods on the test scenes.", ("evaluate", "occlusion", "tracking")),
 }
 """Sub-command: function in `wheretolook.stages`, what it does, groups of settings it reads."""
 

@@ -18,6 +18,7 @@ from wheretolook.sampling import SampleConfig
 from wheretolook.scenes.free_space import FreeSpaceConfig
 from wheretolook.scenes.procedural import ApartmentConfig
 from wheretolook.tracking import TrackingConfig
+from wheretolook.visibility.config import OcclusionConfig
 
 
 @dataclass(frozen=True)
@@ -93,6 +94,7 @@ class Experiment:
         camera: the camera that will look, and with which the map's images are rendered.
         scenes: stage 1, meshes.
         map: stage 2, COLMAP maps.
+        occlusion: how stages 3 and 6 find out which landmarks nothing stands in front of.
         sample: stage 3, viewpoints and what they see.
         label: stage 4, localization errors.
         train: stage 5, the network.
@@ -106,6 +108,7 @@ class Experiment:
     camera: PinholeCamera = field(default_factory=PinholeCamera)
     scenes: ScenesConfig = field(default_factory=ScenesConfig)
     map: MapConfig = field(default_factory=MapConfig)
+    occlusion: OcclusionConfig = field(default_factory=OcclusionConfig)
     sample: SampleConfig = field(default_factory=SampleConfig)
     label: LabelConfig = field(default_factory=LabelConfig)
     train: TrainConfig = field(default_factory=TrainConfig)

@@ -124,31 +124,39 @@ def make_maps(experiment: Experiment, say: Say = print, tick: Tick = lambda work
 def sample(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> Dataset:
     """Stage 3: viewpoints and which landmarks their locations see, `<scene>/viewpoints.parquet` and `occlusion.npz`.
 
+    Every voxel's free location is looked from in every direction; the landmarks it sees are counted exactly.
+
     Raises:
         SceneError: no location is free. MapError: there is no map.
     """
     from wheretolook.grid import VoxelGrid
     from wheretolook.mapping.landmarks import Landmarks
-    from wheretolook.rendering import MeshRaycaster
     from wheretolook.sampling import free_locations, sample_viewpoints
+    from wheretolook.scene_occlusion import scene_occlusion
     from wheretolook.scenes.free_space import FreeSpace
     from wheretolook.scenes.loading import load_mesh
-    from wheretolook.visibility import MeshOcclusion
 
     dataset, device = _dataset(experiment, "map"), experiment.warp_device
     for scene in dataset.scenes:
-        key = _key("sample", [asdict(experiment.sample), asdict(experiment.scenes.free_space), asdict(dataset.camera),
-                              _existing(scene.mesh, SceneError, "scenes"),
+        settings = [asdict(part) for part in (experiment.sample, experiment.occlusion, experiment.scenes.free_space)]
+        key = _key("sample", [settings, asdict(dataset.camera), _existing(scene.mesh, SceneError, "scenes"),
                               _existing(scene.landmarks, MapError, "map")])  # fmt: skip
         if not _is_done(scene, "sample", key, scene.table, scene.occlusion):
             mesh, landmarks = load_mesh(scene.mesh), Landmarks.load(scene.landmarks)
             grid = VoxelGrid.over(mesh.bounds, experiment.sample.grid)
-            occlusion = MeshOcclusion(MeshRaycaster(mesh, device))
             with _naming(scene.mesh):
-                free = free_locations(grid, FreeSpace(mesh, experiment.scenes.free_space, device))
-                table, stored = sample_viewpoints(
-                    grid, free, landmarks, dataset.camera, occlusion, experiment.sample, device
+                free_space = FreeSpace(mesh, experiment.scenes.free_space, device)
+                free = free_locations(grid, free_space)
+                occlusion = scene_occlusion(
+                    scene, dataset.camera, experiment.occlusion, device, mesh, free_space.two_sided
                 )
+                # depth images that have not seen all of the scene may put free space behind surfaces
+                free = free[~occlusion.inside_geometry(grid.centers()[free])]
+                table, stored = sample_viewpoints(
+                    grid, free, landmarks, dataset.camera, occlusion, experiment.sample, device,
+                    progress=f"sample {scene.name}",
+                )  # fmt: skip
+            stored.model = experiment.occlusion.model
             stored.save(scene.occlusion)
             write_table(table, scene.table)
             _stamp(scene, "sample", key)
@@ -208,7 +216,9 @@ def evaluate(experiment: Experiment, say: Say = print, tick: Tick = lambda work:
     from wheretolook.evaluation import evaluate as evaluate_methods
 
     dataset = _dataset(experiment, "label")
-    scores = evaluate_methods(dataset, experiment.evaluate, experiment.tracking, device=experiment.warp_device)
+    scores = evaluate_methods(
+        dataset, experiment.evaluate, experiment.tracking, device=experiment.warp_device, occlusion=experiment.occlusion
+    )
     tick(1)
     return scores
 

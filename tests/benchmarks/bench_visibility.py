@@ -12,6 +12,9 @@ configuration, in a synthetic apartment whose mesh is cut into at least 250,000 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import ctypes
+import gc
 import json
 import os
 import platform
@@ -89,6 +92,9 @@ class Peak:
         self.device, self.bytes = device, 0
 
     def __enter__(self) -> Peak:
+        gc.collect()
+        with contextlib.suppress(OSError, AttributeError):
+            ctypes.CDLL("libc.so.6").malloc_trim(0)  # or memory kept from earlier would not be seen to be used again
         self._done = threading.Event()
         self._before = self._now()
         self._thread = threading.Thread(target=self._watch)
@@ -144,9 +150,13 @@ def peak_flops(device: str) -> float:
 
 
 def machine(device: str) -> dict[str, Any]:
-    name = wp.get_device(device).name if wp.get_device(device).is_cuda else platform.processor() or platform.machine()
-    cores = len(os.sched_getaffinity(0))
-    return {"device": device, "name": name, "cores": cores, "warp": wp.__version__, "numpy": np.__version__}
+    host = platform.machine()
+    with contextlib.suppress(OSError):
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        host = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), host)
+    name = wp.get_device(device).name if wp.get_device(device).is_cuda else host
+    versions = {"warp": wp.__version__, "numpy": np.__version__}
+    return {"device": device, "name": name, "host": host, "cores": len(os.sched_getaffinity(0)), **versions}
 
 
 def paper_size(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
@@ -165,10 +175,12 @@ def paper_size(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
     print(f"{len(mesh.triangles):,} triangles, {len(locations)} locations, {len(rotations)} directions, "
           f"{len(points):,} landmarks: {n / 1e9:.2f} G projections; {machine(device)}")  # fmt: skip
     on_gpu = wp.get_device(device).is_cuda
-    rows = []
+    rows: list[dict[str, Any]] = []
+    size = {"locations": len(locations), "directions": len(rotations), "landmarks": len(points),
+            "triangles": len(mesh.triangles)}  # fmt: skip
 
     def add(what: str, threads: int, work: Callable[[], object], repeats: int = args.repeats) -> None:
-        row = {"what": what, "threads": threads, **timed(work, repeats)}
+        row = {"what": what, "threads": threads, **size, **timed(work, repeats)}
         row["projections_per_s"] = n / row["median_s"]
         rows.append(row)
         spread = f"({1e3 * row['min_s']:,.2f} to {1e3 * row['max_s']:,.2f}, {repeats} repeats)"
@@ -179,9 +191,7 @@ def paper_size(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
         return survey(CAMERA, rotations, locations, landmarks, occlusion, keep=100, threads=threads, counter=counter)
 
     def counts_alone(threads: int) -> object:
-        if on_gpu:
-            return counter.count(locations, landmarks.double).numpy()
-        return survey(CAMERA, rotations, locations, landmarks, NoOcclusion(), keep=100, keep_occlusion=False,
+        return survey(CAMERA, rotations, locations, landmarks, NoOcclusion(), keep=1, keep_occlusion=False,
                       threads=threads, counter=counter)  # fmt: skip
 
     for threads in (1,) if on_gpu else sorted({1, len(os.sched_getaffinity(0))}):
@@ -212,7 +222,8 @@ def paper_size(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
 
     twin_time = timed(twin, args.twin_repeats)
     scale = len(locations) / len(some)
-    row = {"what": "NumPy twin, counts alone, scaled", "threads": 1, "repeats": args.twin_repeats, "scale": scale,
+    row = {"what": "NumPy twin, counts alone, scaled", "threads": 1, **size, "repeats": args.twin_repeats,
+           "scale": scale,
            **{key: twin_time[key] * scale for key in ("median_s", "min_s", "max_s")}}  # fmt: skip
     rows.append({**row, "projections_per_s": n / row["median_s"]})
     print(f"{row['what']:32} 1 thread(s): {row['median_s']:12,.1f} s   ({row['min_s']:,.1f} to {row['max_s']:,.1f}, "
@@ -267,7 +278,8 @@ def scaling(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
                 slow = not on_gpu and (n > 5e10 or (model is occlusion and size["locations"] * size["landmarks"] > 2e7))
                 with Peak(device) as peak:
                     found = timed(work, 1 if slow else args.scaling_repeats)
-                rows.append({"axis": axis, **size, "what": what, **found, "peak_bytes": peak.bytes, "device": device})
+                threads = 1 if on_gpu else len(os.sched_getaffinity(0))
+                rows.append({"axis": axis, **size, "what": what, "threads": threads, **found, "peak_bytes": peak.bytes})
                 print(f"{axis:10} {value:9,} {what:15} {found['median_s']:10.4f} s {peak.bytes / 1e6:10,.1f} MB")
     return rows
 

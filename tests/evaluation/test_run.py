@@ -37,6 +37,7 @@ def test_evaluation_writes_prints_and_logs(
     tracking = TrackingConfig(str(tmp_path / "mlruns"), "tiny")
     models = train(dataset, TrainConfig(("2d", "2d+z"), epochs=2, hidden=(16,), accelerator="cpu"), tracking, False)
     table = evaluate(dataset, CONFIG, tracking, models=models, progress=True)
+    assert {*table["occlusion"]} == {"mesh"}
     methods = {("random", ""), ("visible", ""), ("bins", ""), ("mlp", "2d"), ("mlp", "2d+z"), ("oracle", "")}
     assert {*zip(table["method"], table["inputs"], strict=True)} == methods
     assert {*table["scene"]} == {"all", "scene-2", "scene-3"}

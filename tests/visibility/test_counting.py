@@ -11,7 +11,7 @@ from conftest import RandomViews
 from wheretolook.camera_models import Camera, ColmapCamera
 from wheretolook.geometry import Float, PinholeCamera, rotation_looking_along, transform
 from wheretolook.grid import fibonacci_sphere
-from wheretolook.visibility import DevicePoints, FrustumCounter, count_plain
+from wheretolook.visibility import DevicePoints, FrustumCounter, count_plain, counting
 from wheretolook.visibility.field_of_view import FieldOfView
 from wheretolook.visibility.sphere_cells import cell_centers, octahedral_directions
 
@@ -144,3 +144,14 @@ def test_the_table_of_a_field_of_view_is_never_wrong(camera: ColmapCamera) -> No
     depth, seen = table.depth_rad[row * table.size + column], camera.sees(directions)
     assert seen[depth > 0].all() and not seen[depth < 0].any()
     assert np.mean(depth == 0) < 0.01
+
+
+def test_lists_for_the_camera_that_run_over_change_nothing(
+    random_views: RandomViews, device: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    v, rotations = random_views, rotation_looking_along(random_views.directions)
+    expected = count(DISTORTED, rotations, v.locations, v.points, v.mask, device)
+    for entries in (3, 60):  # shorter than one location's list, and than that of all
+        monkeypatch.setattr(counting, "UNSURE_ENTRIES", entries)
+        monkeypatch.setattr(counting, "ASKED_AT_ONCE", 7)
+        np.testing.assert_array_equal(count(DISTORTED, rotations, v.locations, v.points, v.mask, device), expected)

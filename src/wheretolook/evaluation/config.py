@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from wheretolook.errors import ConfigError
+from wheretolook.visibility.config import OcclusionName, check_occlusion_names
 
 THRESHOLDS = ((0.05, 0.4), (0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
 """Error limits in metres and degrees: the Long-Term Visual Localization benchmark's and the paper's finer one."""
@@ -25,6 +26,8 @@ class EvaluateConfig:
             The first pair is the label.
         seed: seed of the random method and of the bootstrap.
         resamples: bootstrap resamples of the locations, for 95 % intervals.
+        occlusions: occlusion models to see the landmarks by, each scored apart: "mesh", "tsdf", "hidden-points",
+            "none". Empty for the one that the viewpoints were sampled with, which is stored.
     """
 
     methods: tuple[str, ...] = ("random", "visible", "bins", "mlp")
@@ -34,6 +37,7 @@ class EvaluateConfig:
     thresholds: tuple[tuple[float, float], ...] = THRESHOLDS
     seed: int = 0
     resamples: int = 2000
+    occlusions: tuple[OcclusionName, ...] = ()
 
     def __post_init__(self) -> None:
         from wheretolook.scoring.registry import SCORERS
@@ -50,6 +54,7 @@ class EvaluateConfig:
             raise ConfigError("thresholds needs pairs of positive limits", value=self.thresholds)
         if self.resamples < 1:
             raise ConfigError("resamples must be at least 1", value=self.resamples)
+        check_occlusion_names(self.occlusions)
 
 
 def threshold_key(threshold: tuple[float, float]) -> str:

@@ -24,6 +24,10 @@ def score_markdown(scores: pd.DataFrame, title: str = "Localization score") -> s
         scores: the table.
         title: first line.
     """
+    occlusions = list(scores["occlusion"].unique()) if "occlusion" in scores else []
+    comparison = _occlusion_table(scores, occlusions) if len(occlusions) > 1 else []
+    if occlusions:
+        scores = scores[scores["occlusion"] == occlusions[0]]
     pooled = scores[scores["scene"] == ALL]
     scenes = [name for name in scores["scene"].unique() if name != ALL]
     keys = threshold_keys(scores)
@@ -54,7 +58,23 @@ def score_markdown(scores: pd.DataFrame, title: str = "Localization score") -> s
             shares = [_share(by_key[(scene, *method)], keys[0], interval=True) for scene in scenes]
             lines.append([method_style(*method).label, *shares])
         parts.append(_table(["method", *scenes], lines))
-    return "\n\n".join(parts) + "\n"
+    return "\n\n".join([*parts, *comparison]) + "\n"
+
+
+def _occlusion_table(scores: pd.DataFrame, occlusions: Sequence[str]) -> list[str]:
+    """Average precision and the best view's share of every method, by occlusion model."""
+    key, n = threshold_keys(scores)[0], scores["top_n"].iloc[0]
+    pooled = scores[(scores["scene"] == ALL) & (scores["top_n"] == n) & (scores["method"] != "oracle")]
+    by_key = {(row["method"], row["inputs"], row["occlusion"]): row for row in pooled.to_dict("records")}
+    methods = list(dict.fromkeys(zip(pooled["method"], pooled["inputs"], strict=True)))
+    lines = []
+    for method in methods:
+        rows = [by_key[(*method, occlusion)] for occlusion in occlusions]
+        cells = [f"{_number(row['average_precision'])}, {_share(row, key, interval=True)}" for row in rows]
+        lines.append([method_style(*method).label, *cells])
+    title = f"## By occlusion model: AP, and best {n} of each location within {threshold_label(key)}"
+    note = f"The tables above are with {occlusions[0]}."
+    return [title, note, _table(["method", *occlusions], lines)]
 
 
 def _share(row: dict[Any, Any], key: str, interval: bool) -> str:

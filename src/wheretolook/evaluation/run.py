@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,9 +22,12 @@ from wheretolook.evaluation.scores import ALL, Method, score_table
 from wheretolook.features import INPUT_VARIANTS
 from wheretolook.geometry import Float
 from wheretolook.localization_map import LocalizationMap
+from wheretolook.scene_occlusion import scene_occlusion
 from wheretolook.scoring import Scorer, make_scorer
 from wheretolook.table import fingerprint, is_good, poses
 from wheretolook.tracking import TrackingConfig, log, start_run
+from wheretolook.visibility import StoredOcclusion
+from wheretolook.visibility.config import OcclusionConfig
 
 if TYPE_CHECKING:
     from wheretolook.learning.training import TrainedModel
@@ -32,7 +35,7 @@ if TYPE_CHECKING:
 BLOCK = 4096
 """Views binned and scored at a time."""
 
-SCORES_CSV, SCORES_MD, SCORES_PNG = "scores.csv", "scores.md", "scores.png"
+SCORES_CSV, SCORES_MD, SCORES_PNG, OCCLUSION_PNG = "scores.csv", "scores.md", "scores.png", "occlusion.png"
 """Files of an evaluation, in `<dataset>/results/` and as artifacts of its run."""
 
 
@@ -43,11 +46,13 @@ def evaluate(
     models: Sequence[TrainedModel | Path] | None = None,
     progress: bool = True,
     device: str = "cpu",
+    occlusion: OcclusionConfig = OcclusionConfig(),
 ) -> pd.DataFrame:
     """Compare all methods on the scenes of one split.
 
     Writes the table as `<dataset>/results/scores.csv` and `scores.md`, a figure `scores.png`, and an MLflow run with
-    one nested run for each method, inputs and N.
+    one nested run for each method, inputs, N and occlusion model. With several occlusion models `scores.md` and
+    `scores.png` show the first, and `occlusion.png` compares them.
 
     Args:
         dataset: labelled scenes; they need not be of the dataset the models were trained on.
@@ -56,9 +61,10 @@ def evaluate(
         models: models or weights files to compare, instead of those that `config.weights` tells.
         progress: show a progress bar, and print the table at the end.
         device: where kernels and networks run, "cpu" or a CUDA device.
+        occlusion: settings of the models that `config.occlusions` names.
 
     Returns:
-        The table, see `wheretolook.evaluation.scores.score_table`.
+        The tables of `wheretolook.evaluation.scores.score_table`, one below the other, with a column `occlusion`.
 
     Raises:
         TableError: there is no scene of the split, or a viewpoint has no label.
@@ -74,13 +80,23 @@ def evaluate(
         _check_unseen(scenes, weights)
     tables = [scene.read_table() for scene in scenes]
     views = _test_views(scenes, tables, config)
-    scores = _score_scenes(dataset, scenes, tables, config, weights, device, progress)
-    table = score_table(views, scores, [scene.name for scene in scenes], config)
+    parts = []
+    for name in config.occlusions or (None,):
+        model = None if name is None else replace(occlusion, model=name)
+        scores = _score_scenes(dataset, scenes, tables, config, weights, device, progress, model)
+        part = score_table(views, scores, [scene.name for scene in scenes], config)
+        part.insert(2, "occlusion", name or _stored_model(scenes))
+        parts.append(part)
+    table = pd.concat(parts, ignore_index=True)
     _write_results(dataset.root / "results", table, f"Localization score on {dataset.name}")
-    _log(dataset, scenes, config, tracking, weights, views, table)
+    _log(dataset, scenes, config, tracking, weights, views, table, occlusion)
     if progress:
         print(score_markdown(table, f"Localization score on {dataset.name}"))
     return table
+
+
+def _stored_model(scenes: Sequence[SceneFolder]) -> str:
+    return " ".join(sorted({StoredOcclusion.load(scene.occlusion).model for scene in scenes}))
 
 
 def _weights(dataset: Dataset, config: EvaluateConfig, models: Sequence[TrainedModel | Path] | None) -> list[Path]:
@@ -162,12 +178,20 @@ def _score_scenes(
     weights: Sequence[Path],
     device: str,
     progress: bool,
+    occlusion: OcclusionConfig | None,
 ) -> dict[Method, Float]:
-    """Scores (B,) of every method over all scenes. Views are binned once for all methods."""
+    """Scores (B,) of every method over all scenes. Views are binned once for all methods.
+
+    Without an occlusion model the one that is stored with the sampled locations serves.
+    """
     scores: dict[Method, list[Float]] = {}
-    with tqdm(total=sum(map(len, tables)), desc="score views", unit="view", disable=not progress) as bar:
+    text = "score views" if occlusion is None else f"score views, {occlusion.model}"
+    with tqdm(total=sum(map(len, tables)), desc=text, unit="view", disable=not progress) as bar:
         for scene, table in zip(scenes, tables, strict=True):
             localization_map = scene.localization_map(dataset.camera, device)
+            if occlusion is not None:
+                model = scene_occlusion(scene, dataset.camera, occlusion, device, progress=False)
+                localization_map = replace(localization_map, occlusion=model)
             scorers = _scorers(localization_map, config, weights)
             cam_from_world = poses(table)
             for begin in range(0, len(table), BLOCK):
@@ -198,6 +222,11 @@ def _write_results(folder: Path, table: pd.DataFrame, title: str) -> None:
     from wheretolook.figures.style import save_figure
 
     folder.mkdir(parents=True, exist_ok=True)
+    (folder / OCCLUSION_PNG).unlink(missing_ok=True)
+    if table["occlusion"].nunique() > 1:
+        from wheretolook.figures.occlusion import occlusion_figure
+
+        save_figure(occlusion_figure(table), folder / OCCLUSION_PNG)
     for name, text in ((SCORES_CSV, table.to_csv(index=False)), (SCORES_MD, score_markdown(table, title))):
         partial = folder / f"{name}.partial"
         partial.write_text(text, encoding="utf-8")
@@ -213,12 +242,14 @@ def _log(
     weights: Sequence[Path],
     views: TestViews,
     table: pd.DataFrame,
+    occlusion: OcclusionConfig,
 ) -> None:
     params: dict[str, Any] = {
         "dataset": dataset.name,
         "dataset_fingerprint": Dataset(dataset.root, dataset.camera, tuple(scenes)).fingerprint(),
         "scenes": " ".join(scene.name for scene in scenes),
         **{name: value for name, value in asdict(config).items() if name not in ("weights", "methods")},
+        **{f"occlusion_{name}": value for name, value in asdict(occlusion).items() if name != "model"},
         "weights": " ".join(f"{path.stem}:{fingerprint(path)}" for path in weights),
     }
     positives = float(views.good[:, 0].mean())
@@ -228,10 +259,11 @@ def _log(
         log(client, run, metrics=metrics)
         client.log_artifacts(run, str(dataset.root / "results"))
         for row in table[table["scene"] == ALL].to_dict("records"):
-            name = " ".join(part for part in (row["method"], row["inputs"], f"best {row['top_n']}") if part)
-            child_params = {"dataset": dataset.name, **{key: row[key] for key in ("method", "inputs", "top_n")}}
-            named = ("method", "inputs", "scene", "top_n")
-            numbers = {str(key): float(value) for key, value in row.items() if key not in named}
+            named = ("method", "inputs", "occlusion", "top_n")
+            shown = (row["method"], row["inputs"], f"best {row['top_n']}", f"({row['occlusion']})")
+            name = " ".join(part for part in shown if part)
+            child_params = {"dataset": dataset.name, **{key: row[key] for key in named}}
+            numbers = {str(key): float(value) for key, value in row.items() if key not in (*named, "scene")}
             with start_run(tracking, name, "evaluate", child_params, parent=run) as (_, child):
                 log(client, child, metrics=numbers)
 

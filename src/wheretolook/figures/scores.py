@@ -17,12 +17,15 @@ def score_figure(scores: pd.DataFrame) -> Figure:
     """Localization score of each method at each threshold, one panel for each N.
 
     Args:
-        scores: a table of `wheretolook.evaluation.scores.score_table`; its rows over all scenes are drawn.
+        scores: a table of `wheretolook.evaluation.scores.score_table`; its rows over all scenes are drawn, those of the
+            first occlusion model if there are several.
 
     Returns:
         Bars of the normalized share with bootstrap intervals, the oracle a line at 100 %; a dark line across each bar
         tells the raw share.
     """
+    if "occlusion" in scores:
+        scores = scores[scores["occlusion"] == scores["occlusion"].iloc[0]]
     pooled = scores[(scores["scene"] == ALL) & (scores["method"] != "oracle")]
     top_n, keys = list(pooled["top_n"].unique()), threshold_keys(scores)
     methods = list(dict.fromkeys(zip(pooled["method"], pooled["inputs"], strict=True)))

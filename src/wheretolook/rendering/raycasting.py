@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,6 +11,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
+from wheretolook.rendering import ray_kernels
 from wheretolook.rendering.ray_kernels import cast_kernel, clear_kernel, distance_kernel, unoccluded_kernel
 from wheretolook.scenes.mesh import TexturedMesh
 from wheretolook.warp_setup import start_warp, vec3_array, warp_mesh
@@ -65,11 +68,17 @@ class MeshRaycaster:
         occluded = np.zeros((len(origins_at), n_points), dtype=np.bool_)
         if occluded.size == 0:
             return occluded
-        block = max(1, self.block_rays // n_points)
-        for start in range(0, len(origins_at), block):
+        threads = len(os.sched_getaffinity(0)) if self.device == "cpu" else 1
+        block = max(1, min(self.block_rays // n_points, -(-len(origins_at) // threads)))
+
+        def work(start: int) -> None:
             rows = slice(start, start + block)
             free = self.unoccluded_on_device(origins_at[rows], points_on_device, margin_m)
             occluded[rows] = ~free.numpy().astype(np.bool_)
+
+        wp.load_module(ray_kernels, device=self.device)  # only one thread may do that
+        with ThreadPoolExecutor(threads) as pool:  # Warp lets go of Python's lock while a kernel runs
+            list(pool.map(work, range(0, len(origins_at), block)))
         return occluded
 
     def unoccluded_on_device(self, origins: ArrayLike, points: Any, margin_m: float = 0.02) -> Any:

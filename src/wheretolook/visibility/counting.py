@@ -34,6 +34,12 @@ GPU_LANES = 16
 BITMAP_BYTES = 1 << 28
 """Memory for the bitmaps of distinct pixels."""
 
+UNSURE_ENTRIES = 1 << 22
+"""Landmarks listed at a time that the table of a field of view cannot decide; 20 bytes each."""
+
+ASKED_AT_ONCE = 1 << 18
+"""Of these, how many a COLMAP camera projects at a time."""
+
 
 class FrustumCounter:
     """Counts the landmarks in view of a fixed set of orientations from any location.
@@ -138,26 +144,36 @@ class FrustumCounter:
     def _count_by_field(self, starts: Any, offsets: Any, counts: Any) -> Any:
         assert self._field is not None and isinstance(self.camera, ColmapCamera)
         inputs = [
-            self._axes, self._depth, self._field.size, *self._runs, starts, offsets,
-            self.cells.size, self.lanes,
+            self._axes, self._depth, self._field.size, *self._runs, starts, offsets, self.cells.size,
         ]  # fmt: skip
-        n_unsure: Any = wp.zeros(1, dtype=wp.int32, device=self.device)
-        capacity = 1 << 20
-        while True:  # once more if the list was too short
-            unsure: Any = wp.empty(capacity, dtype=wp.vec3i, device=self.device)
-            outputs = [counts, n_unsure, unsure]
-            wp.launch(count_field_kernel, (*counts.shape, self.lanes), inputs, outputs, device=self.device)
-            number = int(n_unsure.numpy()[0])
-            if number <= capacity:
-                break
-            capacity = number
-            counts.zero_()
-            n_unsure.zero_()
-        location, orientation, entry = unsure.numpy()[:number].T
-        seen = self.camera.sees(rotate(self.rotations[orientation], offsets.numpy()[entry]))
-        exact = counts.numpy()
-        np.add.at(exact, (location[seen], orientation[seen]), 1)
-        return wp.array(exact, dtype=wp.int32, device=self.device)
+        capacity, first, group = UNSURE_ENTRIES, 0, counts.shape[0]
+        while first < counts.shape[0]:
+            group = min(group, counts.shape[0] - first)
+            number: Any = wp.zeros(1, dtype=wp.int32, device=self.device)
+            pairs: Any = wp.empty(capacity, dtype=wp.vec2i, device=self.device)
+            unsure: Any = wp.empty(capacity, dtype=wp.vec3, device=self.device)
+            shape = (group, len(self.rotations), self.lanes)
+            outputs = [counts, number, pairs, unsure]
+            wp.launch(count_field_kernel, shape, [*inputs, first, self.lanes], outputs, device=self.device)
+            n = int(number.numpy()[0])
+            if n > capacity:  # fewer locations at a time, or a longer list where that is one already
+                counts[first : first + group].zero_()
+                capacity = n if group == 1 else capacity
+                group = max(1, group * capacity // (n + 1))
+                continue
+            self._ask_camera(pairs[:n].numpy(), unsure[:n].numpy(), counts)
+            first += group
+        return counts
+
+    def _ask_camera(self, pairs: NDArray[np.int32], offsets: NDArray[np.float32], counts: Any) -> None:
+        """Add those of the offsets (n, 3) that the camera sees to the counts of their pairs (n, 2)."""
+        assert isinstance(self.camera, ColmapCamera)
+        more = np.zeros(counts.shape, dtype=np.int32)
+        for start in range(0, len(pairs), ASKED_AT_ONCE):
+            location, orientation = pairs[start : start + ASKED_AT_ONCE].T
+            seen = self.camera.sees(rotate(self.rotations[orientation], offsets[start : start + ASKED_AT_ONCE]))
+            np.add.at(more, (location[seen], orientation[seen]), 1)
+        wp.copy(counts, wp.array(counts.numpy() + more, dtype=wp.int32, device=self.device))
 
     def _count_on_host(self, locations: Float, points: Any, unoccluded: Any | None) -> Any:
         mask = np.ones((len(locations), points.shape[0]), bool) if unoccluded is None else unoccluded.numpy()

@@ -115,13 +115,16 @@ def count_field_kernel(
     starts: wp.array[wp.int32],
     offsets: wp.array[wp.vec3],
     size: wp.int32,
+    first: wp.int32,
     lanes: wp.int32,
     counts: wp.array2d[wp.int32],
     n_unsure: wp.array[wp.int32],
-    unsure: wp.array[wp.vec3i],
+    pairs: wp.array[wp.vec2i],
+    unsure: wp.array[wp.vec3],
 ):
     """As `count_kernel`, by a table of the field of view; what it cannot decide is listed for the camera itself."""
-    location, orientation, lane = wp.tid()
+    row, orientation, lane = wp.tid()
+    location = first + row
     base = location * (size * size + 1)
     count = wp.int32(0)
     for run in range(inside_starts[orientation * size] + lane, inside_starts[(orientation + 1) * size], lanes):
@@ -134,12 +137,14 @@ def count_field_kernel(
             elif inside_by == 0.0:
                 slot = wp.atomic_add(n_unsure, 0, 1)
                 if slot < unsure.shape[0]:
-                    unsure[slot] = wp.vec3i(location, orientation, entry)
+                    pairs[slot] = wp.vec2i(location, orientation)
+                    unsure[slot] = offsets[entry]
     near = base + size * size
     for entry in range(starts[near] + lane, starts[near + 1], lanes):
         slot = wp.atomic_add(n_unsure, 0, 1)
         if slot < unsure.shape[0]:
-            unsure[slot] = wp.vec3i(location, orientation, entry)
+            pairs[slot] = wp.vec2i(location, orientation)
+            unsure[slot] = offsets[entry]
     if count > 0:
         wp.atomic_add(counts, location, orientation, count)
 

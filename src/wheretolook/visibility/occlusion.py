@@ -49,12 +49,23 @@ class OcclusionModel(ABC):
         mask = self.unoccluded(locations, points.positions)
         return wp.array(np.ascontiguousarray(mask[:, points.order]), dtype=wp.bool, device=points.device)
 
-    def check_locations(self, locations: Float) -> None:  # noqa: B027 (nothing to refuse unless a model knows better)
+    def inside_geometry(self, locations: Float) -> NDArray[np.bool_]:
+        """Whether locations (L, 3) m lie inside geometry, where no camera can be; (L,). False where nothing tells."""
+        return np.zeros(len(locations), dtype=bool)
+
+    def check_locations(self, locations: Float) -> None:
         """Refuse locations (L, 3) m where no camera can be, before any long work.
 
         Raises:
-            SceneError: a location lies inside geometry, as far as the model can tell; names the location.
+            SceneError: a location lies inside geometry; names the first.
         """
+        inside = self.inside_geometry(locations)
+        if inside.any():
+            raise SceneError(
+                "this location lies inside geometry",
+                value=tuple(np.round(np.asarray(locations)[inside][0], 3).tolist()),
+                fix="Give locations in free space, as `FreeSpace.is_free` finds them.",
+            )
 
 
 class NoOcclusion(OcclusionModel):
@@ -91,26 +102,16 @@ class MeshOcclusion(OcclusionModel):
             return super().unoccluded_on_device(locations, points)
         return self.raycaster.unoccluded_on_device(locations, points.single, self.margin_m)
 
-    def check_locations(self, locations: Float) -> None:
-        """Refuse locations (L, 3) m on a surface or, in a one-sided mesh, where most of what is around is a back.
-
-        Raises:
-            SceneError: names the first such location.
-        """
+    def inside_geometry(self, locations: Float) -> NDArray[np.bool_]:
+        """Whether locations (L, 3) m lie on a surface or, in a one-sided mesh, see mostly backs of triangles; (L,)."""
         at = np.asarray(locations, dtype=np.float64).reshape(-1, 3)
-        bad = np.asarray(~np.isfinite(at).all(1))
-        bad[~bad] = self.raycaster.distance_to_surface(at[~bad], ON_SURFACE_M) <= ON_SURFACE_M
-        if not self.two_sided and not bad.all():
+        inside = self.raycaster.distance_to_surface(at, ON_SURFACE_M) <= ON_SURFACE_M
+        if not self.two_sided:
             around = fibonacci_sphere(32)
-            rays = np.repeat(at[~bad], len(around), axis=0), np.tile(around, (int((~bad).sum()), 1))
-            hits = self.raycaster.cast(*rays)
+            hits = self.raycaster.cast(np.repeat(at, len(around), axis=0), np.tile(around, (len(at), 1)))
             backs = (np.isfinite(hits.distance_m) & ~hits.front).reshape(-1, len(around))
-            bad[~bad] = backs.mean(1) > 0.5
-        if bad.any():
-            raise SceneError(
-                "this location lies inside geometry", value=tuple(np.round(at[bad][0], 3).tolist()),
-                fix="Give locations in free space, as `FreeSpace.is_free` finds them.",
-            )  # fmt: skip
+            inside |= backs.mean(1) > 0.5
+        return np.asarray(inside)
 
 
 class StoredOcclusion(OcclusionModel):
@@ -121,11 +122,12 @@ class StoredOcclusion(OcclusionModel):
         packed: (L, ceil(N / 8)) uint8, bits as `numpy.packbits` packs them: set where the line of sight is free.
             Columns follow the map's landmarks.
         n_landmarks: N.
+        model: name of the occlusion model it was computed with.
     """
 
-    def __init__(self, locations: ArrayLike, packed: NDArray[np.uint8], n_landmarks: int) -> None:
+    def __init__(self, locations: ArrayLike, packed: NDArray[np.uint8], n_landmarks: int, model: str = "mesh") -> None:
         self.locations = np.asarray(locations, dtype=np.float64)
-        self.packed, self.n_landmarks = packed, n_landmarks
+        self.packed, self.n_landmarks, self.model = packed, n_landmarks, model
         if packed.shape != (len(self.locations), (n_landmarks + 7) // 8):
             raise ValueError(f"{packed.shape} bytes for {len(self.locations)} locations and {n_landmarks} landmarks")
         self._tree = cKDTree(self.locations)
@@ -168,7 +170,9 @@ class StoredOcclusion(OcclusionModel):
         """Write locations and the bit-packed mask as a compressed NPZ, atomically."""
         partial = path.with_name(path.name + ".partial")
         with open(partial, "wb") as file:
-            np.savez_compressed(file, locations=self.locations, mask=self.packed, n_landmarks=self.n_landmarks)
+            np.savez_compressed(
+                file, locations=self.locations, mask=self.packed, n_landmarks=self.n_landmarks, model=self.model
+            )
         os.replace(partial, path)
 
     @classmethod
@@ -180,7 +184,8 @@ class StoredOcclusion(OcclusionModel):
         """
         try:
             with np.load(path) as data:
-                return cls(data["locations"], data["mask"], int(data["n_landmarks"]))
+                model = str(data["model"]) if "model" in data else "mesh"
+                return cls(data["locations"], data["mask"], int(data["n_landmarks"]), model)
         except Exception as error:  # a damaged zip raises many kinds of errors
             raise TableError(
                 f"cannot read stored occlusion: {error}", path=path, fix="Run the sample stage again."

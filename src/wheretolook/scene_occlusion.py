@@ -1,0 +1,98 @@
+"""The occlusion models of a scene of a dataset, by name."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import overload
+
+import numpy as np
+
+from wheretolook.dataset import SceneFolder
+from wheretolook.errors import MapError, SceneError
+from wheretolook.geometry import Float, PinholeCamera
+from wheretolook.rendering import MeshRaycaster, WarpRenderer
+from wheretolook.scenes.free_space import FreeSpace
+from wheretolook.scenes.loading import load_mesh
+from wheretolook.scenes.mesh import TexturedMesh
+from wheretolook.visibility import HiddenPointRemoval, MeshOcclusion, NoOcclusion, OcclusionModel
+from wheretolook.visibility.config import OcclusionConfig
+from wheretolook.visibility.tsdf import DepthImage, TsdfConfig, TsdfOcclusion, TsdfVolume
+
+
+def scene_occlusion(
+    scene: SceneFolder,
+    camera: PinholeCamera,
+    config: OcclusionConfig,
+    device: str = "cpu",
+    mesh: TexturedMesh | None = None,
+    two_sided: bool | None = None,
+    progress: bool = True,
+) -> OcclusionModel:
+    """Build the occlusion model that `config.model` names.
+
+    Args:
+        scene: its files; the mesh is needed for "mesh" and "tsdf" only, the map's images for "tsdf".
+        camera: takes the depth images of "tsdf".
+        config: which model, and its settings.
+        device: where rays are cast and depth is rendered.
+        mesh: the scene's mesh, if it is loaded already.
+        two_sided: whether the backs of the mesh's triangles are surfaces; None finds out.
+        progress: show a progress bar for the fusion of depth images.
+
+    Raises:
+        SceneError: there is no mesh. MapError: there is no COLMAP model.
+        ConfigError: the voxels do not fit into memory.
+    """
+    if config.model == "none":
+        return NoOcclusion()
+    if config.model == "hidden-points":
+        return HiddenPointRemoval(config.radius, config.margin_m)
+    if mesh is None:
+        if not scene.mesh.is_file():
+            raise SceneError(f"occlusion by {config.model} needs the scene's mesh", path=scene.mesh,
+                             fix="Run the scenes stage, or use hidden-points or none.")  # fmt: skip
+        mesh = load_mesh(scene.mesh)
+    if config.model == "tsdf":
+        images = RenderedDepth(WarpRenderer(mesh, device), camera, map_poses(scene))
+        tsdf = TsdfConfig(voxel_size_m=config.voxel_m, max_depth_m=config.max_depth_m)
+        return TsdfOcclusion(TsdfVolume.from_images(images, tsdf, progress), config.margin_m, device)
+    if two_sided is None:
+        two_sided = FreeSpace(mesh, device=device).two_sided
+    return MeshOcclusion(MeshRaycaster(mesh, device), config.margin_m, two_sided)
+
+
+def map_poses(scene: SceneFolder) -> Float:
+    """Poses cam_from_world (B, 3, 4) of the images of a scene's map, in the order of their ids.
+
+    Raises:
+        MapError: there is no COLMAP model, or it holds no image.
+    """
+    import pycolmap
+
+    try:
+        images = pycolmap.Reconstruction(scene.map).images
+    except Exception as error:
+        raise MapError(f"cannot read the map's images: {error}", path=scene.map, fix="Run the map stage.") from error
+    if not images:
+        raise MapError("the map has no images", path=scene.map, value=0, fix="Run the map stage again.")
+    return np.stack([images[number].cam_from_world().matrix() for number in sorted(images)])
+
+
+class RenderedDepth(Sequence[DepthImage]):
+    """Depth images of poses (B, 3, 4), each rendered when it is asked for."""
+
+    def __init__(self, renderer: WarpRenderer, camera: PinholeCamera, cam_from_world: Float) -> None:
+        self.renderer, self.camera, self.cam_from_world = renderer, camera, cam_from_world
+
+    def __len__(self) -> int:
+        return len(self.cam_from_world)
+
+    @overload
+    def __getitem__(self, index: int) -> DepthImage: ...
+    @overload
+    def __getitem__(self, index: slice) -> RenderedDepth: ...
+    def __getitem__(self, index: int | slice) -> DepthImage | RenderedDepth:
+        if isinstance(index, slice):
+            return RenderedDepth(self.renderer, self.camera, self.cam_from_world[index])
+        pose = self.cam_from_world[index]
+        return DepthImage(self.renderer.render(self.camera, pose[None]).depth_m[0], self.camera, pose)

@@ -1,0 +1,52 @@
+"""Options of occlusion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from wheretolook.errors import ConfigError
+
+OcclusionName = Literal["mesh", "tsdf", "hidden-points", "none"]
+OCCLUSION_NAMES: tuple[str, ...] = get_args(OcclusionName)
+
+
+@dataclass(frozen=True)
+class OcclusionConfig:
+    """Options of occlusion.
+
+    Args:
+        model: "mesh" casts one ray for each landmark; "tsdf" does so against the surface that depth images fuse to,
+            here rendered where the map's images were taken; "hidden-points" needs nothing but the landmarks; "none"
+            sees through walls, as the paper's released code.
+        margin_m: a surface this close in front of a landmark is the landmark's own.
+        radius: of hidden-point removal, in distances of the farthest landmark.
+        voxel_m: voxel size of the TSDF.
+        max_depth_m: range of the depth images.
+    """
+
+    model: OcclusionName = "mesh"
+    margin_m: float = 0.05
+    radius: float = 50.0
+    voxel_m: float = 0.02
+    max_depth_m: float = 10.0
+
+    def __post_init__(self) -> None:
+        check_occlusion_names((self.model,))
+        if not self.margin_m >= 0:
+            raise ConfigError("occlusion.margin_m must not be negative", value=self.margin_m)
+        if not self.radius >= 1:
+            raise ConfigError("occlusion.radius must be at least 1", value=self.radius)
+        for name in ("voxel_m", "max_depth_m"):
+            if not getattr(self, name) > 0:
+                raise ConfigError(f"occlusion.{name} must be positive", value=getattr(self, name))
+
+
+def check_occlusion_names(names: tuple[str, ...]) -> None:
+    """Raise ConfigError if an occlusion model is unknown or named twice."""
+    unknown = [name for name in names if name not in OCCLUSION_NAMES]
+    if unknown or len(set(names)) < len(names):
+        raise ConfigError(
+            "occlusion models must be known and named once", value=" ".join(names),
+            fix=f"There are {', '.join(OCCLUSION_NAMES)}.",
+        )  # fmt: skip

@@ -306,7 +306,6 @@ def bounded(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
 
 def draw(args: argparse.Namespace) -> None:
     from wheretolook.figures.runtimes import runtime_figure, scaling_figure
-
     from wheretolook.figures.style import save_figure
 
     results = [json.loads(Path(file).read_text()) for file in args.draw]

@@ -135,7 +135,7 @@ def test_what_nothing_has_seen_hides_nothing() -> None:
     assert occlusion.unoccluded(np.zeros((1, 3)), points).tolist() == [[True, True, False, True, True]]
 
 
-def test_more_blocks_than_expected_and_other_threads_change_nothing(images: list[DepthImage]) -> None:
+def test_more_blocks_than_expected_change_nothing(images: list[DepthImage]) -> None:
     config = TsdfConfig(voxel_size_m=0.04)
     small, large = TsdfVolume(config, expected_blocks=16), TsdfVolume(config, expected_blocks=1 << 15)
     for image in images[:30]:
@@ -143,8 +143,8 @@ def test_more_blocks_than_expected_and_other_threads_change_nothing(images: list
         large.integrate(image)
     assert len(small) == len(large) > 500
     locations, points, _ = lines_of_sight(room(), seed=6)
-    mask = TsdfOcclusion(small, threads=1).unoccluded(locations, points)
-    np.testing.assert_array_equal(mask, TsdfOcclusion(large, threads=3).unoccluded(locations, points))
+    mask = TsdfOcclusion(small).unoccluded(locations, points)
+    np.testing.assert_array_equal(mask, TsdfOcclusion(large).unoccluded(locations, points))
     assert TsdfOcclusion(large).unoccluded(locations[:0], points).shape == (0, len(points))
     assert TsdfOcclusion(large).unoccluded(locations, points[:0]).shape == (len(locations), 0)
 
@@ -169,7 +169,7 @@ def test_a_location_inside_geometry_is_refused(occlusion: TsdfOcclusion) -> None
     occlusion.check_locations(free[:0])
     inside_wall, inside_cupboard, on_floor, outside = (2.0, 1.0, 1.2), (0.5, 2.6, 0.8), (1.0, 1.0, 0.0), (9.0, 1.0, 1.0)
     for location in (inside_wall, inside_cupboard, on_floor, outside, (np.nan, 1.0, 1.0)):
-        with pytest.raises(SceneError, match="inside geometry") as caught:
+        with pytest.raises(SceneError, match="inside geometry|not finite") as caught:
             occlusion.check_locations(np.vstack([free, location]))
         assert repr(tuple(np.float64(location).tolist())) in str(caught.value)
 
@@ -219,8 +219,6 @@ def test_settings_and_scenes_without_sense_are_refused(volume: TsdfVolume, image
             TsdfConfig(**setting)
     with pytest.raises(ConfigError, match=r"margin.*-0\.1"):
         TsdfOcclusion(volume, margin_m=-0.1)
-    with pytest.raises(ConfigError, match="threads"):
-        TsdfOcclusion(volume, threads=-1)
     with pytest.raises(SceneError, match="0 images"):
         TsdfVolume.from_images([], progress=False)
     with pytest.raises(SceneError, match=r"up to 0\.1 m"):

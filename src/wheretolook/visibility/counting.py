@@ -9,6 +9,7 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.camera_models import Camera, ColmapCamera
+from wheretolook.errors import ConfigError
 from wheretolook.geometry import Float, PinholeCamera
 from wheretolook.visibility.counting_kernel import cell_kernel, count_field_kernel, count_kernel, sort_kernel
 from wheretolook.visibility.field_of_view import FieldOfView
@@ -86,6 +87,10 @@ class FrustumCounter:
         """Device memory that `count` takes for each location, results included."""
         return n_points * (8 + 12) + (self.cells.size**2 + 1) * 8 + len(self.rotations) * 4
 
+    def max_locations(self, n_points: int) -> int:
+        """Locations that `count` takes at a time: entries are numbered by int32."""
+        return int(np.iinfo(np.int32).max // max(n_points, self.cells.size**2 + 1)) - 1
+
     def count(self, locations: ArrayLike, points: Any, unoccluded: Any | None = None) -> Any:
         """Count from locations (L, 3) m.
 
@@ -96,8 +101,14 @@ class FrustumCounter:
 
         Returns:
             (L, D) counts, a Warp array of int32 on the device.
+
+        Raises:
+            ConfigError: these are more than `max_locations`; `survey` divides them into blocks.
         """
         at = np.asarray(locations, dtype=np.float64).reshape(-1, 3)
+        if len(at) > self.max_locations(points.shape[0]):
+            raise ConfigError("too many locations at once", value=len(at),
+                              fix=f"Give at most {self.max_locations(points.shape[0])}, or use survey.")  # fmt: skip
         if isinstance(self.camera, ColmapCamera) and self.distinct_pixels:
             return self._count_on_host(at, points, unoccluded)
         device, n_cells, shape = self.device, self.cells.size**2 + 1, (len(at), points.shape[0])

@@ -86,16 +86,6 @@ class HiddenPointRemoval(OcclusionModel):
                 pass
         return free
 
-    def check_locations(self, locations: Float) -> None:
-        """Refuse locations (L, 3) m that are not finite.
-
-        Raises:
-            SceneError: names the location.
-        """
-        bad = ~np.isfinite(locations).all(axis=1)
-        if bad.any():
-            raise SceneError("a location is not finite", value=tuple(np.asarray(locations)[bad][0].tolist()))
-
     def _free_from(self, location: Float, places: Float) -> NDArray[np.bool_]:
         """Which of the distinct places (N, 3) are free from a location (3,); (N,)."""
         lines = places - location

@@ -57,15 +57,19 @@ class OcclusionModel(ABC):
         """Refuse locations (L, 3) m where no camera can be, before any long work.
 
         Raises:
-            SceneError: a location lies inside geometry; names the first.
+            SceneError: a location is not finite, or lies inside geometry; names the first.
         """
-        inside = self.inside_geometry(locations)
+        at = np.asarray(locations, dtype=np.float64).reshape(-1, 3)
+        finite = np.isfinite(at).all(axis=-1)
+        if not finite.all():
+            value = tuple(at[~finite][0].tolist())
+            raise SceneError("a location is not finite", value=value, fix="Give locations in metres.")
+        inside = self.inside_geometry(at)
         if inside.any():
             raise SceneError(
-                "this location lies inside geometry",
-                value=tuple(np.round(np.asarray(locations)[inside][0], 3).tolist()),
+                "this location lies inside geometry", value=tuple(np.round(at[inside][0], 3).tolist()),
                 fix="Give locations in free space, as `FreeSpace.is_free` finds them.",
-            )
+            )  # fmt: skip
 
 
 class NoOcclusion(OcclusionModel):

@@ -15,7 +15,6 @@ from tqdm.auto import tqdm
 
 from wheretolook.camera_models import Camera
 from wheretolook.errors import ConfigError, MapError, SceneError
-from wheretolook.geometry import Float
 from wheretolook.visibility.counting import FrustumCounter
 from wheretolook.visibility.counting_kernel import pack_kernel
 from wheretolook.visibility.device_points import DevicePoints
@@ -86,7 +85,9 @@ def survey(
     n_points = len(points) if isinstance(points, DevicePoints) else len(np.asarray(points).reshape(-1, 3))
     if n_points == 0:
         raise MapError("the map has no landmarks", value=0, fix="Map the scene with more or sharper images.")
-    _check_locations(at, occlusion)
+    if len(at) == 0:
+        raise SceneError("there are no locations to look from", value=0, fix="Refine the grid or check the bounds.")
+    occlusion.check_locations(at)
     landmarks = points if isinstance(points, DevicePoints) else DevicePoints(points, device)
     counter = counter or FrustumCounter(
         camera, np.asarray(rotations), n_points, landmarks.device, distinct_pixels=distinct_pixels
@@ -102,6 +103,7 @@ def survey(
             value=memory_bytes, fix=f"Allow at least {per_location} bytes.",
         )  # fmt: skip
     block = max(1, min(memory_bytes if on_gpu else CPU_BLOCK_BYTES, memory_bytes // workers) // per_location)
+    block = min(block, counter.max_locations(n_points))
     workers = min(workers, memory_bytes // per_location, -(-len(at) // block))
 
     counts = np.empty((len(at), n_directions), dtype=np.int32)
@@ -124,16 +126,6 @@ def survey(
     if keep_occlusion and n_points % 8:
         packed[:, -1] &= np.uint8((0xFF00 >> (n_points % 8)) & 0xFF)
     return Survey(counts, best, StoredOcclusion(at, packed, n_points) if keep_occlusion else None)
-
-
-def _check_locations(locations: Float, occlusion: OcclusionModel) -> None:
-    if len(locations) == 0:
-        raise SceneError("there are no locations to look from", value=0, fix="Refine the grid or check the bounds.")
-    finite = np.isfinite(locations).all(1)
-    if not finite.all():
-        value = tuple(locations[~finite][0].tolist())
-        raise SceneError("a location is not finite", value=value, fix="Give locations in metres.")
-    occlusion.check_locations(locations)
 
 
 def _in_threads(work: Any, blocks: list[slice], workers: int) -> Iterator[int]:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,7 +30,7 @@ BLOCK_VOXELS = 8
 BYTES_PER_BLOCK = 24 * 1024
 """Greatest memory in use for each block, from fusion to ray casting: measured on three scenes, 19 to 23 KiB."""
 MAX_BLOCKS = 1 << 20
-"""Open3D numbers four entries of each voxel with 32 bits when it extracts triangles, and crashes beyond."""
+"""Open3D's extraction of triangles numbers four entries of each voxel by 32 bits: more blocks are refused."""
 
 _TOUCH_STRIDE = 4  # Open3D looks for blocks at every fourth pixel
 _SURVEY_IMAGES, _SURVEY_PIXELS = 100, 5000  # looked at to estimate the memory
@@ -260,56 +259,31 @@ class TsdfOcclusion(MeshOcclusion):
         volume: the fused depth images; not needed any more afterwards.
         margin_m: a surface this close in front of a landmark is the landmark's own. Keep it above two voxels.
         device: "cpu" or a CUDA device; casts the rays.
-        threads: on the CPU, locations worked on at a time; 0 means one for each core.
 
     Raises:
-        ConfigError: a negative margin or number of threads, or no such device.
+        ConfigError: a negative margin, or no such device.
         SceneError: the depth images show no surface.
     """
 
-    def __init__(self, volume: TsdfVolume, margin_m: float = 0.05, device: str = "cpu", threads: int = 0) -> None:
+    def __init__(self, volume: TsdfVolume, margin_m: float = 0.05, device: str = "cpu") -> None:
         if not 0 <= margin_m < np.inf:
             raise ConfigError("the margin must be a distance of at least 0 m", value=margin_m)
-        if threads < 0:
-            raise ConfigError("threads must be >= 0", value=threads)
         super().__init__(MeshRaycaster(volume.surface(), device), margin_m)
-        self.threads = threads or os.cpu_count() or 1
         self._too_close_m = volume.config.voxel_size_m / 2
 
-    def unoccluded(self, locations: Float, points: Float) -> NDArray[np.bool_]:
-        """(L, N), True where no fused surface stands between location and landmark."""
-        at, inherited = np.asarray(locations, dtype=np.float64).reshape(-1, 3), super().unoccluded
-        parts = min(self.threads, len(at))
-        if self.raycaster.device != "cpu" or parts < 2 or len(points) == 0:
-            return inherited(at, points)
-        inherited(at[:1], points[:1])  # loads the kernel, which threads must not do at the same time
-        with ThreadPoolExecutor(parts) as pool:
-            return np.concatenate(list(pool.map(lambda rows: inherited(rows, points), np.array_split(at, parts))))
-
-    def check_locations(self, locations: Float) -> None:
-        """Refuse locations (L, 3) m that are not finite, within half a voxel of a surface, or behind surfaces.
+    def inside_geometry(self, locations: Float) -> NDArray[np.bool_]:
+        """Whether locations (L, 3) m lie within half a voxel of a surface, or behind surfaces; (L,).
 
         A location is behind surfaces if more of the 32 rays around it meet a back than a front: it lies in furniture
         or a wall, or outside of what the depth images saw. Where nothing was seen around it, nothing can be told.
-
-        Raises:
-            SceneError: names the first such location.
         """
         at = np.asarray(locations, dtype=np.float64).reshape(-1, 3)
-        bad = np.asarray(~np.isfinite(at).all(1))
-        finite = at[~bad]
         around = fibonacci_sphere(32)
-        hits = self.raycaster.cast(np.repeat(finite, len(around), axis=0), np.tile(around, (len(finite), 1)))
+        hits = self.raycaster.cast(np.repeat(at, len(around), axis=0), np.tile(around, (len(at), 1)))
         hit, front = (values.reshape(-1, len(around)) for values in (np.isfinite(hits.distance_m), hits.front))
         behind = (hit & ~front).sum(1) > (hit & front).sum(1)
-        close = self.raycaster.distance_to_surface(finite, self._too_close_m) <= self._too_close_m
-        bad[~bad] = behind | close
-        if bad.any():
-            raise SceneError(
-                "this location lies inside geometry, or behind all that the depth images saw",
-                value=tuple(np.round(at[bad][0], 3).tolist()),
-                fix="Give locations in space that the depth images saw to be free.",
-            )
+        close = self.raycaster.distance_to_surface(at, self._too_close_m) <= self._too_close_m
+        return np.asarray(behind | close)
 
 
 def estimate_blocks(images: Sequence[DepthImage], config: TsdfConfig) -> int:

@@ -13,7 +13,7 @@ from wheretolook.geometry import Float, PinholeCamera, rotation_looking_along, t
 from wheretolook.grid import fibonacci_sphere
 from wheretolook.visibility import DevicePoints, FrustumCounter, count_plain, counting
 from wheretolook.visibility.field_of_view import FieldOfView
-from wheretolook.visibility.sphere_cells import cell_centers, octahedral_directions
+from wheretolook.visibility.octahedral_map import cell_centers, octahedral_directions
 
 DISTORTED = ColmapCamera("OPENCV", 640, 480, (300.0, 310.0, 330.0, 235.0, -0.2, 0.05, 1e-3, -1e-3))
 FISHEYE = ColmapCamera("OPENCV_FISHEYE", 640, 480, (200.0, 200.0, 320.0, 240.0, 0.01, 0.0, 0.0, 0.0))
@@ -134,7 +134,7 @@ def test_cells_cover_the_sphere_once() -> None:
 
 @pytest.mark.parametrize("camera", [DISTORTED, FISHEYE, PANORAMA])
 def test_the_table_of_a_field_of_view_is_never_wrong(camera: ColmapCamera) -> None:
-    from wheretolook.visibility.sphere_cells import octahedral_directions
+    from wheretolook.visibility.octahedral_map import octahedral_directions
 
     table = FieldOfView.of(camera)
     rng = np.random.default_rng(0)

@@ -11,7 +11,13 @@ from numpy.typing import ArrayLike, NDArray
 from wheretolook.camera_models import Camera, ColmapCamera
 from wheretolook.errors import ConfigError
 from wheretolook.geometry import Float, PinholeCamera
-from wheretolook.visibility.counting_kernel import cell_kernel, count_field_kernel, count_kernel, sort_kernel
+from wheretolook.visibility.counting_kernel import (
+    SortedLandmarks,
+    cell_kernel,
+    count_field_kernel,
+    count_kernel,
+    sort_kernel,
+)
 from wheretolook.visibility.field_of_view import FieldOfView
 from wheretolook.visibility.frustum import (
     MIN_DEPTH_M,
@@ -123,27 +129,30 @@ class FrustumCounter:
         wp.utils.array_scan(numbers, starts, inclusive=False)
         offsets: Any = wp.empty(max(1, shape[0] * shape[1]), dtype=wp.vec3, device=device)
         wp.launch(sort_kernel, shape, [centers, points, places, starts, self.cells.size], [offsets], device=device)
+        in_cells = self._sorted(starts, offsets)
         if isinstance(self.camera, ColmapCamera):
-            return self._count_by_field(starts, offsets, counts)
+            return self._count_by_field(in_cells, counts)
         if self.distinct_pixels:
-            return self._count_pixels(starts, offsets, counts)
-        inputs = [self._sides, *self._runs, starts, offsets, self.cells.size, self._rounding, wp.float64(MIN_DEPTH_M)]
+            return self._count_pixels(in_cells, counts)
+        inputs = [self._sides, in_cells, self._rounding, wp.float64(MIN_DEPTH_M)]
         wp.launch(count_kernel, (*counts.shape, self.lanes), [*inputs, self.lanes], [counts], device=device)
         return counts
 
-    @property
-    def _runs(self) -> tuple[Any, Any, Any, Any]:
-        inside, border = self.cells.inside, self.cells.border
-        return inside.starts, inside.cells, border.starts, border.cells
+    def _sorted(self, starts: Any, offsets: Any) -> Any:
+        landmarks: Any = SortedLandmarks()
+        landmarks.size, landmarks.starts, landmarks.offsets = self.cells.size, starts, offsets
+        landmarks.inside_starts, landmarks.inside = self.cells.inside.starts, self.cells.inside.cells
+        landmarks.border_starts, landmarks.border = self.cells.border.starts, self.cells.border.cells
+        return landmarks
 
-    def _count_pixels(self, starts: Any, offsets: Any, counts: Any) -> Any:
+    def _count_pixels(self, landmarks: Any, counts: Any) -> Any:
         assert isinstance(self.camera, PinholeCamera)
         camera, n_orientations = self.camera, len(self.rotations)
         words = (camera.width * camera.height + 31) // 32
         block = max(1, BITMAP_BYTES // (words * 4 * n_orientations))
         inputs = [
-            self._sides, self._axes, *self._runs, starts, offsets, self.cells.size, wp.float64(camera.focal_px),
-            wp.float64(camera.cx), wp.float64(camera.cy), camera.width, camera.height, wp.float64(MIN_DEPTH_M),
+            self._sides, self._axes, landmarks, wp.float64(camera.focal_px), wp.float64(camera.cx),
+            wp.float64(camera.cy), camera.width, camera.height, wp.float64(MIN_DEPTH_M),
         ]  # fmt: skip
         for first in range(0, counts.shape[0], block):
             n_locations = min(block, counts.shape[0] - first)
@@ -152,11 +161,9 @@ class FrustumCounter:
             wp.launch(count_pixels_kernel, shape, [*inputs, first, self.lanes], [bits, counts], device=self.device)
         return counts
 
-    def _count_by_field(self, starts: Any, offsets: Any, counts: Any) -> Any:
+    def _count_by_field(self, landmarks: Any, counts: Any) -> Any:
         assert self._field is not None and isinstance(self.camera, ColmapCamera)
-        inputs = [
-            self._axes, self._depth, self._field.size, *self._runs, starts, offsets, self.cells.size,
-        ]  # fmt: skip
+        inputs = [self._axes, self._depth, self._field.size, landmarks]
         capacity, first, group = UNSURE_ENTRIES, 0, counts.shape[0]
         while first < counts.shape[0]:
             group = min(group, counts.shape[0] - first)

@@ -57,16 +57,61 @@ def sort_kernel(
         offsets[entry] = offset_from(locations[location], points[landmark])
 
 
+@wp.struct
+class SortedLandmarks:
+    """The landmarks of a block of locations sorted into cells, and the cells of each orientation (`SphereCells`)."""
+
+    size: wp.int32
+    inside_starts: wp.array[wp.int32]
+    inside: wp.array[wp.vec2i]
+    border_starts: wp.array[wp.int32]
+    border: wp.array[wp.vec2i]
+    starts: wp.array[wp.int32]
+    offsets: wp.array[wp.vec3]
+
+
+@wp.func
+def inside_runs(s: SortedLandmarks, orientation: wp.int32) -> wp.vec2i:
+    """First run of cells wholly in view, and the one after the last."""
+    return wp.vec2i(s.inside_starts[orientation * s.size], s.inside_starts[(orientation + 1) * s.size])
+
+
+@wp.func
+def border_runs(s: SortedLandmarks, orientation: wp.int32) -> wp.vec2i:
+    return wp.vec2i(s.border_starts[orientation * s.size], s.border_starts[(orientation + 1) * s.size])
+
+
+@wp.func
+def entries_of(s: SortedLandmarks, location: wp.int32, run: wp.vec2i) -> wp.vec2i:
+    """First entry in a run of cells of a location, and the one after the last."""
+    base = location * (s.size * s.size + 1)
+    return wp.vec2i(s.starts[base + run[0]], s.starts[base + run[1]])
+
+
+@wp.func
+def near_entries(s: SortedLandmarks, location: wp.int32) -> wp.vec2i:
+    """The entries of the last cell, of landmarks close to the camera."""
+    n_cells = s.size * s.size
+    return entries_of(s, location, wp.vec2i(n_cells, n_cells + 1))
+
+
+@wp.func
+def count_inside(
+    s: SortedLandmarks, location: wp.int32, orientation: wp.int32, lane: wp.int32, lanes: wp.int32
+) -> wp.int32:
+    """Landmarks of every lanes-th run of cells wholly in view."""
+    count = wp.int32(0)
+    runs = inside_runs(s, orientation)
+    for run in range(runs[0] + lane, runs[1], lanes):
+        entries = entries_of(s, location, s.inside[run])
+        count += entries[1] - entries[0]
+    return count
+
+
 @wp.kernel
 def count_kernel(
     sides: wp.array2d[wp.vec3],
-    inside_starts: wp.array[wp.int32],
-    inside: wp.array[wp.vec2i],
-    border_starts: wp.array[wp.int32],
-    border: wp.array[wp.vec2i],
-    starts: wp.array[wp.int32],
-    offsets: wp.array[wp.vec3],
-    size: wp.int32,
+    landmarks: SortedLandmarks,
     rounding: wp.float32,
     min_depth: wp.float64,
     lanes: wp.int32,
@@ -74,17 +119,16 @@ def count_kernel(
 ):
     """Several threads (lanes) share a location and an orientation."""
     location, orientation, lane = wp.tid()
-    base = location * (size * size + 1)
-    count = wp.int32(0)
-    for run in range(inside_starts[orientation * size] + lane, inside_starts[(orientation + 1) * size], lanes):
-        count += starts[base + inside[run][1]] - starts[base + inside[run][0]]
+    count = count_inside(landmarks, location, orientation, lane, lanes)
     left = sides[orientation, 0]
     right = sides[orientation, 1]
     top = sides[orientation, 2]
     bottom = sides[orientation, 3]
-    for run in range(border_starts[orientation * size], border_starts[(orientation + 1) * size]):
-        for entry in range(starts[base + border[run][0]] + lane, starts[base + border[run][1]], lanes):
-            offset = offsets[entry]
+    runs = border_runs(landmarks, orientation)
+    for run in range(runs[0], runs[1]):
+        entries = entries_of(landmarks, location, landmarks.border[run])
+        for entry in range(entries[0] + lane, entries[1], lanes):
+            offset = landmarks.offsets[entry]
             # in single precision first; within its rounding error of a side, in double
             least = wp.min(
                 wp.min(wp.dot(left, offset), wp.dot(right, offset)), wp.min(wp.dot(top, offset), wp.dot(bottom, offset))
@@ -95,12 +139,28 @@ def count_kernel(
             elif least >= -error:  # noqa: SIM102 (Warp evaluates both sides of an `and`)
                 if inside_sides(left, right, top, bottom, offset):
                     count += 1
-    near = base + size * size
-    for entry in range(starts[near] + lane, starts[near + 1], lanes):
-        if in_view(sides, orientation, offsets[entry], min_depth):
+    near = near_entries(landmarks, location)
+    for entry in range(near[0] + lane, near[1], lanes):
+        if in_view(sides, orientation, landmarks.offsets[entry], min_depth):
             count += 1
     if count > 0:
         wp.atomic_add(counts, location, orientation, count)
+
+
+@wp.func
+def list_unsure(
+    location: wp.int32,
+    orientation: wp.int32,
+    offset: wp.vec3,
+    number: wp.array[wp.int32],
+    pairs: wp.array[wp.vec2i],
+    offsets: wp.array[wp.vec3],
+):
+    """Append to the list, or only count where it is full."""
+    slot = wp.atomic_add(number, 0, 1)
+    if slot < offsets.shape[0]:
+        pairs[slot] = wp.vec2i(location, orientation)
+        offsets[slot] = offset
 
 
 @wp.kernel
@@ -108,43 +168,31 @@ def count_field_kernel(
     rotations: wp.array[wp.mat33],
     depth: wp.array[wp.float32],
     field_size: wp.int32,
-    inside_starts: wp.array[wp.int32],
-    inside: wp.array[wp.vec2i],
-    border_starts: wp.array[wp.int32],
-    border: wp.array[wp.vec2i],
-    starts: wp.array[wp.int32],
-    offsets: wp.array[wp.vec3],
-    size: wp.int32,
+    landmarks: SortedLandmarks,
     first: wp.int32,
     lanes: wp.int32,
     counts: wp.array2d[wp.int32],
     n_unsure: wp.array[wp.int32],
-    pairs: wp.array[wp.vec2i],
-    unsure: wp.array[wp.vec3],
+    unsure_pairs: wp.array[wp.vec2i],
+    unsure_offsets: wp.array[wp.vec3],
 ):
     """As `count_kernel`, by a table of the field of view; what it cannot decide is listed for the camera itself."""
     row, orientation, lane = wp.tid()
     location = first + row
-    base = location * (size * size + 1)
-    count = wp.int32(0)
-    for run in range(inside_starts[orientation * size] + lane, inside_starts[(orientation + 1) * size], lanes):
-        count += starts[base + inside[run][1]] - starts[base + inside[run][0]]
-    for run in range(border_starts[orientation * size], border_starts[(orientation + 1) * size]):
-        for entry in range(starts[base + border[run][0]] + lane, starts[base + border[run][1]], lanes):
-            inside_by = depth[cell_of(rotations[orientation] * offsets[entry], field_size)]
+    count = count_inside(landmarks, location, orientation, lane, lanes)
+    runs = border_runs(landmarks, orientation)
+    for run in range(runs[0], runs[1]):
+        entries = entries_of(landmarks, location, landmarks.border[run])
+        for entry in range(entries[0] + lane, entries[1], lanes):
+            offset = landmarks.offsets[entry]
+            inside_by = depth[cell_of(rotations[orientation] * offset, field_size)]
             if inside_by > 0.0:
                 count += 1
             elif inside_by == 0.0:
-                slot = wp.atomic_add(n_unsure, 0, 1)
-                if slot < unsure.shape[0]:
-                    pairs[slot] = wp.vec2i(location, orientation)
-                    unsure[slot] = offsets[entry]
-    near = base + size * size
-    for entry in range(starts[near] + lane, starts[near + 1], lanes):
-        slot = wp.atomic_add(n_unsure, 0, 1)
-        if slot < unsure.shape[0]:
-            pairs[slot] = wp.vec2i(location, orientation)
-            unsure[slot] = offsets[entry]
+                list_unsure(location, orientation, offset, n_unsure, unsure_pairs, unsure_offsets)
+    near = near_entries(landmarks, location)
+    for entry in range(near[0] + lane, near[1], lanes):
+        list_unsure(location, orientation, landmarks.offsets[entry], n_unsure, unsure_pairs, unsure_offsets)
     if count > 0:
         wp.atomic_add(counts, location, orientation, count)
 

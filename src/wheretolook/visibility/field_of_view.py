@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from wheretolook.camera_models import ColmapCamera
 from wheretolook.geometry import Float
+from wheretolook.visibility.octahedral_map import cell_centers
 
 TABLE_SIZE = 1024
 """Cells along a side of the table: 0.06 to 0.19 degrees from a cell's centre to its farthest corner."""
@@ -46,8 +47,6 @@ class FieldOfView:
 
 @lru_cache(maxsize=4)
 def _tabulate(camera: ColmapCamera, size: int) -> FieldOfView:
-    from wheretolook.visibility.sphere_cells import cell_centers
-
     centers, radii = cell_centers(size)
     grid = np.arange(size * size).reshape(size, size)
     # The map's edge folds onto itself, mirrored: beyond (row, size - 1) lies (size - 1 - row, size - 1).

@@ -7,6 +7,13 @@ from __future__ import annotations
 
 import warp as wp
 
+from wheretolook.visibility.counting_kernel import (
+    SortedLandmarks,
+    border_runs,
+    entries_of,
+    inside_runs,
+    near_entries,
+)
 from wheretolook.visibility.frustum_kernel import dot, in_view
 
 # A fused multiply-add rounds once where NumPy rounds twice, which moves a landmark on a pixel's edge to the next pixel.
@@ -44,13 +51,7 @@ def mark(bits: wp.array2d[wp.uint32], view: wp.int32, pixel: wp.int32) -> wp.int
 def count_pixels_kernel(
     sides: wp.array2d[wp.vec3],
     axes: wp.array[wp.mat33],
-    inside_starts: wp.array[wp.int32],
-    inside: wp.array[wp.vec2i],
-    border_starts: wp.array[wp.int32],
-    border: wp.array[wp.vec2i],
-    starts: wp.array[wp.int32],
-    offsets: wp.array[wp.vec3],
-    size: wp.int32,
+    landmarks: SortedLandmarks,
     focal: wp.float64,
     cx: wp.float64,
     cy: wp.float64,
@@ -63,22 +64,25 @@ def count_pixels_kernel(
     counts: wp.array2d[wp.int32],
 ):
     """As `count_kernel`, but a landmark counts only if it is the first to reach its pixel."""
-    block_location, orientation, lane = wp.tid()
-    location = first + block_location
-    view = block_location * axes.shape[0] + orientation
-    base = location * (size * size + 1)
+    row, orientation, lane = wp.tid()
+    location = first + row
+    view = row * axes.shape[0] + orientation
     axis = axes[orientation]
     count = wp.int32(0)
-    for run in range(inside_starts[orientation * size], inside_starts[(orientation + 1) * size]):
-        for entry in range(starts[base + inside[run][0]] + lane, starts[base + inside[run][1]], lanes):
-            count += mark(bits, view, pixel_of(axis, offsets[entry], focal, cx, cy, width, height))
-    for run in range(border_starts[orientation * size], border_starts[(orientation + 1) * size]):
-        for entry in range(starts[base + border[run][0]] + lane, starts[base + border[run][1]], lanes):
-            if in_view(sides, orientation, offsets[entry], min_depth):
-                count += mark(bits, view, pixel_of(axis, offsets[entry], focal, cx, cy, width, height))
-    near = base + size * size
-    for entry in range(starts[near] + lane, starts[near + 1], lanes):
-        if in_view(sides, orientation, offsets[entry], min_depth):
-            count += mark(bits, view, pixel_of(axis, offsets[entry], focal, cx, cy, width, height))
+    runs = inside_runs(landmarks, orientation)
+    for run in range(runs[0], runs[1]):
+        entries = entries_of(landmarks, location, landmarks.inside[run])
+        for entry in range(entries[0] + lane, entries[1], lanes):
+            count += mark(bits, view, pixel_of(axis, landmarks.offsets[entry], focal, cx, cy, width, height))
+    runs = border_runs(landmarks, orientation)
+    for run in range(runs[0], runs[1]):
+        entries = entries_of(landmarks, location, landmarks.border[run])
+        for entry in range(entries[0] + lane, entries[1], lanes):
+            if in_view(sides, orientation, landmarks.offsets[entry], min_depth):
+                count += mark(bits, view, pixel_of(axis, landmarks.offsets[entry], focal, cx, cy, width, height))
+    near = near_entries(landmarks, location)
+    for entry in range(near[0] + lane, near[1], lanes):
+        if in_view(sides, orientation, landmarks.offsets[entry], min_depth):
+            count += mark(bits, view, pixel_of(axis, landmarks.offsets[entry], focal, cx, cy, width, height))
     if count > 0:
         wp.atomic_add(counts, location, orientation, count)

@@ -4,9 +4,8 @@ Whether a direction is in view does not depend on the location. So the sphere is
 orientation's cells are sorted into those wholly in view, whose landmarks count without a test, those wholly out of
 view, and those on the border, whose landmarks are tested one by one: a few per cent of all.
 
-The cells are the squares of an octahedral map (Praun and Hoppe, "Spherical parametrization and remeshing", SIGGRAPH
-2003): the octahedron |x| + |y| + |z| = 1 unfolded onto the square [-1, 1]^2. Within a face a cell is the cone over a
-planar quadrilateral, so that a plane through the centre has it on one side if it has its corners there.
+The cells are the squares of an octahedral map. Within a face of the octahedron a cell is the cone over a planar
+quadrilateral, so that a plane through the centre has it on one side if it has its corners there.
 """
 
 from __future__ import annotations
@@ -16,12 +15,12 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from numpy.typing import ArrayLike
 
 from wheretolook.camera_models import Camera, ColmapCamera
 from wheretolook.geometry import Float
 from wheretolook.visibility.field_of_view import FieldOfView
 from wheretolook.visibility.frustum import frustum_sides
+from wheretolook.visibility.octahedral_map import cell_centers, octahedral_directions
 from wheretolook.visibility.sphere_cells_kernel import (
     BORDER,
     INSIDE,
@@ -33,28 +32,6 @@ from wheretolook.visibility.sphere_cells_kernel import (
 
 ROUNDING = 1e-5
 """A cell's corners must be this far (relative) from a plane: a landmark on its edge may be rounded out of the cell."""
-
-
-def octahedral_directions(u: ArrayLike, v: ArrayLike) -> Float:
-    """Directions (..., 3) with |x| + |y| + |z| = 1 of points (u, v) of the octahedral map, each in [-1, 1]."""
-    u, v = np.broadcast_arrays(np.asarray(u, dtype=np.float64), np.asarray(v, dtype=np.float64))
-    z = 1 - np.abs(u) - np.abs(v)
-    sign_u, sign_v = np.where(u >= 0, 1.0, -1.0), np.where(v >= 0, 1.0, -1.0)
-    x = np.where(z >= 0, u, (1 - np.abs(v)) * sign_u)
-    y = np.where(z >= 0, v, (1 - np.abs(u)) * sign_v)
-    return np.stack([x, y, z], axis=-1)
-
-
-def cell_centers(size: int) -> tuple[Float, Float]:
-    """Unit directions (size * size, 3) of the cells' centres, row by row, and the angle (size * size,) in radians from
-    each to the farthest corner of its cell."""
-    middle, edge = (np.arange(size) + 0.5) / size * 2 - 1, np.arange(size + 1) / size * 2 - 1
-    centers = octahedral_directions(middle[None, :], middle[:, None])
-    corners = octahedral_directions(edge[None, :], edge[:, None])
-    centers /= np.linalg.norm(centers, axis=-1, keepdims=True)
-    corners /= np.linalg.norm(corners, axis=-1, keepdims=True)
-    chords = [np.linalg.norm(centers - corners[i : i + size, j : j + size], axis=-1) for i in (0, 1) for j in (0, 1)]
-    return np.asarray(centers.reshape(-1, 3)), 2 * np.arcsin(np.max(chords, axis=0) / 2).reshape(-1)
 
 
 def choose_size(n_points: int) -> int:

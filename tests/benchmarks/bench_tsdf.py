@@ -115,7 +115,7 @@ def main() -> None:
     rows = []
     for path, points in zip(args.mesh or [None], landmarks or [None], strict=True):
         mesh = generate_apartment(ApartmentConfig(), args.seed) if path is None else load_mesh(path, up=args.up)
-        name = "generated" if path is None else Path(path).stem
+        name = "generated" if path is None else Path(path).parent.name if Path(path).stem == "mesh" else Path(path).stem
         for row in measure(name, mesh, points, args):
             rows.append(row)
             print(" ".join(f"{value:.4g}" if isinstance(value, float) else str(value) for value in row.values()))

@@ -169,7 +169,7 @@ def test_a_location_inside_geometry_is_refused(occlusion: TsdfOcclusion) -> None
     occlusion.check_locations(free[:0])
     inside_wall, inside_cupboard, on_floor, outside = (2.0, 1.0, 1.2), (0.5, 2.6, 0.8), (1.0, 1.0, 0.0), (9.0, 1.0, 1.0)
     for location in (inside_wall, inside_cupboard, on_floor, outside, (np.nan, 1.0, 1.0)):
-        with pytest.raises(SceneError, match="inside geometry|not finite") as caught:
+        with pytest.raises(SceneError, match=r"inside geometry|not finite") as caught:
             occlusion.check_locations(np.vstack([free, location]))
         assert repr(tuple(np.float64(location).tolist())) in str(caught.value)
 

@@ -153,10 +153,10 @@ def test_every_occlusion_model_scores_the_same_viewpoints(copy: Path) -> None:
 def test_viewpoints_can_be_sampled_with_every_occlusion_model(copy: Path, model: str) -> None:
     scene = Dataset.load(copy / "data" / "tiny").scenes[0]
     by_mesh = StoredOcclusion.load(scene.occlusion)
-    assert by_mesh.model == "mesh"
+    assert by_mesh.name == "mesh"
     assert run("sample", copy, "--occlusion.model", model, "--occlusion.voxel_m", "0.04") == 0
     stored = StoredOcclusion.load(scene.occlusion)
-    assert stored.model == model
+    assert stored.name == model
     if model == "none":
         assert stored.mask.all() and not by_mesh.mask.all()
     same = [row for row in stored.locations if (by_mesh.locations == row).all(1).any()]

@@ -26,6 +26,7 @@ class ColmapCamera:
 
     Distortion polynomials turn back beyond the field of view they were fitted to and then map points far outside it
     into the image. A point counts as seen only if the ray of its pixel, by COLMAP's own inverse, leads back to it.
+    COLMAP's fisheye models see nothing 90 degrees off the axis and beyond.
 
     Args:
         model: COLMAP's name of the model, such as "OPENCV" or "OPENCV_FISHEYE".
@@ -56,6 +57,9 @@ class ColmapCamera:
                 f"camera model {self.model} needs a positive size and the parameters {expected}",
                 value=(self.width, self.height, *self.params),
             )
+        has_focal_length = len(self._camera.focal_length_idxs()) > 0
+        if not np.isfinite(self.params).all() or (has_focal_length and not self._camera.mean_focal_length() > 0):
+            raise ConfigError("a camera needs finite parameters and a positive focal length", value=self.params)
 
     @classmethod
     def of(cls, camera: pycolmap.Camera) -> ColmapCamera:
@@ -90,6 +94,20 @@ class ColmapCamera:
 
         return pycolmap.Camera(model=self.model, width=self.width, height=self.height, params=list(self.params))
 
+    @property
+    def matrix(self) -> Float:
+        """Intrinsic matrix K, (3, 3).
+
+        Raises:
+            ConfigError: the model has distortion.
+        """
+        if not self._camera.is_perspective_pinhole():
+            raise ConfigError(
+                "a camera with distortion has no intrinsic matrix", value=self.model,
+                fix="Undistort the images, for instance with COLMAP's image_undistorter.",
+            )  # fmt: skip
+        return np.asarray(self._camera.calibration_matrix())
+
     def project(self, points_cam: ArrayLike) -> Float:
         """Project points given in the camera frame.
 
@@ -105,11 +123,18 @@ class ColmapCamera:
         with np.errstate(all="ignore"):
             pixels = np.asarray(self._camera.img_from_cam(flat))
             rows = np.flatnonzero(self.in_image(pixels))
-            rays = np.asarray(self._camera.cam_ray_from_img(pixels[rows]))
             length = np.linalg.norm(flat[rows], axis=1, keepdims=True)
-            miss = np.linalg.norm(flat[rows] / length - rays / np.linalg.norm(rays, axis=1, keepdims=True), axis=1)
+            miss = np.linalg.norm(flat[rows] / length - self.unproject(pixels[rows]), axis=1)
         pixels[rows[~(miss <= MAX_RAY_ERROR)]] = np.nan
         return pixels.reshape(*points.shape[:-1], 2)
+
+    def unproject(self, pixels: ArrayLike) -> Float:
+        """Unit rays (..., 3) of pixels (..., 2) in the camera frame; NaN where the model has none."""
+        at = np.asarray(pixels, dtype=np.float64)
+        rays = np.asarray(self._camera.cam_ray_from_img(at.reshape(-1, 2)))
+        with np.errstate(invalid="ignore"):
+            rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+        return rays.reshape(*at.shape[:-1], 3)
 
     def in_image(self, pixels: ArrayLike) -> NDArray[np.bool_]:
         """Whether pixels (..., 2) lie in the image: 0 <= x < width and 0 <= y < height. NaN is outside."""

@@ -94,7 +94,8 @@ class Experiment:
         camera: the camera that will look, and with which the map's images are rendered.
         scenes: stage 1, meshes.
         map: stage 2, COLMAP maps.
-        occlusion: how stages 3 and 6 find out which landmarks nothing stands in front of.
+        occlusion: how stage 3 finds out which landmarks nothing stands in front of. Stage 6 takes its settings, but the
+            names of models from `evaluate.occlusions`.
         sample: stage 3, viewpoints and what they see.
         label: stage 4, localization errors.
         train: stage 5, the network.

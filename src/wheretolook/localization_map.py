@@ -40,6 +40,7 @@ class LocalizationMap:
         model: str | Path,
         camera: Camera = PinholeCamera(),
         mesh: str | Path | None = None,
+        occlusion: OcclusionModel | None = None,
         max_reprojection_error_px: float = 0.5,
         device: str = "cpu",
     ) -> LocalizationMap:
@@ -49,7 +50,9 @@ class LocalizationMap:
             model: folder of the model.
             camera: the camera that will look, which need not be the one that mapped; `ColmapCamera.of_map(model)` is
                 the latter, with its distortion.
-            mesh: a mesh of the scene, for true occlusion; without one, landmarks are seen through walls.
+            mesh: a mesh of the scene, for true occlusion.
+            occlusion: another model, such as `HiddenPointRemoval()` where there is nothing but the landmarks, or
+                `TsdfOcclusion` where there are depth images. With neither, landmarks are seen through walls.
             max_reprojection_error_px: landmarks with a larger mean error are left out.
             device: where kernels run.
 
@@ -58,7 +61,7 @@ class LocalizationMap:
             SceneError: the mesh cannot be used.
         """
         landmarks = load_colmap_landmarks(Path(model), max_reprojection_error_px=max_reprojection_error_px)
-        occlusion: OcclusionModel = NoOcclusion()
+        occlusion = occlusion or NoOcclusion()
         if mesh is not None:
             from wheretolook.rendering import MeshRaycaster
             from wheretolook.scenes.free_space import FreeSpace

@@ -54,7 +54,7 @@ class SampleConfig:
         for name in ("keep", "min_visible", "max_locations", "max_directions"):
             if getattr(self, name) < 0:
                 raise ConfigError(f"sample.{name} must not be negative", value=getattr(self, name))
-        if not self.memory_gb > 0:
+        if not 0 < self.memory_gb < float("inf"):
             raise ConfigError("sample.memory_gb must be positive", value=self.memory_gb)
 
 

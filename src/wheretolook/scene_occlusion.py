@@ -11,7 +11,6 @@ from wheretolook.dataset import SceneFolder
 from wheretolook.errors import MapError, SceneError
 from wheretolook.geometry import Float, PinholeCamera
 from wheretolook.rendering import MeshRaycaster, WarpRenderer
-from wheretolook.scenes.free_space import FreeSpace
 from wheretolook.scenes.loading import load_mesh
 from wheretolook.scenes.mesh import TexturedMesh
 from wheretolook.visibility import HiddenPointRemoval, MeshOcclusion, NoOcclusion, OcclusionModel
@@ -25,7 +24,7 @@ def scene_occlusion(
     config: OcclusionConfig,
     device: str = "cpu",
     mesh: TexturedMesh | None = None,
-    two_sided: bool | None = None,
+    two_sided: bool = True,
     progress: bool = True,
 ) -> OcclusionModel:
     """Build the occlusion model that `config.model` names.
@@ -36,7 +35,7 @@ def scene_occlusion(
         config: which model, and its settings.
         device: where rays are cast and depth is rendered.
         mesh: the scene's mesh, if it is loaded already.
-        two_sided: whether the backs of the mesh's triangles are surfaces; None finds out.
+        two_sided: whether the backs of the mesh's triangles are surfaces; if not, locations inside solids are known.
         progress: show a progress bar for the fusion of depth images.
 
     Raises:
@@ -56,8 +55,6 @@ def scene_occlusion(
         images = RenderedDepth(WarpRenderer(mesh, device), camera, map_poses(scene))
         tsdf = TsdfConfig(voxel_size_m=config.voxel_m, max_depth_m=config.max_depth_m)
         return TsdfOcclusion(TsdfVolume.from_images(images, tsdf, progress), config.margin_m, device)
-    if two_sided is None:
-        two_sided = FreeSpace(mesh, device=device).two_sided
     return MeshOcclusion(MeshRaycaster(mesh, device), config.margin_m, two_sided)
 
 

@@ -138,8 +138,9 @@ def sample(experiment: Experiment, say: Say = print, tick: Tick = lambda work: N
 
     dataset, device = _dataset(experiment, "map"), experiment.warp_device
     for scene in dataset.scenes:
-        settings = [asdict(part) for part in (experiment.sample, experiment.occlusion, experiment.scenes.free_space)]
-        key = _key("sample", [settings, asdict(dataset.camera), _existing(scene.mesh, SceneError, "scenes"),
+        chosen = {name: value for name, value in asdict(experiment.sample).items() if name != "memory_gb"}
+        key = _key("sample", [chosen, experiment.occlusion.settings(), asdict(experiment.scenes.free_space),
+                              asdict(dataset.camera), _existing(scene.mesh, SceneError, "scenes"),
                               _existing(scene.landmarks, MapError, "map")])  # fmt: skip
         if not _is_done(scene, "sample", key, scene.table, scene.occlusion):
             mesh, landmarks = load_mesh(scene.mesh), Landmarks.load(scene.landmarks)
@@ -156,7 +157,6 @@ def sample(experiment: Experiment, say: Say = print, tick: Tick = lambda work: N
                     grid, free, landmarks, dataset.camera, occlusion, experiment.sample, device,
                     progress=f"sample {scene.name}",
                 )  # fmt: skip
-            stored.model = experiment.occlusion.model
             stored.save(scene.occlusion)
             write_table(table, scene.table)
             _stamp(scene, "sample", key)

@@ -9,11 +9,12 @@ from scipy.spatial.transform import Rotation
 
 from conftest import RandomViews
 from wheretolook.camera_models import Camera, ColmapCamera
+from wheretolook.errors import ConfigError
 from wheretolook.geometry import Float, PinholeCamera, rotation_looking_along, transform
 from wheretolook.grid import fibonacci_sphere
 from wheretolook.visibility import DevicePoints, FrustumCounter, count_plain, counting
 from wheretolook.visibility.field_of_view import FieldOfView
-from wheretolook.visibility.octahedral_map import cell_centers, octahedral_directions
+from wheretolook.visibility.octahedral_map import cell_centers, cells_of, octahedral_directions
 
 DISTORTED = ColmapCamera("OPENCV", 640, 480, (300.0, 310.0, 330.0, 235.0, -0.2, 0.05, 1e-3, -1e-3))
 FISHEYE = ColmapCamera("OPENCV_FISHEYE", 640, 480, (200.0, 200.0, 320.0, 240.0, 0.01, 0.0, 0.0, 0.0))
@@ -27,6 +28,8 @@ CAMERAS: dict[str, Camera] = {
     "panorama": PANORAMA,
 }
 
+PINHOLES = [name for name, camera in CAMERAS.items() if isinstance(camera, PinholeCamera)]
+
 
 def count(
     camera: Camera, rotations: Float, locations: Float, points: Float, mask: np.ndarray | None = None,
@@ -38,8 +41,10 @@ def count(
     return counter.count(locations, on_device.double, free).numpy()  # type: ignore[no-any-return]
 
 
-@pytest.mark.parametrize("distinct_pixels", [False, True])
-@pytest.mark.parametrize("name", CAMERAS)
+# with a COLMAP camera distinct pixels are counted by the plain twin itself
+@pytest.mark.parametrize(
+    ("name", "distinct_pixels"), [*((name, False) for name in CAMERAS), *((name, True) for name in PINHOLES)]
+)
 def test_counts_are_those_of_the_plain_twin(
     name: str, distinct_pixels: bool, random_views: RandomViews, device: str
 ) -> None:
@@ -48,7 +53,7 @@ def test_counts_are_those_of_the_plain_twin(
     # twins of landmarks share pixels; some landmarks lie around a location closer than the least depth, some at it
     points = np.concatenate(
         [v.points, v.points[:200], v.locations[0] + rng.normal(size=(60, 3)) * 10.0 ** rng.uniform(-5, -2, (60, 1)),
-         v.locations[:2], [[np.nan, 0, 0], [np.inf, 0, 0]]]
+         v.locations[:2], [[np.nan, 0, 0], [np.inf, 0, 0]], rng.normal(size=(60, 3)) * 1e37]
     )  # fmt: skip
     mask = rng.random((len(v.locations), len(points))) < 0.7
     rotations = rotation_looking_along(v.directions)
@@ -126,24 +131,73 @@ def test_cells_cover_the_sphere_once() -> None:
     np.testing.assert_allclose(np.linalg.norm(centers, axis=1), 1)
     directions = fibonacci_sphere(20_000)
     assert np.all(np.min(2 - 2 * directions @ centers.T, axis=1) <= (2 * np.sin(radii.max() / 2)) ** 2 + 1e-12)
-    for face in ((1, 1, 1), (-1, 1, -1), (1, -1, -1)):  # the map and its inverse agree on each face
-        u, v = np.random.default_rng(0).uniform(0, 0.5, (2, 100))
-        xyz = octahedral_directions(u * face[0], v * face[1])
-        assert np.all(xyz[:, 2] >= 0) and np.allclose(np.abs(xyz).sum(1), 1)
+    np.testing.assert_array_equal(cells_of(centers, 16), np.arange(256))
+    u, v = np.random.default_rng(0).uniform(-1, 1, (2, 5000))
+    cell = ((v + 1) * 8).astype(int) * 16 + ((u + 1) * 8).astype(int)
+    np.testing.assert_array_equal(cells_of(octahedral_directions(u, v) * 3.7, 16), cell)
 
 
 @pytest.mark.parametrize("camera", [DISTORTED, FISHEYE, PANORAMA])
 def test_the_table_of_a_field_of_view_is_never_wrong(camera: ColmapCamera) -> None:
-    from wheretolook.visibility.octahedral_map import octahedral_directions
-
     table = FieldOfView.of(camera)
     rng = np.random.default_rng(0)
     u, v = rng.uniform(-1, 1, (2, 300_000))
     directions = octahedral_directions(u, v)
-    row, column = ((np.stack([v, u]) + 1) / 2 * table.size).astype(int)
-    depth, seen = table.depth_rad[row * table.size + column], camera.sees(directions)
+    depth, seen = table.depth_rad[cells_of(directions, table.size)], camera.sees(directions)
     assert seen[depth > 0].all() and not seen[depth < 0].any()
-    assert np.mean(depth == 0) < 0.01
+    assert np.mean(depth == 0) < 0.02
+    # corners of the cells that are only just certain, where a table too sure of itself would err first
+    rows, columns = np.divmod(np.flatnonzero((depth_of := table.depth_rad) != 0), table.size)
+    just = np.abs(depth_of[rows * table.size + columns]) < 2e-4
+    for shift_u, shift_v in ((0.001, 0.001), (0.001, 0.999), (0.999, 0.001), (0.999, 0.999)):
+        u, v = (columns[just] + shift_u) / table.size * 2 - 1, (rows[just] + shift_v) / table.size * 2 - 1
+        sure = depth_of[rows[just] * table.size + columns[just]]
+        np.testing.assert_array_equal(camera.sees(octahedral_directions(u, v)), sure > 0)
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        ColmapCamera("SIMPLE_PINHOLE", 640, 480, (4e5, 320.0, 240.0)),
+        ColmapCamera("SIMPLE_PINHOLE", 4096, 1, (4000.0, 2048.0, 0.5)),
+        ColmapCamera("SIMPLE_PINHOLE", 1, 1, (600.0, 0.5, 0.5)),
+        ColmapCamera("PINHOLE", 640, 480, (300.0, 500.0, -100.0, 900.0)),
+    ],
+)
+def test_a_view_narrower_than_the_tables_cells_is_counted_too(camera: ColmapCamera, device: str) -> None:
+    rng = np.random.default_rng(0)
+    pixels = rng.uniform(-0.5, 1.5, (2000, 2)) * (camera.width, camera.height)
+    points = camera.unproject(pixels) * rng.uniform(1, 5, (2000, 1))
+    rotations = np.concatenate([np.eye(3)[None], rotation_looking_along(fibonacci_sphere(5))])
+    counts = count(camera, rotations, np.zeros((1, 3)), points, device=device)
+    np.testing.assert_array_equal(
+        counts, count_plain(camera, rotations, np.zeros((1, 3)), points, np.ones((1, 2000), bool))
+    )
+    assert 300 < counts[0, 0] < 1000
+
+
+def test_a_pinhole_of_colmap_counts_as_ours(random_views: RandomViews, device: str) -> None:
+    v, rotations = random_views, rotation_looking_along(random_views.directions)
+    colmap = ColmapCamera(
+        "SIMPLE_PINHOLE", v.camera.width, v.camera.height, (v.camera.focal_px, v.camera.cx, v.camera.cy)
+    )
+    for distinct in (False, True):
+        ours = count(v.camera, rotations, v.locations, v.points, v.mask, device, distinct_pixels=distinct)
+        theirs = count(colmap, rotations, v.locations, v.points, v.mask, device, distinct_pixels=distinct)
+        assert np.abs(ours - theirs).max() <= 1 and (ours != theirs).mean() < 0.02  # rounding on the border
+
+
+def test_what_cannot_be_counted_is_refused(random_views: RandomViews) -> None:
+    v, rotations = random_views, rotation_looking_along(random_views.directions)
+    for size in (0, -4, 7):
+        with pytest.raises(ConfigError, match=f"even number.*{size}"):
+            FrustumCounter(v.camera, rotations, 100, size=size)
+    with pytest.raises(ConfigError, match="finite"):
+        FrustumCounter(v.camera, rotations * np.nan, 100)
+    counter = FrustumCounter(v.camera, rotations, 100)
+    many = np.broadcast_to(0.0, (counter.max_locations(len(v.points)) + 1, 3))
+    with pytest.raises(ConfigError, match="too many locations at once"):
+        counter.count(many, DevicePoints(v.points).double)
 
 
 def test_lists_for_the_camera_that_run_over_change_nothing(
@@ -151,7 +205,17 @@ def test_lists_for_the_camera_that_run_over_change_nothing(
 ) -> None:
     v, rotations = random_views, rotation_looking_along(random_views.directions)
     expected = count(DISTORTED, rotations, v.locations, v.points, v.mask, device)
-    for entries in (3, 60):  # shorter than one location's list, and than that of all
-        monkeypatch.setattr(counting, "UNSURE_ENTRIES", entries)
-        monkeypatch.setattr(counting, "ASKED_AT_ONCE", 7)
-        np.testing.assert_array_equal(count(DISTORTED, rotations, v.locations, v.points, v.mask, device), expected)
+    monkeypatch.setattr(counting, "ASKED_AT_ONCE", 7)
+    for entries in (1, 60):  # shorter than the list of one view, and than that of all
+        short = {"scratch_bytes": 20 * entries}
+        found = count(DISTORTED, rotations, v.locations, v.points, v.mask, device, **short)
+        np.testing.assert_array_equal(found, expected)
+
+
+def test_little_room_for_bitmaps_changes_nothing(random_views: RandomViews, device: str) -> None:
+    v, rotations = random_views, rotation_looking_along(random_views.directions)
+    arguments = v.camera, rotations, v.locations, v.points, v.mask, device
+    for scratch in (1, 200_000):  # a view at a time, a few
+        np.testing.assert_array_equal(
+            count(*arguments, distinct_pixels=True, scratch_bytes=scratch), count(*arguments, distinct_pixels=True)
+        )

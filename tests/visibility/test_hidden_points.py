@@ -187,7 +187,7 @@ def test_what_cannot_be_answered_is_refused_by_name() -> None:
         model.unoccluded(ORIGIN, np.array([[0, 0, 1.0], [1, np.nan, 2]]))
     with pytest.raises(SceneError, match=r"landmark lies at the location.*got \(0.0, 1.0, 0.0\)"):
         model.unoccluded(np.array([[0.0, 0, 2], [0, 1, 0]]), points)
-    for refuse in (model.check_locations, lambda at: model.unoccluded(at, points)):
+    for refuse in (lambda at: model.check(at, points), lambda at: model.unoccluded(at, points)):
         with pytest.raises(SceneError, match=r"not finite.*got \(0.0, inf, 0.0\)"):
             refuse(np.array([[5.0, 5, 5], [0, np.inf, 0]]))
 

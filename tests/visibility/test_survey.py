@@ -16,6 +16,7 @@ from wheretolook.scenes.mesh import TexturedMesh
 from wheretolook.visibility import (
     DevicePoints,
     FrustumCounter,
+    HiddenPointRemoval,
     MeshOcclusion,
     NoOcclusion,
     OcclusionModel,
@@ -44,13 +45,13 @@ def test_a_survey_is_what_its_plain_parts_say(random_views: RandomViews, threads
     v = random_views
     rotations = rotation_looking_along(v.directions)
     seen = survey(v.camera, rotations, v.locations, v.points, Given(v.locations, v.mask), keep=6, device=device,
-                  threads=threads, memory_bytes=200_000)  # a block or two of locations at a time  # fmt: skip
+                  threads=threads)  # fmt: skip
     plain = count_plain(v.camera, rotations, v.locations, v.points, v.mask)
     np.testing.assert_array_equal(seen.counts, plain)
     for row in range(len(v.locations)):
         ranked = sorted(range(len(rotations)), key=lambda direction: (-plain[row, direction], direction))
         assert seen.best[row].tolist() == ranked[:6]
-    assert seen.occlusion is not None
+    assert seen.occlusion is not None and seen.occlusion.name == "custom"
     np.testing.assert_array_equal(seen.occlusion.mask, v.mask)
     np.testing.assert_array_equal(seen.occlusion.unoccluded(v.locations[2:4], v.points), v.mask[2:4])
 
@@ -82,12 +83,44 @@ def test_a_mesh_hides_what_is_behind_it_on_the_device_too(device: str) -> None:
     np.testing.assert_array_equal(seen.counts, count_plain(PinholeCamera(), rotations, locations, points, mask))
 
 
+def test_blocks_keep_to_the_memory_allowed(
+    random_views: RandomViews, device: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    v, rotations = random_views, rotation_looking_along(random_views.directions)
+    locations = np.random.default_rng(0).uniform(-2, 2, (40, 3))
+    whole = survey(v.camera, rotations, locations, v.points, NoOcclusion(), device=device)
+    blocks: list[int] = []
+    original = FrustumCounter.count
+
+    def spy(self: FrustumCounter, at: Float, *rest: object) -> object:
+        blocks.append(len(at))
+        return original(self, at, *rest)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(FrustumCounter, "count", spy)
+    one = FrustumCounter(v.camera, rotations, len(v.points), device).bytes_per_location(len(v.points)) + len(v.points)
+    for threads, memory, longest in ((1, 7 * one + 5, 7), (2, 7 * one, 3), (8, one, 1)):
+        blocks.clear()
+        part = survey(v.camera, rotations, locations, v.points, NoOcclusion(), device=device, threads=threads,
+                      memory_bytes=memory)  # fmt: skip
+        np.testing.assert_array_equal(part.counts, whole.counts)
+        assert sum(blocks) == 40 and max(blocks) <= (7 if device != "cpu" and longest == 3 else longest)
+    for camera, distinct in ((v.camera, True), (ColmapCamera("RADIAL", 64, 48, (30.0, 32.0, 24.0, 0.1, 0.0)), False)):
+        seen = survey(camera, rotations, locations, v.points, NoOcclusion(), device=device, threads=2,
+                      distinct_pixels=distinct, memory_bytes=200_000)  # fmt: skip
+        everything = np.ones((40, len(v.points)), bool)
+        np.testing.assert_array_equal(
+            seen.counts, count_plain(camera, rotations, locations, v.points, everything, distinct)
+        )
+
+
 def test_a_counter_and_points_on_the_device_can_be_used_again(random_views: RandomViews, device: str) -> None:
     v = random_views
     rotations, points = rotation_looking_along(v.directions), DevicePoints(v.points, device)
     counter = FrustumCounter(v.camera, rotations, len(points), device, distinct_pixels=True)
     for rows in (slice(0, 3), slice(3, 5)):
-        seen = survey(v.camera, rotations, v.locations[rows], points, NoOcclusion(), counter=counter)
+        seen = survey(
+            v.camera, rotations, v.locations[rows], points, NoOcclusion(), distinct_pixels=True, counter=counter
+        )
         everything = np.ones((len(v.locations[rows]), len(points)), bool)
         plain = count_plain(v.camera, rotations, v.locations[rows], v.points, everything, distinct_pixels=True)
         np.testing.assert_array_equal(seen.counts, plain)
@@ -117,18 +150,26 @@ def test_bad_input_is_refused_before_any_work(random_views: RandomViews) -> None
         survey(v.camera, rotations, [[0, np.nan, 0]], v.points, Untouchable())
     with pytest.raises(ConfigError, match="one location with 800 landmarks"):
         survey(v.camera, rotations, v.locations, v.points, Untouchable(), memory_bytes=1000)
+    with pytest.raises(ConfigError, match="must not be negative"):
+        survey(v.camera, rotations, v.locations, v.points, Untouchable(), keep=-1)
+    another = FrustumCounter(PinholeCamera(), rotations, len(v.points))
+    with pytest.raises(ConfigError, match="counter is of another camera"):
+        survey(v.camera, rotations, v.locations, v.points, Untouchable(), counter=another)
+    on_a_landmark = np.concatenate([v.locations, v.points[:1]])
+    with pytest.raises(SceneError, match="a landmark lies at the location"):
+        HiddenPointRemoval().check(on_a_landmark, v.points)
 
 
 @pytest.mark.parametrize("two_sided", [False, True])
 def test_a_location_inside_geometry_is_named(two_sided: bool, device: str) -> None:
     room, block = box_quads((-3, -3, -3), (3, 3, 3), inward=True), box_quads((0, 0, 0), (1, 1, 1))
     occlusion = MeshOcclusion(MeshRaycaster(boxes(room, block), device), two_sided=two_sided)
-    occlusion.check_locations(np.array([[-1.0, -1, -1], [2, 2, 2]]))
+    occlusion.check(np.array([[-1.0, -1, -1], [2, 2, 2]]), np.ones((5, 3)))
     with pytest.raises(SceneError, match=r"inside geometry.*1\.0, 0\.5, 0\.5"):
-        occlusion.check_locations(np.array([[-1.0, -1, -1], [1, 0.5, 0.5]]))  # on a face
+        occlusion.check(np.array([[-1.0, -1, -1], [1, 0.5, 0.5]]), np.ones((5, 3)))  # on a face
     inside = np.array([[-1.0, -1, -1], [0.4, 0.5, 0.6]])
     if two_sided:
-        occlusion.check_locations(inside)  # might be a room
+        occlusion.check(inside, np.ones((5, 3)))  # might be a room
     else:
         with pytest.raises(SceneError, match=r"inside geometry.*0\.4, 0\.5, 0\.6"):
             survey(PinholeCamera(), np.eye(3)[None], inside, np.ones((5, 3)), occlusion, device=device)

@@ -165,12 +165,12 @@ def test_moving_the_world_changes_little(images: list[DepthImage]) -> None:
 
 def test_a_location_inside_geometry_is_refused(occlusion: TsdfOcclusion) -> None:
     free = free_points(np.random.default_rng(7), 200, clearance_m=0.1)
-    occlusion.check_locations(free)
-    occlusion.check_locations(free[:0])
+    occlusion.check(free, free)
+    occlusion.check(free[:0], free)
     inside_wall, inside_cupboard, on_floor, outside = (2.0, 1.0, 1.2), (0.5, 2.6, 0.8), (1.0, 1.0, 0.0), (9.0, 1.0, 1.0)
     for location in (inside_wall, inside_cupboard, on_floor, outside, (np.nan, 1.0, 1.0)):
         with pytest.raises(SceneError, match=r"inside geometry|not finite") as caught:
-            occlusion.check_locations(np.vstack([free, location]))
+            occlusion.check(np.vstack([free, location]), free)
         assert repr(tuple(np.float64(location).tolist())) in str(caught.value)
 
 

@@ -96,7 +96,7 @@ def evaluate(
 
 
 def _stored_model(scenes: Sequence[SceneFolder]) -> str:
-    return " ".join(sorted({StoredOcclusion.load(scene.occlusion).model for scene in scenes}))
+    return " ".join(sorted({StoredOcclusion.load(scene.occlusion).name for scene in scenes}))
 
 
 def _weights(dataset: Dataset, config: EvaluateConfig, models: Sequence[TrainedModel | Path] | None) -> list[Path]:
@@ -249,7 +249,11 @@ def _log(
         "dataset_fingerprint": Dataset(dataset.root, dataset.camera, tuple(scenes)).fingerprint(),
         "scenes": " ".join(scene.name for scene in scenes),
         **{name: value for name, value in asdict(config).items() if name not in ("weights", "methods")},
-        **{f"occlusion_{name}": value for name, value in asdict(occlusion).items() if name != "model"},
+        **(
+            {f"occlusion_{name}": value for name, value in asdict(occlusion).items() if name != "model"}
+            if config.occlusions
+            else {}
+        ),
         "weights": " ".join(f"{path.stem}:{fingerprint(path)}" for path in weights),
     }
     positives = float(views.good[:, 0].mean())

@@ -47,6 +47,7 @@ class MeshRaycaster:
     def __init__(self, mesh: TexturedMesh, device: str = "cpu", block_rays: int = 1 << 28) -> None:
         self.device = start_warp(device)
         self.block_rays = block_rays
+        wp.load_module(ray_kernels, device=self.device)  # only one thread may do that
         self.warp_mesh = warp_mesh(mesh, self.device)
 
     def occluded(self, origins: ArrayLike, points: ArrayLike, margin_m: float = 0.02) -> NDArray[np.bool_]:
@@ -76,7 +77,6 @@ class MeshRaycaster:
             free = self.unoccluded_on_device(origins_at[rows], points_on_device, margin_m)
             occluded[rows] = ~free.numpy().astype(np.bool_)
 
-        wp.load_module(ray_kernels, device=self.device)  # only one thread may do that
         with ThreadPoolExecutor(threads) as pool:  # Warp lets go of Python's lock while a kernel runs
             list(pool.map(work, range(0, len(origins_at), block)))
         return occluded

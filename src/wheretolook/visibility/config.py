@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import inf
 from typing import Literal, get_args
 
 from wheretolook.errors import ConfigError
@@ -33,13 +34,19 @@ class OcclusionConfig:
 
     def __post_init__(self) -> None:
         check_occlusion_names((self.model,))
-        if not self.margin_m >= 0:
+        if not 0 <= self.margin_m < inf:
             raise ConfigError("occlusion.margin_m must not be negative", value=self.margin_m)
-        if not self.radius >= 1:
+        if not 1 <= self.radius < inf:
             raise ConfigError("occlusion.radius must be at least 1", value=self.radius)
         for name in ("voxel_m", "max_depth_m"):
-            if not getattr(self, name) > 0:
+            if not 0 < getattr(self, name) < inf:
                 raise ConfigError(f"occlusion.{name} must be positive", value=getattr(self, name))
+
+    def settings(self) -> dict[str, str | float]:
+        """The model and those settings that it reads."""
+        read = {"mesh": ["margin_m"], "tsdf": ["margin_m", "voxel_m", "max_depth_m"],
+                "hidden-points": ["margin_m", "radius"], "none": []}  # fmt: skip
+        return {"model": self.model, **{name: getattr(self, name) for name in read[self.model]}}
 
 
 def check_occlusion_names(names: tuple[str, ...]) -> None:

@@ -10,6 +10,9 @@ import warp as wp
 from wheretolook.visibility.frustum_kernel import in_view, inside_sides, offset_from
 from wheretolook.visibility.sphere_cells_kernel import cell_of
 
+FAR = wp.constant(1.0e15)
+"""Beyond this many metres single precision may overflow."""
+
 
 @wp.kernel
 def cell_kernel(
@@ -33,8 +36,9 @@ def cell_kernel(
     if free:
         offset = offset_from(locations[location], points[landmark])
         if wp.isfinite(offset):
-            cell = size * size  # close to the camera the depth matters too: these are tested whole
-            if wp.length(offset) > near_radius:
+            cell = size * size  # tested whole: close to the camera, where the depth matters, and absurdly far
+            distance = wp.length(offset)
+            if distance > near_radius and distance < FAR:
                 cell = cell_of(offset, size)
             place = wp.atomic_add(numbers, location * n_cells + cell, 1)
     places[location, landmark] = wp.vec2i(cell, place)
@@ -90,7 +94,7 @@ def entries_of(s: SortedLandmarks, location: wp.int32, run: wp.vec2i) -> wp.vec2
 
 @wp.func
 def near_entries(s: SortedLandmarks, location: wp.int32) -> wp.vec2i:
-    """The entries of the last cell, of landmarks close to the camera."""
+    """The entries of the last cell, of landmarks that each orientation tests."""
     n_cells = s.size * s.size
     return entries_of(s, location, wp.vec2i(n_cells, n_cells + 1))
 
@@ -117,7 +121,7 @@ def count_kernel(
     lanes: wp.int32,
     counts: wp.array2d[wp.int32],
 ):
-    """Several threads (lanes) share a location and an orientation."""
+    """Several threads (lanes) share a view, which is a location and an orientation."""
     location, orientation, lane = wp.tid()
     count = count_inside(landmarks, location, orientation, lane, lanes)
     left = sides[orientation, 0]
@@ -177,8 +181,9 @@ def count_field_kernel(
     unsure_offsets: wp.array[wp.vec3],
 ):
     """As `count_kernel`, by a table of the field of view; what it cannot decide is listed for the camera itself."""
-    row, orientation, lane = wp.tid()
-    location = first + row
+    row, lane = wp.tid()
+    location = (first + row) / counts.shape[1]
+    orientation = first + row - location * counts.shape[1]
     count = count_inside(landmarks, location, orientation, lane, lanes)
     runs = border_runs(landmarks, orientation)
     for run in range(runs[0], runs[1]):

@@ -57,9 +57,9 @@ def morton_codes(positions: NDArray[np.float64]) -> NDArray[np.int64]:
     codes = np.zeros(len(positions), dtype=np.int64)
     if not finite.any():
         return codes
-    low, high = positions[finite].min(0), positions[finite].max(0)
-    scale = ((1 << MORTON_BITS) - 1) / np.maximum(high - low, 1e-12)
-    cells = ((positions[finite] - low) * scale).astype(np.int64)
+    low, high = positions[finite].min(0) / 2, positions[finite].max(0) / 2  # halves: their difference is finite
+    share = (positions[finite] / 2 - low) / np.maximum(high - low, 1e-12)
+    cells = (share * ((1 << MORTON_BITS) - 1)).astype(np.int64)
     for bit in range(MORTON_BITS):
         for axis in range(3):
             codes[finite] |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)

@@ -11,13 +11,16 @@ from scipy.spatial import cKDTree
 
 from wheretolook.camera_models import ColmapCamera
 from wheretolook.geometry import Float
-from wheretolook.visibility.octahedral_map import cell_centers
+from wheretolook.visibility.octahedral_map import cell_centers, cells_of
 
 TABLE_SIZE = 1024
 """Cells along a side of the table: 0.06 to 0.19 degrees from a cell's centre to its farthest corner."""
 
 MAX_DEPTH_RAD = 0.25
 """Deeper than this is not told apart: cells of the sphere that need more are small in number."""
+
+EDGE_SAMPLES, GRID_SAMPLES = 2048, 512
+"""Pixels looked at along each edge of the image, and along each side of a grid over it."""
 
 BISECTIONS = 20
 """Halvings of the gap between neighbouring centres, of which one is seen: the border is found to 1e-8 rad."""
@@ -28,7 +31,8 @@ class FieldOfView:
     """How deep inside the field of view every direction of the camera frame lies at least.
 
     Where the table says zero the camera itself must be asked. So one table serves every camera model, and the answer
-    stays that of the model. (A hole in the field of view smaller than a cell of the table would be missed.)
+    stays that of the model. (Missed would be a hole smaller than a cell of the table, or a lobe so narrow
+    that it also falls between a grid of pixels, as only absurd distortion makes them.)
 
     Attributes:
         size: cells along a side of the octahedral map.
@@ -57,18 +61,41 @@ def _tabulate(camera: ColmapCamera, size: int) -> FieldOfView:
     neighbours = np.concatenate([*pairs, first_column, first_row])
     seen = camera.sees(centers)
     a, b = neighbours[seen[neighbours[:, 0]] != seen[neighbours[:, 1]]].T
-    sign = np.where(seen, 1.0, -1.0)
-    if len(a) == 0:
-        return FieldOfView(size, (sign * MAX_DEPTH_RAD).astype(np.float32))
     first_is_seen = seen[a]
     a, b = np.where(first_is_seen, a, b), np.where(first_is_seen, b, a)
-    border = _border_between(camera, centers[a], centers[b])
+    rays, on_edge = _rays_of_image(camera)
+    border = np.concatenate([_border_between(camera, centers[a], centers[b]), rays[on_edge]])
+    between_centers = rays[~seen[cells_of(rays, size)]]  # strips and lobes too narrow for the centres
+    if len(border):
+        chord, _ = cKDTree(border).query(between_centers)
+        between_centers = between_centers[chord > 4 * radii.max()]
+    border = np.concatenate([border, between_centers])
+    sign = np.where(seen, 1.0, -1.0)
+    if len(border) == 0:
+        return FieldOfView(size, (sign * MAX_DEPTH_RAD).astype(np.float32))
     reach = 2 * np.sin(MAX_DEPTH_RAD / 2)
     chord, _ = cKDTree(border).query(centers, distance_upper_bound=reach, workers=-1)
     angle = 2 * np.arcsin(np.minimum(chord, reach) / 2)
-    # A cell's points are within its radius of its centre. Points found on the border are at most a cell apart.
-    certain = np.maximum(angle - radii - radii.max(), 0)
+    # A cell's points are within its radius of its centre; points on the border are at most a cell (of about this size)
+    # apart, so that the border passes within a radius of one of them. The rest is room to spare.
+    certain = np.maximum(angle - 2.5 * radii, 0)
     return FieldOfView(size, (sign * certain).astype(np.float32))
+
+
+def _rays_of_image(camera: ColmapCamera) -> tuple[Float, NDArray[np.bool_]]:
+    """Unit rays (n, 3) of pixels on a grid over the image that the camera does see, and which lie on its edge."""
+    side = np.linspace(1e-9, 1 - 1e-9, EDGE_SAMPLES)
+    x, y = (
+        part.ravel()
+        for part in np.meshgrid(side[:: EDGE_SAMPLES // GRID_SAMPLES], side[:: EDGE_SAMPLES // GRID_SAMPLES])
+    )
+    ends = np.full(EDGE_SAMPLES, side[0]), np.full(EDGE_SAMPLES, side[-1])
+    x = np.concatenate([x, side, side, *ends]) * camera.width
+    y = np.concatenate([y, *ends, side, side]) * camera.height
+    rays = camera.unproject(np.column_stack([x, y]))
+    on_edge = np.arange(len(rays)) >= len(rays) - 4 * EDGE_SAMPLES
+    seen = camera.sees(rays)
+    return rays[seen], on_edge[seen]
 
 
 def _border_between(camera: ColmapCamera, seen: Float, unseen: Float) -> Float:

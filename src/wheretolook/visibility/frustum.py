@@ -105,7 +105,7 @@ def in_view(camera: Camera, rotations: ArrayLike, offsets: NDArray[np.float32]) 
     """
     with np.errstate(invalid="ignore"):
         if isinstance(camera, ColmapCamera):
-            return camera.sees(rotate(np.asarray(rotations, dtype=np.float32)[:, None], offsets))
+            return np.stack([camera.sees(rotate(one, offsets)) for one in np.asarray(rotations, dtype=np.float32)])
         seen = np.empty((len(np.asarray(rotations)), len(offsets)), dtype=np.bool_)
         finite, columns = np.isfinite(offsets).all(-1), np.ascontiguousarray(offsets.T)
         for row, sides in enumerate(frustum_sides(camera, rotations)):

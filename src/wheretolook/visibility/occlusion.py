@@ -15,7 +15,7 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from wheretolook.errors import SceneError, TableError
+from wheretolook.errors import ConfigError, MapError, SceneError, TableError
 from wheretolook.geometry import Float
 from wheretolook.grid import fibonacci_sphere
 from wheretolook.visibility.device_points import DevicePoints
@@ -35,7 +35,14 @@ class OcclusionModel(ABC):
     """Tells which landmarks nothing stands in front of.
 
     Callers ask for as many locations at once as their memory allows, so a model need not divide its work.
+
+    Attributes:
+        name: of the model, as in `OcclusionConfig`.
+        uses_all_cores: whether `unoccluded` occupies all cores of a CPU by itself.
     """
+
+    name: str = "custom"
+    uses_all_cores: bool = False
 
     @abstractmethod
     def unoccluded(self, locations: Float, points: Float) -> NDArray[np.bool_]:
@@ -53,12 +60,15 @@ class OcclusionModel(ABC):
         """Whether locations (L, 3) m lie inside geometry, where no camera can be; (L,). False where nothing tells."""
         return np.zeros(len(locations), dtype=bool)
 
-    def check_locations(self, locations: Float) -> None:
-        """Refuse locations (L, 3) m where no camera can be, before any long work.
+    def check(self, locations: Float, points: Float) -> None:
+        """Refuse what cannot be answered for locations (L, 3) m and points (N, 3) m, before any long work.
 
         Raises:
             SceneError: a location is not finite, or lies inside geometry; names the first.
+            MapError: there are no landmarks.
         """
+        if len(points) == 0:
+            raise MapError("the map has no landmarks", value=0, fix="Map the scene with more or sharper images.")
         at = np.asarray(locations, dtype=np.float64).reshape(-1, 3)
         finite = np.isfinite(at).all(axis=-1)
         if not finite.all():
@@ -74,6 +84,8 @@ class OcclusionModel(ABC):
 
 class NoOcclusion(OcclusionModel):
     """Sees through walls: every landmark has a free line of sight, as in the paper's released code."""
+
+    name = "none"
 
     def unoccluded(self, locations: Float, points: Float) -> NDArray[np.bool_]:
         """All True, (L, N)."""
@@ -91,9 +103,16 @@ class MeshOcclusion(OcclusionModel):
         margin_m: a surface this close in front of a landmark is the landmark's own.
         two_sided: whether the backs of triangles are surfaces too. If not, a location that sees mostly backs lies
             inside geometry (`FreeSpace` finds out which it is).
+
+    Raises:
+        ConfigError: the margin is negative or not finite.
     """
 
+    name = "mesh"
+
     def __init__(self, raycaster: MeshRaycaster, margin_m: float = 0.05, two_sided: bool = True) -> None:
+        if not 0 <= margin_m < np.inf:
+            raise ConfigError("the margin must be a distance of at least 0 m", value=margin_m)
         self.raycaster, self.margin_m, self.two_sided = raycaster, margin_m, two_sided
 
     def unoccluded(self, locations: Float, points: Float) -> NDArray[np.bool_]:
@@ -131,15 +150,15 @@ class StoredOcclusion(OcclusionModel):
 
     def __init__(self, locations: ArrayLike, packed: NDArray[np.uint8], n_landmarks: int, model: str = "mesh") -> None:
         self.locations = np.asarray(locations, dtype=np.float64)
-        self.packed, self.n_landmarks, self.model = packed, n_landmarks, model
+        self.packed, self.n_landmarks, self.name = packed, n_landmarks, model
         if packed.shape != (len(self.locations), (n_landmarks + 7) // 8):
             raise ValueError(f"{packed.shape} bytes for {len(self.locations)} locations and {n_landmarks} landmarks")
         self._tree = cKDTree(self.locations)
 
     @classmethod
-    def from_mask(cls, locations: ArrayLike, mask: NDArray[np.bool_]) -> StoredOcclusion:
+    def from_mask(cls, locations: ArrayLike, mask: NDArray[np.bool_], model: str = "mesh") -> StoredOcclusion:
         """From a dense mask (L, N), True where the line of sight is free."""
-        return cls(locations, np.packbits(mask, axis=1), mask.shape[1])
+        return cls(locations, np.packbits(mask, axis=1), mask.shape[1], model)
 
     @property
     def mask(self) -> NDArray[np.bool_]:
@@ -175,7 +194,7 @@ class StoredOcclusion(OcclusionModel):
         partial = path.with_name(path.name + ".partial")
         with open(partial, "wb") as file:
             np.savez_compressed(
-                file, locations=self.locations, mask=self.packed, n_landmarks=self.n_landmarks, model=self.model
+                file, locations=self.locations, mask=self.packed, n_landmarks=self.n_landmarks, model=self.name
             )
         os.replace(partial, path)
 

@@ -64,9 +64,9 @@ def count_pixels_kernel(
     counts: wp.array2d[wp.int32],
 ):
     """As `count_kernel`, but a landmark counts only if it is the first to reach its pixel."""
-    row, orientation, lane = wp.tid()
-    location = first + row
-    view = row * axes.shape[0] + orientation
+    view, lane = wp.tid()
+    location = (first + view) / axes.shape[0]
+    orientation = first + view - location * axes.shape[0]
     axis = axes[orientation]
     count = wp.int32(0)
     runs = inside_runs(landmarks, orientation)

@@ -51,7 +51,7 @@ def classify_pinhole_kernel(
         b = wp.dot(normal, corners[corner + 1])
         c = wp.dot(normal, corners[corner + size + 1])
         d = wp.dot(normal, corners[corner + size + 2])
-        if wp.min(wp.min(a, b), wp.min(c, d)) < margin:
+        if not (wp.min(wp.min(a, b), wp.min(c, d)) >= margin):
             inside = False
         if wp.max(wp.max(a, b), wp.max(c, d)) < -margin:
             outside = True

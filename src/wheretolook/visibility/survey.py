@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -14,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
 from wheretolook.camera_models import Camera
-from wheretolook.errors import ConfigError, MapError, SceneError
+from wheretolook.errors import ConfigError, SceneError
 from wheretolook.visibility.counting import FrustumCounter
 from wheretolook.visibility.counting_kernel import pack_kernel
 from wheretolook.visibility.device_points import DevicePoints
@@ -72,39 +71,47 @@ def survey(
         device: "cpu" or a CUDA device.
         threads: threads on a CPU, 0 for all cores.
         memory_bytes: bound on what the blocks in work take on the device.
-        counter: of the same camera and rotations, to use again; it may stand for these and `distinct_pixels`.
+        counter: of the same camera, rotations and rule, to use again.
         progress: text of a progress bar; None shows none.
 
     Raises:
         MapError: there are no landmarks.
         SceneError: there are no locations, one is not finite, or lies inside geometry as far as the occlusion model can
             tell.
-        ConfigError: a single location takes more memory than allowed.
+        ConfigError: a single location takes more memory than allowed, or the counter is another's.
     """
     at = np.asarray(locations, dtype=np.float64).reshape(-1, 3)
-    n_points = len(points) if isinstance(points, DevicePoints) else len(np.asarray(points).reshape(-1, 3))
-    if n_points == 0:
-        raise MapError("the map has no landmarks", value=0, fix="Map the scene with more or sharper images.")
     if len(at) == 0:
         raise SceneError("there are no locations to look from", value=0, fix="Refine the grid or check the bounds.")
-    occlusion.check_locations(at)
-    landmarks = points if isinstance(points, DevicePoints) else DevicePoints(points, device)
-    counter = counter or FrustumCounter(
-        camera, np.asarray(rotations), n_points, landmarks.device, distinct_pixels=distinct_pixels
-    )
+    if keep < 0 or threads < 0:
+        raise ConfigError("keep and threads must not be negative", value=(keep, threads))
+    positions = points.positions if isinstance(points, DevicePoints) else np.asarray(points, np.float64).reshape(-1, 3)
+    occlusion.check(at, positions)
+    landmarks = points if isinstance(points, DevicePoints) else DevicePoints(positions, device)
+    n_points = len(landmarks)
+    on_gpu = wp.get_device(landmarks.device).is_cuda
+    workers = 1 if on_gpu or occlusion.uses_all_cores else (threads or len(os.sched_getaffinity(0)))
+    if counter is None:
+        scratch = max(1, memory_bytes // (4 * workers))
+        counter = FrustumCounter(
+            camera, np.asarray(rotations), n_points, landmarks.device, distinct_pixels, scratch_bytes=scratch
+        )
+    elif not counter.serves(camera, np.asarray(rotations), distinct_pixels, landmarks.device):
+        raise ConfigError("the counter is of another camera, other rotations, another rule or another device")
     n_directions = len(counter.rotations)
     keep = min(keep or n_directions, n_directions)
-    on_gpu = wp.get_device(landmarks.device).is_cuda
-    workers = 1 if on_gpu else (threads or len(os.sched_getaffinity(0)))
     per_location = counter.bytes_per_location(n_points) + n_points  # and its mask
-    if per_location > memory_bytes:
+    least = per_location + counter.fixed_bytes
+    if least > memory_bytes:
         raise ConfigError(
-            f"one location with {n_points:,} landmarks takes {per_location / 1e9:.1f} GB",
-            value=memory_bytes, fix=f"Allow at least {per_location} bytes.",
+            f"one location with {n_points:,} landmarks takes {least:,} bytes", value=memory_bytes,
+            fix=f"Allow at least {least} bytes.",
         )  # fmt: skip
-    block = max(1, min(memory_bytes if on_gpu else CPU_BLOCK_BYTES, memory_bytes // workers) // per_location)
-    block = min(block, counter.max_locations(n_points))
-    workers = min(workers, memory_bytes // per_location, -(-len(at) // block))
+    workers = min(workers, memory_bytes // least)
+    share = memory_bytes // workers - counter.fixed_bytes
+    if not on_gpu and not occlusion.uses_all_cores:
+        share = min(share, CPU_BLOCK_BYTES)
+    block = min(max(1, share // per_location), counter.max_locations(n_points), -(-len(at) // workers))
 
     counts = np.empty((len(at), n_directions), dtype=np.int32)
     best = np.empty((len(at), keep), dtype=np.int32)
@@ -120,26 +127,18 @@ def survey(
         return rows.stop - rows.start
 
     blocks = [slice(start, min(start + block, len(at))) for start in range(0, len(at), block)]
-    with tqdm(total=len(at), desc=progress, unit="location", disable=progress is None) as bar:
-        for done in _in_threads(work, blocks, workers):
-            bar.update(done)
-    if keep_occlusion and n_points % 8:
-        packed[:, -1] &= np.uint8((0xFF00 >> (n_points % 8)) & 0xFF)
-    return Survey(counts, best, StoredOcclusion(at, packed, n_points) if keep_occlusion else None)
-
-
-def _in_threads(work: Any, blocks: list[slice], workers: int) -> Iterator[int]:
-    """Warp lets go of Python's lock while a kernel runs, so that threads run kernels on several cores."""
-    yield work(blocks[0])  # loads the kernels, which only one thread may do
-    if workers == 1:
-        yield from map(work, blocks[1:])
-        return
-    with ThreadPoolExecutor(workers) as pool:
+    bar = tqdm(total=len(at), desc=progress, unit="location", disable=progress is None)
+    # Warp lets go of Python's lock while a kernel runs, so that threads run kernels on several cores.
+    with bar, ThreadPoolExecutor(workers) as pool:
         try:
-            yield from pool.map(work, blocks[1:])
+            for done in pool.map(work, blocks):
+                bar.update(done)
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
+    if keep_occlusion and n_points % 8:
+        packed[:, -1] &= np.uint8((0xFF00 >> (n_points % 8)) & 0xFF)
+    return Survey(counts, best, StoredOcclusion(at, packed, n_points, occlusion.name) if keep_occlusion else None)
 
 
 def _best(counts: Any, keep: int, on_gpu: bool) -> NDArray[np.int32]:

@@ -18,8 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
+from wheretolook.camera_models import Camera
 from wheretolook.errors import ConfigError, SceneError
-from wheretolook.geometry import Float, PinholeCamera
+from wheretolook.geometry import Float
 from wheretolook.grid import fibonacci_sphere
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.scenes.mesh import TexturedMesh
@@ -83,18 +84,20 @@ class DepthImage:
 
     Attributes:
         depth_m: (H, W) floats, metres along the optical axis; 0, negative, NaN and infinite mean no reading.
-        camera: intrinsics.
+        camera: intrinsics: a pinhole, or a COLMAP camera of the model SIMPLE_PINHOLE or PINHOLE.
         cam_from_world: (3, 4).
 
     Raises:
-        ConfigError: the image has another size than the camera or holds integers, or the pose is no rigid transform.
+        ConfigError: the image has another size than the camera or holds integers, the camera has distortion, or the
+            pose is no rigid transform.
     """
 
     depth_m: NDArray[Any]
-    camera: PinholeCamera
+    camera: Camera
     cam_from_world: Float
 
     def __post_init__(self) -> None:
+        _ = self.camera.matrix  # a camera with distortion has none
         expected = (self.camera.height, self.camera.width)
         if np.shape(self.depth_m) != expected:
             raise ConfigError(
@@ -131,8 +134,8 @@ class DepthImage:
         depth = self.readings(max_depth_m, stride)
         row, column = np.nonzero(depth)
         z = depth[row, column].astype(np.float64)
-        x, y = (column * stride + 0.5 - self.camera.cx), (row * stride + 0.5 - self.camera.cy)
-        in_camera = np.column_stack([x * z / self.camera.focal_px, y * z / self.camera.focal_px, z])
+        pixels = np.column_stack([column * stride + 0.5, row * stride + 0.5, np.ones(len(z))])
+        in_camera = pixels @ np.linalg.inv(self.camera.matrix).T * z[:, None]
         pose = np.asarray(self.cam_from_world, dtype=np.float64)
         return (in_camera - pose[:, 3]) @ pose[:, :3]
 
@@ -236,6 +239,8 @@ class TsdfVolume:
         values -= shift
         try:
             mesh = self._grid.extract_triangle_mesh(0.5, -1)  # all voxels with at least one reading
+        except RuntimeError:  # Open3D cannot colour a mesh without vertices
+            raise nothing from None
         finally:
             values += shift
         if "indices" not in mesh.triangle or len(mesh.triangle.indices) == 0:
@@ -265,9 +270,9 @@ class TsdfOcclusion(MeshOcclusion):
         SceneError: the depth images show no surface.
     """
 
+    name = "tsdf"
+
     def __init__(self, volume: TsdfVolume, margin_m: float = 0.05, device: str = "cpu") -> None:
-        if not 0 <= margin_m < np.inf:
-            raise ConfigError("the margin must be a distance of at least 0 m", value=margin_m)
         super().__init__(MeshRaycaster(volume.surface(), device), margin_m)
         self._too_close_m = volume.config.voxel_size_m / 2
 

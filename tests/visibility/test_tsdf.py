@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from box_scenes import box_quads, quads_mesh, random_texture
+from wheretolook.camera_models import ColmapCamera
 from wheretolook.errors import ConfigError, SceneError
 from wheretolook.geometry import PinholeCamera, poses_looking_along
 from wheretolook.rendering import MeshRaycaster
@@ -172,6 +173,27 @@ def test_a_location_inside_geometry_is_refused(occlusion: TsdfOcclusion) -> None
         with pytest.raises(SceneError, match=r"inside geometry|not finite") as caught:
             occlusion.check(np.vstack([free, location]), free)
         assert repr(tuple(np.float64(location).tolist())) in str(caught.value)
+
+
+def test_a_depth_camera_may_have_two_focal_lengths_and_its_own_centre() -> None:
+    depth, pose = np.random.default_rng(0).uniform(1, 2, (240, 320)), np.eye(4)[:3]
+    camera = ColmapCamera("PINHOLE", 320, 240, (200.0, 210.0, 155.0, 118.0))
+    points = DepthImage(depth, camera, pose).points(10.0)
+    rows, columns = np.divmod(np.arange(320 * 240), 320)
+    np.testing.assert_allclose(camera.project(points), np.column_stack([columns + 0.5, rows + 0.5]), atol=1e-4)
+    np.testing.assert_allclose(points[:, 2], depth.ravel(), rtol=1e-6)
+    same = ColmapCamera("SIMPLE_PINHOLE", 320, 240, (CAMERA.focal_px, CAMERA.cx, CAMERA.cy))
+    assert (CAMERA.width, CAMERA.height) == (320, 240)
+    np.testing.assert_allclose(DepthImage(depth, same, pose).points(10.0), DepthImage(depth, CAMERA, pose).points(10.0))
+    with pytest.raises(ConfigError, match=r"no intrinsic matrix.*RADIAL"):
+        DepthImage(depth, ColmapCamera("RADIAL", 320, 240, (200.0, 160.0, 120.0, 0.1, 0.0)), pose)
+
+
+def test_voxels_larger_than_the_scene_show_no_surface(images: list[DepthImage]) -> None:
+    with pytest.raises(SceneError, match="no surface"):
+        TsdfOcclusion(
+            TsdfVolume.from_images(images[:20], TsdfConfig(voxel_size_m=20.0, max_depth_m=20.0), progress=False)
+        )
 
 
 def test_a_depth_image_must_fit_its_camera() -> None:

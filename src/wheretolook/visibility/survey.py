@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -112,6 +113,8 @@ def survey(
     if not on_gpu and not occlusion.uses_all_cores:
         share = min(share, CPU_BLOCK_BYTES)
     block = min(max(1, share // per_location), counter.max_locations(n_points), -(-len(at) // workers))
+    if occlusion.uses_all_cores:
+        block = min(block, 16 * len(os.sched_getaffinity(0)))  # enough for all cores, and the progress bar moves
 
     counts = np.empty((len(at), n_directions), dtype=np.int32)
     best = np.empty((len(at), keep), dtype=np.int32)
@@ -127,18 +130,25 @@ def survey(
         return rows.stop - rows.start
 
     blocks = [slice(start, min(start + block, len(at))) for start in range(0, len(at), block)]
-    bar = tqdm(total=len(at), desc=progress, unit="location", disable=progress is None)
-    # Warp lets go of Python's lock while a kernel runs, so that threads run kernels on several cores.
-    with bar, ThreadPoolExecutor(workers) as pool:
-        try:
-            for done in pool.map(work, blocks):
-                bar.update(done)
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
+    with tqdm(total=len(at), desc=progress, unit="location", disable=progress is None) as bar:
+        for done in _each(work, blocks, workers):
+            bar.update(done)
     if keep_occlusion and n_points % 8:
         packed[:, -1] &= np.uint8((0xFF00 >> (n_points % 8)) & 0xFF)
     return Survey(counts, best, StoredOcclusion(at, packed, n_points, occlusion.name) if keep_occlusion else None)
+
+
+def _each(work: Callable[[slice], int], blocks: list[slice], workers: int) -> Iterator[int]:
+    """Results of all blocks. Warp lets go of Python's lock while a kernel runs, so that threads use several cores."""
+    if workers == 1:
+        yield from map(work, blocks)
+        return
+    with ThreadPoolExecutor(workers) as pool:
+        try:
+            yield from pool.map(work, blocks)
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
 
 
 def _best(counts: Any, keep: int, on_gpu: bool) -> NDArray[np.int32]:

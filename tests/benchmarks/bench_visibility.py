@@ -315,6 +315,7 @@ def draw(args: argparse.Namespace) -> None:
     sizes = pd.DataFrame([{**row, **result["machine"]} for result in results for row in result.get("paper_size", [])])
     growth = pd.DataFrame([{**row, **result["machine"]} for result in results for row in result.get("scaling", [])])
     folder = Path(args.figures)
+    folder.mkdir(parents=True, exist_ok=True)
     figures = {"runtimes.png": runtime_figure(sizes)}
     if len(growth):
         figures["visibility-scaling.png"] = scaling_figure(growth)
@@ -323,12 +324,17 @@ def draw(args: argparse.Namespace) -> None:
     if args.log:
         from wheretolook.tracking import TrackingConfig, log, start_run
 
-        tracking = TrackingConfig()
-        with start_run(tracking, "visibility runtimes", "benchmark") as run:
-            tables = {"runtimes.csv": sizes, "scaling.csv": growth}
+        tables = {"runtimes.csv": sizes, "scaling.csv": growth}
+        metrics = {}
+        for row in sizes.dropna(subset="median_s").to_dict("records"):
+            name = f"{row['what']} {row['device'].split(':')[0]} {row['threads']} threads s"
+            metrics["".join(letter for letter in name if letter.isalnum() or letter == " ")] = row["median_s"]
+        with start_run(TrackingConfig(), "visibility runtimes", "benchmark") as (client, run):
+            log(client, run, metrics=metrics)
             for name, table in tables.items():
                 table.to_csv(folder / name, index=False)
-            log(tracking, run, artifacts=[folder / name for name in (*figures, *tables)])
+            for name in (*figures, *tables):
+                client.log_artifact(run, str(folder / name))
 
 
 def main() -> None:

@@ -166,12 +166,10 @@ def test_viewpoints_can_be_sampled_with_every_occlusion_model(copy: Path, model:
     assert stored.name == model
     if model == "none":
         assert stored.mask.all() and not by_mesh.mask.all()
-    same = [row for row in stored.locations if (by_mesh.locations == row).all(1).any()]
-    assert len(same) >= 3
-    points = np.empty((by_mesh.n_landmarks, 3))
-    agreement = MaskAgreement.between(
-        stored.unoccluded(np.array(same), points), by_mesh.unoccluded(np.array(same), points)
-    )
+    exact = LocalizationMap.from_colmap(scene.map, mesh=scene.mesh)
+    truth = exact.occlusion.unoccluded(stored.locations, exact.landmarks.points)
+    agreement = MaskAgreement.between(stored.mask, truth)
+    assert agreement.precision > truth.mean() + {"tsdf": 0.3, "hidden-points": 0.03, "none": -1e-9}[model]
     assert agreement.recall > {"tsdf": 0.9, "hidden-points": 0.6, "none": 0.999}[model]
 
 

@@ -101,7 +101,7 @@ class ColmapCamera:
         Raises:
             ConfigError: the model has distortion.
         """
-        if not self._camera.is_perspective_pinhole():
+        if self.model not in ("SIMPLE_PINHOLE", "PINHOLE"):
             raise ConfigError(
                 "a camera with distortion has no intrinsic matrix", value=self.model,
                 fix="Undistort the images, for instance with COLMAP's image_undistorter.",

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.errors import ConfigError, MapError
-from wheretolook.geometry import Float, PinholeCamera
+from wheretolook.geometry import Float, PinholeCamera, in_image
 
 if TYPE_CHECKING:
     import pycolmap
@@ -138,8 +138,7 @@ class ColmapCamera:
 
     def in_image(self, pixels: ArrayLike) -> NDArray[np.bool_]:
         """Whether pixels (..., 2) lie in the image: 0 <= x < width and 0 <= y < height. NaN is outside."""
-        x, y = np.moveaxis(np.asarray(pixels), -1, 0)
-        return (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
+        return in_image(pixels, self.width, self.height)
 
     def sees(self, points_cam: ArrayLike) -> NDArray[np.bool_]:
         """Whether points (..., 3) of the camera frame fall into the image."""

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from wheretolook.camera_models import Camera, ColmapCamera
 from wheretolook.errors import ConfigError
 from wheretolook.features_kernel import bin_kernel
-from wheretolook.geometry import Float
+from wheretolook.geometry import Float, split_poses
 from wheretolook.visibility.frustum import (
     MIN_DEPTH_M,
     VisibleSets,
@@ -26,7 +26,6 @@ from wheretolook.visibility.frustum import (
     offsets_from,
     pixels_of,
     rotate,
-    split_poses,
 )
 from wheretolook.warp_setup import start_warp
 

@@ -7,10 +7,9 @@ from __future__ import annotations
 
 import warp as wp
 
-from wheretolook.visibility.frustum_kernel import dot, in_view, offset_from
+from wheretolook.visibility.frustum_kernel import dot, in_view, offset_from, pixel_of
 
-# A fused multiply-add rounds once where NumPy rounds twice, which moves a landmark on a bin's edge to the next bin.
-wp.set_module_options({"fuse_fp": False})
+wp.set_module_options({"fuse_fp": False})  # for `pixel_of`
 
 
 @wp.kernel
@@ -39,20 +38,16 @@ def bin_kernel(
     for entry in range(starts[location], starts[location + 1]):
         offset = offset_from(center, points[indices[entry]])
         if in_view(sides, view, offset, min_depth):
-            x = dot(rotation[0], offset)
-            y = dot(rotation[1], offset)
-            z = dot(rotation[2], offset)
-            u = focal * (x / z) + cx
-            v = focal * (y / z) + cy
-            column = wp.clamp(wp.int32(u * columns_per_pixel), 0, bins - 1)
-            row = wp.clamp(wp.int32(v * rows_per_pixel), 0, bins - 1)
+            pixel = pixel_of(rotation, offset, focal, cx, cy)
+            column = wp.clamp(wp.int32(pixel[0] * columns_per_pixel), 0, bins - 1)
+            row = wp.clamp(wp.int32(pixel[1] * rows_per_pixel), 0, bins - 1)
             cell = row * bins + column
             counts[view, cell] = counts[view, cell] + 1
-            means[view, 0, cell] = means[view, 0, cell] + wp.float32(u)
-            means[view, 1, cell] = means[view, 1, cell] + wp.float32(v)
-            means[view, 2, cell] = means[view, 2, cell] + wp.float32(x)
-            means[view, 3, cell] = means[view, 3, cell] + wp.float32(y)
-            means[view, 4, cell] = means[view, 4, cell] + wp.float32(z)
+            means[view, 0, cell] = means[view, 0, cell] + wp.float32(pixel[0])
+            means[view, 1, cell] = means[view, 1, cell] + wp.float32(pixel[1])
+            means[view, 2, cell] = means[view, 2, cell] + wp.float32(dot(rotation[0], offset))
+            means[view, 3, cell] = means[view, 3, cell] + wp.float32(dot(rotation[1], offset))
+            means[view, 4, cell] = means[view, 4, cell] + wp.float32(dot(rotation[2], offset))
     for cell in range(bins * bins):
         if counts[view, cell] > 1:
             scale = 1.0 / wp.float32(counts[view, cell])

@@ -68,8 +68,13 @@ class PinholeCamera:
 
     def in_image(self, pixels: ArrayLike) -> NDArray[np.bool_]:
         """Whether pixels (..., 2) lie in the image: 0 <= x < width and 0 <= y < height. NaN is outside."""
-        x, y = np.moveaxis(np.asarray(pixels), -1, 0)
-        return (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
+        return in_image(pixels, self.width, self.height)
+
+
+def in_image(pixels: ArrayLike, width: int, height: int) -> NDArray[np.bool_]:
+    """Whether pixels (..., 2) lie in an image: 0 <= x < width and 0 <= y < height. NaN is outside."""
+    x, y = np.moveaxis(np.asarray(pixels), -1, 0)
+    return (x >= 0) & (x < width) & (y >= 0) & (y < height)
 
 
 def transform(cam_from_world: ArrayLike, points: ArrayLike) -> Float:
@@ -88,6 +93,12 @@ def invert_poses(poses: ArrayLike) -> Float:
 def camera_centers(cam_from_world: ArrayLike) -> Float:
     """Camera centres in the world, (..., 3) metres, of poses (..., 3, 4)."""
     return invert_poses(cam_from_world)[..., 3]
+
+
+def split_poses(cam_from_world: ArrayLike) -> tuple[Float, Float]:
+    """Rotations (..., 3, 3) and camera centres (..., 3) in metres of cam_from_world poses (..., 3, 4)."""
+    poses = np.asarray(cam_from_world, dtype=np.float64)
+    return poses[..., :3], camera_centers(poses)
 
 
 def rotation_looking_along(directions: ArrayLike) -> Float:

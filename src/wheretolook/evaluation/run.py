@@ -26,7 +26,6 @@ from wheretolook.scene_occlusion import scene_occlusion
 from wheretolook.scoring import Scorer, make_scorer
 from wheretolook.table import fingerprint, is_good, poses
 from wheretolook.tracking import TrackingConfig, log, start_run
-from wheretolook.visibility import StoredOcclusion
 from wheretolook.visibility.config import OcclusionConfig
 
 if TYPE_CHECKING:
@@ -83,9 +82,9 @@ def evaluate(
     parts = []
     for name in config.occlusions or (None,):
         model = None if name is None else replace(occlusion, model=name)
-        scores = _score_scenes(dataset, scenes, tables, config, weights, device, progress, model)
+        scores, used = _score_scenes(dataset, scenes, tables, config, weights, device, progress, model)
         part = score_table(views, scores, [scene.name for scene in scenes], config)
-        part.insert(2, "occlusion", name or _stored_model(scenes))
+        part.insert(2, "occlusion", used)
         parts.append(part)
     table = pd.concat(parts, ignore_index=True)
     _write_results(dataset.root / "results", table, f"Localization score on {dataset.name}")
@@ -93,10 +92,6 @@ def evaluate(
     if progress:
         print(score_markdown(table, f"Localization score on {dataset.name}"))
     return table
-
-
-def _stored_model(scenes: Sequence[SceneFolder]) -> str:
-    return " ".join(sorted({StoredOcclusion.load(scene.occlusion).name for scene in scenes}))
 
 
 def _weights(dataset: Dataset, config: EvaluateConfig, models: Sequence[TrainedModel | Path] | None) -> list[Path]:
@@ -179,19 +174,21 @@ def _score_scenes(
     device: str,
     progress: bool,
     occlusion: OcclusionConfig | None,
-) -> dict[Method, Float]:
-    """Scores (B,) of every method over all scenes. Views are binned once for all methods.
+) -> tuple[dict[Method, Float], str]:
+    """Scores (B,) of every method over all scenes, and the occlusion model's name. Views are binned once for all.
 
     Without an occlusion model the one that is stored with the sampled locations serves.
     """
     scores: dict[Method, list[Float]] = {}
+    used: set[str] = set()
     text = "score views" if occlusion is None else f"score views, {occlusion.model}"
     with tqdm(total=sum(map(len, tables)), desc=text, unit="view", disable=not progress) as bar:
         for scene, table in zip(scenes, tables, strict=True):
             localization_map = scene.localization_map(dataset.camera, device)
             if occlusion is not None:
-                model = scene_occlusion(scene, dataset.camera, occlusion, device, progress=False)
+                model = scene_occlusion(scene, dataset.camera, occlusion, device, progress=progress)
                 localization_map = replace(localization_map, occlusion=model)
+            used.add(localization_map.occlusion.name)
             scorers = _scorers(localization_map, config, weights)
             cam_from_world = poses(table)
             for begin in range(0, len(table), BLOCK):
@@ -200,7 +197,7 @@ def _score_scenes(
                 for method, scorer in scorers.items():
                     scores.setdefault(method, []).append(scorer.score_binned(block, binned))
                 bar.update(len(block))
-    return {method: np.concatenate(parts) for method, parts in scores.items()}
+    return {method: np.concatenate(parts) for method, parts in scores.items()}, " ".join(sorted(used))
 
 
 def _scorers(

@@ -7,6 +7,7 @@ from math import inf
 from typing import Literal, get_args
 
 from wheretolook.errors import ConfigError
+from wheretolook.visibility.hidden_points import DEFAULT_RADIUS
 
 OcclusionName = Literal["mesh", "tsdf", "hidden-points", "none"]
 OCCLUSION_NAMES: tuple[str, ...] = get_args(OcclusionName)
@@ -28,7 +29,7 @@ class OcclusionConfig:
 
     model: OcclusionName = "mesh"
     margin_m: float = 0.05
-    radius: float = 50.0
+    radius: float = DEFAULT_RADIUS
     voxel_m: float = 0.02
     max_depth_m: float = 10.0
 

@@ -92,7 +92,7 @@ class FrustumCounter:
         self._field = FieldOfView.of(camera) if isinstance(camera, ColmapCamera) and not on_host else None
         self.size = size or choose_size(n_points)
         if not on_host:
-            self.cells = SphereCells.of(camera, rotations, self.size, self.device, self._field)
+            self.cells = SphereCells.of(camera, rotations, self.size, self.device)
         self._axes: Any = wp.array(self.rotations, dtype=wp.mat33, device=self.device)
         self._near = 0.0
         if isinstance(camera, PinholeCamera):

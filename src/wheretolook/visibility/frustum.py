@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.camera_models import Camera, ColmapCamera
 from wheretolook.errors import ConfigError
-from wheretolook.geometry import Float, PinholeCamera, camera_centers
+from wheretolook.geometry import Float, PinholeCamera, split_poses
 from wheretolook.visibility.frustum_kernel import collect_kernel
 from wheretolook.warp_setup import start_warp
 
@@ -194,9 +194,3 @@ def visible_landmarks_plain(
         sets.append(candidates[in_view(camera, rotation[None], offsets_from(center, points[candidates]))[0]])
     lengths = np.array([len(rows) for rows in sets], dtype=np.int64)
     return VisibleSets(_starts(lengths), np.concatenate([np.empty(0, np.int32), *sets]))
-
-
-def split_poses(cam_from_world: ArrayLike) -> tuple[Float, Float]:
-    """Rotations (B, 3, 3) and camera centres (B, 3) m of cam_from_world poses (B, 3, 4)."""
-    poses = np.asarray(cam_from_world, dtype=np.float64)
-    return poses[..., :3], camera_centers(poses)

@@ -46,6 +46,17 @@ def in_view(sides: wp.array2d[wp.vec3], row: wp.int32, offset: wp.vec3, min_dept
     )
 
 
+@wp.func
+def pixel_of(axes: wp.mat33, offset: wp.vec3, focal: wp.float64, cx: wp.float64, cy: wp.float64) -> wp.vec2d:
+    """Pixel coordinates; `axes` are the camera's in the world, the rows of cam_from_world.
+
+    Only in modules that do not fuse multiply and add: fused, it rounds once where NumPy rounds twice, which moves a
+    landmark on the edge of a pixel or a bin to the next.
+    """
+    depth = dot(axes[2], offset)
+    return wp.vec2d(focal * (dot(axes[0], offset) / depth) + cx, focal * (dot(axes[1], offset) / depth) + cy)
+
+
 @wp.kernel
 def collect_kernel(
     sides: wp.array2d[wp.vec3],

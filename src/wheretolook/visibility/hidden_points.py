@@ -178,8 +178,6 @@ def _missing_axes(directions: Float) -> Float:
 
 
 def _check_landmarks(points: Float) -> None:
-    if len(points) == 0:
-        raise MapError("the map has no landmarks", value=0, fix="Map the scene with more images or texture.")
     bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
     if len(bad):
         raise MapError(

@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 MATCH_M = 1e-4
 """Locations closer than this are taken for the same stored location."""
 
-
 ON_SURFACE_M = 1e-3
 """A location this close to a triangle is on it."""
 
@@ -130,11 +129,16 @@ class MeshOcclusion(OcclusionModel):
         at = np.asarray(locations, dtype=np.float64).reshape(-1, 3)
         inside = self.raycaster.distance_to_surface(at, ON_SURFACE_M) <= ON_SURFACE_M
         if not self.two_sided:
-            around = fibonacci_sphere(32)
-            hits = self.raycaster.cast(np.repeat(at, len(around), axis=0), np.tile(around, (len(at), 1)))
-            backs = (np.isfinite(hits.distance_m) & ~hits.front).reshape(-1, len(around))
+            _, backs = self._sides_around(at)
             inside |= backs.mean(1) > 0.5
         return np.asarray(inside)
+
+    def _sides_around(self, locations: Float) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Which of 32 rays around each location (L, 3) m meet a front first, and which a back; each (L, 32)."""
+        around = fibonacci_sphere(32)
+        hits = self.raycaster.cast(np.repeat(locations, len(around), axis=0), np.tile(around, (len(locations), 1)))
+        hit = np.isfinite(hits.distance_m)
+        return (hit & hits.front).reshape(-1, len(around)), (hit & ~hits.front).reshape(-1, len(around))
 
 
 class StoredOcclusion(OcclusionModel):

@@ -14,14 +14,13 @@ from wheretolook.visibility.counting_kernel import (
     inside_runs,
     near_entries,
 )
-from wheretolook.visibility.frustum_kernel import dot, in_view
+from wheretolook.visibility.frustum_kernel import in_view, pixel_of
 
-# A fused multiply-add rounds once where NumPy rounds twice, which moves a landmark on a pixel's edge to the next pixel.
-wp.set_module_options({"fuse_fp": False})
+wp.set_module_options({"fuse_fp": False})  # for `pixel_of`
 
 
 @wp.func
-def pixel_of(
+def pixel_number(
     axes: wp.mat33,
     offset: wp.vec3,
     focal: wp.float64,
@@ -30,11 +29,9 @@ def pixel_of(
     width: wp.int32,
     height: wp.int32,
 ) -> wp.int32:
-    depth = dot(axes[2], offset)
-    u = focal * (dot(axes[0], offset) / depth) + cx
-    v = focal * (dot(axes[1], offset) / depth) + cy
-    column = wp.clamp(wp.int32(wp.floor(u)), 0, width - 1)
-    row = wp.clamp(wp.int32(wp.floor(v)), 0, height - 1)
+    pixel = pixel_of(axes, offset, focal, cx, cy)
+    column = wp.clamp(wp.int32(wp.floor(pixel[0])), 0, width - 1)
+    row = wp.clamp(wp.int32(wp.floor(pixel[1])), 0, height - 1)
     return row * width + column
 
 
@@ -73,16 +70,16 @@ def count_pixels_kernel(
     for run in range(runs[0], runs[1]):
         entries = entries_of(landmarks, location, landmarks.inside[run])
         for entry in range(entries[0] + lane, entries[1], lanes):
-            count += mark(bits, view, pixel_of(axis, landmarks.offsets[entry], focal, cx, cy, width, height))
+            count += mark(bits, view, pixel_number(axis, landmarks.offsets[entry], focal, cx, cy, width, height))
     runs = border_runs(landmarks, orientation)
     for run in range(runs[0], runs[1]):
         entries = entries_of(landmarks, location, landmarks.border[run])
         for entry in range(entries[0] + lane, entries[1], lanes):
             if in_view(sides, orientation, landmarks.offsets[entry], min_depth):
-                count += mark(bits, view, pixel_of(axis, landmarks.offsets[entry], focal, cx, cy, width, height))
+                count += mark(bits, view, pixel_number(axis, landmarks.offsets[entry], focal, cx, cy, width, height))
     near = near_entries(landmarks, location)
     for entry in range(near[0] + lane, near[1], lanes):
         if in_view(sides, orientation, landmarks.offsets[entry], min_depth):
-            count += mark(bits, view, pixel_of(axis, landmarks.offsets[entry], focal, cx, cy, width, height))
+            count += mark(bits, view, pixel_number(axis, landmarks.offsets[entry], focal, cx, cy, width, height))
     if count > 0:
         wp.atomic_add(counts, location, orientation, count)

@@ -67,14 +67,12 @@ class SphereCells:
     border: CellRuns
 
     @classmethod
-    def of(
-        cls, camera: Camera, rotations: Float, size: int, device: str, field: FieldOfView | None = None
-    ) -> SphereCells:
-        """Sort the cells of orientations (D, 3, 3) cam_from_world. `field` is the field of view of a COLMAP camera."""
+    def of(cls, camera: Camera, rotations: Float, size: int, device: str) -> SphereCells:
+        """Sort the cells, size along a side of the map, of orientations (D, 3, 3) cam_from_world on a Warp device."""
         shape = (len(rotations), size * size)
         classes: Any = wp.empty(shape, dtype=wp.uint8, device=device)
         if isinstance(camera, ColmapCamera):
-            field = field or FieldOfView.of(camera)
+            field = FieldOfView.of(camera)
             centers, radii = cell_centers(size)
             inputs: list[Any] = [
                 wp.array(np.asarray(rotations, dtype=np.float32), dtype=wp.mat33, device=device),

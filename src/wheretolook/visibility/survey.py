@@ -118,7 +118,8 @@ def survey(
 
     counts = np.empty((len(at), n_directions), dtype=np.int32)
     best = np.empty((len(at), keep), dtype=np.int32)
-    packed = np.empty((len(at) if keep_occlusion else 0, (n_points + 7) // 8), dtype=np.uint8)
+    all_free = np.packbits(np.ones(n_points, dtype=bool))
+    packed = np.empty((len(at) if keep_occlusion else 0, len(all_free)), dtype=np.uint8)
 
     def work(rows: slice) -> int:
         mask = occlusion.unoccluded_on_device(at[rows], landmarks)
@@ -126,15 +127,13 @@ def survey(
         best[rows] = _best(counted, keep, on_gpu)
         counts[rows] = counted.numpy()
         if keep_occlusion:
-            packed[rows] = 255 if mask is None else _pack(mask, landmarks)
+            packed[rows] = all_free if mask is None else _pack(mask, landmarks)
         return rows.stop - rows.start
 
     blocks = [slice(start, min(start + block, len(at))) for start in range(0, len(at), block)]
     with tqdm(total=len(at), desc=progress, unit="location", disable=progress is None) as bar:
         for done in _each(work, blocks, workers):
             bar.update(done)
-    if keep_occlusion and n_points % 8:
-        packed[:, -1] &= np.uint8((0xFF00 >> (n_points % 8)) & 0xFF)
     return Survey(counts, best, StoredOcclusion(at, packed, n_points, occlusion.name) if keep_occlusion else None)
 
 

@@ -21,7 +21,6 @@ from tqdm.auto import tqdm
 from wheretolook.camera_models import Camera
 from wheretolook.errors import ConfigError, SceneError
 from wheretolook.geometry import Float
-from wheretolook.grid import fibonacci_sphere
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.scenes.mesh import TexturedMesh
 from wheretolook.visibility.occlusion import MeshOcclusion
@@ -283,10 +282,8 @@ class TsdfOcclusion(MeshOcclusion):
         or a wall, or outside of what the depth images saw. Where nothing was seen around it, nothing can be told.
         """
         at = np.asarray(locations, dtype=np.float64).reshape(-1, 3)
-        around = fibonacci_sphere(32)
-        hits = self.raycaster.cast(np.repeat(at, len(around), axis=0), np.tile(around, (len(at), 1)))
-        hit, front = (values.reshape(-1, len(around)) for values in (np.isfinite(hits.distance_m), hits.front))
-        behind = (hit & ~front).sum(1) > (hit & front).sum(1)
+        fronts, backs = self._sides_around(at)
+        behind = backs.sum(1) > fronts.sum(1)
         close = self.raycaster.distance_to_surface(at, self._too_close_m) <= self._too_close_m
         return np.asarray(behind | close)
 

@@ -18,8 +18,6 @@ from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.table import fingerprint, read_table
 from wheretolook.visibility import StoredOcclusion
 
-Split = Literal["train", "val", "test"]
-
 
 @dataclass(frozen=True)
 class SceneFolder:
@@ -57,6 +55,11 @@ class SceneFolder:
     def table(self) -> Path:
         """Table of viewpoints."""
         return self.folder / "viewpoints.parquet"
+
+    @property
+    def label_manifest(self) -> Path:
+        """What the labels were made with: versions, settings, fingerprints, shards."""
+        return self.folder / "labels.json"
 
     @property
     def occlusion(self) -> Path:

@@ -47,5 +47,9 @@ class WorkerError(WhereToLookError):
     """A worker process ended before its work was done."""
 
 
+class StorageError(WhereToLookError):
+    """A result cannot be written, or vanished after it was."""
+
+
 class WeightsError(WhereToLookError):
     """Trained weights are missing or do not fit the network or the inputs asked for."""

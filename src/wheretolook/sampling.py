@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
+from wheretolook.dataset import Split
 from wheretolook.errors import ConfigError, SceneError
 from wheretolook.geometry import PinholeCamera, poses_looking_along, rotation_looking_along
 from wheretolook.grid import Lattice, VoxelGrid, direction_lattice
@@ -32,7 +33,8 @@ class SampleConfig:
         keep: K, the directions kept at each location, those that see most landmarks; 0 keeps all.
         min_visible: directions that see fewer landmarks are dropped ("none or only a minimal number", Sec. 3.2).
         max_locations: a random subset of the free locations, 0 for all.
-        max_directions: a random subset of the kept directions of each location, 0 for all.
+        max_directions: a random subset of the kept directions of each location, 0 for all; one number, or one for
+            each split, such as `{train: 50, val: 50, test: 100}`.
         seed: of those subsets.
         distinct_pixels: rank by the number of distinct pixels with a landmark, as the released code counts, instead of
             the number of landmarks.
@@ -45,17 +47,26 @@ class SampleConfig:
     keep: int = 100
     min_visible: int = 1
     max_locations: int = 0
-    max_directions: int = 0
+    max_directions: int | dict[Split, int] = 0
     seed: int = 0
     distinct_pixels: bool = False
     memory_gb: float = 2.0
 
     def __post_init__(self) -> None:
-        for name in ("keep", "min_visible", "max_locations", "max_directions"):
+        for name in ("keep", "min_visible", "max_locations"):
             if getattr(self, name) < 0:
                 raise ConfigError(f"sample.{name} must not be negative", value=getattr(self, name))
+        if isinstance(self.max_directions, dict) and set(self.max_directions) != set(get_args(Split)):
+            fix = "Give one number, or one for each of train, val and test."
+            raise ConfigError("sample.max_directions lacks or misnames a split", value=self.max_directions, fix=fix)
+        if min(map(self.directions_of, get_args(Split))) < 0:
+            raise ConfigError("sample.max_directions must not be negative", value=self.max_directions)
         if not 0 < self.memory_gb < float("inf"):
             raise ConfigError("sample.memory_gb must be positive", value=self.memory_gb)
+
+    def directions_of(self, split: Split) -> int:
+        """`max_directions` for a split."""
+        return self.max_directions[split] if isinstance(self.max_directions, dict) else self.max_directions
 
 
 def free_locations(grid: VoxelGrid, free_space: FreeSpace) -> NDArray[np.int64]:
@@ -83,6 +94,7 @@ def sample_viewpoints(
     config: SampleConfig | None = None,
     device: str = "cpu",
     progress: str | None = None,
+    split: Split = "train",
 ) -> tuple[pd.DataFrame, StoredOcclusion]:
     """Choose viewpoints by what they see.
 
@@ -98,6 +110,7 @@ def sample_viewpoints(
         config: how many of what.
         device: where visibility is counted.
         progress: text of a progress bar; None shows none.
+        split: the scene's, for an option that differs by split.
 
     Raises:
         SceneError: no viewpoint sees enough landmarks, or a location lies inside geometry. MapError: no landmarks.
@@ -123,7 +136,7 @@ def sample_viewpoints(
     for row in range(len(ids)):
         kept = seen.best[row]
         kept = kept[counts[row, kept] >= config.min_visible]
-        kept = np.sort(_subset(kept, config.max_directions, rng))
+        kept = np.sort(_subset(kept, config.directions_of(split), rng))
         rows.append(np.full(len(kept), row))
         columns.append(kept)
     row_index, direction = np.concatenate(rows), np.concatenate(columns)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
+import time
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -139,6 +140,7 @@ def sample(experiment: Experiment, say: Say = print, tick: Tick = lambda work: N
     dataset, device = _dataset(experiment, "map"), experiment.warp_device
     for scene in dataset.scenes:
         chosen = {name: value for name, value in asdict(experiment.sample).items() if name != "memory_gb"}
+        chosen["max_directions"] = experiment.sample.directions_of(scene.split)
         key = _key("sample", [chosen, experiment.occlusion.settings(), asdict(experiment.scenes.free_space),
                               asdict(dataset.camera), _existing(scene.mesh, SceneError, "scenes"),
                               _existing(scene.landmarks, MapError, "map")])  # fmt: skip
@@ -155,7 +157,7 @@ def sample(experiment: Experiment, say: Say = print, tick: Tick = lambda work: N
                 free = free[~occlusion.inside_geometry(grid.centers()[free])]
                 table, stored = sample_viewpoints(
                     grid, free, landmarks, dataset.camera, occlusion, experiment.sample, device,
-                    progress=f"sample {scene.name}",
+                    progress=f"sample {scene.name}", split=scene.split,
                 )  # fmt: skip
             stored.save(scene.occlusion)
             write_table(table, scene.table)
@@ -171,29 +173,49 @@ def sample(experiment: Experiment, say: Say = print, tick: Tick = lambda work: N
 def label(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> Dataset:
     """Stage 4: every viewpoint rendered and localized; status and errors into `<scene>/viewpoints.parquet`.
 
-    Resumes after an interruption, see `wheretolook.labelling.label_viewpoints`.
+    Resumes after an interruption, see `wheretolook.labelling.label_scenes`. How the labels came out goes to
+    `<dataset>/results/labels.*` and an MLflow run.
     """
-    from wheretolook.labelling import label_viewpoints
+    from wheretolook.labelling import LabelTask, label_scenes
+    from wheretolook.labelling.report import log_labels
+    from wheretolook.labelling.shard import SceneJob
     from wheretolook.table import is_good
 
-    dataset = _dataset(experiment, "sample")
-    for scene in dataset.scenes:
-        table, extractor = scene.read_table(), _extractor_of(scene)
-        key = _key("label", [asdict(experiment.label.localizer), asdict(extractor), asdict(dataset.camera),
-                             _existing(scene.mesh, SceneError, "scenes"),
-                             _existing(scene.landmarks, MapError, "map"), _read_stamp(scene, "sample")])  # fmt: skip
-        if not _is_done(scene, "label", key, scene.table):
-            shards = scene.folder / "shards"
-            table = label_viewpoints(
-                table, scene.mesh, scene.landmarks, dataset.camera, shards, experiment.label, extractor,
-                experiment.warp_device, description=f"label {scene.name}",
-            )  # fmt: skip
-            write_table(table, scene.table)
-            _stamp(scene, "label", key)
-            shutil.rmtree(shards)
+    def report(scene: SceneFolder, table: pd.DataFrame) -> None:
         say(f"{scene.name}: {is_good(table).mean():.0%} of {len(table):,} viewpoints localize within 5 cm and 0.4 "
             f"degrees -> {scene.table}")  # fmt: skip
         tick(1)
+
+    dataset, config = _dataset(experiment, "sample"), experiment.label
+    scenes: dict[str, tuple[SceneFolder, str]] = {}
+    tasks: list[LabelTask] = []
+    for scene in dataset.scenes:
+        table, extractor = scene.read_table(), _extractor_of(scene)
+        key = _key("label", [asdict(config.localizer), asdict(extractor), asdict(dataset.camera),
+                             _existing(scene.mesh, SceneError, "scenes"),
+                             _existing(scene.landmarks, MapError, "map"), _read_stamp(scene, "sample")])  # fmt: skip
+        if _is_done(scene, "label", key, scene.table):
+            report(scene, table)
+            continue
+        scenes[scene.name] = scene, key
+        job = SceneJob(scene.mesh, scene.landmarks, dataset.camera, config.localizer, extractor, experiment.warp_device)
+        tasks.append(LabelTask(scene.name, job, table, scene.folder / "shards"))
+    seconds: dict[str, float] = {}
+    start = time.monotonic()
+    for labelled in label_scenes(tasks, config):
+        scene, key = scenes[labelled.task.name]
+        write_table(labelled.table, scene.table)
+        write_json(scene.label_manifest, labelled.manifest)
+        _stamp(scene, "label", key)
+        shutil.rmtree(labelled.task.shards)
+        for step, spent in labelled.seconds.items():
+            seconds[step] = seconds.get(step, 0.0) + spent
+        report(scene, labelled.table)
+    if tasks:
+        seconds["wall"] = time.monotonic() - start
+        log_labels(dataset, experiment.tracking, seconds)
+        say("seconds: " + ", ".join(f"{step} {spent:.1f}" for step, spent in seconds.items())
+            + " (workers' time in each step, added up; then the clock's)")  # fmt: skip
     return dataset
 
 

@@ -64,10 +64,15 @@ def is_good(table: pd.DataFrame, max_error_m: float = 0.05, max_error_deg: float
 
 
 def write_table(table: pd.DataFrame, path: Path) -> None:
-    """Write a table atomically as zstd Parquet. The same rows give the same bytes."""
+    """Write a table atomically as zstd Parquet with checksums. The same rows give the same bytes."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".partial")
-    pq.write_table(pa.Table.from_pandas(table, schema=SCHEMA, preserve_index=False), partial, compression="zstd")
+    content = pa.Table.from_pandas(table, schema=SCHEMA, preserve_index=False)
+    try:
+        pq.write_table(content, partial, compression="zstd", write_page_checksum=True)
+    except OSError:
+        partial.unlink(missing_ok=True)
+        raise
     os.replace(partial, path)
 
 
@@ -80,7 +85,7 @@ def read_table(path: Path) -> pd.DataFrame:
     if not path.is_file():
         raise TableError("there is no table of viewpoints", path=path, fix="Run the sample stage first.")
     try:
-        table = pq.read_table(path)
+        table = pq.read_table(path, page_checksum_verification=True)
     except (pa.ArrowException, OSError) as error:
         raise TableError(
             f"not a readable Parquet file: {error}",

@@ -1,7 +1,8 @@
-"""Worker processes that leave Ctrl-C to their parent and do not outlive it."""
+"""Worker processes that leave Ctrl-C to their parent, do not outlive it, and hold on to their memory."""
 
 from __future__ import annotations
 
+import ctypes
 import multiprocessing
 import os
 import signal
@@ -32,6 +33,22 @@ def end_with_parent() -> None:
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=_wait_and_exit, args=(parent,), daemon=True).start()
+
+
+def keep_freed_memory() -> None:
+    """Called in a worker: let the C library reuse memory that was freed instead of giving it back to the system.
+
+    SIFT takes and frees about 70 MB for each 640 x 480 image; getting it back page by page took a third of its time.
+    """
+    try:
+        library = ctypes.CDLL("libc.so.6")
+        library.mallopt(_M_MMAP_THRESHOLD, 32 * 2**20)  # the most that glibc allows
+        library.mallopt(_M_TRIM_THRESHOLD, 2**31 - 1)
+    except (OSError, AttributeError):  # another C library
+        pass
+
+
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of malloc.h
 
 
 def _wait_and_exit(parent: BaseProcess) -> None:

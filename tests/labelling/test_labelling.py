@@ -19,9 +19,8 @@ from mapping.conftest import ROOM_SIZE, BoxFreeSpace, box_room
 from wheretolook.errors import MapError, SceneError
 from wheretolook.geometry import PinholeCamera, poses_looking_along
 from wheretolook.labelling import LabelConfig, Localizer, LocalizerConfig, label_viewpoints
-from wheretolook.labelling.labeller import label_rows
+from wheretolook.labelling.shard import label_rows
 from wheretolook.mapping.building import MapConfig, build_map
-from wheretolook.mapping.extraction import unit_descriptors
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.rendering import MeshRaycaster, WarpRenderer
 from wheretolook.scenes.loading import load_mesh, save_glb
@@ -146,11 +145,11 @@ def test_killed_at_any_moment_it_resumes_to_the_same_table(room: MappedRoom, tmp
         [sys.executable, str(script), str(tmp_path), str(room.mesh), str(room.landmarks)], env=environment
     )
     deadline = time.monotonic() + 120
-    while len(list(tmp_path.glob("shards/*/*.parquet"))) < 3 and time.monotonic() < deadline and run.poll() is None:
+    while len(list(tmp_path.glob("shards/*.parquet"))) < 3 and time.monotonic() < deadline and run.poll() is None:
         time.sleep(0.02)
     run.send_signal(signal.SIGKILL)
     run.wait()
-    finished = sorted(tmp_path.glob("shards/*/*.parquet"))
+    finished = sorted(tmp_path.glob("shards/*.parquet"))
     assert 3 <= len(finished) < 12
     time.sleep(2)  # its orphaned workers end themselves
     times = {path: path.stat().st_mtime_ns for path in finished}
@@ -178,22 +177,3 @@ def test_landmarks_without_descriptors_are_refused(room: MappedRoom, tmp_path: P
     replace(Landmarks.load(room.landmarks), descriptors=None).save(bare)
     with pytest.raises(MapError, match="without descriptors"):
         label_viewpoints(facing(POSTER, 2, 1.5), room.mesh, bare, CAMERA, tmp_path, progress=False)
-
-
-def test_matching_follows_lowe_and_takes_each_landmark_once(room: MappedRoom) -> None:
-    """Against brute force over all pairs."""
-    landmarks = Landmarks.load(room.landmarks)
-    localizer = Localizer(landmarks, CAMERA, LocalizerConfig(max_ratio=0.8))
-    rng = np.random.default_rng(0)
-    assert landmarks.descriptors is not None
-    base = unit_descriptors(landmarks.descriptors)
-    query = unit_descriptors(np.abs(base[rng.integers(0, len(base), 300)] + rng.normal(0, 0.03, (300, 128))))
-    keypoint_rows, landmark_rows = localizer.match(query)
-    distance = np.sqrt(np.maximum(2 - 2 * query @ base.T, 0))
-    best: dict[int, tuple[float, int]] = {}
-    for keypoint, row in enumerate(distance):
-        first, second = np.argsort(row)[:2]
-        if row[first] < 0.8 * row[second] and row[first] < best.get(first, (np.inf, 0))[0]:
-            best[first] = (row[first], keypoint)
-    assert dict(zip(landmark_rows.tolist(), keypoint_rows.tolist(), strict=True)) == {k: v[1] for k, v in best.items()}
-    assert len(best) > 50

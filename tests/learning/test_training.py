@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -15,8 +16,11 @@ from synthetic_dataset import make_dataset
 from wheretolook.dataset import Dataset
 from wheretolook.errors import ConfigError, TableError
 from wheretolook.learning.config import TrainConfig
-from wheretolook.learning.data import ViewpointDataModule, hold_out_locations
-from wheretolook.learning.training import EpochRecord, train
+from wheretolook.learning.data import BatchLoader, ViewpointDataModule, balance_classes, hold_out_locations
+from wheretolook.learning.fit import EpochRecord
+from wheretolook.learning.network import InputStatistics
+from wheretolook.learning.training import train
+from wheretolook.learning.weights import load_classifier
 from wheretolook.table import LOCALIZED, NO_POSE, UNLABELLED, is_good, write_table
 from wheretolook.tracking import TrackingConfig, client
 
@@ -86,12 +90,71 @@ def test_every_pass_visits_every_training_view_once_in_its_own_order(dataset: Da
     data = ViewpointDataModule(dataset, replace(SMALL, batch_size=100), progress=False)
     data.setup()
     loader, again = data.train_dataloader(), data.train_dataloader()
-    first, second = (torch.cat([labels for _, _, labels in loader]) for _ in range(2))
+    first, second = (torch.cat([batch.labels for batch in loader]) for _ in range(2))
     assert len(first) == len(data.train_rows)
     assert first.sum() == data.views.labels[data.train_rows].sum()
     assert not torch.equal(first, second)
-    assert torch.equal(first, torch.cat([labels for _, _, labels in again]))
+    assert torch.equal(first, torch.cat([batch.labels for batch in again]))
     assert len(loader) == len(list(loader))
+
+
+def test_batches_hold_the_channels_asked_for(dataset: Dataset) -> None:
+    data = ViewpointDataModule(dataset, replace(SMALL, batch_size=7), progress=False)
+    data.setup()
+    data.channels = ("z", "u")
+    batches = list(data.val_dataloader())
+    means = data.views.means[data.val_rows]
+    torch.testing.assert_close(torch.cat([batch.means for batch in batches]), means[:, [4, 0]], rtol=0, atol=0)
+    filled, labels = data.views.filled[data.val_rows], data.views.labels[data.val_rows]
+    assert torch.equal(torch.cat([batch.filled for batch in batches]), filled)
+    assert torch.equal(torch.cat([batch.labels for batch in batches]), labels)
+
+
+@pytest.mark.parametrize("world_size", [2, 3])
+def test_processes_share_out_every_batch(dataset: Dataset, world_size: int) -> None:
+    data = ViewpointDataModule(dataset, SMALL, progress=False)
+    data.setup()
+    rows = data.train_rows[:101]  # the last batch has one view: some processes get none
+    whole = list(BatchLoader(data.views, rows, 10, shuffle_seed=5))
+    loaders = [BatchLoader(data.views, rows, 10, 5, rank=rank, world_size=world_size) for rank in range(world_size)]
+    shared_out = list(zip(*loaders, strict=True))
+    assert len(shared_out) == len(whole) == 11
+    for batch, shares in zip(whole, shared_out, strict=True):
+        assert torch.equal(torch.cat([share.means for share in shares]), batch.means)
+        assert {share.total for share in shares} == {batch.total} == {len(batch.labels)}
+        sizes = [len(share.labels) for share in shares]
+        assert max(sizes) - min(sizes) <= 1
+
+
+def test_balanced_training_views_are_equally_many_and_all_of_the_rarer_class(dataset: Dataset) -> None:
+    for scene in dataset.split("train"):
+        table = scene.read_table()
+        write_table(table.assign(status=np.where(table.index % 4 == 0, table["status"], NO_POSE)), scene.table)
+    plain, balanced = (
+        ViewpointDataModule(dataset, replace(SMALL, balance=balance), progress=False) for balance in (False, True)
+    )
+    plain.setup()
+    balanced.setup()
+    positives = {*plain.train_rows[plain.views.labels[plain.train_rows] > 0].tolist()}
+    chosen = {*balanced.train_rows.tolist()}
+    assert 0 < len(positives) < len(plain.train_rows) / 3
+    assert len(chosen) == len(balanced.train_rows) == 2 * len(positives)
+    assert positives < chosen < {*plain.train_rows.tolist()}
+    assert balanced.class_weights == (1.0, 1.0)
+    assert torch.equal(plain.val_rows, balanced.val_rows)
+    views = balanced.views
+    assert balanced.statistics == InputStatistics.of(views.means, views.filled, balanced.train_rows)
+
+
+def test_the_choice_of_a_balance_follows_its_seed() -> None:
+    labels = torch.tensor([1.0] * 90 + [0.0] * 10)[torch.randperm(100, generator=torch.Generator().manual_seed(0))]
+    rows = balance_classes(labels, seed=3)
+    assert torch.equal(rows, rows.sort().values)
+    assert labels[rows].sum() == 10
+    assert torch.equal(rows, balance_classes(labels, seed=3))
+    assert not torch.equal(rows, balance_classes(labels, seed=4))
+    assert torch.equal(balance_classes(1 - labels, seed=3), balance_classes(1 - labels, seed=3))
+    assert (1 - labels)[balance_classes(1 - labels, seed=3)].sum() == 10
 
 
 @pytest.mark.parametrize("status", [NO_POSE, LOCALIZED])
@@ -131,6 +194,7 @@ def test_no_label_and_no_train_scene_are_refused(tmp_path: Path, dataset: Datase
         {"learning_rate": float("nan")},
         {"l2": -1.0},
         {"patience": 0},
+        {"devices": 0},
     ],
 )
 def test_options_out_of_range_are_refused(options: dict) -> None:
@@ -189,6 +253,51 @@ def test_the_same_seed_gives_the_same_weights(dataset: Dataset, store: str) -> N
     assert train(dataset, config, tracking, progress=False, force=True)[0].path.read_bytes() == first
     assert torch.equal(torch.get_rng_state(), state)  # training leaves the caller's random numbers alone
     assert train(dataset, replace(config, seed=1), tracking, progress=False)[0].path.read_bytes() != first
+
+
+def test_two_processes_train_as_one_does(dataset: Dataset, store: str, capfd: pytest.CaptureFixture[str]) -> None:
+    # 920 training views: the last batch has one view, so that one of two processes has none
+    tracking, one = TrackingConfig(store, "devices"), replace(SMALL, dropout=0.0, batch_size=919)
+    (alone,) = train(dataset, one, tracking, progress=False)
+    expected = load_classifier(alone.path).state_dict()
+    capfd.readouterr()
+    (shared,) = train(dataset, replace(one, devices=2), tracking, progress=False, force=True)
+    assert not "".join(capfd.readouterr())  # the processes are as quiet as one
+    for name, weights in load_classifier(shared.path).state_dict().items():
+        torch.testing.assert_close(weights, expected[name], rtol=1e-4, atol=1e-5)
+    assert shared.metrics == pytest.approx(alone.metrics, rel=1e-4)
+    experiment = client(tracking).get_experiment_by_name("devices")
+    runs = client(tracking).search_runs([experiment.experiment_id])
+    assert {run.info.run_id for run in runs} == {alone.run_id, shared.run_id}
+    histories = [
+        [(metric.step, metric.value) for metric in client(tracking).get_metric_history(model.run_id, "val_bce")]
+        for model in (alone, shared)
+    ]
+    assert [step for step, _ in histories[1]] == [0, 1, 2]
+    np.testing.assert_allclose(histories[1], histories[0], rtol=1e-4)
+    # which devices trained does not decide what was learnt
+    assert train(dataset, one, tracking, progress=False)[0].reused
+
+
+@pytest.mark.parametrize(("accelerator", "gpus"), [("auto", 1), ("gpu", 1), ("gpu", 0)])
+def test_more_gpus_than_there_are_are_refused(
+    dataset: Dataset, accelerator: Any, gpus: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: gpus)
+    config = replace(SMALL, accelerator=accelerator, devices=2)
+    with pytest.raises(ConfigError, match=rf"more GPUs than there are: {gpus} \(got 2\)"):
+        train(dataset, config, TrackingConfig(str(dataset.root / "mlruns")), progress=False)
+
+
+def test_views_that_do_not_fit_into_shared_memory_are_refused(
+    dataset: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise RuntimeError("unable to allocate shared memory: No space left on device")
+
+    monkeypatch.setattr(torch.Tensor, "share_memory_", full)
+    with pytest.raises(ConfigError, match=r"do not fit into shared memory.*No space left.*devices to 1"):
+        ViewpointDataModule(dataset, replace(SMALL, devices=2), progress=False).setup()
 
 
 def test_an_interrupted_training_is_reported_as_such(

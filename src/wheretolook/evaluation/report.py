@@ -47,7 +47,7 @@ def score_markdown(scores: pd.DataFrame, title: str = "Localization score") -> s
             shares = [_share(row, key, interval=index == 0) for index, key in enumerate(keys)]
             metrics = [_number(row["average_precision"]), _number(row["roc_auc"])]
             lines.append([method_style(row["method"], row["inputs"]).label, *shares, *metrics])
-        parts.append(_table(["method", *map(threshold_label, keys), "AP", "AUC"], lines))
+        parts.append(markdown_table(["method", *map(threshold_label, keys), "AP", "AUC"], lines))
     first = scores[(scores["top_n"] == scores["top_n"].iloc[0]) & (scores["scene"] != ALL)]
     if len(scenes) > 1:
         parts.append(f"## By scene: best {scores['top_n'].iloc[0]} of each location, within {threshold_label(keys[0])}")
@@ -57,7 +57,7 @@ def score_markdown(scores: pd.DataFrame, title: str = "Localization score") -> s
         for method in methods:
             shares = [_share(by_key[(scene, *method)], keys[0], interval=True) for scene in scenes]
             lines.append([method_style(*method).label, *shares])
-        parts.append(_table(["method", *scenes], lines))
+        parts.append(markdown_table(["method", *scenes], lines))
     return "\n\n".join([*parts, *comparison]) + "\n"
 
 
@@ -74,7 +74,7 @@ def _occlusion_table(scores: pd.DataFrame, occlusions: Sequence[str]) -> list[st
         lines.append([method_style(*method).label, *cells])
     title = f"## By occlusion model: AP, and best {n} of each location within {threshold_label(key)}"
     note = f"The tables above are with {occlusions[0]}."
-    return [title, note, _table(["method", *occlusions], lines)]
+    return [title, note, markdown_table(["method", *occlusions], lines)]
 
 
 def _share(row: dict[Any, Any], key: str, interval: bool) -> str:
@@ -92,7 +92,7 @@ def _number(value: float) -> str:
     return "–" if pd.isna(value) else f"{value:.3f}"
 
 
-def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A Markdown table whose columns also line up as plain text."""
     widths = [max(len(line[column]) for line in [header, *rows]) for column in range(len(header))]
     lines = [header, ["-" * width for width in widths], *rows]

@@ -7,17 +7,25 @@ from typing import TYPE_CHECKING, Any
 from wheretolook.labelling.config import LabelConfig, LocalizerConfig
 
 if TYPE_CHECKING:
-    from wheretolook.labelling.labeller import label_viewpoints
+    from wheretolook.labelling.labeller import LabelTask, label_scenes, label_viewpoints
     from wheretolook.labelling.localizer import Localization, Localizer
 
-__all__ = ["LabelConfig", "Localization", "Localizer", "LocalizerConfig", "label_viewpoints"]
+__all__ = [
+    "LabelConfig",
+    "LabelTask",
+    "Localization",
+    "Localizer",
+    "LocalizerConfig",
+    "label_scenes",
+    "label_viewpoints",
+]
 
 
 def __getattr__(name: str) -> Any:
-    if name == "label_viewpoints":  # loads PyTorch and pycolmap
-        from wheretolook.labelling.labeller import label_viewpoints
+    if name in ("LabelTask", "label_scenes", "label_viewpoints"):  # loads PyTorch and pycolmap
+        from wheretolook.labelling import labeller
 
-        return label_viewpoints
+        return getattr(labeller, name)
     if name in ("Localization", "Localizer"):
         from wheretolook.labelling import localizer
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 from wheretolook.errors import ConfigError
 
@@ -41,14 +42,21 @@ class LabelConfig:
 
     Args:
         localizer: matching and pose estimation.
-        workers: processes; 0 means one for each CPU core this process may use.
+        engine: "local" works in processes on this machine, "ray" the same shards on a Ray cluster
+            (`pip install 'wheretolook[ray]'`).
+        ray_address: the cluster's address, such as "auto" or "ray://head:10001"; empty starts one on this machine.
+        workers: processes of the local engine; 0 means one for each CPU core this process may use.
         shard_size: viewpoints a shard, the unit of work and of what an interruption can lose.
     """
 
     localizer: LocalizerConfig = field(default_factory=LocalizerConfig)
+    engine: Literal["local", "ray"] = "local"
+    ray_address: str = ""
     workers: int = 0
-    shard_size: int = 16
+    shard_size: int = 256
 
     def __post_init__(self) -> None:
+        if self.engine not in ("local", "ray"):
+            raise ConfigError("unknown label.engine", value=self.engine, fix="Use local or ray.")
         if self.workers < 0 or self.shard_size < 1:
             raise ConfigError("workers must be >= 0 and shard_size >= 1", value=(self.workers, self.shard_size))

@@ -1,32 +1,68 @@
-"""Labels a table of viewpoints, in shards that survive interruption."""
+"""Labels tables of viewpoints, in shards that survive interruption."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-import multiprocessing
 import os
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from tqdm.auto import tqdm
 
-from wheretolook.errors import MapError, TableError, WorkerError
-from wheretolook.geometry import PinholeCamera, pose_error
-from wheretolook.labelling.config import LabelConfig, LocalizerConfig
-from wheretolook.labelling.localizer import Localizer
+import wheretolook
+from wheretolook.dataset import write_json
+from wheretolook.errors import MapError, StorageError, TableError
+from wheretolook.geometry import PinholeCamera
+from wheretolook.labelling.config import LabelConfig
+from wheretolook.labelling.shard import LabelledShard, SceneJob, Shard
 from wheretolook.mapping.extraction import ExtractorConfig
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.table import POSE_COLUMNS, fingerprint, poses, read_table, write_table
-from wheretolook.worker_processes import end_with_parent, spawning
+from wheretolook.table import POSE_COLUMNS, fingerprint, read_table, write_table
 
-if TYPE_CHECKING:
-    from wheretolook.rendering import Renderer
+MANIFEST = "manifest.json"
+"""In the folder of shards while work goes on, and as `labels.json` beside a finished table."""
+
+
+@dataclass(frozen=True, eq=False)
+class LabelTask:
+    """A scene to label.
+
+    Attributes:
+        name: of the scene.
+        job: what workers need.
+        table: its viewpoints, see `wheretolook.table.SCHEMA`.
+        shards: folder for finished shards.
+    """
+
+    name: str
+    job: SceneJob
+    table: pd.DataFrame
+    shards: Path
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledScene:
+    """A scene all of whose viewpoints are labelled.
+
+    Attributes:
+        task: what was asked.
+        table: the viewpoints with status, error_m, error_deg and n_inliers; the paper's label y follows from them by
+            `wheretolook.table.is_good`.
+        manifest: what the labels were made with: versions, settings, fingerprints, and each shard's name and content.
+        seconds: workers' time in each step, of the shards made in this run.
+    """
+
+    task: LabelTask
+    table: pd.DataFrame
+    manifest: dict[str, Any]
+    seconds: dict[str, float] = field(default_factory=dict)
 
 
 def label_viewpoints(
@@ -41,17 +77,14 @@ def label_viewpoints(
     progress: bool = True,
     description: str = "label",
 ) -> pd.DataFrame:
-    """Render every viewpoint, localize its image against the map and measure the error (paper, Sec. 3.3).
-
-    Finished shards lie in a folder named by all that decides a label (viewpoints, mesh, landmarks, settings), so that a
-    run which was interrupted, or killed, goes on where it stopped and ends with the same table.
+    """Render every viewpoint of one scene, localize its image and measure the error: `label_scenes` for one scene.
 
     Args:
         table: viewpoints, see `wheretolook.table.SCHEMA`.
         mesh: file of the scene's mesh.
         landmarks: file of the map's landmarks, with descriptors.
         camera: intrinsics of the viewpoints.
-        shards: folder for unfinished work.
+        shards: folder for finished shards.
         config: how.
         extractor: what the map was made with.
         device: where images are rendered and descriptors matched.
@@ -59,113 +92,168 @@ def label_viewpoints(
         description: the bar's title.
 
     Returns:
-        The table with status, error_m, error_deg and n_inliers filled in; the paper's label y follows from them by
-        `wheretolook.table.is_good`.
+        The table with its labels.
 
     Raises:
-        SceneError, MapError: the mesh or the landmarks cannot be used.
-        TableError: the table is empty.
-        WorkerError: a worker process was killed.
+        As `label_scenes`.
     """
-    config, extractor = config or LabelConfig(), extractor or ExtractorConfig()
-    if table.empty:
-        raise TableError("no viewpoints to label", fix="Run the sample stage with other settings.")
-    if Landmarks.load(landmarks).descriptors is None:
-        raise MapError("landmarks without descriptors cannot be matched", path=landmarks, fix="Build the map again.")
-    settings = [asdict(config.localizer), asdict(extractor), asdict(camera), fingerprint(mesh), fingerprint(landmarks)]
-    digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
-    digest.update(pd.util.hash_pandas_object(table[["viewpoint_id", *POSE_COLUMNS]], index=False).to_numpy().tobytes())
-    folder = shards / f"{digest.hexdigest()[:16]}-{config.shard_size}"
-    folder.mkdir(parents=True, exist_ok=True)
-
-    chunks = {
-        folder / f"{begin:08d}.parquet": table.iloc[begin : begin + config.shard_size]
-        for begin in range(0, len(table), config.shard_size)
-    }
-    missing = {path: chunk for path, chunk in chunks.items() if not _is_finished(path, chunk)}
-    n_workers = min(config.workers or len(os.sched_getaffinity(0)), max(1, len(missing)))
-    job = _Job(mesh, landmarks, camera, config.localizer, extractor, device)
-    with tqdm(total=len(table), desc=description, unit="view", disable=not progress, smoothing=0.05) as bar:
-        bar.update(len(table) - sum(map(len, missing.values())))
-        bar.initial = bar.n  # so that the estimate counts only what is done now
-        if missing:
-            context = multiprocessing.get_context("spawn")
-            pool = ProcessPoolExecutor(n_workers, context)
-            try:
-                with spawning():
-                    futures = {pool.submit(_label_shard, job, path, chunk): chunk for path, chunk in missing.items()}
-                for future in as_completed(futures):
-                    future.result()
-                    bar.update(len(futures[future]))
-            except BrokenProcessPool as error:
-                raise WorkerError(
-                    "a labelling process was killed, probably for lack of memory",
-                    value=f"{n_workers} workers",
-                    fix="Lower label.workers and run again: finished shards are kept.",
-                ) from error
-            finally:
-                pool.shutdown(wait=True, cancel_futures=True)
-    return pd.concat([read_table(path) for path in chunks], ignore_index=True)
+    config = config or LabelConfig()
+    job = SceneJob(mesh, landmarks, camera, config.localizer, extractor or ExtractorConfig(), device)
+    (scene,) = label_scenes([LabelTask(description, job, table, shards)], config, progress, description)
+    return scene.table
 
 
-def label_rows(table: pd.DataFrame, renderer: Renderer, localizer: Localizer, camera: PinholeCamera) -> pd.DataFrame:
-    """Label the rows of a table in this process; `label_viewpoints` is this over many processes and shards."""
-    true_poses = poses(table)
-    found = [localizer.localize(renderer.render(camera, pose[None]).rgb[0]) for pose in true_poses]
-    estimates = np.stack(
-        [np.full((3, 4), np.nan) if one.cam_from_world is None else one.cam_from_world for one in found]
-    )
-    error_m, error_deg = pose_error(estimates, true_poses)
-    return table.assign(
-        status=[one.status for one in found],
-        error_m=error_m.astype(np.float32),
-        error_deg=error_deg.astype(np.float32),
-        n_inliers=np.array([len(one.inlier_rows) for one in found], dtype=np.int32),
-    )
+def label_scenes(
+    tasks: Sequence[LabelTask], config: LabelConfig, progress: bool = True, description: str = "label"
+) -> Iterator[LabelledScene]:
+    """Render every viewpoint, localize its image against the map and measure the error (paper, Sec. 3.3).
+
+    Work is cut into shards. A finished shard is a file named by all that decides its labels (viewpoints, mesh,
+    landmarks, settings, versions), so that a run which was interrupted, or killed, goes on where it stopped and ends
+    with the same table, whichever engine and however many workers are at it.
+
+    Args:
+        tasks: the scenes; workers go from one to the next without pause.
+        config: how.
+        progress: show one progress bar for all scenes.
+        description: the bar's title.
+
+    Yields:
+        Scenes as they are finished; the caller stores their tables, and may then remove their shards.
+
+    Raises:
+        SceneError, MapError: a mesh or landmarks cannot be used.
+        TableError: a table is empty.
+        WorkerError: workers were killed again and again, or something failed in one.
+        StorageError: a shard cannot be written, as when the disk is full.
+        ConfigError: the Ray engine cannot be used.
+    """
+    scenes = [_Scene.of(task, config.shard_size) for task in tasks]
+    by_path = {shard.path: scene for scene in scenes for shard in scene.missing}
+    missing = [shard for scene in scenes for shard in scene.missing]
+    total, left = sum(len(task.table) for task in tasks), sum(len(shard.rows) for shard in missing)
+    with tqdm(
+        total=total, initial=total - left, desc=description, unit="view", disable=not progress, smoothing=0.05
+    ) as bar:
+        for scene in scenes:
+            if not scene.missing:
+                yield scene.result()
+        for shard, labelled in _run(missing, config, bar.update):
+            _store(labelled.rows, shard.path)
+            scene = by_path[shard.path]
+            scene.missing.remove(shard)
+            for step, seconds in labelled.seconds.items():
+                scene.seconds[step] = scene.seconds.get(step, 0.0) + seconds
+            bar.set_postfix_str(scene.task.name, refresh=False)
+            if not scene.missing:
+                yield scene.result()
 
 
-@dataclass(frozen=True)
-class _Job:
-    """All a worker process needs to start."""
-
-    mesh: Path
-    landmarks: Path
-    camera: PinholeCamera
-    localizer: LocalizerConfig
-    extractor: ExtractorConfig
-    device: str
-
-
-_worker: tuple[_Job, Renderer, Localizer] | None = None
+@cache
+def versions() -> dict[str, str]:
+    """Versions of what decides a label."""
+    found = {"wheretolook": wheretolook.__version__}
+    for package in ("pycolmap", "opencv-python-headless", "warp-lang", "numpy", "torch"):
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:  # installed some other way
+            found[package] = "unknown"
+    return found
 
 
-def _label_shard(job: _Job, path: Path, chunk: pd.DataFrame) -> None:
-    global _worker
-    if _worker is None or _worker[0] != job:  # not in a pool initializer, where an error would lose its type
-        _worker = job, *_start_worker(job)
-    _, renderer, localizer = _worker
-    write_table(label_rows(chunk, renderer, localizer, job.camera), path)
+@dataclass(eq=False)
+class _Scene:
+    """A scene on its way."""
+
+    task: LabelTask
+    settings: dict[str, Any]
+    shards: list[Shard]
+    missing: list[Shard]
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, task: LabelTask, shard_size: int) -> _Scene:
+        job, table = task.job, task.table
+        if table.empty:
+            raise TableError("no viewpoints to label", value=task.name, fix="Run the sample stage with other settings.")
+        if Landmarks.load(job.landmarks).descriptors is None:
+            fix = "Build the map again."
+            raise MapError("landmarks without descriptors cannot be matched", path=job.landmarks, fix=fix)
+        settings = {
+            "versions": versions(),
+            "localizer": asdict(job.localizer),
+            "extractor": asdict(job.extractor),
+            "camera": asdict(job.camera),
+            "mesh": fingerprint(job.mesh),
+            "landmarks": fingerprint(job.landmarks),
+        }
+        text = json.dumps(settings, sort_keys=True).encode()
+        shards = []
+        for begin in range(0, len(table), shard_size):
+            rows = table.iloc[begin : begin + shard_size]
+            content = pd.util.hash_pandas_object(rows[["viewpoint_id", *POSE_COLUMNS]], index=False).to_numpy()
+            digest = hashlib.sha256(text + content.tobytes()).hexdigest()[:16]
+            shards.append(Shard(job, task.shards / f"{begin:08d}-{digest}.parquet", rows))
+        scene = cls(task, settings, shards, [shard for shard in shards if not _is_finished(shard)])
+        task.shards.mkdir(parents=True, exist_ok=True)
+        write_json(task.shards / MANIFEST, scene.manifest())
+        return scene
+
+    def manifest(self) -> dict[str, Any]:
+        return {
+            **self.settings,
+            "n_viewpoints": len(self.task.table),
+            "shards": {shard.path.name: len(shard.rows) for shard in self.shards},
+        }
+
+    def result(self) -> LabelledScene:
+        parts = []
+        for shard in self.shards:
+            if not _is_finished(shard):
+                raise StorageError(
+                    "a finished shard was damaged or removed", path=shard.path, fix="Run again: it is made anew."
+                )
+            parts.append(read_table(shard.path))
+        contents = {shard.path.name: {"n": len(shard.rows), "sha256": _sha256(shard.path)} for shard in self.shards}
+        manifest = {**self.manifest(), "shards": contents}
+        return LabelledScene(self.task, pd.concat(parts, ignore_index=True), manifest, self.seconds)
 
 
-def _start_worker(job: _Job) -> tuple[Renderer, Localizer]:
-    import torch
+def _run(
+    shards: Sequence[Shard], config: LabelConfig, tick: Callable[[int], Any]
+) -> Iterator[tuple[Shard, LabelledShard]]:
+    if not shards:
+        return iter(())
+    if config.engine == "ray":
+        from wheretolook.labelling.ray_engine import run_ray
 
-    from wheretolook.rendering import WarpRenderer
-    from wheretolook.scenes.loading import load_mesh
+        return run_ray(shards, config.ray_address, tick)
+    from wheretolook.labelling.local_engine import run_local
 
-    end_with_parent()
-    torch.set_num_threads(1)
-    renderer = WarpRenderer(load_mesh(job.mesh), job.device)
-    return renderer, Localizer(Landmarks.load(job.landmarks), job.camera, job.localizer, job.extractor, job.device)
+    return run_local(shards, config.workers or len(os.sched_getaffinity(0)), tick)
 
 
-def _is_finished(path: Path, chunk: pd.DataFrame) -> bool:
-    """Whether a shard is whole; a damaged one is removed and made again."""
-    if not path.exists():
+def _store(rows: pd.DataFrame, path: Path) -> None:
+    try:
+        write_table(rows, path)
+    except OSError as error:
+        raise StorageError(
+            f"a finished shard cannot be written: {error.strerror or error}", path=path,
+            fix="Make room (or mend the disk) and run again: the shards before it are kept.",
+        ) from error  # fmt: skip
+
+
+def _is_finished(shard: Shard) -> bool:
+    """Whether a shard's file is whole; a damaged one is removed and made again."""
+    if not shard.path.exists():
         return False
     try:
-        done = read_table(path)
+        done = read_table(shard.path)
     except TableError:
-        path.unlink()
+        shard.path.unlink()
         return False
-    return np.array_equal(done["viewpoint_id"], chunk["viewpoint_id"])
+    return np.array_equal(done["viewpoint_id"], shard.rows["viewpoint_id"])
+
+
+def _sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()

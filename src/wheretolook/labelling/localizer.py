@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 import pycolmap
-import torch
 from numpy.typing import NDArray
 
 from wheretolook.errors import MapError
 from wheretolook.geometry import Float, PinholeCamera
 from wheretolook.labelling.config import LocalizerConfig
-from wheretolook.mapping.extraction import ExtractorConfig, KeypointExtractor, unit_descriptors
+from wheretolook.labelling.matching import DescriptorMatcher, Matches, match
+from wheretolook.mapping.extraction import ExtractorConfig, KeypointExtractor, Keypoints, quantize_descriptors
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.table import LOCALIZED, NO_POSE, TOO_FEW_MATCHES
 
@@ -46,7 +47,7 @@ class Localizer:
         camera: intrinsics of the images.
         config: matching and RANSAC settings.
         extractor: must be what the map was made with.
-        device: where descriptors are matched, "cpu" or a CUDA device (there in half precision).
+        device: where descriptors are matched, "cpu" or a CUDA device, with the same result.
 
     Raises:
         MapError: the landmarks have no descriptors.
@@ -62,10 +63,9 @@ class Localizer:
     ) -> None:
         if landmarks.descriptors is None:
             raise MapError("landmarks without descriptors cannot be matched", fix="Build the map with its database.")
-        self.landmarks, self.config, self.device = landmarks, config or LocalizerConfig(), device
+        self.landmarks, self.config = landmarks, config or LocalizerConfig()
         self.extractor = KeypointExtractor(extractor)
-        self._dtype = torch.float32 if torch.device(device).type == "cpu" else torch.float16
-        self._descriptors = torch.from_numpy(unit_descriptors(landmarks.descriptors)).to(device, self._dtype)
+        self._matcher = DescriptorMatcher(landmarks.descriptors, device)
         self._camera = pycolmap.Camera(
             model="SIMPLE_PINHOLE",
             width=camera.width,
@@ -79,8 +79,21 @@ class Localizer:
 
     def localize(self, rgb: NDArray[np.uint8]) -> Localization:
         """Localize one image (H, W, 3) uint8."""
-        keypoints = self.extractor.extract(rgb)
-        keypoint_rows, landmark_rows = self.match(keypoints.descriptors)
+        keypoints = self.extract(rgb)
+        return self.estimate(keypoints, *self.match([keypoints])[0])
+
+    def extract(self, rgb: NDArray[np.uint8]) -> Keypoints:
+        """Step 1: keypoints of one image (H, W, 3) uint8."""
+        return self.extractor.extract(rgb)
+
+    def match(self, keypoints: Sequence[Keypoints]) -> list[Matches]:
+        """Step 2: 2D-3D matches of several images at once, which do not depend on each other."""
+        return match(self._matcher, [quantize_descriptors(one.descriptors) for one in keypoints], self.config.max_ratio)
+
+    def estimate(
+        self, keypoints: Keypoints, keypoint_rows: NDArray[np.int64], landmark_rows: NDArray[np.int64]
+    ) -> Localization:
+        """Step 3: the pose from the matches of one image."""
         n_matches = len(keypoint_rows)
         if n_matches < self.config.min_matches:
             return Localization(TOO_FEW_MATCHES, None, n_matches)
@@ -96,24 +109,3 @@ class Localizer:
         pose = np.asarray(estimate["cam_from_world"].matrix())
         status = LOCALIZED if estimate["num_inliers"] >= self.config.min_inliers else NO_POSE
         return Localization(status, pose, n_matches, landmark_rows[np.asarray(estimate["inlier_mask"], dtype=bool)])
-
-    def match(self, descriptors: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Match unit descriptors (K, 128) against the landmarks'.
-
-        A match passes Lowe's ratio test (IJCV 2004, Sec. 7.1), and a landmark keeps only its most similar keypoint.
-
-        Returns:
-            Rows of the keypoints and rows of their landmarks, (M,) each, in ascending order of the keypoints.
-        """
-        if len(descriptors) == 0 or len(self._descriptors) < 2:
-            return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
-        similarity = torch.from_numpy(descriptors).to(self.device, self._dtype) @ self._descriptors.T
-        top, rows = (part.cpu() for part in torch.topk(similarity, 2, dim=1))
-        distance = torch.sqrt(torch.clamp(2 - 2 * top.float(), min=0))
-        kept = torch.nonzero(distance[:, 0] < self.config.max_ratio * distance[:, 1])[:, 0].numpy()
-        landmark_rows, best = rows[:, 0].numpy()[kept], top[:, 0].float().numpy()[kept]
-        by_landmark = np.lexsort((kept, -best, landmark_rows))
-        first = np.ones(len(kept), dtype=bool)
-        first[1:] = np.diff(landmark_rows[by_landmark]) > 0
-        unique = np.sort(by_landmark[first])
-        return kept[unique], landmark_rows[unique]

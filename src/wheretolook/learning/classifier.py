@@ -8,8 +8,8 @@ import torch
 from lightning.pytorch import LightningModule
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits
-from torchmetrics import MetricCollection
-from torchmetrics.classification import BinaryAUROC, BinaryAveragePrecision, BinaryCalibrationError
+from torchmetrics.functional.classification import binary_auroc, binary_average_precision, binary_calibration_error
+from torchmetrics.utilities.distributed import gather_all_tensors
 
 from wheretolook.features import CHANNELS
 from wheretolook.learning.config import TrainConfig
@@ -20,40 +20,46 @@ CALIBRATION_BINS = 15
 """Equal-width bins of the expected calibration error (Guo et al., ICML 2017)."""
 
 
-def weighted_bce(logits: Tensor, labels: Tensor, class_weights: tuple[float, float]) -> Tensor:
+def weighted_bce(
+    logits: Tensor, labels: Tensor, class_weights: tuple[float, float], count: float | None = None
+) -> Tensor:
     """Mean weighted binary cross-entropy on logits (paper, Sec. 3.3), a scalar.
 
     Args:
         logits: (B,).
         labels: (B,) float, 0 or 1.
         class_weights: weights of the negative and the positive class.
+        count: what to divide the sum by, if not by B.
     """
     negative, positive = class_weights
     weights = negative + (positive - negative) * labels
-    return binary_cross_entropy_with_logits(logits, labels, weight=weights)
+    return binary_cross_entropy_with_logits(logits, labels, weight=weights, reduction="sum") / (count or len(labels))
 
 
 def weight_penalty(module: nn.Module) -> Tensor:
     """Sum of the squares of all weight matrices, a scalar. Biases are left out (the paper's sum is over W_l)."""
-    squares = [layer.weight.square().sum() for layer in module.modules() if isinstance(layer, nn.Linear)]
-    return torch.stack(squares).sum()
+    weights = torch.cat([layer.weight.flatten() for layer in module.modules() if isinstance(layer, nn.Linear)])
+    return weights.dot(weights)
 
 
-def add_noise(means: Tensor, filled: Tensor, noise_px: float, noise_m: float) -> Tensor:
+def add_noise(
+    means: Tensor, filled: Tensor, noise_px: float, noise_m: float, channels: tuple[str, ...] = CHANNELS
+) -> Tensor:
     """Gaussian noise on filled bins, as the released code adds while training.
 
     Args:
-        means: (B, len(CHANNELS), bins, bins).
+        means: (B, C, bins, bins).
         filled: (B, bins, bins) bool; empty bins stay zero.
         noise_px: standard deviation on u and v.
         noise_m: standard deviation on x, y and z.
+        channels: names of the C channels.
     """
-    scale = means.new_tensor([noise_px if name in ("u", "v") else noise_m for name in CHANNELS])
+    scale = means.new_tensor([noise_px if name in ("u", "v") else noise_m for name in channels])
     return means + torch.randn_like(means) * scale[:, None, None] * filled[:, None]
 
 
 class ViewpointClassifier(LightningModule):
-    """Learns whether a viewpoint localizes.
+    """Learns whether a viewpoint localizes, from batches that hold the network's own channels.
 
     Logged every epoch: `{train,val}_loss`, `{train,val}_bce`, `l2` (the weighted penalty), `train_average_precision`
     (with dropout on), `val_average_precision`, `val_roc_auc` and `val_calibration_error`. Balancing the classes shifts
@@ -68,48 +74,79 @@ class ViewpointClassifier(LightningModule):
     def __init__(self, network: ViewpointNetwork, config: TrainConfig, class_weights: tuple[float, float]) -> None:
         super().__init__()
         self.network, self.config, self.class_weights = network, config, class_weights
-        self.train_metrics = MetricCollection({"average_precision": BinaryAveragePrecision()}, prefix="train_")
-        self.val_metrics = MetricCollection(
-            {
-                "average_precision": BinaryAveragePrecision(),
-                "roc_auc": BinaryAUROC(),
-                "calibration_error": BinaryCalibrationError(n_bins=CALIBRATION_BINS, norm="l1"),
-            },
-            prefix="val_",
-        )
+        # logits and labels of an epoch's batches: metrics of every step would take longer than the steps
+        self._train_seen: list[Tensor] = []
+        self._val_seen: list[Tensor] = []
+        self._penalties: list[Tensor] = []
 
     def forward(self, means: Tensor, filled: Tensor) -> Tensor:
         """Logits (B,) of binned views."""
         return self.network(means, filled)
 
+    def on_fit_start(self) -> None:
+        """Give every process its own dropout and noise."""
+        if self.trainer.world_size > 1:
+            torch.manual_seed(self.config.seed + self.trainer.global_rank)
+
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        """Loss of one batch."""
-        means, filled, labels = batch
+        """Loss of one process's share of a batch. The mean over processes is the loss of the batch."""
+        means, filled, labels, total = batch
         if self.config.noise_px > 0 or self.config.noise_m > 0:
-            means = add_noise(means, filled, self.config.noise_px, self.config.noise_m)
-        return self._step("train", self(means, filled), labels, self.train_metrics)
+            means = add_noise(means, filled, self.config.noise_px, self.config.noise_m, self.network.spec.channels)
+        logits = self(means, filled)
+        penalty = self.config.l2 * weight_penalty(self.network)
+        self._train_seen.append(torch.stack([logits.detach(), labels]))
+        self._penalties.append(penalty.detach() * total)
+        return weighted_bce(logits, labels, self.class_weights, total / self.trainer.world_size) + penalty
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
-        """Loss and metrics of one batch."""
-        means, filled, labels = batch
-        self._step("val", self(means, filled), labels, self.val_metrics)
+        """Logits of one process's share of a batch."""
+        self._val_seen.append(torch.stack([self(batch.means, batch.filled), batch.labels]))
+
+    def on_validation_epoch_end(self) -> None:
+        """Log the metrics of all validation views."""
+        logits, labels = self._gather(self._val_seen)
+        bce = weighted_bce(logits, labels, self.class_weights)
+        penalty = self.config.l2 * weight_penalty(self.network)
+        probabilities, truth = logits.sigmoid(), labels.long()
+        self._log(
+            {
+                "val_loss": bce + penalty,
+                "val_bce": bce,
+                "l2": penalty,
+                "val_average_precision": binary_average_precision(probabilities, truth, validate_args=False),
+                "val_roc_auc": binary_auroc(probabilities, truth, validate_args=False),
+                "val_calibration_error": binary_calibration_error(
+                    probabilities, truth, n_bins=CALIBRATION_BINS, norm="l1", validate_args=False
+                ),
+            }
+        )
+
+    def on_train_epoch_end(self) -> None:
+        """Log the metrics of all training views, each as it was when the network learnt from it."""
+        logits, labels = self._gather(self._train_seen)
+        bce = weighted_bce(logits, labels, self.class_weights)
+        penalty = torch.stack(self._penalties).sum() / len(labels)
+        self._penalties.clear()
+        precision = binary_average_precision(logits.sigmoid(), labels.long(), validate_args=False)
+        self._log({"train_loss": bce + penalty, "train_bce": bce, "train_average_precision": precision})
 
     def configure_optimizers(self) -> Any:
         """Adam (paper, Sec. 4), with a constant or a cosine learning rate."""
-        optimizer = torch.optim.Adam(self.parameters(), lr=self.config.learning_rate)
+        optimizer = torch.optim.Adam(self.parameters(), lr=self.config.learning_rate, fused=True)
         if self.config.schedule == "constant":
             return optimizer
         return [optimizer], [torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, T_max=self.config.epochs)]
 
-    def _step(self, split: str, logits: Tensor, labels: Tensor, metrics: MetricCollection) -> Tensor:
-        bce = weighted_bce(logits, labels, self.class_weights)
-        penalty = self.config.l2 * weight_penalty(self.network)
-        values = {f"{split}_loss": bce + penalty, f"{split}_bce": bce}
-        if split == "val":
-            values["l2"] = penalty
-        # the key "step" makes the logger count epochs instead of batches
-        values["step"] = torch.tensor(float(self.current_epoch))
-        self.log_dict(values, on_step=False, on_epoch=True, batch_size=len(labels))
-        metrics.update(logits.sigmoid().detach(), labels.long())
-        self.log_dict(metrics, on_step=False, on_epoch=True)  # type: ignore[arg-type]
-        return bce + penalty
+    def _gather(self, seen: list[Tensor]) -> tuple[Tensor, Tensor]:
+        """Logits and labels of an epoch, (B,) each, over all processes."""
+        values = torch.cat(seen, 1)
+        seen.clear()
+        if self.trainer.world_size > 1:
+            values = torch.cat(gather_all_tensors(values), 1)
+        logits, labels = values
+        return logits, labels
+
+    def _log(self, values: dict[str, Tensor]) -> None:
+        # all processes have gathered the same values; without sync_dist Lightning warns that they might not have
+        self.log_dict(values, on_step=False, on_epoch=True, sync_dist=True)

@@ -16,7 +16,7 @@ class TrainConfig:
     Args:
         variants: inputs to train a network for, of "2d", "2d+z" and "2d+3d".
         epochs: passes over the training viewpoints (paper: 300).
-        batch_size: viewpoints a step (the paper gives none; 128 is the released code's).
+        batch_size: viewpoints a step, shared out over the devices (the paper gives none; 128 is the released code's).
         learning_rate: Adam's initial learning rate (paper: 1e-3; released code: 1e-4).
         schedule: "constant" as in the paper, or "cosine", which lets the rate fall to zero over the epochs.
         l2: lambda, the factor of the sum of squared weights (paper: a lambda without a value; released code: 0). The
@@ -34,11 +34,15 @@ class TrainConfig:
         max_error_deg: and its orientation error too, in degrees.
         val_fraction: share of the locations of each training scene held out for validation when the dataset has no
             validation scene.
+        balance: learn from equally many positive and negative viewpoints, as the paper does (Sec. 4): all of the rarer
+            class and a random choice of the other. Validation viewpoints stay as they are.
         keep: "best" keeps the weights of the epoch with the best validation average precision, "last" those of the
             last epoch.
         patience: stop after so many epochs without a better validation average precision; null trains them all.
-        seed: seed of the split, the initial weights, dropout, noise and the order of batches.
+        seed: seed of the split, the balance, the initial weights, dropout, noise and the order of batches.
         accelerator: where to train: "auto", "cpu" or "gpu".
+        devices: GPUs, or processes on the CPU, to train with. One step of many is one step of one: each takes its share
+            of the same batch. Dropout and noise draw other numbers, though.
     """
 
     variants: tuple[str, ...] = tuple(INPUT_VARIANTS)
@@ -57,10 +61,12 @@ class TrainConfig:
     max_error_m: float = 0.05
     max_error_deg: float = 0.4
     val_fraction: float = 0.15
+    balance: bool = False
     keep: Literal["best", "last"] = "best"
     patience: int | None = None
     seed: int = 0
     accelerator: Literal["auto", "cpu", "gpu"] = "auto"
+    devices: int = 1
 
     def __post_init__(self) -> None:
         unknown = [name for name in self.variants if name not in INPUT_VARIANTS]
@@ -75,7 +81,7 @@ class TrainConfig:
         ):
             if getattr(self, name) not in choices:
                 raise ConfigError(f"unknown {name}", value=getattr(self, name), fix=f"Use {' or '.join(choices)}.")
-        for name in ("epochs", "batch_size", "bins"):
+        for name in ("epochs", "batch_size", "bins", "devices"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"{name} must be at least 1", value=getattr(self, name))
         for name in ("learning_rate", "max_error_m", "max_error_deg"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from math import ceil
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -15,7 +16,7 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from wheretolook.dataset import Dataset, SceneFolder
-from wheretolook.errors import TableError
+from wheretolook.errors import ConfigError, TableError
 from wheretolook.features import CHANNELS
 from wheretolook.learning.config import TrainConfig
 from wheretolook.learning.network import InputStatistics
@@ -24,8 +25,24 @@ from wheretolook.table import UNLABELLED, is_good, poses
 BLOCK = 4096
 """Views binned at a time."""
 
-Batch = tuple[Tensor, Tensor, Tensor]
-"""Means (B, C, bins, bins) float32, filled (B, bins, bins) bool and labels (B,) float32."""
+ROOM = 2
+"""Views are kept on a GPU that has this many times the memory they need."""
+
+
+class Batch(NamedTuple):
+    """One process's share of a batch.
+
+    Attributes:
+        means: (B, C, bins, bins) float32.
+        filled: (B, bins, bins) bool.
+        labels: (B,) float32.
+        total: views in the whole batch, over all processes.
+    """
+
+    means: Tensor
+    filled: Tensor
+    labels: Tensor
+    total: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +80,11 @@ class LabelledViews:
         return sum(tensor.nbytes for tensor in (self.means, self.filled, self.labels))
 
 
+def has_room(device: torch.device | str, n_bytes: int) -> bool:
+    """Whether a device is a GPU with room for views of so many bytes, and for training on them."""
+    return torch.device(device).type == "cuda" and torch.cuda.mem_get_info(device)[0] > ROOM * n_bytes
+
+
 def load_views(
     dataset: Dataset, scenes: Sequence[SceneFolder], config: TrainConfig, device: str = "cpu", progress: bool = True
 ) -> LabelledViews:
@@ -71,13 +93,15 @@ def load_views(
     Args:
         dataset: gives the camera.
         scenes: scenes of the dataset.
-        config: number of bins and error limits of a positive label.
-        device: where the binning runs, "cpu" or a CUDA device. The views come back on the CPU.
+        config: number of bins, error limits of a positive label, and the number of devices to train on.
+        device: where the binning runs, "cpu" or a CUDA device. The views come back on this device if one device trains
+            and it has room for them, else on the CPU; for several, in memory that processes can share.
         progress: show a progress bar.
 
     Raises:
         TableError: a scene has no table or no labelled viewpoint, or its occlusion does not fit.
         MapError: a scene has no landmarks.
+        ConfigError: the views do not fit into shared memory.
     """
     tables: list[pd.DataFrame] = []
     for scene in scenes:
@@ -87,8 +111,12 @@ def load_views(
             raise TableError("no viewpoint has a label", path=scene.table, fix="Run the label stage.")
         tables.append(table)
     total, bins = sum(map(len, tables)), config.bins
-    means = torch.empty((total, len(CHANNELS), bins, bins))
-    filled = torch.empty((total, bins, bins), dtype=torch.bool)
+    n_bytes = total * bins**2 * (len(CHANNELS) * torch.float32.itemsize + torch.bool.itemsize)
+    home = device if config.devices == 1 and has_room(device, n_bytes) else "cpu"
+    means = torch.empty((total, len(CHANNELS), bins, bins), device=home)
+    filled = torch.empty((total, bins, bins), dtype=torch.bool, device=home)
+    if config.devices > 1:
+        _share(means, filled)
     start = 0
     with tqdm(total=total, desc="bin views", unit="view", disable=not progress) as bar:
         for scene, table in zip(scenes, tables, strict=True):
@@ -104,10 +132,21 @@ def load_views(
     return LabelledViews(
         means,
         filled,
-        torch.from_numpy(np.concatenate(good).astype(np.float32)),
+        torch.from_numpy(np.concatenate(good).astype(np.float32)).to(home),
         np.repeat(np.arange(len(tables)), [len(table) for table in tables]),
         np.concatenate([table["location_id"].to_numpy(np.int64) for table in tables]),
     )
+
+
+def _share(*tensors: Tensor) -> None:
+    """Move tensors into memory that other processes can map."""
+    try:
+        for tensor in tensors:
+            tensor.share_memory_()
+    except RuntimeError as error:
+        size = sum(tensor.nbytes for tensor in tensors) / 1e9
+        fix = "Give it more room (in a container, --shm-size), or set train.devices to 1."
+        raise ConfigError(f"the views, {size:.1f} GB, do not fit into shared memory: {error}", fix=fix) from error
 
 
 def hold_out_locations(
@@ -136,18 +175,52 @@ def hold_out_locations(
     return held_out
 
 
+def balance_classes(labels: Tensor, seed: int) -> Tensor:
+    """Choose equally many views of both classes: all of the rarer one, and as many of the other at random.
+
+    Args:
+        labels: (B,) 0 or 1.
+        seed: the same seed and labels give the same choice.
+
+    Returns:
+        Rows of the chosen views, (n,) int64, in ascending order, on the CPU.
+    """
+    positive = labels.cpu().numpy() > 0
+    classes = [np.flatnonzero(positive), np.flatnonzero(~positive)]
+    count = min(map(len, classes))
+    rng = np.random.default_rng(seed)
+    return torch.from_numpy(np.sort(np.concatenate([rng.permutation(rows)[:count] for rows in classes])))
+
+
 class BatchLoader:
     """Iterates over batches cut from tensors by index: no worker, no per-sample work, no copy of the views.
+
+    With several processes, every one cuts the same batches and keeps its share of each. Shares differ by one view at
+    most and can be empty, so that all processes take equally many steps.
 
     Args:
         views: the views.
         rows: which of them, (n,) int64.
-        batch_size: views a batch; the last one may be smaller.
+        batch_size: views a batch, over all processes; the last one may be smaller.
         shuffle_seed: every pass has its own order, the same in every run; None keeps the order of `rows`.
+        channels: channels that batches hold.
+        rank: number of this process.
+        world_size: number of processes.
     """
 
-    def __init__(self, views: LabelledViews, rows: Tensor, batch_size: int, shuffle_seed: int | None = None) -> None:
+    def __init__(
+        self,
+        views: LabelledViews,
+        rows: Tensor,
+        batch_size: int,
+        shuffle_seed: int | None = None,
+        channels: tuple[str, ...] = CHANNELS,
+        rank: int = 0,
+        world_size: int = 1,
+    ) -> None:
         self.views, self.rows, self.batch_size, self.shuffle_seed = views, rows, batch_size, shuffle_seed
+        self.rank, self.world_size = rank, world_size
+        self._channels = torch.tensor([CHANNELS.index(name) for name in channels])
         self._passes = 0
 
     def __len__(self) -> int:
@@ -159,22 +232,37 @@ class BatchLoader:
             order = np.random.default_rng([self.shuffle_seed, self._passes]).permutation(len(rows))
             rows = rows[torch.from_numpy(order)]
             self._passes += 1
-        for batch in rows.to(self.views.labels.device).split(self.batch_size):
-            yield self.views.means[batch], self.views.filled[batch], self.views.labels[batch]
+        means, filled, labels = self.views.means, self.views.filled, self.views.labels
+        # whole planes of one channel are copied: a variant of two channels does not pay for five
+        planes = means.flatten(0, 1)
+        shape = (len(self._channels), *means.shape[2:])
+        of_rows = (rows[:, None] * means.shape[1] + self._channels).to(means.device)
+        rows = rows.to(means.device)
+        for batch, wanted in zip(rows.split(self.batch_size), of_rows.split(self.batch_size), strict=True):
+            share, planes_of_share = (part.tensor_split(self.world_size)[self.rank] for part in (batch, wanted))
+            yield Batch(
+                planes.index_select(0, planes_of_share.flatten()).view(len(share), *shape),
+                filled.index_select(0, share),
+                labels.index_select(0, share),
+                len(batch),
+            )
 
 
 class ViewpointDataModule(LightningDataModule):
     """The labelled viewpoints of a dataset, split by scene.
 
-    Batches hold all of `CHANNELS`, unstandardized: the network picks its own and standardizes them. So the views are
-    binned once, whichever networks train on them.
+    Batches hold means that are not standardized yet: the network does that. So the views are binned once, whichever
+    networks train on them.
 
     Args:
         dataset: its train scenes are learnt from; its val scenes, or else held-out locations of the train scenes, tell
             which epoch was best.
-        config: batch size, bins, label limits, share held out, seed.
-        device: where the binning runs.
+        config: batch size, bins, label limits, share held out, balance, devices, seed.
+        device: where the binning runs, and where the views are kept if one device trains and it has room for them.
         progress: show progress bars.
+
+    Attributes:
+        channels: channels that batches hold; all of `CHANNELS` unless set otherwise.
 
     Attributes (after `setup`):
         views: the views of train and val scenes.
@@ -193,15 +281,30 @@ class ViewpointDataModule(LightningDataModule):
     def __init__(self, dataset: Dataset, config: TrainConfig, device: str = "cpu", progress: bool = True) -> None:
         super().__init__()
         self.dataset, self.config, self.device, self.progress = dataset, config, device, progress
+        self.channels: tuple[str, ...] = CHANNELS
 
     def setup(self, stage: str | None = None) -> None:
-        """Read, bin and split the views, once.
+        """Read, bin and split the views, once; in a process that trains, bring them to its device.
 
         Raises:
             TableError: there is no train scene, or the labels of a split are of one class.
         """
-        if hasattr(self, "views"):
-            return
+        if not hasattr(self, "views"):
+            self._load()
+        if self.trainer is not None:
+            device = self.trainer.strategy.root_device
+            if device != self.views.means.device and has_room(device, self.views.n_bytes):
+                self.views = self.views.to(device)
+
+    def train_dataloader(self) -> BatchLoader:
+        """Shuffled batches of the training views."""
+        return self._loader(self.train_rows, self.config.batch_size, self.config.seed)
+
+    def val_dataloader(self) -> BatchLoader:
+        """Batches of the validation views, in order."""
+        return self._loader(self.val_rows, 8 * self.config.batch_size)
+
+    def _load(self) -> None:
         train, val = self.dataset.split("train"), self.dataset.split("val")
         if not train:
             raise TableError(
@@ -212,24 +315,31 @@ class ViewpointDataModule(LightningDataModule):
             held_out = views.scene >= len(train)
         else:
             held_out = hold_out_locations(views.scene, views.location, self.config.val_fraction, self.config.seed)
+        self.use(views, held_out)
+
+    def use(self, views: LabelledViews, held_out: NDArray[np.bool_]) -> None:
+        """Train on these views instead of those of the dataset.
+
+        Args:
+            views: the views.
+            held_out: (B,) True where a view is for validation.
+
+        Raises:
+            TableError: the labels of a split are of one class.
+        """
         self.train_rows, self.val_rows = (torch.from_numpy(np.flatnonzero(side)) for side in (~held_out, held_out))
+        labels = views.labels.cpu()
         for name, rows in (("training", self.train_rows), ("validation", self.val_rows)):
-            self._check_classes(name, views.labels[rows])
-        self.class_weights = class_weights(views.labels[self.train_rows])
+            self._check_classes(name, labels[rows])
+        if self.config.balance:
+            self.train_rows = self.train_rows[balance_classes(labels[self.train_rows], self.config.seed)]
+        self.class_weights = class_weights(labels[self.train_rows])
         self.statistics = InputStatistics.of(views.means, views.filled, self.train_rows)
         self.views = views
 
-    def move_to(self, device: torch.device) -> None:
-        """Keep the views on a device; for a GPU with room for them, no batch has to travel then."""
-        self.views = self.views.to(device)
-
-    def train_dataloader(self) -> BatchLoader:
-        """Shuffled batches of the training views."""
-        return BatchLoader(self.views, self.train_rows, self.config.batch_size, shuffle_seed=self.config.seed)
-
-    def val_dataloader(self) -> BatchLoader:
-        """Batches of the validation views, in order."""
-        return BatchLoader(self.views, self.val_rows, 8 * self.config.batch_size)
+    def _loader(self, rows: Tensor, batch_size: int, shuffle_seed: int | None = None) -> BatchLoader:
+        rank, world_size = (0, 1) if self.trainer is None else (self.trainer.global_rank, self.trainer.world_size)
+        return BatchLoader(self.views, rows, batch_size, shuffle_seed, self.channels, rank, world_size)
 
     def _check_classes(self, split: str, labels: Tensor) -> None:
         positives = int(labels.sum())

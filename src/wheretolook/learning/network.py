@@ -11,8 +11,8 @@ from wheretolook.errors import ConfigError
 from wheretolook.features import CHANNELS, INPUT_VARIANTS, Layout
 from wheretolook.geometry import PinholeCamera
 
-STATISTICS_BLOCK = 4096
-"""Views worked through at a time when statistics are taken."""
+STATISTICS_BLOCK = 256
+"""Views worked through at a time when statistics are taken: few enough for a processor's cache."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +39,7 @@ class InputStatistics:
             rows: views to use, (n,) int64.
             channels: names of the C channels.
         """
+        rows = rows.to(means.device)
         count = torch.zeros((), dtype=torch.float64, device=means.device)
         total = torch.zeros(len(channels), dtype=torch.float64, device=means.device)
         for block in rows.split(STATISTICS_BLOCK):  # empty bins are zero: they add nothing to the sum
@@ -102,7 +103,7 @@ class NetworkSpec:
 
 
 class BinnedInput(nn.Module):
-    """Turns binned views with all of `CHANNELS` into a network's standardized, flat input.
+    """Turns binned views into a network's standardized, flat input.
 
     Each channel is standardized by its kind (paper, Sec. 3.3 "Data"); empty bins are exactly zero afterwards, that is,
     the mean of their kind.
@@ -124,8 +125,10 @@ class BinnedInput(nn.Module):
         self.register_buffer("std", torch.tensor(spec.statistics.std)[:, None, None], persistent=False)
 
     def forward(self, means: Tensor, filled: Tensor) -> Tensor:
-        """(B, len(CHANNELS), bins, bins) float32 and (B, bins, bins) bool to (B, input_size) float32."""
-        values = (means.index_select(1, self.index) - self.mean) / self.std * filled[:, None]
+        """Means and filled, as `ViewpointNetwork.forward` takes them, to (B, input_size) float32."""
+        if means.shape[1] != len(self.index):
+            means = means.index_select(1, self.index)
+        values = (means - self.mean) / self.std * filled[:, None]
         if self.layout == "compact":
             values = move_to_front(values, filled)
         return values.reshape(-1, self.input_size)
@@ -166,5 +169,10 @@ class ViewpointNetwork(nn.Module):
         self.layers = nn.Sequential(*layers, nn.Linear(width, 1))
 
     def forward(self, means: Tensor, filled: Tensor) -> Tensor:
-        """Logits (B,) of binned views: means (B, len(CHANNELS), bins, bins), filled (B, bins, bins) bool."""
+        """Logits (B,) of binned views.
+
+        Args:
+            means: (B, C, bins, bins) float32, with all of `CHANNELS` or with the variant's own alone.
+            filled: (B, bins, bins) bool.
+        """
         return self.layers(self.input(means, filled)).squeeze(-1)

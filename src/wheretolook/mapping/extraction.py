@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from wheretolook.errors import ConfigError
 from wheretolook.mapping.colmap_model import quiet_colmap
-from wheretolook.worker_processes import end_with_parent, spawning
+from wheretolook.worker_processes import end_with_parent, keep_freed_memory, spawning
 
 
 @dataclass(frozen=True)
@@ -186,12 +186,21 @@ def _opencv_sift(config: ExtractorConfig) -> Any:
     return cv2.SIFT.create(0, layers, contrast, config.edge_threshold, 1.6, enable_precise_upscale=True)
 
 
+def one_thread() -> None:
+    """Called in a worker: keep OpenCV to one thread, as there is a worker for each core."""
+    import cv2
+
+    cv2.setNumThreads(1)
+
+
 _worker: KeypointExtractor | None = None
 
 
 def _start_worker(config: ExtractorConfig) -> None:
     global _worker
     end_with_parent()
+    keep_freed_memory()
+    one_thread()
     _worker = KeypointExtractor(config)
 
 

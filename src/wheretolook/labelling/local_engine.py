@@ -1,0 +1,121 @@
+"""The local engine: shards in processes of this machine. A process that dies is replaced, and its shard done again."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+
+from wheretolook.errors import WorkerError
+from wheretolook.labelling.shard import LabelledShard, Shard, ShardWorker
+from wheretolook.worker_processes import end_with_parent, spawning
+
+MAX_DEATHS = 3
+"""A shard whose worker was killed so often is given up."""
+
+
+@dataclass(eq=False)
+class _Worker:
+    process: BaseProcess
+    pipe: Connection
+    shard: Shard | None = None
+    ticked: int = 0
+
+
+def run_local(
+    shards: Sequence[Shard], workers: int, tick: Callable[[int], None] = lambda n: None
+) -> Iterator[tuple[Shard, LabelledShard]]:
+    """Label shards in processes.
+
+    Args:
+        shards: begun in this order.
+        workers: number of processes.
+        tick: called with the number of viewpoints just finished, negative for those of a worker that died.
+
+    Yields:
+        Shards as they are finished.
+
+    Raises:
+        SceneError, MapError, WorkerError: from a worker.
+        WorkerError: a shard's worker was killed `MAX_DEATHS` times.
+    """
+    waiting, deaths = deque(shards), Counter[Shard]()
+    team: list[_Worker] = []
+    try:
+        with spawning():
+            team += [_start(number) for number in range(min(workers, len(shards)))]
+        for worker in team:
+            _give(worker, waiting)
+        while any(worker.shard is not None for worker in team):
+            by_pipe = {worker.pipe: worker for worker in team if worker.shard is not None}
+            for pipe in wait(list(by_pipe)):
+                worker = by_pipe[pipe]  # type: ignore[index]
+                shard = worker.shard
+                assert shard is not None
+                try:
+                    message = worker.pipe.recv()
+                except (EOFError, ConnectionResetError):  # killed: its end of the pipe is closed
+                    tick(-worker.ticked)
+                    deaths[shard] += 1
+                    if deaths[shard] == MAX_DEATHS:
+                        raise WorkerError(
+                            f"{MAX_DEATHS} labelling processes were killed at the same viewpoints, probably for lack of "
+                            "memory", path=shard.job.mesh, value=f"{workers} workers",
+                            fix="Lower label.workers and run again: finished shards are kept.",
+                        ) from None  # fmt: skip
+                    waiting.appendleft(shard)
+                    worker.process.join()
+                    number = team.index(worker)
+                    with spawning():
+                        team[number] = _start(number)
+                    _give(team[number], waiting)
+                    continue
+                if isinstance(message, int):
+                    worker.ticked += message
+                    tick(message)
+                elif isinstance(message, BaseException):
+                    raise message
+                else:
+                    _give(worker, waiting)
+                    yield shard, message
+    finally:
+        for worker in team:
+            worker.process.kill()
+        for worker in team:
+            worker.process.join()
+
+
+def _start(number: int) -> _Worker:
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe()
+    process = context.Process(target=_work, args=(theirs, number), daemon=True)
+    process.start()
+    theirs.close()  # so that its death closes the pipe
+    return _Worker(process, ours)
+
+
+def _give(worker: _Worker, waiting: deque[Shard]) -> None:
+    """Hand the next shard to a worker, if there is one."""
+    worker.shard, worker.ticked = (waiting.popleft() if waiting else None), 0
+    if worker.shard is not None:
+        try:
+            worker.pipe.send((worker.shard.job, worker.shard.rows))
+        except (BrokenPipeError, ConnectionResetError):
+            pass  # it died; reading from it says so
+
+
+def _work(pipe: Connection, number: int) -> None:
+    end_with_parent()
+    worker = ShardWorker(number)
+    while True:
+        try:
+            job, rows = pipe.recv()
+        except EOFError:
+            return
+        try:
+            pipe.send(worker.label(job, rows, pipe.send))
+        except BaseException as error:
+            pipe.send(error)

@@ -1,0 +1,123 @@
+"""The two landmarks nearest to each keypoint's descriptor, exactly, by one matrix product."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+Matches = tuple[NDArray[np.int64], NDArray[np.int64]]
+"""Rows of keypoints and rows of their landmarks, (M,) each, in ascending order of the keypoints."""
+
+GROUP = 32
+"""Landmarks whose best is found first; the two best of all are then looked for in the two best groups."""
+
+_PRODUCT_BYTES = {"cpu": 2**22, "cuda": 2**30}
+"""Size of a block of products: on a CPU it should stay in the cache."""
+
+
+class DescriptorMatcher:
+    """Finds nearest neighbours among the landmarks' descriptors.
+
+    Descriptors are compared as COLMAP stores them, in whole numbers, by their scalar products. These are then exact, in
+    eight-bit integers on a CPU as in half precision with single-precision sums on a GPU: both give the same neighbours,
+    and those of one descriptor do not depend on what it is matched together with. `nearest_two_plain` is the twin.
+
+    Args:
+        descriptors: (N, 128) uint8, of the landmarks.
+        device: "cpu" or a CUDA device.
+    """
+
+    def __init__(self, descriptors: NDArray[np.uint8], device: str = "cpu") -> None:
+        self.device = torch.device(device)
+        n, length = descriptors.shape
+        padded = -(-max(n, 2 * GROUP) // GROUP) * GROUP
+        whole = torch.zeros((padded, length), dtype=torch.int32)
+        whole[:n] = torch.from_numpy(descriptors.astype(np.int32))
+        if self.device.type == "cpu":  # in signed bytes: q.d = (q - 128).(d - 128) + 128 (sum of d) + terms of q alone
+            self._descriptors = (whole - 128).to(torch.int8).T
+            self._bias = 128 * whole.sum(1, dtype=torch.int32)
+        else:
+            self._descriptors = whole.to(self.device, torch.float16).T
+            self._bias = torch.zeros(padded, device=self.device)
+        self._bias[n:] = -(2**28)  # rows that only pad are never near
+
+    def nearest_two(
+        self, descriptors: NDArray[np.uint8]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+        """Nearest landmark of each descriptor (K, 128) uint8, and its products with the nearest and second nearest.
+
+        Returns:
+            rows (K,), nearest (K,) and second (K,); of several landmarks equally near, `rows` names any.
+        """
+        queries = torch.from_numpy(descriptors.astype(np.int32))
+        block = max(1, _PRODUCT_BYTES[self.device.type] // (4 * len(self._bias)))
+        parts = [self._best_two(part) for part in queries.split(block)]
+        rows, best = (torch.cat([part[i] for part in parts]).cpu().long().numpy() for i in (0, 1))
+        return rows, best[:, 0], best[:, 1]
+
+    def _best_two(self, queries: Tensor) -> tuple[Tensor, Tensor]:
+        """Row of the nearest landmark, (k,), and the two largest products, (k, 2)."""
+        if self.device.type == "cpu":
+            product = torch._int_mm((queries - 128).to(torch.int8), self._descriptors)
+            of_query = 128 * (queries.sum(1, keepdim=True) - 128 * queries.shape[1])
+        else:
+            product = torch.mm(queries.to(self.device, torch.float16), self._descriptors, out_dtype=torch.float32)
+            of_query = torch.zeros((), device=self.device)
+        groups = product.add_(self._bias).view(len(product), -1, GROUP)
+        of_best = groups.amax(2).topk(2, dim=1).indices
+        candidates = groups.gather(1, of_best[:, :, None].expand(-1, -1, GROUP)).flatten(1)
+        best, at = candidates.topk(2, dim=1)
+        first = at[:, 0]
+        rows = of_best.gather(1, first[:, None] // GROUP)[:, 0] * GROUP + first % GROUP
+        return rows, best + of_query
+
+
+def nearest_two_plain(
+    queries: NDArray[np.uint8], descriptors: NDArray[np.uint8]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Twin of `DescriptorMatcher.nearest_two`: all products, sorted."""
+    product = queries.astype(np.int64) @ descriptors.astype(np.int64).T
+    order = np.argsort(-product, axis=1, kind="stable")
+    best = np.take_along_axis(product, order[:, :2], axis=1)
+    return order[:, 0], best[:, 0], best[:, 1]
+
+
+def match(matcher: DescriptorMatcher, descriptors: Sequence[NDArray[np.uint8]], max_ratio: float) -> list[Matches]:
+    """2D-3D matches of several images at once.
+
+    A match passes Lowe's ratio test (IJCV 2004, Sec. 7.1), and a landmark keeps only its nearest keypoint.
+
+    Args:
+        matcher: of the landmarks.
+        descriptors: of each image, (K_i, 128) uint8.
+        max_ratio: the nearest landmark's distance over the second nearest's must be below it.
+
+    Returns:
+        The matches of each image.
+    """
+    lengths = [len(one) for one in descriptors]
+    if sum(lengths) == 0:
+        return [(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)) for _ in descriptors]
+    rows, nearest, second = matcher.nearest_two(np.concatenate(descriptors))
+    # squared distances of descriptors of length 512, of which rounding leaves some a little longer
+    distance, next_distance = (np.maximum(2 * (512**2 - best), 0) for best in (nearest, second))
+    passed = distance < max_ratio**2 * next_distance
+    ends = np.cumsum(lengths)
+    return [
+        _each_landmark_once(rows[start:end], distance[start:end], passed[start:end])
+        for start, end in zip(ends - lengths, ends, strict=True)
+    ]
+
+
+def _each_landmark_once(rows: NDArray[np.int64], distance: NDArray[np.int64], passed: NDArray[np.bool_]) -> Matches:
+    keypoints = np.flatnonzero(passed)
+    landmarks = rows[keypoints]
+    order = np.lexsort((keypoints, distance[keypoints], landmarks))
+    first = np.ones(len(order), dtype=bool)
+    first[1:] = np.diff(landmarks[order]) > 0
+    unique = np.sort(order[first])
+    return keypoints[unique], landmarks[unique]

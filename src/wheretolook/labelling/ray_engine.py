@@ -1,0 +1,128 @@
+"""The Ray engine: the same shards on a cluster, for whoever outgrows one machine.
+
+Machines need not share a file system: meshes and landmarks travel through Ray's object store, labels come back to the
+driver, which alone writes. What a removed machine had in hand, Ray gives to another.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from wheretolook.errors import ConfigError, WhereToLookError, WorkerError
+from wheretolook.labelling.shard import LabelledShard, SceneJob, Shard, ShardWorker
+
+MAX_RETRIES = 5
+"""How often Ray starts a shard again whose process or machine was lost."""
+
+WORKERS_A_GPU = 16
+"""Shards that share one GPU."""
+
+
+def run_ray(
+    shards: Sequence[Shard], address: str = "", tick: Callable[[int], None] = lambda n: None
+) -> Iterator[tuple[Shard, LabelledShard]]:
+    """Label shards on a Ray cluster, one core each; with device "cuda" also a sixteenth of a GPU.
+
+    Args:
+        shards: begun in this order.
+        address: of the cluster; empty uses the one this process is connected to, or starts one on this machine.
+        tick: called with the number of viewpoints just finished.
+
+    Yields:
+        Shards as they are finished.
+
+    Raises:
+        ConfigError: Ray is not installed, or there is no cluster at the address.
+        SceneError, MapError, WorkerError: from a worker.
+        WorkerError: a shard was lost more than `MAX_RETRIES` times.
+    """
+    try:
+        import ray
+    except ImportError as error:
+        fix = "Install it: pip install 'wheretolook[ray]', or use label.engine local."
+        raise ConfigError("Ray is not installed", value="label.engine ray", fix=fix) from error
+    ours = not ray.is_initialized()
+    if ours:
+        _connect(ray, address)
+    try:
+        yield from _run(ray, shards, tick)
+    finally:
+        if ours:
+            ray.shutdown()
+
+
+def _connect(ray: Any, address: str) -> None:
+    try:
+        ray.init(address=address or "local", log_to_driver=False, include_dashboard=False if not address else None,
+                 logging_level="ERROR")  # fmt: skip
+    except (ConnectionError, RuntimeError, ValueError) as error:
+        fix = "Start it (`ray start --head`), or correct label.ray_address."
+        raise ConfigError(f"no Ray cluster there: {error}", value=address, fix=fix) from error
+
+
+def _run(ray: Any, shards: Sequence[Shard], tick: Callable[[int], None]) -> Iterator[tuple[Shard, LabelledShard]]:
+    waiting, running, files = iter(shards), dict[Any, Shard](), dict[SceneJob, Any]()
+
+    def start(shard: Shard) -> None:
+        if shard.job not in files:  # a scene travels to a machine once
+            files.clear()
+            files[shard.job] = ray.put((shard.job.mesh.read_bytes(), shard.job.landmarks.read_bytes()))
+        gpus = 1 / WORKERS_A_GPU if shard.job.device.startswith("cuda") else 0
+        task = ray.remote(num_cpus=1, num_gpus=gpus, max_retries=MAX_RETRIES)(_label_shard)
+        running[task.remote(shard.job, files[shard.job], shard.rows)] = shard
+
+    while True:
+        room = 2 * max(1, int(ray.cluster_resources().get("CPU", 1))) - len(running)  # the cluster may grow and shrink
+        for shard in islice(waiting, max(0, room)):
+            start(shard)
+        if not running:
+            return
+        (done, *_), _ = ray.wait(list(running))
+        shard = running.pop(done)
+        try:
+            labelled = ray.get(done)
+        except ray.exceptions.RayTaskError as error:
+            if isinstance(error.cause, WhereToLookError):
+                raise error.cause from None
+            raise
+        except ray.exceptions.RayError as error:
+            raise WorkerError(
+                f"a shard was lost more than {MAX_RETRIES} times: {error}", path=shard.job.mesh,
+                fix="Finished shards are kept: mend the cluster and run again.",
+            ) from error  # fmt: skip
+        tick(len(shard.rows))
+        yield shard, labelled
+
+
+_worker: ShardWorker | None = None
+
+
+def _label_shard(job: SceneJob, files: tuple[bytes, bytes], rows: pd.DataFrame) -> LabelledShard:
+    """Runs on the cluster. The scene's files are laid down once a machine, named by their content."""
+    global _worker
+    if _worker is None:
+        os.environ.setdefault("OMP_NUM_THREADS", "1")
+        _worker = ShardWorker()
+    folder = Path(tempfile.gettempdir()) / f"wheretolook-{os.getuid()}"
+    folder.mkdir(exist_ok=True)
+    mesh = _lay_down(folder, files[0], job.mesh.suffix)
+    landmarks = _lay_down(folder, files[1], job.landmarks.suffix)
+    return _worker.label(replace(job, mesh=mesh, landmarks=landmarks), rows)
+
+
+def _lay_down(folder: Path, content: bytes, suffix: str) -> Path:
+    path = folder / f"{hashlib.sha256(content).hexdigest()[:32]}{suffix}"
+    if not path.is_file():
+        with tempfile.NamedTemporaryFile(dir=folder, delete=False) as file:
+            file.write(content)
+        os.replace(file.name, path)
+    return path

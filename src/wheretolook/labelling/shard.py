@@ -1,0 +1,185 @@
+"""What a worker does, whichever engine runs it: label the viewpoints of one shard."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+
+from wheretolook.errors import WhereToLookError, WorkerError
+from wheretolook.geometry import Float, PinholeCamera, pose_error
+from wheretolook.labelling.config import LocalizerConfig
+from wheretolook.labelling.pipeline import Step, run_pipeline
+from wheretolook.mapping.extraction import ExtractorConfig
+from wheretolook.table import poses
+from wheretolook.worker_processes import keep_freed_memory
+
+if TYPE_CHECKING:
+    from wheretolook.labelling.localizer import Localization, Localizer
+    from wheretolook.rendering import Renderer
+
+BATCH = 8
+"""Viewpoints that go through the steps together."""
+
+Tick = Callable[[int], None]
+
+
+@dataclass(frozen=True)
+class SceneJob:
+    """All that a worker needs to label viewpoints of a scene.
+
+    Attributes:
+        mesh: file of the scene's mesh.
+        landmarks: file of the map's landmarks, with descriptors.
+        camera: intrinsics of the viewpoints.
+        localizer: matching and pose estimation.
+        extractor: what the map was made with.
+        device: where images are rendered and descriptors matched; "cuda" is spread over all GPUs there are.
+    """
+
+    mesh: Path
+    landmarks: Path
+    camera: PinholeCamera = PinholeCamera()
+    localizer: LocalizerConfig = LocalizerConfig()
+    extractor: ExtractorConfig = ExtractorConfig()
+    device: str = "cpu"
+
+
+@dataclass(frozen=True, eq=False)
+class Shard:
+    """Some viewpoints of one scene, and the file their labels go to."""
+
+    job: SceneJob
+    path: Path
+    rows: pd.DataFrame
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledShard:
+    """What a worker returns.
+
+    Attributes:
+        rows: the shard's viewpoints with their labels.
+        seconds: time the worker spent in each step; steps overlap.
+    """
+
+    rows: pd.DataFrame
+    seconds: dict[str, float] = field(default_factory=dict)
+
+
+class ShardWorker:
+    """Labels shards in this process, and keeps what a scene needs until a shard of another scene comes.
+
+    Args:
+        number: of this worker among its engine's, from 0; tells which GPU it takes.
+    """
+
+    def __init__(self, number: int = 0) -> None:
+        import cv2
+        import torch
+
+        keep_freed_memory()
+        torch.set_num_threads(1)  # there is a worker for each core
+        cv2.setNumThreads(1)
+        self.number = number
+        self._scene: tuple[SceneJob, Renderer, Localizer] | None = None
+
+    def label(self, job: SceneJob, rows: pd.DataFrame, tick: Tick = lambda n: None) -> LabelledShard:
+        """Label viewpoints.
+
+        Args:
+            job: their scene.
+            rows: viewpoints, see `wheretolook.table.SCHEMA`.
+            tick: called with the number of viewpoints just finished.
+
+        Raises:
+            SceneError, MapError: the mesh or the landmarks cannot be used.
+            WorkerError: anything else went wrong, such as a failure of the renderer.
+        """
+        try:
+            seconds: dict[str, float] = {}
+            renderer, localizer = self._open(job)
+            return LabelledShard(label_rows(rows, renderer, localizer, job.camera, seconds, tick), seconds)
+        except WhereToLookError:
+            raise
+        except Exception as error:
+            raise WorkerError(
+                f"labelling failed: {type(error).__name__}: {error}",
+                path=job.mesh,
+                value=f"viewpoints {rows['viewpoint_id'].iloc[0]} to {rows['viewpoint_id'].iloc[-1]}",
+                fix="Finished shards are kept: mend the cause and run again.",
+            ) from error
+
+    def _open(self, job: SceneJob) -> tuple[Renderer, Localizer]:
+        from wheretolook.labelling.localizer import Localizer
+        from wheretolook.mapping.landmarks import Landmarks
+        from wheretolook.rendering import WarpRenderer
+        from wheretolook.scenes.loading import load_mesh
+
+        if self._scene is None or self._scene[0] != job:
+            self._scene = None  # make room first
+            device = _device(job.device, self.number)
+            renderer = WarpRenderer(load_mesh(job.mesh), device)
+            localizer = Localizer(Landmarks.load(job.landmarks), job.camera, job.localizer, job.extractor, device)
+            self._scene = job, renderer, localizer
+        return self._scene[1:]
+
+
+def label_rows(
+    table: pd.DataFrame,
+    renderer: Renderer,
+    localizer: Localizer,
+    camera: PinholeCamera,
+    seconds: dict[str, float] | None = None,
+    tick: Tick = lambda n: None,
+) -> pd.DataFrame:
+    """Render viewpoints, localize the images and measure the errors: three batched steps at a time in this process.
+
+    Args:
+        table: viewpoints.
+        renderer: of the scene.
+        localizer: of its map.
+        camera: intrinsics of the viewpoints.
+        seconds: gets the time spent in each step added: render, extract, match, pose.
+        tick: called with the number of viewpoints just finished.
+
+    Returns:
+        The table with status, error_m, error_deg and n_inliers filled in.
+    """
+    true_poses = poses(table)
+
+    def estimate(batch: list[Any]) -> list[Localization]:
+        return [localizer.estimate(keypoints, *matches) for keypoints, matches in batch]
+
+    steps = [
+        Step("render", lambda batch: renderer.render(camera, batch).rgb),
+        Step("extract", lambda images: [localizer.extract(rgb) for rgb in images]),
+        Step("match", lambda found: list(zip(found, localizer.match(found), strict=True))),
+        Step("pose", estimate),
+    ]
+    batches = [true_poses[start : start + BATCH] for start in range(0, len(true_poses), BATCH)]
+    found: list[Localization] = []
+    for part in run_pipeline(batches, steps, seconds):
+        found += part
+        tick(len(part))
+    none: Float = np.full((3, 4), np.nan)
+    estimates = np.stack([none if one.cam_from_world is None else one.cam_from_world for one in found])
+    error_m, error_deg = pose_error(estimates, true_poses)
+    return table.assign(
+        status=[one.status for one in found],
+        error_m=error_m.astype(np.float32),
+        error_deg=error_deg.astype(np.float32),
+        n_inliers=np.array([len(one.inlier_rows) for one in found], dtype=np.int32),
+    )
+
+
+def _device(device: str, number: int) -> str:
+    if device != "cuda":
+        return device
+    import torch
+
+    return f"cuda:{number % max(1, torch.cuda.device_count())}"

@@ -1,0 +1,232 @@
+"""Fitting a network with Lightning: on one device or several, keeping the best weights and logging every epoch."""
+
+from __future__ import annotations
+
+import logging
+import math
+import signal
+import threading
+import time
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+import pandas as pd
+import torch
+from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.callbacks import Checkpoint, EarlyStopping
+from lightning.pytorch.strategies import DDPStrategy
+from tqdm.auto import tqdm
+
+from wheretolook.errors import ConfigError
+from wheretolook.learning.classifier import ViewpointClassifier
+from wheretolook.learning.config import TrainConfig
+from wheretolook.learning.data import ViewpointDataModule
+from wheretolook.tracking import TrackingConfig, client
+
+if TYPE_CHECKING:
+    from mlflow.entities import Metric
+
+MONITORED = "val_average_precision"
+"""The metric that tells which epoch was best."""
+
+LIGHTNING_LOGGERS = ("lightning.pytorch", "lightning.fabric")
+
+LOG_EVERY_S = 2.0
+"""Epochs are logged together after so many seconds: a transaction takes longer than a short epoch."""
+
+LOG_AT_MOST = 1000
+"""Metrics MLflow takes at a time."""
+
+
+def home_device(config: TrainConfig) -> str:
+    """Torch device of the process that calls: "cuda:0" or "cpu".
+
+    Raises:
+        ConfigError: there are fewer GPUs than asked for.
+    """
+    gpus = torch.cuda.device_count() if config.accelerator != "cpu" else 0
+    wanted = config.devices if gpus or config.accelerator == "gpu" else 0
+    if wanted > max(gpus, torch.backends.mps.is_available()):
+        raise ConfigError(
+            f"train.devices asks for more GPUs than there are: {gpus}",
+            value=config.devices,
+            fix="Ask for fewer, or set train.accelerator to cpu to train in processes on the CPU.",
+        )
+    return "cuda:0" if gpus else "cpu"
+
+
+def fit(classifier: ViewpointClassifier, data: ViewpointDataModule, record: EpochRecord) -> None:
+    """Train a classifier; afterwards `record` has the history and the weights to keep.
+
+    With `config.devices > 1`, every device has its own process, started here and ended here: a script that calls this
+    needs the usual `if __name__ == "__main__":`, and an interactive session cannot call it.
+
+    Args:
+        classifier: what to train.
+        data: the views, set up.
+        record: gathers the results.
+    """
+    config = classifier.config
+    callbacks: list[Callback] = [record]
+    if config.patience is not None:
+        callbacks.append(EarlyStopping(MONITORED, mode="max", patience=config.patience))
+    several = config.devices > 1
+    with _quiet(), TemporaryDirectory() as folder:
+        if several:
+            record.file = Path(folder) / "record.pt"
+        trainer = Trainer(
+            accelerator="cpu" if several and home_device(config) == "cpu" else config.accelerator,
+            devices=config.devices,
+            # spawned processes run nothing but the fit; processes that run the program anew would repeat all else
+            strategy=_Spawned(start_method="spawn") if several else "auto",
+            max_epochs=config.epochs,
+            logger=False,
+            callbacks=callbacks,
+            default_root_dir=folder,
+            num_sanity_val_steps=0,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+        )
+        trainer.fit(classifier, datamodule=data)
+        record.collect()
+
+
+class RunLog:
+    """Logs the metrics of epochs to an MLflow run, several epochs at a time.
+
+    Args:
+        tracking: the store.
+        run_id: the run, open.
+    """
+
+    def __init__(self, tracking: TrackingConfig, run_id: str) -> None:
+        self.tracking, self.run_id = tracking, run_id
+        self._waiting: list[Metric] = []
+        self._flushed = time.monotonic()
+
+    def add(self, epoch: int, metrics: dict[str, float]) -> None:
+        """Log the metrics of an epoch, now or soon. Those that are not finite are left out."""
+        from mlflow.entities import Metric
+
+        now = int(time.time() * 1000)
+        self._waiting += [Metric(name, value, now, epoch) for name, value in metrics.items() if math.isfinite(value)]
+        if time.monotonic() - self._flushed > LOG_EVERY_S or len(self._waiting) > LOG_AT_MOST // 2:
+            self.flush()
+
+    def flush(self) -> None:
+        """Log what waits."""
+        if self._waiting:
+            client(self.tracking).log_batch(self.run_id, metrics=self._waiting)
+        self._waiting, self._flushed = [], time.monotonic()
+
+
+class EpochRecord(Checkpoint):
+    """Keeps each epoch's metrics and the best weights, shows the progress and logs it.
+
+    Args:
+        title: title of the progress bar.
+        config: tells which weights to keep.
+        progress: show a bar.
+        run_log: where to log, if anywhere.
+
+    Attributes:
+        rows: metrics of each epoch.
+        kept: the epoch whose weights are kept.
+        file: where a process that trains leaves the record for the one that started it; None if they are the same.
+    """
+
+    def __init__(self, title: str, config: TrainConfig, progress: bool, run_log: RunLog | None = None) -> None:
+        self.title, self.epochs, self.progress, self.run_log = title, config.epochs, progress, run_log
+        self.keep_best = config.keep == "best"
+        self.rows: list[dict[str, float]] = []
+        self.kept = -1
+        self.file: Path | None = None
+        self._weights: dict[str, torch.Tensor] = {}
+        self._bar: Any = None
+
+    @property
+    def history(self) -> pd.DataFrame:
+        """Metrics of each epoch, one row an epoch."""
+        return pd.DataFrame(self.rows)
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Show the bar."""
+        hidden = not (self.progress and trainer.is_global_zero)
+        self._bar = tqdm(total=self.epochs, desc=self.title, unit="epoch", disable=hidden)
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Note the epoch's metrics; keep its weights if it is the best so far."""
+        metrics = {name: float(value) for name, value in trainer.callback_metrics.items()}
+        best = max((row[MONITORED] for row in self.rows), default=float("-inf"))
+        self.rows.append({"epoch": float(trainer.current_epoch), **metrics})
+        if not self.keep_best or metrics[MONITORED] > best:
+            self.kept = len(self.rows) - 1
+            self._weights = {name: tensor.detach().clone() for name, tensor in pl_module.state_dict().items()}
+        if self.run_log is not None and trainer.is_global_zero:
+            self.run_log.add(trainer.current_epoch, metrics)
+        now = metrics[MONITORED]
+        self._bar.set_postfix_str(f"AP {now:.3f}, best {max(best, now):.3f}", refresh=False)
+        self._bar.update()
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Hand the record over."""
+        if self.file is not None and trainer.is_global_zero:
+            torch.save((self.rows, self.kept, self._weights), self.file)
+
+    def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Close the bar and log what is not logged yet."""
+        if self._bar is not None:
+            self._bar.close()
+        if self.run_log is not None and trainer.is_global_zero:
+            self.run_log.flush()
+
+    def collect(self) -> None:
+        """Take over what the process that trained has left."""
+        if self.file is not None:
+            self.rows, self.kept, self._weights = torch.load(self.file, map_location="cpu")
+
+    def restore(self, classifier: ViewpointClassifier) -> dict[str, float]:
+        """Put the kept weights into the classifier and return the metrics of their epoch."""
+        classifier.load_state_dict(self._weights)
+        return dict(self.rows[self.kept])
+
+
+class _Spawned(DDPStrategy):
+    """Lightning's DDP in spawned processes, which are as quiet as the one that starts them."""
+
+    def setup_environment(self) -> None:
+        """Silence this process, which does nothing but train, and join the others."""
+        _silence()
+        super().setup_environment()
+
+
+def _silence() -> None:
+    for logger in map(logging.getLogger, LIGHTNING_LOGGERS):
+        logger.setLevel(logging.WARNING)
+    warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)`")  # between Lightning and PyTorch
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Silence Lightning's notes on hardware, and turn its exit on Ctrl-C back into a KeyboardInterrupt."""
+    loggers = [logging.getLogger(name) for name in LIGHTNING_LOGGERS]
+    levels = [logger.level for logger in loggers]
+    in_main = threading.current_thread() is threading.main_thread()
+    handler = signal.getsignal(signal.SIGINT) if in_main else None
+    try:
+        with warnings.catch_warnings():
+            _silence()
+            yield
+    except SystemExit as stop:
+        if isinstance(stop.__context__, KeyboardInterrupt):
+            raise KeyboardInterrupt from stop
+        raise
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
+        if in_main:
+            signal.signal(signal.SIGINT, handler)

@@ -18,6 +18,8 @@ from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.table import fingerprint, read_table
 from wheretolook.visibility import StoredOcclusion
 
+Split = Literal["train", "val", "test"]
+
 
 @dataclass(frozen=True)
 class SceneFolder:

@@ -1,6 +1,6 @@
 """How long training takes at paper scale, and how much of it Lightning, validation and logging add to a bare loop.
 
-    python tests/benchmarks/bench_training.py                             # 250,000 views x 300 epochs, GPU if there is one
+    python tests/benchmarks/bench_training.py                     # 250,000 views x 300 epochs, on a GPU if there is one
     python tests/benchmarks/bench_training.py --batch 1024 --variant 2d+3d
     python tests/benchmarks/bench_training.py --device cpu --views 20000 --epochs 5 --batch 1024 --hidden 8
 

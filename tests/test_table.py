@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from wheretolook.errors import TableError
-from wheretolook.geometry import poses_looking_along
+from wheretolook.geometry import camera_centers, poses_looking_along
 from wheretolook.table import SCHEMA, fingerprint, is_good, pose_columns, poses, read_table, write_table
 
 
@@ -69,4 +69,56 @@ def test_missing_truncated_and_foreign_files(table: pd.DataFrame, tmp_path: Path
         read_table(path)
     table.drop(columns="error_m").to_parquet(path)
     with pytest.raises(TableError, match="error_m"):
+        read_table(path)
+
+
+@pytest.fixture
+def many(table: pd.DataFrame) -> pd.DataFrame:
+    """Forty locations with fifty directions each, in no order."""
+    rng = np.random.default_rng(1)
+    locations, directions = rng.uniform(-20, 20, (40, 3)), rng.normal(size=(50, 3))
+    truth = poses_looking_along(np.repeat(locations, 50, axis=0), np.tile(directions, (40, 1)))
+    rows = table.iloc[rng.integers(0, 5, len(truth))].reset_index(drop=True)
+    rows = rows.assign(
+        viewpoint_id=np.arange(len(truth)), location_id=np.arange(len(truth)) // 50,
+        direction_id=np.arange(len(truth)) % 50, **pose_columns(truth),
+        error_m=np.where(rows["error_m"].isna(), np.nan, rng.random(len(truth))),
+    )  # fmt: skip
+    return rows.sample(frac=1, random_state=0).reset_index(drop=True)
+
+
+def test_a_compact_table_reads_the_same(many: pd.DataFrame, tmp_path: Path) -> None:
+    plain, compact, again = (tmp_path / f"{name}.parquet" for name in ("plain", "compact", "again"))
+    write_table(many, plain)
+    write_table(many, compact, compact=True)
+    write_table(read_table(compact), again, compact=True)
+    assert compact.read_bytes() == again.read_bytes()
+    assert compact.stat().st_size < plain.stat().st_size / 2
+    back, before = read_table(compact), read_table(plain)
+    translation = ["tx", "ty", "tz"]
+    pd.testing.assert_frame_equal(back.drop(columns=translation), before.drop(columns=translation))
+    np.testing.assert_allclose(back[translation], before[translation], rtol=0, atol=1e-12)
+    # the centre of a location is stored once, where anyone reads it without arithmetic
+    columns = pd.read_parquet(compact)
+    assert columns.groupby("location_id")[["x_m", "y_m", "z_m"]].nunique().to_numpy().max() == 1
+    centers = camera_centers(poses(before))
+    np.testing.assert_allclose(columns[["x_m", "y_m", "z_m"]], centers, rtol=0, atol=1e-12)
+
+
+def test_damaged_compact_tables(many: pd.DataFrame, tmp_path: Path) -> None:
+    path = tmp_path / "viewpoints.parquet"
+    write_table(many, path, compact=True)
+    content, columns = path.read_bytes(), pd.read_parquet(path)
+    for place in (len(content) // 4, len(content) // 2):
+        path.write_bytes(content[:place] + bytes([content[place] ^ 255]) + content[place + 1 :])
+        with pytest.raises(TableError, match=r"viewpoints\.parquet"):
+            read_table(path)
+    path.write_bytes(content[: len(content) // 2])
+    with pytest.raises(TableError, match="truncated"):
+        read_table(path)
+    columns.drop(columns="y_m").to_parquet(path)
+    with pytest.raises(TableError, match=r"missing \(got \['y_m'\]"):
+        read_table(path)
+    columns.assign(x_m=np.nan).to_parquet(path)
+    with pytest.raises(TableError, match="no rigid transform"):
         read_table(path)

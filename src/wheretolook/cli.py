@@ -33,6 +33,11 @@ STAGES = {
     "label": ("label", "Render and localize every viewpoint, measure the pose error. Resumes.", ("label",)),
     "train": ("train", "Train one network for each input variant.", ("train", "tracking")),
     "evaluate": ("evaluate", "Score all methods on the test scenes.", ("evaluate", "occlusion", "tracking")),
+    "release": (
+        "release",
+        "Make a compact copy, data/release; given that copy and weights trained on it, evaluate and write its card.",
+        ("evaluate", "tracking"),
+    ),
 }
 """Sub-command: function in `wheretolook.stages`, what it does, groups of settings it reads."""
 
@@ -49,6 +54,7 @@ stages, in order; each reads what the one before it left in <data>/<name>/
   wheretolook STAGE --help         the settings a stage reads, with their defaults
   wheretolook demo                 is configs/demo.yaml unless --config names another
   wheretolook map --config configs/demo.yaml --map.n_images 120
+  wheretolook label --config configs/paper.yaml --engine ray     on a Ray cluster; the default is local
   wheretolook --version
 """
 
@@ -118,6 +124,8 @@ def parse_experiment(command: str, arguments: list[str]) -> Experiment | None:
     """
     from wheretolook.config import Experiment
 
+    arguments = [_SHORT.get(name, name) + equals + value for name, equals, value in
+                 (argument.partition("=") for argument in arguments)]  # fmt: skip
     if command == "demo" and not any(argument.startswith("--config") for argument in arguments):
         arguments = ["--config", str(_default_config()), *arguments]
     parser = _parser(command)
@@ -194,6 +202,9 @@ def _help(parser: ArgumentParser, command: str) -> str:
         group._group_actions = [action for action in group._group_actions if belongs(action.dest)]
     return str(parser.format_help())
 
+
+_SHORT = {"--engine": "--label.engine"}
+"""Flags that may be given without their group."""
 
 _GROUPS = {group.partition(".")[0] for _, _, groups in STAGES.values() for group in groups}
 

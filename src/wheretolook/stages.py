@@ -12,7 +12,7 @@ import shutil
 import time
 import zlib
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -41,11 +41,17 @@ def make_scenes(experiment: Experiment, say: Say = print, tick: Tick = lambda wo
 
     Raises:
         SceneError: a mesh of one's own cannot be used, or two scenes have the same name.
+        ConfigError: the dataset's folder holds a release.
     """
     from wheretolook.scenes.loading import load_mesh, save_glb
     from wheretolook.scenes.procedural import generate_apartment
 
     config, root = experiment.scenes, experiment.root
+    if (root / "release.json").is_file():
+        raise ConfigError(
+            "a release is not made from scenes, and would be lost", path=root,
+            fix="Use it with train, evaluate and release alone, or give the experiment another name.",
+        )  # fmt: skip
     numbers: dict[Split, int] = {"train": config.train, "val": config.val, "test": config.test}
     splits = [split for split, number in numbers.items() for _ in range(number)]
     sources: dict[SceneFolder, Callable[[], Any]] = {}
@@ -189,7 +195,7 @@ def label(experiment: Experiment, say: Say = print, tick: Tick = lambda work: No
     dataset, config = _dataset(experiment, "sample"), experiment.label
     scenes: dict[str, tuple[SceneFolder, str]] = {}
     tasks: list[LabelTask] = []
-    for scene in dataset.scenes:
+    for scene in sorted(dataset.scenes, key=lambda scene: scene.split == "train"):  # those to evaluate on come first
         table, extractor = scene.read_table(), _extractor_of(scene)
         key = _key("label", [asdict(config.localizer), asdict(extractor), asdict(dataset.camera),
                              _existing(scene.mesh, SceneError, "scenes"),
@@ -202,15 +208,16 @@ def label(experiment: Experiment, say: Say = print, tick: Tick = lambda work: No
         tasks.append(LabelTask(scene.name, job, table, scene.folder / "shards"))
     seconds: dict[str, float] = {}
     start = time.monotonic()
-    for labelled in label_scenes(tasks, config):
-        scene, key = scenes[labelled.task.name]
-        write_table(labelled.table, scene.table)
-        write_json(scene.label_manifest, labelled.manifest)
-        _stamp(scene, "label", key)
-        shutil.rmtree(labelled.task.shards)
-        for step, spent in labelled.seconds.items():
-            seconds[step] = seconds.get(step, 0.0) + spent
-        report(scene, labelled.table)
+    with closing(label_scenes(tasks, config)) as results:  # so that Ctrl-C here ends the workers
+        for labelled in results:
+            scene, key = scenes[labelled.task.name]
+            write_table(labelled.table, scene.table)
+            write_json(scene.label_manifest, labelled.manifest)
+            _stamp(scene, "label", key)
+            shutil.rmtree(labelled.task.shards)
+            for step, spent in labelled.seconds.items():
+                seconds[step] = seconds.get(step, 0.0) + spent
+            report(scene, labelled.table)
     if tasks:
         seconds["wall"] = time.monotonic() - start
         log_labels(dataset, experiment.tracking, seconds)
@@ -243,6 +250,47 @@ def evaluate(experiment: Experiment, say: Say = print, tick: Tick = lambda work:
     )
     tick(1)
     return scores
+
+
+def release(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> Dataset:
+    """Publish a labelled dataset: a compact copy of it, `<data>/release/`, and in the end its card.
+
+    For any dataset but a release this makes the copy. For the copy itself, once networks are trained on it, it chooses
+    the weights that ship, evaluates them and writes the card. Either can be done again.
+
+    Raises:
+        WeightsError: no weights, or such that do not fit the release.
+        StorageError: it is not smaller than 16 MB.
+        ConfigError: another dataset lies where the copy belongs.
+    """
+    from wheretolook.evaluation.run import SCORES_CSV
+    from wheretolook.release import copy_dataset, is_release, ship_weights, size_text, sizes, trained_weights
+    from wheretolook.release_card import VARIANTS_CSV, write_card
+
+    dataset = _dataset(experiment, "label")
+    if not is_release(dataset):
+        copy = copy_dataset(dataset, experiment)
+        for scene, source in zip(copy.scenes, dataset.scenes, strict=True):
+            stamp = _read_stamp(source, "label")
+            assert stamp is not None  # `_dataset` has seen it
+            _stamp(scene, "label", stamp)
+        say(f"{len(copy.scenes)} scenes -> {copy.root}: {size_text(sizes(copy.root, weights=False))}")
+        say("next: train on it, then `wheretolook release` with its own configuration")
+        return copy
+    # on the CPU, as those who have no GPU will do it
+    on_cpu = replace(experiment, device="cpu", evaluate=replace(experiment.evaluate, weights=()))
+    if len(trained_weights(dataset)) > 1:  # all that were trained, before only the best is left
+        evaluate(on_cpu, say)
+        results = dataset.root / "results"
+        shutil.copyfile(results / SCORES_CSV, results / VARIANTS_CSV)
+    weights, precisions = ship_weights(dataset)
+    compared = ", ".join(f"{variant} {value:.4f}" for variant, value in precisions.items())
+    say(f"validation average precision: {compared}; ships in half precision: {weights}")
+    sizes(dataset.root)  # too large? then before the evaluation
+    evaluate(on_cpu, say, tick)
+    say(f"the card -> {write_card(dataset)}")
+    say(size_text(sizes(dataset.root)))
+    return dataset
 
 
 def _dataset(experiment: Experiment, needs: str) -> Dataset:

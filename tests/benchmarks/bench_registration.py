@@ -14,7 +14,8 @@ is needed by both and is not in their times.
 Every side runs on one thread where it can be told to; CPU seconds count all threads, so they are the fair measure where
 COLMAP's matching and verification overlap. What COLMAP needs once is not in its time a viewpoint but reported beside
 it: the copy of the database, the mapper's cache and the model. Several viewpoints are matched in one call, because
-COLMAP then reads the map's descriptors once for all of them. After each viewpoint its registration is undone.
+COLMAP then reads the map's descriptors once for all of them. After each viewpoint its registration is undone; the model
+is neither refined nor extended by it.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ from wheretolook.table import LOCALIZED, poses
 
 LIMIT_M, LIMIT_DEG = 0.05, 0.4
 FEW_INLIERS = 10
-"""What our localizer asks for by default. COLMAP asks for 30, which alone explains part of the disagreement."""
+"""What our localizer asks for by default, and COLMAP 30: tells how much of the disagreement is due to that."""
 BINS_M = (0.0, 0.5, 1.0, 1.5, 2.0, np.inf)
 STAGES = ("extract", "store", "match_and_verify", "register")
 

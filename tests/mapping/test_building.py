@@ -12,7 +12,16 @@ import pytest
 
 from wheretolook.errors import ConfigError, MapError
 from wheretolook.geometry import PinholeCamera, poses_looking_along
-from wheretolook.mapping import Landmarks, MapConfig, WalkConfig, build_map, load_colmap_landmarks, plan_walk
+from wheretolook.mapping import (
+    Landmarks,
+    MapConfig,
+    WalkConfig,
+    build_map,
+    load_colmap_landmarks,
+    plan_walk,
+    triangulation,
+)
+from wheretolook.mapping.processes import Processes
 from wheretolook.rendering import WarpRenderer
 from wheretolook.scenes.mesh import TexturedMesh
 
@@ -118,8 +127,10 @@ def test_report_is_on_disk(built):
     assert report.config["extractor"]["method"] == "opencv"
 
 
-def test_same_seed_same_bytes_whatever_the_workers(built, room, room_free_space, renderer, tmp_path):
-    folder, _ = built
+def test_same_seed_same_bytes_whatever_the_workers(built, room, room_free_space, renderer, tmp_path, monkeypatch):
+    monkeypatch.setattr(triangulation, "_PAIRS_AT_A_TIME", 16)  # so that both workers match
+    folder, report = built
+    assert report.n_pairs > 32
     again = tmp_path / "again"
     build_map(room, renderer, room_free_space, CAMERA, CONFIG, SEED, again, workers=2, progress=False)
     names = sorted(p.relative_to(folder) for p in folder.rglob("*") if p.is_file())
@@ -128,6 +139,20 @@ def test_same_seed_same_bytes_whatever_the_workers(built, room, room_free_space,
     for name in names:
         if name.name not in ("report.json", "database.db"):
             assert (folder / name).read_bytes() == (again / name).read_bytes(), name
+
+
+def test_no_two_threads_match_in_one_process(room, room_free_space, renderer, tmp_path, monkeypatch):
+    """pycolmap's BLAS would give them the same buffer once in many maps."""
+    threads, match = [], pycolmap.match_image_pairs
+
+    def watched(database, options, *arguments, **named):
+        threads.append(options.num_threads)
+        return match(database, options, *arguments, **named)
+
+    monkeypatch.setattr(pycolmap, "match_image_pairs", watched)
+    monkeypatch.setattr(Processes, "map", lambda self, function, items: map(function, items))  # where it is watched
+    build_map(room, renderer, room_free_space, CAMERA, CONFIG, SEED, tmp_path / "map", workers=3, progress=False)
+    assert set(threads) == {1}
 
 
 def test_two_view_landmarks_add_short_tracks(built, room, room_free_space, renderer, tmp_path):

@@ -218,6 +218,42 @@ def test_save_and_load(tmp_path, model_dir, with_descriptors):
     assert not list(tmp_path.glob("*.partial"))
 
 
+@pytest.mark.parametrize("with_descriptors", [False, True])
+def test_compact_landmarks_keep_all_but_descriptors(tmp_path, model_dir, with_descriptors):
+    database = None
+    if with_descriptors:
+        model, keypoints = hand_written_model()
+        database = write_database(
+            tmp_path / "database.db", model, keypoints, random_descriptors([len(k) for k in keypoints])
+        )
+    landmarks = load_colmap_landmarks(model_dir, database)
+    landmarks.save(tmp_path / "a.npz", compact=True)
+    again = Landmarks.load(tmp_path / "a.npz")
+    assert again.descriptors is None
+    assert np.isnan(again.ambiguity).all() == (not with_descriptors)
+    for name, value in vars(landmarks).items():
+        if name != "descriptors":
+            other = getattr(again, name)
+            assert other.dtype == value.dtype
+            rtol = 0 if value.dtype.kind == "i" else 1e-7 if name == "points" else 5e-4
+            np.testing.assert_allclose(other, value, rtol=rtol, atol=1e-7)
+    again.save(tmp_path / "b.npz", compact=True)
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+    assert not list(tmp_path.glob("*.partial"))
+
+
+@pytest.mark.parametrize("place", [0.1, 0.3, 0.5, 0.7, 0.98])
+def test_damaged_compact_landmarks(tmp_path, model_dir, place):
+    path = tmp_path / "landmarks.npz"
+    load_colmap_landmarks(model_dir).save(path, compact=True)
+    data = bytearray(path.read_bytes())
+    at = int(place * len(data))
+    data[at : at + 30] = bytes(byte ^ 255 for byte in data[at : at + 30])
+    path.write_bytes(data)
+    with pytest.raises(MapError, match=r"landmarks\.npz"):
+        Landmarks.load(path)
+
+
 def test_old_models_without_rigs_and_frames_are_read(model_dir):
     before = load_colmap_landmarks(model_dir)
     for name in ("rigs.bin", "frames.bin"):

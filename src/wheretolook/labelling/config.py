@@ -44,7 +44,8 @@ class LabelConfig:
         localizer: matching and pose estimation.
         engine: "local" works in processes on this machine, "ray" the same shards on a Ray cluster
             (`pip install 'wheretolook[ray]'`).
-        ray_address: the cluster's address, such as "auto" or "ray://head:10001"; empty starts one on this machine.
+        ray_address: the cluster's address, such as "auto" on one of its machines, or "ray://head:10001" from elsewhere
+            (which needs `pip install 'ray[client]'`); empty starts one on this machine.
         workers: processes of the local engine; 0 means one for each CPU core this process may use.
         shard_size: viewpoints a shard, the unit of work and of what an interruption can lose.
     """

@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -18,16 +19,19 @@ from tqdm.auto import tqdm
 
 import wheretolook
 from wheretolook.dataset import write_json
-from wheretolook.errors import MapError, StorageError, TableError
+from wheretolook.errors import MapError, SceneError, StorageError, TableError
 from wheretolook.geometry import PinholeCamera
 from wheretolook.labelling.config import LabelConfig
 from wheretolook.labelling.shard import LabelledShard, SceneJob, Shard
 from wheretolook.mapping.extraction import ExtractorConfig
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.table import POSE_COLUMNS, fingerprint, read_table, write_table
+from wheretolook.table import SCHEMA, fingerprint, read_table, write_table
 
 MANIFEST = "manifest.json"
 """In the folder of shards while work goes on, and as `labels.json` beside a finished table."""
+
+LABELS = ("status", "error_m", "error_deg", "n_inliers")
+"""Columns of a table that labelling fills in."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +129,7 @@ def label_scenes(
         SceneError, MapError: a mesh or landmarks cannot be used.
         TableError: a table is empty.
         WorkerError: workers were killed again and again, or something failed in one.
-        StorageError: a shard cannot be written, as when the disk is full.
+        StorageError: a shard or its manifest cannot be written, as when the disk is full.
         ConfigError: the Ray engine cannot be used.
     """
     scenes = [_Scene.of(task, config.shard_size) for task in tasks]
@@ -139,7 +143,8 @@ def label_scenes(
             if not scene.missing:
                 yield scene.result()
         for shard, labelled in _run(missing, config, bar.update):
-            _store(labelled.rows, shard.path)
+            with _storing(shard.path):
+                write_table(labelled.rows, shard.path)
             scene = by_path[shard.path]
             scene.missing.remove(shard)
             for step, seconds in labelled.seconds.items():
@@ -176,6 +181,8 @@ class _Scene:
         job, table = task.job, task.table
         if table.empty:
             raise TableError("no viewpoints to label", value=task.name, fix="Run the sample stage with other settings.")
+        if not job.mesh.is_file():
+            raise SceneError("there is no such mesh", path=job.mesh, fix="Run the scenes stage first.")
         if Landmarks.load(job.landmarks).descriptors is None:
             fix = "Build the map again."
             raise MapError("landmarks without descriptors cannot be matched", path=job.landmarks, fix=fix)
@@ -188,15 +195,16 @@ class _Scene:
             "landmarks": fingerprint(job.landmarks),
         }
         text = json.dumps(settings, sort_keys=True).encode()
+        inputs = [name for name in SCHEMA.names if name not in LABELS]  # a shard's file holds them all
         shards = []
         for begin in range(0, len(table), shard_size):
             rows = table.iloc[begin : begin + shard_size]
-            content = pd.util.hash_pandas_object(rows[["viewpoint_id", *POSE_COLUMNS]], index=False).to_numpy()
+            content = pd.util.hash_pandas_object(rows[inputs], index=False).to_numpy()
             digest = hashlib.sha256(text + content.tobytes()).hexdigest()[:16]
             shards.append(Shard(job, task.shards / f"{begin:08d}-{digest}.parquet", rows))
         scene = cls(task, settings, shards, [shard for shard in shards if not _is_finished(shard)])
-        task.shards.mkdir(parents=True, exist_ok=True)
-        write_json(task.shards / MANIFEST, scene.manifest())
+        with _storing(task.shards / MANIFEST):
+            write_json(task.shards / MANIFEST, scene.manifest())
         return scene
 
     def manifest(self) -> dict[str, Any]:
@@ -233,13 +241,14 @@ def _run(
     return run_local(shards, config.workers or len(os.sched_getaffinity(0)), tick)
 
 
-def _store(rows: pd.DataFrame, path: Path) -> None:
+@contextmanager
+def _storing(path: Path) -> Iterator[None]:
     try:
-        write_table(rows, path)
+        yield
     except OSError as error:
         raise StorageError(
-            f"a finished shard cannot be written: {error.strerror or error}", path=path,
-            fix="Make room (or mend the disk) and run again: the shards before it are kept.",
+            f"this file cannot be written: {error.strerror or error}", path=path,
+            fix="Make room (or mend the disk) and run again: finished shards are kept.",
         ) from error  # fmt: skip
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
@@ -46,7 +47,8 @@ def run_local(
     team: list[_Worker] = []
     try:
         with spawning():
-            team += [_start(number) for number in range(min(workers, len(shards)))]
+            for number in range(min(workers, len(shards))):
+                team.append(_start(number))
         for worker in team:
             _give(worker, waiting)
         while any(worker.shard is not None for worker in team):
@@ -57,13 +59,13 @@ def run_local(
                 assert shard is not None
                 try:
                     message = worker.pipe.recv()
-                except (EOFError, ConnectionResetError):  # killed: its end of the pipe is closed
+                except (EOFError, OSError):  # killed, perhaps in the middle of a message: its end of the pipe is closed
                     tick(-worker.ticked)
                     deaths[shard] += 1
                     if deaths[shard] == MAX_DEATHS:
                         raise WorkerError(
-                            f"{MAX_DEATHS} labelling processes were killed at the same viewpoints, probably for lack of "
-                            "memory", path=shard.job.mesh, value=f"{workers} workers",
+                            f"{MAX_DEATHS} labelling processes were killed at the same viewpoints, probably for lack "
+                            "of memory", path=shard.job.mesh, value=f"{workers} workers",
                             fix="Lower label.workers and run again: finished shards are kept.",
                         ) from None  # fmt: skip
                     waiting.appendleft(shard)
@@ -101,10 +103,8 @@ def _give(worker: _Worker, waiting: deque[Shard]) -> None:
     """Hand the next shard to a worker, if there is one."""
     worker.shard, worker.ticked = (waiting.popleft() if waiting else None), 0
     if worker.shard is not None:
-        try:
+        with suppress(OSError):  # it died; reading from it says so
             worker.pipe.send((worker.shard.job, worker.shard.rows))
-        except (BrokenPipeError, ConnectionResetError):
-            pass  # it died; reading from it says so
 
 
 def _work(pipe: Connection, number: int) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 
 import numpy as np
 import torch
@@ -24,7 +25,8 @@ class DescriptorMatcher:
 
     Descriptors are compared as COLMAP stores them, in whole numbers, by their scalar products. These are then exact, in
     eight-bit integers on a CPU as in half precision with single-precision sums on a GPU: both give the same neighbours,
-    and those of one descriptor do not depend on what it is matched together with. `nearest_two_plain` is the twin.
+    and those of one descriptor do not depend on what it is matched together with. `nearest_two_plain` is the twin. A
+    CPU whose byte products saturate works in single precision, where 128 * 255^2 < 2^24 is exact, too.
 
     Args:
         descriptors: (N, 128) uint8, of the landmarks.
@@ -34,14 +36,17 @@ class DescriptorMatcher:
     def __init__(self, descriptors: NDArray[np.uint8], device: str = "cpu") -> None:
         self.device = torch.device(device)
         n, length = descriptors.shape
+        self.n_landmarks = n
+        self._in_bytes = self.device.type == "cpu" and _byte_products_are_exact()
         padded = -(-max(n, 2 * GROUP) // GROUP) * GROUP
         whole = torch.zeros((padded, length), dtype=torch.int32)
         whole[:n] = torch.from_numpy(descriptors.astype(np.int32))
-        if self.device.type == "cpu":  # in signed bytes: q.d = (q - 128).(d - 128) + 128 (sum of d) + terms of q alone
+        if self._in_bytes:  # in signed bytes: q.d = (q - 128).(d - 128) + 128 (sum of d) + terms of q alone
             self._descriptors = (whole - 128).to(torch.int8).T
             self._bias = 128 * whole.sum(1, dtype=torch.int32)
         else:
-            self._descriptors = whole.to(self.device, torch.float16).T
+            number = torch.float32 if self.device.type == "cpu" else torch.float16
+            self._descriptors = whole.to(self.device, number).T
             self._bias = torch.zeros(padded, device=self.device)
         self._bias[n:] = -(2**28)  # rows that only pad are never near
 
@@ -51,8 +56,11 @@ class DescriptorMatcher:
         """Nearest landmark of each descriptor (K, 128) uint8, and its products with the nearest and second nearest.
 
         Returns:
-            rows (K,), nearest (K,) and second (K,); of several landmarks equally near, `rows` names any.
+            rows (K,), nearest (K,) and second (K,); of several landmarks equally near, `rows` names any. Where there
+            are fewer than two landmarks, what is missing has a product of -2^28.
         """
+        # OpenMP counts by thread: without this, the first product in a new thread would start one thread for each core
+        torch.set_num_threads(torch.get_num_threads())
         queries = torch.from_numpy(descriptors.astype(np.int32))
         block = max(1, _PRODUCT_BYTES[self.device.type] // (4 * len(self._bias)))
         parts = [self._best_two(part) for part in queries.split(block)]
@@ -61,19 +69,36 @@ class DescriptorMatcher:
 
     def _best_two(self, queries: Tensor) -> tuple[Tensor, Tensor]:
         """Row of the nearest landmark, (k,), and the two largest products, (k, 2)."""
-        if self.device.type == "cpu":
+        of_query = torch.zeros((), device=self.device)
+        if self._in_bytes:
             product = torch._int_mm((queries - 128).to(torch.int8), self._descriptors)
             of_query = 128 * (queries.sum(1, keepdim=True) - 128 * queries.shape[1])
+        elif self.device.type == "cpu":
+            product = queries.float() @ self._descriptors
         else:
             product = torch.mm(queries.to(self.device, torch.float16), self._descriptors, out_dtype=torch.float32)
-            of_query = torch.zeros((), device=self.device)
-        groups = product.add_(self._bias).view(len(product), -1, GROUP)
+        groups = product.add_(self._bias).view(len(product), len(self._bias) // GROUP, GROUP)
         of_best = groups.amax(2).topk(2, dim=1).indices
         candidates = groups.gather(1, of_best[:, :, None].expand(-1, -1, GROUP)).flatten(1)
         best, at = candidates.topk(2, dim=1)
         first = at[:, 0]
         rows = of_best.gather(1, first[:, None] // GROUP)[:, 0] * GROUP + first % GROUP
         return rows, best + of_query
+
+
+@cache
+def _byte_products_are_exact() -> bool:
+    """Whether this CPU adds up products of signed bytes without saturation, as it does with VNNI instructions.
+
+    Without them (AVX2, the first AVX-512) pairs of products are added in 16 bits, and large ones come out wrong.
+    """
+    left, right = torch.full((64, 128), 127), torch.full((128, 64), 127)
+    left[::2], right[:, ::2] = -128, -128
+    try:
+        product = torch._int_mm(left.to(torch.int8), right.to(torch.int8))
+    except RuntimeError:  # not supported at all
+        return False
+    return torch.equal(product.long(), left @ right)
 
 
 def nearest_two_plain(
@@ -91,6 +116,8 @@ def match(matcher: DescriptorMatcher, descriptors: Sequence[NDArray[np.uint8]], 
 
     A match passes Lowe's ratio test (IJCV 2004, Sec. 7.1), and a landmark keeps only its nearest keypoint.
 
+    With a single landmark there is no second nearest, so nothing matches.
+
     Args:
         matcher: of the landmarks.
         descriptors: of each image, (K_i, 128) uint8.
@@ -100,7 +127,7 @@ def match(matcher: DescriptorMatcher, descriptors: Sequence[NDArray[np.uint8]], 
         The matches of each image.
     """
     lengths = [len(one) for one in descriptors]
-    if sum(lengths) == 0:
+    if sum(lengths) == 0 or matcher.n_landmarks < 2:
         return [(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)) for _ in descriptors]
     rows, nearest, second = matcher.nearest_two(np.concatenate(descriptors))
     # squared distances of descriptors of length 512, of which rounding leaves some a little longer

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import socket
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -61,46 +62,56 @@ def run_ray(
 
 
 def _connect(ray: Any, address: str) -> None:
+    host, _, port = address.removeprefix("ray://").rpartition(":")
     try:
+        if port.isdigit():  # where nothing listens, Ray itself would try for many minutes
+            socket.create_connection((host, int(port)), timeout=10).close()
         ray.init(address=address or "local", log_to_driver=False, include_dashboard=False if not address else None,
                  logging_level="ERROR")  # fmt: skip
-    except (ConnectionError, RuntimeError, ValueError) as error:
+    except (OSError, RuntimeError, ValueError, ImportError) as error:
         fix = "Start it (`ray start --head`), or correct label.ray_address."
         raise ConfigError(f"no Ray cluster there: {error}", value=address, fix=fix) from error
 
 
 def _run(ray: Any, shards: Sequence[Shard], tick: Callable[[int], None]) -> Iterator[tuple[Shard, LabelledShard]]:
     waiting, running, files = iter(shards), dict[Any, Shard](), dict[SceneJob, Any]()
+    label = ray.remote(num_cpus=1, max_retries=MAX_RETRIES)(_label_shard)
 
     def start(shard: Shard) -> None:
         if shard.job not in files:  # a scene travels to a machine once
             files.clear()
             files[shard.job] = ray.put((shard.job.mesh.read_bytes(), shard.job.landmarks.read_bytes()))
         gpus = 1 / WORKERS_A_GPU if shard.job.device.startswith("cuda") else 0
-        task = ray.remote(num_cpus=1, num_gpus=gpus, max_retries=MAX_RETRIES)(_label_shard)
-        running[task.remote(shard.job, files[shard.job], shard.rows)] = shard
+        running[label.options(num_gpus=gpus).remote(shard.job, files[shard.job], shard.rows)] = shard
 
-    while True:
-        room = 2 * max(1, int(ray.cluster_resources().get("CPU", 1))) - len(running)  # the cluster may grow and shrink
-        for shard in islice(waiting, max(0, room)):
-            start(shard)
-        if not running:
-            return
-        (done, *_), _ = ray.wait(list(running))
-        shard = running.pop(done)
-        try:
-            labelled = ray.get(done)
-        except ray.exceptions.RayTaskError as error:
-            if isinstance(error.cause, WhereToLookError):
-                raise error.cause from None
-            raise
-        except ray.exceptions.RayError as error:
-            raise WorkerError(
-                f"a shard was lost more than {MAX_RETRIES} times: {error}", path=shard.job.mesh,
-                fix="Finished shards are kept: mend the cluster and run again.",
-            ) from error  # fmt: skip
-        tick(len(shard.rows))
-        yield shard, labelled
+    try:
+        while True:
+            n_cores = int(ray.cluster_resources().get("CPU", 1))  # the cluster may grow and shrink
+            for shard in islice(waiting, max(0, 2 * max(1, n_cores) - len(running))):
+                start(shard)
+            if not running:
+                return
+            (done, *_), _ = ray.wait(list(running))
+            shard = running.pop(done)
+            try:
+                labelled = ray.get(done)
+            except ray.exceptions.RayTaskError as error:
+                if isinstance(error.cause, WhereToLookError):
+                    raise error.cause from None
+                raise WorkerError(
+                    f"labelling failed: {type(error.cause).__name__}: {error.cause}", path=shard.job.mesh,
+                    fix="Finished shards are kept: mend the cause and run again.",
+                ) from error  # fmt: skip
+            except ray.exceptions.RayError as error:
+                raise WorkerError(
+                    f"a shard was lost more than {MAX_RETRIES} times: {error}", path=shard.job.mesh,
+                    fix="Finished shards are kept: mend the cluster and run again.",
+                ) from error  # fmt: skip
+            tick(len(shard.rows))
+            yield shard, labelled
+    finally:  # a cluster that is not ours would go on with what nobody waits for
+        for unfinished in running:
+            ray.cancel(unfinished)
 
 
 _worker: ShardWorker | None = None
@@ -116,13 +127,20 @@ def _label_shard(job: SceneJob, files: tuple[bytes, bytes], rows: pd.DataFrame) 
     folder.mkdir(exist_ok=True)
     mesh = _lay_down(folder, files[0], job.mesh.suffix)
     landmarks = _lay_down(folder, files[1], job.landmarks.suffix)
-    return _worker.label(replace(job, mesh=mesh, landmarks=landmarks), rows)
+    try:
+        return _worker.label(replace(job, mesh=mesh, landmarks=landmarks), rows)
+    except WhereToLookError as error:  # the user knows the files by their own names
+        path = {mesh: job.mesh, landmarks: job.landmarks}.get(Path(error.path or ""), error.path)
+        raise type(error)(error.problem, path=path, value=error.value, fix=error.fix) from error
 
 
 def _lay_down(folder: Path, content: bytes, suffix: str) -> Path:
     path = folder / f"{hashlib.sha256(content).hexdigest()[:32]}{suffix}"
     if not path.is_file():
-        with tempfile.NamedTemporaryFile(dir=folder, delete=False) as file:
-            file.write(content)
-        os.replace(file.name, path)
+        partial = path.with_name(f"{path.name}.{os.getpid()}.partial")  # others may be at it
+        try:
+            partial.write_bytes(content)
+            os.replace(partial, path)
+        finally:
+            partial.unlink(missing_ok=True)
     return path

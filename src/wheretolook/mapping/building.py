@@ -22,6 +22,7 @@ from wheretolook.mapping.config import MapConfig
 from wheretolook.mapping.extraction import KeypointExtractor, Keypoints
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
 from wheretolook.mapping.pairs import choose_pairs, shrink_depth, surface_overlap
+from wheretolook.mapping.processes import Processes
 from wheretolook.mapping.triangulation import image_name, triangulate_known_poses
 from wheretolook.mapping.walk import FreeSpaceQueries, plan_walk
 from wheretolook.scenes.mesh import TexturedMesh
@@ -101,7 +102,7 @@ def build_map(
         seed: the same seed gives the same model and landmarks byte for byte.
         out_dir: folder to make; an earlier map there is replaced.
         raycaster: measures the distance from landmarks to the mesh; made on the CPU if None.
-        workers: processes that extract keypoints and threads that match. Above 1 the caller's script must be guarded
+        workers: processes that extract keypoints and match them. Above 1 the caller's script must be guarded
             by `if __name__ == "__main__":`, as for any of Python's process pools.
         progress: show progress bars.
 
@@ -117,13 +118,13 @@ def build_map(
         raise MapError(
             "will not be replaced: it is not a map built here", path=out_dir, fix="Give another folder, or remove it."
         )
-    with _partial_folder(out_dir) as partial:
+    with _partial_folder(out_dir) as partial, Processes(workers) as processes:
         with clock("walk"):
             walk = plan_walk(free_space, mesh.bounds, config.n_images, config.walk, seed)
             poses = poses_looking_along(walk.positions, walk.directions)
         with clock("render_and_extract"):
             keypoints, colors, depth_m = _render_and_extract(
-                renderer, camera, poses, config, partial, workers, progress
+                renderer, camera, poses, config, partial, processes, progress
             )
         with clock("pairs"):
             pairs = choose_pairs(surface_overlap(camera, poses, depth_m), config.partners)
@@ -140,7 +141,7 @@ def build_map(
             min_triangulation_angle_deg=config.min_triangulation_angle_deg,
             two_view_landmarks=config.two_view_landmarks,
             seed=seed,
-            workers=workers,
+            processes=processes,
             progress=progress,
         )
         with clock("filter_and_write"):
@@ -220,7 +221,7 @@ def _render_and_extract(
     poses: NDArray[np.floating[Any]],
     config: MapConfig,
     partial: Path,
-    workers: int,
+    processes: Processes,
     progress: bool,
 ) -> tuple[list[Keypoints], list[NDArray[np.uint8]], NDArray[np.float32]]:
     """Keypoints and their colours, image by image, and shrunk depth (I, h, w). Rendering overlaps with extraction."""
@@ -237,7 +238,7 @@ def _render_and_extract(
                 waiting.append(rgb)
                 yield rgb
 
-    extracted = KeypointExtractor(config.extractor).extract_many(images(), workers)
+    extracted = KeypointExtractor(config.extractor).extract_many(images(), processes)
     keypoints, colors = [], []
     with closing(extracted):
         for found in tqdm(extracted, "map: render, extract", total=len(poses), disable=not progress, unit="image"):

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import multiprocessing
 from collections.abc import Generator, Iterable
-from concurrent.futures import ProcessPoolExecutor
+from contextlib import nullcontext
 from dataclasses import dataclass
-from itertools import islice
+from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 
 from wheretolook.errors import ConfigError
 from wheretolook.mapping.colmap_model import quiet_colmap
-from wheretolook.worker_processes import end_with_parent, keep_freed_memory, spawning
+from wheretolook.mapping.processes import Processes
 
 
 @dataclass(frozen=True)
@@ -112,29 +111,23 @@ class KeypointExtractor:
         grey = pycolmap.Bitmap.from_array(np.ascontiguousarray(rgb)).clone_as_grey()
         return self._extract_colmap(grey) if self.config.method == "colmap" else self._extract_opencv(grey.to_array())
 
-    def extract_many(self, images: Iterable[NDArray[np.uint8]], workers: int = 1) -> Generator[Keypoints, None, None]:
+    def extract_many(
+        self, images: Iterable[NDArray[np.uint8]], workers: int | Processes = 1
+    ) -> Generator[Keypoints, None, None]:
         """Extract keypoints of many images, in processes of their own (pycolmap's extractor holds Python's lock).
 
         Args:
             images: each (H, W, 3) uint8; read only a few images ahead of what is returned.
-            workers: processes; 1 stays in this one.
+            workers: processes, or how many to spawn; 1 stays in this one.
 
         Yields:
             Keypoints in the order of the images, the same whatever the number of workers.
         """
-        if workers <= 1:
-            yield from map(self.extract, images)
-            return
-        context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(workers, context, initializer=_start_worker, initargs=(self.config,)) as pool:
-            source = iter(images)
-            pending = []
-            for rgb in islice(source, 4 * workers):
-                with spawning():
-                    pending.append(pool.submit(_extract_in_worker, rgb))
-            while pending:
-                yield pending.pop(0).result()
-                pending += [pool.submit(_extract_in_worker, rgb) for rgb in islice(source, 1)]
+        with nullcontext(workers) if isinstance(workers, Processes) else Processes(workers) as processes:
+            if processes.workers <= 1:
+                yield from map(self.extract, images)
+            else:
+                yield from processes.map(_extract_in_worker, ((self.config, rgb) for rgb in images))
 
     def _extract_colmap(self, bitmap: Any) -> Keypoints:
         keypoints, descriptors = self._extractor.extract(bitmap)
@@ -186,24 +179,9 @@ def _opencv_sift(config: ExtractorConfig) -> Any:
     return cv2.SIFT.create(0, layers, contrast, config.edge_threshold, 1.6, enable_precise_upscale=True)
 
 
-def one_thread() -> None:
-    """Called in a worker: keep OpenCV to one thread, as there is a worker for each core."""
-    import cv2
-
-    cv2.setNumThreads(1)
+_extractor_of = lru_cache(maxsize=1)(KeypointExtractor)
 
 
-_worker: KeypointExtractor | None = None
-
-
-def _start_worker(config: ExtractorConfig) -> None:
-    global _worker
-    end_with_parent()
-    keep_freed_memory()
-    one_thread()
-    _worker = KeypointExtractor(config)
-
-
-def _extract_in_worker(rgb: NDArray[np.uint8]) -> Keypoints:
-    assert _worker is not None
-    return _worker.extract(rgb)
+def _extract_in_worker(job: tuple[ExtractorConfig, NDArray[np.uint8]]) -> Keypoints:
+    config, rgb = job
+    return _extractor_of(config).extract(rgb)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -14,8 +16,9 @@ from tqdm.auto import tqdm
 from wheretolook.geometry import PinholeCamera
 from wheretolook.mapping.colmap_model import quiet_colmap
 from wheretolook.mapping.extraction import Keypoints, quantize_descriptors
+from wheretolook.mapping.processes import Processes
 
-_PAIRS_AT_A_TIME = 64  # a step of the progress bar
+_PAIRS_AT_A_TIME = 64  # of a process; also a step of the progress bar
 
 
 def image_name(index: int) -> str:
@@ -35,7 +38,7 @@ def triangulate_known_poses(
     min_triangulation_angle_deg: float = 1.5,
     two_view_landmarks: bool = False,
     seed: int = 0,
-    workers: int = 1,
+    processes: Processes | None = None,
     progress: bool = True,
 ) -> Any:
     """Match pairs of images, verify the matches against the known poses, and triangulate.
@@ -52,7 +55,7 @@ def triangulate_known_poses(
         min_triangulation_angle_deg: points whose rays meet at less are not made.
         two_view_landmarks: whether two observations make a point.
         seed: of COLMAP's sampling.
-        workers: threads.
+        processes: match; as many threads verify. This process and one thread if None.
         progress: show a progress bar.
 
     Returns:
@@ -60,29 +63,24 @@ def triangulate_known_poses(
     """
     import pycolmap
 
+    processes = processes or Processes(1)
     seed %= 2**31  # COLMAP keeps it in an int
     pycolmap.set_random_seed(seed)
     with clock("database"):
-        model = _posed_model(camera, cam_from_world, keypoints)
-        _fill_database(database, model, keypoints)
+        model = _posed_model(camera, cam_from_world)
+        for index, found in enumerate(keypoints):
+            points = [pycolmap.Point2D(p) for p in found.pixels.astype(np.float64)]
+            model.images[index + 1].points2D = pycolmap.Point2DList(points)
+        _fill_database(database, model, map(_stored, keypoints))
     with clock("match"):
-        matching = pycolmap.FeatureMatchingOptions(num_threads=workers, skip_geometric_verification=True)
-        listed = database.with_suffix(".pairs.txt")
-        with quiet_colmap(), tqdm(total=len(pairs), desc="map: match", disable=not progress, unit="pair") as bar:
-            for start in range(0, len(pairs), _PAIRS_AT_A_TIME):
-                chunk = pairs[start : start + _PAIRS_AT_A_TIME]
-                listed.write_text("".join(f"{image_name(i)} {image_name(j)}\n" for i, j in chunk))
-                pairing = pycolmap.ImportedPairingOptions(match_list_path=str(listed))
-                pycolmap.match_image_pairs(str(database), matching, pairing, device=pycolmap.Device.cpu)
-                bar.update(len(chunk))
-        listed.unlink(missing_ok=True)
+        _match(database, camera, keypoints, pairs, processes, progress)
     with clock("verify"):
         verification = pycolmap.TwoViewGeometryOptions()
         verification.ransac.max_error = max_epipolar_error_px
         verification.ransac.random_seed = seed
         with quiet_colmap():
             pycolmap.guided_geometric_verification(
-                model, str(database), two_view_geometry_options=verification, num_threads=workers
+                model, str(database), two_view_geometry_options=verification, num_threads=processes.workers
             )
     with clock("triangulate"):
         options = pycolmap.IncrementalPipelineOptions(
@@ -102,9 +100,77 @@ def triangulate_known_poses(
     return model
 
 
-def _posed_model(
-    camera: PinholeCamera, cam_from_world: NDArray[np.floating[Any]], keypoints: Sequence[Keypoints]
-) -> Any:
+def _match(
+    database: Path,
+    camera: PinholeCamera,
+    keypoints: Sequence[Keypoints],
+    pairs: NDArray[np.int64],
+    processes: Processes,
+    progress: bool,
+) -> None:
+    """Match pairs of images and write the matches to the database.
+
+    In processes: pycolmap's BLAS is built without locks, and when two threads call it, now and then both get the same
+    buffer. The nearest neighbours of a pair then come out wrong, and another map with them.
+    """
+    import pycolmap
+
+    chunks = [pairs[start : start + _PAIRS_AT_A_TIME] for start in range(0, len(pairs), _PAIRS_AT_A_TIME)]
+    jobs = (_MatchJob.of(chunk, camera, keypoints, database.parent) for chunk in chunks)
+    with (
+        tqdm(total=len(pairs), desc="map: match", disable=not progress, unit="pair") as bar,
+        pycolmap.Database.open(str(database)) as db,
+    ):
+        for chunk, matches in zip(chunks, processes.map(_match_job, jobs), strict=True):
+            for (i, j), found in zip(chunk.tolist(), matches, strict=True):
+                db.write_matches(i + 1, j + 1, found)
+            bar.update(len(chunk))
+
+
+_Stored = tuple[NDArray[np.float32], NDArray[np.uint8]]
+
+
+@dataclass(frozen=True, eq=False)
+class _MatchJob:
+    """Pairs to match, self-contained: in a small database of only their images.
+
+    Attributes:
+        pairs: (P, 2) indices into `stored`.
+        stored: pixels and descriptors of the images, as in a database.
+        camera: intrinsics of the images.
+        folder: where to put the database.
+    """
+
+    pairs: NDArray[np.int64]
+    stored: list[_Stored]
+    camera: PinholeCamera
+    folder: Path
+
+    @staticmethod
+    def of(pairs: NDArray[np.int64], camera: PinholeCamera, keypoints: Sequence[Keypoints], folder: Path) -> _MatchJob:
+        images, renumbered = np.unique(pairs, return_inverse=True)
+        return _MatchJob(renumbered.reshape(-1, 2), [_stored(keypoints[i]) for i in images], camera, folder)
+
+
+def _match_job(job: _MatchJob) -> list[NDArray[np.uint32]]:
+    """(M, 2) indices of matched keypoints, of each pair."""
+    import pycolmap
+
+    matching = pycolmap.FeatureMatchingOptions(num_threads=1, skip_geometric_verification=True)
+    with TemporaryDirectory(dir=job.folder) as folder:
+        database, listed = Path(folder) / "database.db", Path(folder) / "pairs.txt"
+        anywhere = np.tile(np.eye(3, 4), (len(job.stored), 1, 1))
+        _fill_database(database, _posed_model(job.camera, anywhere), job.stored)
+        listed.write_text("".join(f"{image_name(i)} {image_name(j)}\n" for i, j in job.pairs))
+        pairing = pycolmap.ImportedPairingOptions(match_list_path=str(listed))
+        with quiet_colmap():
+            pycolmap.match_image_pairs(str(database), matching, pairing, device=pycolmap.Device.cpu)
+        with pycolmap.Database.open(str(database)) as db:
+            return [db.read_matches(i + 1, j + 1) for i, j in job.pairs.tolist()]
+
+
+def _posed_model(camera: PinholeCamera, cam_from_world: NDArray[np.floating[Any]]) -> Any:
+    """A reconstruction of images with poses, without keypoints."""
     import pycolmap
 
     model = pycolmap.Reconstruction()
@@ -116,13 +182,15 @@ def _posed_model(
     )
     for index, pose in enumerate(np.asarray(cam_from_world, dtype=np.float64)):
         image = pycolmap.Image(name=image_name(index), camera_id=1, image_id=index + 1)
-        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(p) for p in keypoints[index].pixels.astype(np.float64)])
-        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:, :3]), pose[:, 3])
-        model.add_image_with_trivial_frame(image, pose)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:, :3]), pose[:, 3]))
     return model
 
 
-def _fill_database(database: Path, model: Any, keypoints: Sequence[Keypoints]) -> None:
+def _stored(keypoints: Keypoints) -> _Stored:
+    return keypoints.pixels, quantize_descriptors(keypoints.descriptors)
+
+
+def _fill_database(database: Path, model: Any, stored: Iterable[_Stored]) -> None:
     import pycolmap
 
     with pycolmap.Database.open(str(database)) as db:
@@ -130,13 +198,9 @@ def _fill_database(database: Path, model: Any, keypoints: Sequence[Keypoints]) -
             db.write_camera(camera, use_camera_id=True)
         for rig in model.rigs.values():
             db.write_rig(rig, use_rig_id=True)
-        for image_id in sorted(model.images):
+        for image_id, (pixels, descriptors) in zip(sorted(model.images), stored, strict=True):
             image = model.images[image_id]
             db.write_frame(image.frame, use_frame_id=True)
             db.write_image(image, use_image_id=True)
-            found = keypoints[image_id - 1]
-            db.write_keypoints(image_id, found.pixels)
-            data = pycolmap.FeatureDescriptors(
-                pycolmap.FeatureExtractorType.SIFT, quantize_descriptors(found.descriptors)
-            )
-            db.write_descriptors(image_id, data)
+            db.write_keypoints(image_id, pixels)
+            db.write_descriptors(image_id, pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, descriptors))

@@ -1,0 +1,236 @@
+"""A release: a labelled dataset small enough to travel with the code, weights trained on it, and a card about both.
+
+A release is a dataset folder of its own. It has neither meshes nor COLMAP models nor descriptors, so it cannot be
+labelled anew, but it is read, trained on and evaluated as any other.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import wheretolook
+from wheretolook.dataset import Dataset, SceneFolder, write_json
+from wheretolook.errors import ConfigError, StorageError, TableError, WeightsError
+from wheretolook.features import INPUT_VARIANTS
+from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.table import write_table
+from wheretolook.visibility import StoredOcclusion
+
+if TYPE_CHECKING:
+    from wheretolook.config import Experiment
+
+RELEASE = "release"
+"""Name of the dataset's folder."""
+
+ABOUT = "release.json"
+"""What a release was made from; the file that makes a dataset one."""
+
+CARD = "README.md"
+
+SHELF = "others"
+"""Folder beside the shipped weights for those of other variants. Only their records ship."""
+
+MAX_BYTES = 16_000_000
+"""A release is smaller than this."""
+
+
+def is_release(dataset: Dataset) -> bool:
+    """Whether a dataset is a release."""
+    return (dataset.root / ABOUT).is_file()
+
+
+def copy_dataset(dataset: Dataset, experiment: Experiment) -> Dataset:
+    """Write a compact copy of a labelled dataset to `<data>/release/`. The same dataset gives the same bytes.
+
+    Tables are written compact (`wheretolook.table.COMPACT_SCHEMA`), landmarks without descriptors and in half
+    precision, and what labels were made with without the list of shards. Weights and results that lie there stay; the
+    card goes if the data changed.
+
+    Args:
+        dataset: what to copy.
+        experiment: the settings it was made with, and the folder of all datasets.
+
+    Returns:
+        The copy.
+
+    Raises:
+        ConfigError: the release's folder holds another dataset, or a release of another one.
+        TableError, MapError: a scene's table, landmarks or occlusion are missing or damaged.
+    """
+    root = experiment.data / RELEASE
+    before = _release_of(root, dataset.name)
+    fingerprint = None if before is None else before.fingerprint()
+    copied = [(scene, SceneFolder(root / scene.name, scene.split)) for scene in dataset.scenes]
+    for scene, copy in copied:
+        copy.map.mkdir(parents=True, exist_ok=True)
+        write_table(scene.read_table(), copy.table, compact=True)
+        Landmarks.load(scene.landmarks).save(copy.landmarks, compact=True)
+        StoredOcclusion.load(scene.occlusion).save(copy.occlusion)
+        copy.label_manifest.unlink(missing_ok=True)
+        if scene.label_manifest.is_file():
+            write_json(copy.label_manifest, _manifest(scene.label_manifest))
+    about = {
+        "source": dataset.name,
+        "source_fingerprint": dataset.fingerprint(),
+        "code_version": wheretolook.__version__,
+        "settings": _settings(experiment),
+    }
+    write_json(root / ABOUT, about)
+    release = Dataset(root, dataset.camera, tuple(copy for _, copy in copied))
+    release.save()
+    if before is not None:
+        for scene in before.scenes:
+            if scene.name not in {copy.name for copy in release.scenes}:
+                shutil.rmtree(scene.folder, ignore_errors=True)
+    if release.fingerprint() != fingerprint:
+        (root / CARD).unlink(missing_ok=True)
+    return release
+
+
+def trained_weights(release: Dataset) -> list[Path]:
+    """Weights in a release's folder, one for each input variant trained."""
+    named = (release.root / "weights" / f"mlp-{variant}.safetensors" for variant in INPUT_VARIANTS)
+    return [path for path in named if path.is_file()]
+
+
+def ship_weights(release: Dataset) -> tuple[Path, dict[str, float]]:
+    """Choose the variant with the best validation average precision, and store its weights in half precision.
+
+    Weights of other variants are put on the shelf, `weights/others/`, where no evaluation finds them. Done again,
+    nothing changes.
+
+    Returns:
+        The weights that ship, and the validation average precision of every variant.
+
+    Raises:
+        WeightsError: there are no weights, or they or their record do not fit the release.
+    """
+    from wheretolook.learning.training import training_fingerprint
+    from wheretolook.learning.weights import load_classifier, read_training, save_classifier
+
+    folder, now = release.root / "weights", training_fingerprint(release)
+    fix = f"Run `wheretolook train --config configs/{release.name}.yaml`."
+    records: dict[Path, dict[str, Any]] = {}
+    for path in trained_weights(release):
+        records[path], training = _record(path), read_training(path)
+        if records[path]["about"] != training or training.get("dataset_fingerprint") != now:
+            raise WeightsError("these weights were not trained on this release", path=path, fix=fix)
+    if not records:
+        raise WeightsError("there are no weights to ship", path=folder, fix=fix)
+    precision = {path: float(record["metrics"]["val_average_precision"]) for path, record in records.items()}
+    best = max(precision, key=lambda path: precision[path])
+    for path in records:
+        if path != best:
+            (folder / SHELF).mkdir(exist_ok=True)
+            for file in (path, path.with_suffix(".json")):
+                os.replace(file, folder / SHELF / file.name)
+    save_classifier(load_classifier(best).half(), best, read_training(best))
+    write_json(best.with_suffix(".json"), {**records[best], "weights_sha256": sha256(best)})
+    return best, {path.stem.removeprefix("mlp-"): value for path, value in precision.items()}
+
+
+def sizes(root: Path, weights: bool = True) -> dict[str, int]:
+    """Bytes of what ships of a release, by kind of file. Figures and shelved weights do not ship.
+
+    Args:
+        root: folder of the release.
+        weights: whether to count the weights; before they are chosen there may be several.
+
+    Raises:
+        StorageError: it is not smaller than `MAX_BYTES`.
+    """
+    kinds = {"viewpoints.parquet": "tables", "landmarks.npz": "landmarks", "occlusion.npz": "occlusion"}
+    parts = dict.fromkeys((*kinds.values(), "weights", "text"), 0)
+    for path in root.rglob("*"):
+        shelved = path.suffix == ".safetensors" and (path.parent.name == SHELF or not weights)
+        if path.is_file() and not shelved and path.suffix not in (".png", ".partial"):
+            parts["weights" if path.suffix == ".safetensors" else kinds.get(path.name, "text")] += path.stat().st_size
+    if sum(parts.values()) >= MAX_BYTES:
+        raise StorageError(
+            f"the release is not smaller than {MAX_BYTES / 1e6:.0f} MB", path=root, value=size_text(parts),
+            fix="Label fewer viewpoints or scenes, or map with fewer landmarks.",
+        )  # fmt: skip
+    return parts
+
+
+def size_text(parts: Mapping[str, int]) -> str:
+    """Sizes for people: "tables 4.81 MB, ..., in all 13.20 MB"."""
+    return ", ".join(f"{name} {size / 1e6:.2f} MB" for name, size in {**parts, "in all": sum(parts.values())}.items())
+
+
+def sha256(path: Path) -> str:
+    """SHA-256 of a file, in hexadecimal digits."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def read_about(release: Dataset) -> dict[str, Any]:
+    """What a release was made from: source, source_fingerprint, code_version and settings.
+
+    Raises:
+        ConfigError: the file is missing or damaged.
+    """
+    path = release.root / ABOUT
+    try:
+        about = dict(json.loads(path.read_text()))
+        return {name: about[name] for name in ("source", "source_fingerprint", "code_version", "settings")}
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise ConfigError(
+            f"not the description of a release: {error}", path=path, fix="Run `wheretolook release` on its source."
+        ) from error
+
+
+def _release_of(root: Path, source: str) -> Dataset | None:
+    """The release that lies at `root`, which must be of the same source; None if there is nothing yet."""
+    if not (root / "dataset.json").is_file():
+        return None
+    release, fix = Dataset.load(root), "Move it elsewhere first."
+    if not is_release(release):
+        raise ConfigError("this dataset is no release and would be overwritten", path=root, fix=fix)
+    found = read_about(release)["source"]
+    if found != source:
+        raise ConfigError(f"here lies the release of another dataset than {source}", path=root, value=found, fix=fix)
+    return release
+
+
+def _manifest(path: Path) -> dict[str, Any]:
+    """What labels were made with, but for the shards, of which there are thousands."""
+    try:
+        return {name: value for name, value in json.loads(path.read_text()).items() if name != "shards"}
+    except (ValueError, AttributeError) as error:
+        raise TableError(
+            f"not what the label stage wrote: {error}", path=path, fix="Remove it, or label the scene again."
+        ) from error
+
+
+def _settings(experiment: Experiment) -> dict[str, Any]:
+    """Settings that decide what a dataset holds, as JSON values. Meshes go by name: paths mean nothing elsewhere."""
+    meshes = [{"name": mesh.scene_name, "split": mesh.split, "up": mesh.up} for mesh in experiment.scenes.meshes]
+    settings = {
+        "camera": asdict(experiment.camera),
+        "scenes": {**asdict(experiment.scenes), "meshes": meshes},
+        "map": asdict(experiment.map),
+        "occlusion": asdict(experiment.occlusion),
+        "sample": asdict(experiment.sample),
+        "label": {"localizer": asdict(experiment.label.localizer)},
+    }
+    return dict(json.loads(json.dumps(settings, default=str)))
+
+
+def _record(weights: Path) -> dict[str, Any]:
+    """What the train stage wrote beside weights."""
+    path = weights.with_suffix(".json")
+    try:
+        record = dict(json.loads(path.read_text()))
+        float(record["metrics"]["val_average_precision"]), record["about"]
+        return record
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise WeightsError(
+            f"the record of training is missing or damaged: {error}", path=path, fix="Train again."
+        ) from error

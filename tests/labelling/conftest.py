@@ -1,0 +1,58 @@
+"""One room for all tests of labelling, and its labels from a plain loop in this process."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+
+import cv2
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from labelling.rooms import CAMERA, PLAIN, POSTER, MappedRoom, facing, file_bytes, map_room
+from wheretolook.labelling import Localizer, local_engine
+from wheretolook.labelling.shard import LabelledShard, Shard, ShardWorker, label_rows
+from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.rendering import WarpRenderer
+from wheretolook.scenes.loading import load_mesh
+
+
+@pytest.fixture(scope="session")
+def room(tmp_path_factory: pytest.TempPathFactory) -> MappedRoom:
+    """No texture repeats: the room is 5 m long, and so is a texture."""
+    return map_room(tmp_path_factory.mktemp("room"), texture_scale=0.5)
+
+
+@pytest.fixture(scope="session")
+def views() -> pd.DataFrame:
+    """24 unlabelled viewpoints, of which some localize."""
+    parts = facing(POSTER, 12, 1.5), facing(PLAIN, 6, 2.5, seed=1), facing(PLAIN, 6, 1.1)
+    return pd.concat(parts, ignore_index=True).assign(viewpoint_id=np.arange(24))
+
+
+@pytest.fixture(scope="session")
+def expected(room: MappedRoom, views: pd.DataFrame, tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """The file of their labels that any engine must end with."""
+    localizer = Localizer(Landmarks.load(room.landmarks), CAMERA)
+    labelled = label_rows(views, WarpRenderer(load_mesh(room.mesh)), localizer, CAMERA)
+    assert labelled["status"].nunique() > 1
+    return file_bytes(labelled, tmp_path_factory.mktemp("expected"))
+
+
+@pytest.fixture
+def in_this_process(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Shards are labelled here one after the other: quicker, for what the workers have no part in."""
+    threads = torch.get_num_threads(), cv2.getNumThreads()
+
+    def run(
+        shards: Sequence[Shard], workers: int, tick: Callable[[int], None]
+    ) -> Iterator[tuple[Shard, LabelledShard]]:
+        worker = ShardWorker()
+        for shard in shards:
+            yield shard, worker.label(shard.job, shard.rows, tick)
+
+    monkeypatch.setattr(local_engine, "run_local", run)
+    yield
+    torch.set_num_threads(threads[0])
+    cv2.setNumThreads(threads[1])

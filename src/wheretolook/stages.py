@@ -183,7 +183,8 @@ def label(experiment: Experiment, say: Say = print, tick: Tick = lambda work: No
     `<dataset>/results/labels.*` and an MLflow run.
     """
     from wheretolook.labelling import LabelTask, label_scenes
-    from wheretolook.labelling.report import log_labels
+    from wheretolook.labelling.labeller import storing
+    from wheretolook.labelling.report import LABELS_MD, log_labels
     from wheretolook.labelling.shard import SceneJob
     from wheretolook.table import is_good
 
@@ -200,27 +201,32 @@ def label(experiment: Experiment, say: Say = print, tick: Tick = lambda work: No
         key = _key("label", [asdict(config.localizer), asdict(extractor), asdict(dataset.camera),
                              _existing(scene.mesh, SceneError, "scenes"),
                              _existing(scene.landmarks, MapError, "map"), _read_stamp(scene, "sample")])  # fmt: skip
+        shards = scene.folder / "shards"
         if _is_done(scene, "label", key, scene.table):
+            shutil.rmtree(shards, ignore_errors=True)  # killed before it could remove them
             report(scene, table)
             continue
         scenes[scene.name] = scene, key
         job = SceneJob(scene.mesh, scene.landmarks, dataset.camera, config.localizer, extractor, experiment.warp_device)
-        tasks.append(LabelTask(scene.name, job, table, scene.folder / "shards"))
+        tasks.append(LabelTask(scene.name, job, table, shards))
     seconds: dict[str, float] = {}
     start = time.monotonic()
     with closing(label_scenes(tasks, config)) as results:  # so that Ctrl-C here ends the workers
         for labelled in results:
             scene, key = scenes[labelled.task.name]
-            write_table(labelled.table, scene.table)
-            write_json(scene.label_manifest, labelled.manifest)
-            _stamp(scene, "label", key)
-            shutil.rmtree(labelled.task.shards)
+            with storing(scene.table):
+                write_table(labelled.table, scene.table)
+                write_json(scene.label_manifest, labelled.manifest)
+                _stamp(scene, "label", key)
+            shutil.rmtree(labelled.task.shards, ignore_errors=True)
             for step, spent in labelled.seconds.items():
                 seconds[step] = seconds.get(step, 0.0) + spent
             report(scene, labelled.table)
     if tasks:
         seconds["wall"] = time.monotonic() - start
+    if tasks or not (dataset.root / "results" / LABELS_MD).is_file():
         log_labels(dataset, experiment.tracking, seconds)
+    if tasks:
         say("seconds: " + ", ".join(f"{step} {spent:.1f}" for step, spent in seconds.items())
             + " (workers' time in each step, added up; then the clock's)")  # fmt: skip
     return dataset

@@ -135,15 +135,16 @@ def read_table(path: Path) -> pd.DataFrame:
         raise TableError("there is no table of viewpoints", path=path, fix="Run the sample stage first.")
     try:
         table = pq.read_table(path, page_checksum_verification=True)
-    except (pa.ArrowException, OSError) as error:
+        names = table.column_names
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise TableError(
             f"not a readable Parquet file: {error}",
             path=path,
             fix="It may be truncated: get it anew, or delete it and run the stage that writes it.",
         ) from error
-    compact = any(name in table.column_names for name in CENTER_COLUMNS)
+    compact = any(name in names for name in CENTER_COLUMNS)
     schema, columns = (COMPACT_SCHEMA, CENTER_COLUMNS) if compact else (SCHEMA, POSE_COLUMNS[4:])
-    missing = [name for name in schema.names if name not in table.column_names]
+    missing = [name for name in schema.names if name not in names]
     if missing:
         raise TableError("columns are missing", path=path, value=missing, fix="Run the sample stage again.")
     try:

@@ -137,5 +137,14 @@ def write_report(path: Path | None, report: dict[str, Any]) -> None:
         "opencv": cv2.__version__,
     }
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps({"machine": machine, **report}, indent=2) + "\n")
+    path.write_text(json.dumps(_without_nan({"machine": machine, **report}), indent=2, allow_nan=False) + "\n")
     print(f"numbers -> {path}")
+
+
+def _without_nan(value: Any) -> Any:
+    """The same with null for NaN and infinity, which JSON does not know."""
+    if isinstance(value, dict):
+        return {name: _without_nan(one) for name, one in value.items()}
+    if isinstance(value, list):
+        return [_without_nan(one) for one in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value

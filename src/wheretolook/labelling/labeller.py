@@ -5,8 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, field
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -109,7 +109,7 @@ def label_viewpoints(
 
 def label_scenes(
     tasks: Sequence[LabelTask], config: LabelConfig, progress: bool = True, description: str = "label"
-) -> Iterator[LabelledScene]:
+) -> Generator[LabelledScene, None, None]:
     """Render every viewpoint, localize its image against the map and measure the error (paper, Sec. 3.3).
 
     Work is cut into shards. A finished shard is a file named by all that decides its labels (viewpoints, mesh,
@@ -136,14 +136,17 @@ def label_scenes(
     by_path = {shard.path: scene for scene in scenes for shard in scene.missing}
     missing = [shard for scene in scenes for shard in scene.missing]
     total, left = sum(len(task.table) for task in tasks), sum(len(shard.rows) for shard in missing)
-    with tqdm(
-        total=total, initial=total - left, desc=description, unit="view", disable=not progress, smoothing=0.05
-    ) as bar:
+    with (
+        tqdm(
+            total=total, initial=total - left, desc=description, unit="view", disable=not progress, smoothing=0.05
+        ) as bar,
+        closing(_run(missing, config, bar.update)) as results,  # so that an error here ends the workers
+    ):
         for scene in scenes:
             if not scene.missing:
                 yield scene.result()
-        for shard, labelled in _run(missing, config, bar.update):
-            with _storing(shard.path):
+        for shard, labelled in results:
+            with storing(shard.path):
                 write_table(labelled.rows, shard.path)
             scene = by_path[shard.path]
             scene.missing.remove(shard)
@@ -191,6 +194,7 @@ class _Scene:
             "localizer": asdict(job.localizer),
             "extractor": asdict(job.extractor),
             "camera": asdict(job.camera),
+            "renderer": job.device.partition(":")[0],  # a GPU rounds some pixels otherwise
             "mesh": fingerprint(job.mesh),
             "landmarks": fingerprint(job.landmarks),
         }
@@ -203,7 +207,7 @@ class _Scene:
             digest = hashlib.sha256(text + content.tobytes()).hexdigest()[:16]
             shards.append(Shard(job, task.shards / f"{begin:08d}-{digest}.parquet", rows))
         scene = cls(task, settings, shards, [shard for shard in shards if not _is_finished(shard)])
-        with _storing(task.shards / MANIFEST):
+        with storing(task.shards / MANIFEST):
             write_json(task.shards / MANIFEST, scene.manifest())
         return scene
 
@@ -229,20 +233,20 @@ class _Scene:
 
 def _run(
     shards: Sequence[Shard], config: LabelConfig, tick: Callable[[int], Any]
-) -> Iterator[tuple[Shard, LabelledShard]]:
-    if not shards:
-        return iter(())
-    if config.engine == "ray":
+) -> Generator[tuple[Shard, LabelledShard], None, None]:
+    if config.engine == "ray" and shards:
         from wheretolook.labelling.ray_engine import run_ray
 
-        return run_ray(shards, config.ray_address, tick)
-    from wheretolook.labelling.local_engine import run_local
+        yield from run_ray(shards, config.ray_address, tick)
+    elif shards:
+        from wheretolook.labelling.local_engine import run_local
 
-    return run_local(shards, config.workers or len(os.sched_getaffinity(0)), tick)
+        yield from run_local(shards, config.workers or len(os.sched_getaffinity(0)), tick)
 
 
 @contextmanager
-def _storing(path: Path) -> Iterator[None]:
+def storing(path: Path) -> Iterator[None]:
+    """Say in a StorageError which file of a labelling run could not be written."""
     try:
         yield
     except OSError as error:

@@ -118,6 +118,7 @@ def make_maps(experiment: Experiment, say: Say = print, tick: Tick = lambda work
                     out_dir=scene.map,
                     workers=experiment.n_workers,
                     raycaster=raycaster,
+                    device=device,
                 )
             _stamp(scene, "map", key)
             say(f"{scene.name}: {report.n_landmarks:,} landmarks from {report.n_registered} images, median "

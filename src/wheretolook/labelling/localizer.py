@@ -47,7 +47,7 @@ class Localizer:
         camera: intrinsics of the images.
         config: matching and RANSAC settings.
         extractor: must be what the map was made with.
-        device: where descriptors are matched, "cpu" or a CUDA device, with the same result.
+        device: where keypoints are extracted and descriptors matched, "cpu" or a CUDA device.
 
     Raises:
         MapError: the landmarks have no descriptors.
@@ -64,7 +64,7 @@ class Localizer:
         if landmarks.descriptors is None:
             raise MapError("landmarks without descriptors cannot be matched", fix="Build the map with its database.")
         self.landmarks, self.config = landmarks, config or LocalizerConfig()
-        self.extractor = KeypointExtractor(extractor)
+        self.extractor = KeypointExtractor(extractor, device)
         self._matcher = DescriptorMatcher(landmarks.descriptors, device)
         self._camera = pycolmap.Camera(
             model="SIMPLE_PINHOLE",
@@ -79,12 +79,12 @@ class Localizer:
 
     def localize(self, rgb: NDArray[np.uint8]) -> Localization:
         """Localize one image (H, W, 3) uint8."""
-        keypoints = self.extract(rgb)
+        keypoints = self.extractor.extract(rgb)
         return self.estimate(keypoints, *self.match([keypoints])[0])
 
-    def extract(self, rgb: NDArray[np.uint8]) -> Keypoints:
-        """Step 1: keypoints of one image (H, W, 3) uint8."""
-        return self.extractor.extract(rgb)
+    def extract(self, images: Sequence[NDArray[np.uint8]]) -> list[Keypoints]:
+        """Step 1: keypoints of images (H, W, 3) uint8."""
+        return self.extractor.extract_batch(images)
 
     def match(self, keypoints: Sequence[Keypoints]) -> list[Matches]:
         """Step 2: 2D-3D matches of several images at once, which do not depend on each other."""

@@ -157,7 +157,7 @@ def label_rows(
 
     steps = [
         Step("render", lambda batch: renderer.render(camera, batch).rgb),
-        Step("extract", lambda images: [localizer.extract(rgb) for rgb in images]),
+        Step("extract", localizer.extract),
         Step("match", lambda found: list(zip(found, localizer.match(found), strict=True))),
         Step("pose", estimate),
     ]

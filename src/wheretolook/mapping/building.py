@@ -85,6 +85,7 @@ def build_map(
     out_dir: str | Path = "map",
     raycaster: MeshRaycaster | None = None,
     workers: int = 2,
+    device: str = "cpu",
     progress: bool = True,
 ) -> MapReport:
     """Map a scene: walk, render, extract, match, triangulate with known poses, filter.
@@ -104,6 +105,7 @@ def build_map(
         raycaster: measures the distance from landmarks to the mesh; made on the CPU if None.
         workers: processes that extract keypoints and match them. Above 1 the caller's script must be guarded
             by `if __name__ == "__main__":`, as for any of Python's process pools.
+        device: where keypoints are extracted, "cpu" or a CUDA device.
         progress: show progress bars.
 
     Returns:
@@ -124,7 +126,7 @@ def build_map(
             poses = poses_looking_along(walk.positions, walk.directions)
         with clock("render_and_extract"):
             keypoints, colors, depth_m = _render_and_extract(
-                renderer, camera, poses, config, partial, processes, progress
+                renderer, camera, poses, config, partial, processes, progress, device
             )
         with clock("pairs"):
             pairs = choose_pairs(surface_overlap(camera, poses, depth_m), config.partners)
@@ -223,6 +225,7 @@ def _render_and_extract(
     partial: Path,
     processes: Processes,
     progress: bool,
+    device: str,
 ) -> tuple[list[Keypoints], list[NDArray[np.uint8]], NDArray[np.float32]]:
     """Keypoints and their colours, image by image, and shrunk depth (I, h, w). Rendering overlaps with extraction."""
     depth: list[NDArray[np.float32]] = []
@@ -238,7 +241,7 @@ def _render_and_extract(
                 waiting.append(rgb)
                 yield rgb
 
-    extracted = KeypointExtractor(config.extractor).extract_many(images(), processes)
+    extracted = KeypointExtractor(config.extractor, device).extract_many(images(), processes)
     keypoints, colors = [], []
     with closing(extracted):
         for found in tqdm(extracted, "map: render, extract", total=len(poses), disable=not progress, unit="image"):

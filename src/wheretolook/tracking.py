@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from mlflow.entities import Run
 
 STAGE_TAG = "stage"
-"""Tag of every run this package logs: "train" or "evaluate"."""
+"""Tag of every run this package logs: "label", "train" or "evaluate"."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ def start_run(
     Args:
         tracking: the store.
         name: name of the run in the UI.
-        stage: "train" or "evaluate", stored as a tag.
+        stage: "label", "train" or "evaluate", stored as a tag.
         params: parameters to log.
         parent: id of the run this one is nested under.
         tags: further tags.
@@ -143,7 +143,7 @@ def newest_run(tracking: TrackingConfig, stage: str, tags: Mapping[str, str] | N
 
     Args:
         tracking: the store.
-        stage: "train" or "evaluate".
+        stage: "label", "train" or "evaluate".
         tags: tags the run must have.
     """
     if not (tracking.root / "mlflow.db").is_file():

@@ -243,8 +243,9 @@ def test_what_is_missing_is_named(folder: Path, monkeypatch: pytest.MonkeyPatch)
     with pytest.raises(WeightsError, match=r"no weights to ship.*wheretolook train"):
         stages.release(experiment, say=quiet)
     # a release cannot be labelled anew
-    with pytest.raises(TableError, match="sample stage has not been run"):
-        stages.label(experiment, say=quiet)
+    for stage in (stages.make_scenes, stages.make_maps, stages.sample, stages.label):
+        with pytest.raises(ConfigError, match="a release has no meshes"):
+            stage(experiment, say=quiet)
 
 
 def test_from_the_command_line(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

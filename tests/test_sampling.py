@@ -78,6 +78,15 @@ def test_subsets_are_drawn_by_seed(landmarks: Landmarks) -> None:
     assert first["viewpoint_id"].is_monotonic_increasing and first["viewpoint_id"].is_unique
 
 
+def test_directions_may_differ_by_split() -> None:
+    config = SampleConfig(max_directions={"train": 3, "val": 0, "test": 7})
+    assert [config.directions_of(split) for split in ("train", "val", "test")] == [3, 0, 7]
+    assert SampleConfig(max_directions=5).directions_of("test") == 5
+    for bad in ({"train": 3}, {"train": 3, "val": 1, "test": -1}, -1):
+        with pytest.raises(ConfigError, match="max_directions"):
+            SampleConfig(max_directions=bad)  # type: ignore[arg-type]
+
+
 def test_a_scene_without_free_space_says_so() -> None:
     class Solid:
         def is_free(self, points: np.ndarray) -> np.ndarray:

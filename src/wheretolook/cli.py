@@ -30,13 +30,13 @@ STAGES = {
         ("map", "scenes.free_space", "label.workers"),
     ),
     "sample": ("sample", "Choose viewpoints by the landmarks they see.", ("sample", "occlusion", "scenes.free_space")),
-    "label": ("label", "Render and localize every viewpoint, measure the pose error. Resumes.", ("label",)),
+    "label": ("label", "Render and localize every viewpoint, measure the pose error. Resumes.", ("label", "tracking")),
     "train": ("train", "Train one network for each input variant.", ("train", "tracking")),
     "evaluate": ("evaluate", "Score all methods on the test scenes.", ("evaluate", "occlusion", "tracking")),
     "release": (
         "release",
         "Make a compact copy, data/release; given that copy and weights trained on it, evaluate and write its card.",
-        ("evaluate", "tracking"),
+        ("evaluate", "occlusion", "tracking"),
     ),
 }
 """Sub-command: function in `wheretolook.stages`, what it does, groups of settings it reads."""

@@ -47,11 +47,7 @@ def make_scenes(experiment: Experiment, say: Say = print, tick: Tick = lambda wo
     from wheretolook.scenes.procedural import generate_apartment
 
     config, root = experiment.scenes, experiment.root
-    if (root / "release.json").is_file():
-        raise ConfigError(
-            "a release is not made from scenes, and would be lost", path=root,
-            fix="Use it with train, evaluate and release alone, or give the experiment another name.",
-        )  # fmt: skip
+    _refuse_release(root)
     numbers: dict[Split, int] = {"train": config.train, "val": config.val, "test": config.test}
     splits = [split for split, number in numbers.items() for _ in range(number)]
     sources: dict[SceneFolder, Callable[[], Any]] = {}
@@ -212,7 +208,7 @@ def label(experiment: Experiment, say: Say = print, tick: Tick = lambda work: No
         tasks.append(LabelTask(scene.name, job, table, shards))
     seconds: dict[str, float] = {}
     start = time.monotonic()
-    with closing(label_scenes(tasks, config)) as results:  # so that Ctrl-C here ends the workers
+    with closing(label_scenes(tasks, config, progress=bool(tasks))) as results:  # so that Ctrl-C here ends the workers
         for labelled in results:
             scene, key = scenes[labelled.task.name]
             with storing(scene.table):
@@ -303,6 +299,8 @@ def release(experiment: Experiment, say: Say = print, tick: Tick = lambda work: 
 def _dataset(experiment: Experiment, needs: str) -> Dataset:
     """The dataset, once the stage that is needed has been through all of its scenes with what they now hold."""
     dataset = Dataset.load(experiment.root)
+    if needs != "label":
+        _refuse_release(experiment.root)
     if dataset.camera != experiment.camera:
         raise ConfigError(
             "the dataset was made with another camera", path=experiment.root, value=dataset.camera,
@@ -315,6 +313,14 @@ def _dataset(experiment: Experiment, needs: str) -> Dataset:
                 path=scene.folder, fix=f"Run `wheretolook {needs}`.",
             )  # fmt: skip
     return dataset
+
+
+def _refuse_release(root: Path) -> None:
+    if (root / "release.json").is_file():
+        raise ConfigError(
+            "a release has no meshes and maps, and would be lost if they were made anew", path=root,
+            fix="Use it with train, evaluate and release alone, or give the experiment another name.",
+        )  # fmt: skip
 
 
 @contextmanager

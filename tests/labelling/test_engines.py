@@ -54,8 +54,17 @@ def test_a_run_that_was_left_goes_on_where_it_stopped(
 def test_without_ray_the_extra_to_install_is_named(room: MappedRoom, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     shard = Shard(room.job, Path("shard.parquet"), facing(POSTER, 1, 1.5))
-    with pytest.raises(ConfigError, match=r"pip install 'wheretolook\[ray\]'"):
+    with pytest.raises(ConfigError, match="pip install ray"):
         next(ray_engine.run_ray([shard]))
+
+
+@pytest.mark.parametrize("resources", [{"CPU": 8.0}, {"GPU": 1.0}])
+def test_what_no_machine_of_the_cluster_has_is_named(resources: dict[str, float]) -> None:
+    """Ray would wait for it for ever."""
+    missing = "GPU" if "CPU" in resources else "CPU"
+    with pytest.raises(ConfigError, match=f"has no {missing}"):
+        ray_engine._check_resources(resources, needs_gpu=True)
+    ray_engine._check_resources({"CPU": 1.0}, needs_gpu=False)
 
 
 def test_an_address_without_a_cluster_is_refused_at_once(room: MappedRoom) -> None:

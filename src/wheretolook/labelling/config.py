@@ -43,7 +43,7 @@ class LabelConfig:
     Args:
         localizer: matching and pose estimation.
         engine: "local" works in processes on this machine, "ray" the same shards on a Ray cluster
-            (`pip install 'wheretolook[ray]'`).
+            (`pip install ray`).
         ray_address: the cluster's address, such as "auto" on one of its machines, or "ray://head:10001" from elsewhere
             (which needs `pip install 'ray[client]'`); empty starts one on this machine.
         workers: processes of the local engine; 0 means one for each CPU core this process may use.

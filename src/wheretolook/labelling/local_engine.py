@@ -109,13 +109,14 @@ def _give(worker: _Worker, waiting: deque[Shard]) -> None:
 
 def _work(pipe: Connection, number: int) -> None:
     end_with_parent()
-    worker = ShardWorker(number)
+    worker: ShardWorker | None = None
     while True:
         try:
             job, rows = pipe.recv()
         except EOFError:
             return
         try:
+            worker = worker or ShardWorker(number)
             pipe.send(worker.label(job, rows, pipe.send))
         except BaseException as error:
             pipe.send(error)

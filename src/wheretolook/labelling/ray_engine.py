@@ -10,7 +10,7 @@ import hashlib
 import os
 import socket
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -49,7 +49,7 @@ def run_ray(
     try:
         import ray
     except ImportError as error:
-        fix = "Install it: pip install 'wheretolook[ray]', or use label.engine local."
+        fix = "Install it: pip install ray, or use label.engine local."
         raise ConfigError("Ray is not installed", value="label.engine ray", fix=fix) from error
     ours = not ray.is_initialized()
     if ours:
@@ -73,7 +73,18 @@ def _connect(ray: Any, address: str) -> None:
         raise ConfigError(f"no Ray cluster there: {error}", value=address, fix=fix) from error
 
 
+def _check_resources(resources: Mapping[str, float], needs_gpu: bool) -> None:
+    """What no machine of the cluster has, Ray would wait for without a word."""
+    for name, needed in (("CPU", True), ("GPU", needs_gpu)):
+        if needed and resources.get(name, 0) == 0:
+            raise ConfigError(
+                f"the Ray cluster has no {name}", value=dict(resources),
+                fix="Add a machine that has one, or give --device cpu." if name == "GPU" else "Add a machine.",
+            )  # fmt: skip
+
+
 def _run(ray: Any, shards: Sequence[Shard], tick: Callable[[int], None]) -> Iterator[tuple[Shard, LabelledShard]]:
+    _check_resources(ray.cluster_resources(), any(shard.job.device != "cpu" for shard in shards))
     waiting, running, files = iter(shards), dict[Any, Shard](), dict[SceneJob, Any]()
     label = ray.remote(num_cpus=1, max_retries=MAX_RETRIES)(_label_shard)
 
@@ -81,7 +92,7 @@ def _run(ray: Any, shards: Sequence[Shard], tick: Callable[[int], None]) -> Iter
         if shard.job not in files:  # a scene travels to a machine once
             files.clear()
             files[shard.job] = ray.put((shard.job.mesh.read_bytes(), shard.job.landmarks.read_bytes()))
-        gpus = 1 / WORKERS_A_GPU if shard.job.device.startswith("cuda") else 0
+        gpus = 1 / WORKERS_A_GPU if shard.job.device != "cpu" else 0
         running[label.options(num_gpus=gpus).remote(shard.job, files[shard.job], shard.rows)] = shard
 
     try:
@@ -125,6 +136,8 @@ def _label_shard(job: SceneJob, files: tuple[bytes, bytes], rows: pd.DataFrame) 
         _worker = ShardWorker()
     folder = Path(tempfile.gettempdir()) / f"wheretolook-{os.getuid()}"
     folder.mkdir(exist_ok=True)
+    if job.device != "cpu":
+        job = replace(job, device="cuda")  # the only one that Ray lets this task see
     mesh = _lay_down(folder, files[0], job.mesh.suffix)
     landmarks = _lay_down(folder, files[1], job.landmarks.suffix)
     try:

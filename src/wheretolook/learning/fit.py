@@ -19,9 +19,10 @@ import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint, EarlyStopping
 from lightning.pytorch.strategies import DDPStrategy
+from torch.multiprocessing.spawn import ProcessException
 from tqdm.auto import tqdm
 
-from wheretolook.errors import ConfigError
+from wheretolook.errors import ConfigError, WorkerError
 from wheretolook.learning.classifier import ViewpointClassifier
 from wheretolook.learning.config import TrainConfig
 from wheretolook.learning.data import ViewpointDataModule
@@ -91,7 +92,13 @@ def fit(classifier: ViewpointClassifier, data: ViewpointDataModule, record: Epoc
             enable_progress_bar=False,
             enable_model_summary=False,
         )
-        trainer.fit(classifier, datamodule=data)
+        try:
+            trainer.fit(classifier, datamodule=data)
+        except ProcessException as error:
+            raise WorkerError(
+                f"a training process ended before its work was done: {error}", value=f"train.devices {config.devices}",
+                fix="There may be too little memory: lower train.devices.",
+            ) from error  # fmt: skip
         record.collect()
 
 

@@ -23,7 +23,7 @@ class ExtractorConfig:
 
     Args:
         method: whose SIFT to run. `opencv` finds nearly the same keypoints as `colmap`, COLMAP's own extraction on the
-            CPU, in a third of the time; on a GPU, Warp kernels find OpenCV's up to rounding.
+            CPU, in 40 % of the time; on a GPU, Warp kernels find OpenCV's up to rounding.
         first_octave: -1 doubles the image first, which gives about three times as many (and smaller) keypoints, for
             `colmap` at four times the cost; 0 starts at the image's own size. COLMAP's default is -1.
         max_keypoints: the most keypoints kept an image. `colmap` prefers large scales, `opencv` strong contrast.

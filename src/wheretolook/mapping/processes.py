@@ -6,10 +6,12 @@ import multiprocessing
 from collections import deque
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from itertools import islice
 from types import TracebackType
 from typing import TypeVar
 
+from wheretolook.errors import WorkerError
 from wheretolook.worker_processes import end_with_parent, keep_freed_memory, spawning
 
 Item = TypeVar("Item")
@@ -42,6 +44,9 @@ class Processes:
 
         Yields:
             Results in the order of the items.
+
+        Raises:
+            WorkerError: a process was killed.
         """
         if self._pool is None:
             yield from map(function, items)
@@ -55,6 +60,11 @@ class Processes:
                 if not pending:
                     return
                 yield pending.popleft().result()
+        except BrokenProcessPool as error:
+            raise WorkerError(
+                "a process was killed, probably for lack of memory", value=f"{self.workers} workers",
+                fix="Lower label.workers and run again.",
+            ) from error  # fmt: skip
         finally:
             for future in pending:
                 future.cancel()

@@ -167,24 +167,6 @@ def _half_gaussian(sigma: float) -> NDArray[np.float64]:
     return (weights / weights.sum())[radius:]
 
 
-def _sorted_unique(keys: NDArray[np.int64]) -> NDArray[np.int64]:
-    keys = np.sort(keys)
-    return keys[np.flatnonzero(np.diff(keys, prepend=-1))]
-
-
-def _by_response(image: NDArray[np.int64], table: NDArray[np.float32], angle: NDArray[np.float32]) -> NDArray[np.intp]:
-    """Order by image, -response, y, x, scale, angle. `table` is x, y, scale, response, which is positive."""
-    # Positive floats are in the order of their bits.
-    key = (image << 32) - np.ascontiguousarray(table[:, 3]).view(np.int32)
-    order = np.argsort(key)
-    equal = np.diff(key[order]) == 0
-    tied = np.flatnonzero(np.append(equal, False) | np.insert(equal, 0, False))
-    rows = order[tied]
-    x, y, scale, _ = table[rows].T
-    order[tied] = rows[np.lexsort((angle[rows], scale, y, x, key[rows]))]
-    return order
-
-
 def roomy(n: int) -> int:
     """At least n, one of few sizes."""
     return 1 << max(10, (n - 1).bit_length())

@@ -138,7 +138,12 @@ class Dataset:
 
 def write_json(path: Path, content: Any) -> None:
     """Write JSON atomically, keys in the order given."""
+    write_text(path, json.dumps(content, indent=2) + "\n")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text atomically; its folder is made when needed."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".partial")
-    partial.write_text(json.dumps(content, indent=2) + "\n")
+    partial.write_text(text, encoding="utf-8")
     os.replace(partial, path)

@@ -6,7 +6,6 @@ labelled anew, but it is read, trained on and evaluated as any other.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import shutil
@@ -20,7 +19,7 @@ from wheretolook.dataset import Dataset, SceneFolder, write_json
 from wheretolook.errors import ConfigError, StorageError, TableError, WeightsError
 from wheretolook.features import INPUT_VARIANTS
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.table import write_table
+from wheretolook.table import sha256, write_table
 from wheretolook.visibility import StoredOcclusion
 
 if TYPE_CHECKING:
@@ -163,11 +162,6 @@ def sizes(root: Path, weights: bool = True) -> dict[str, int]:
 def size_text(parts: Mapping[str, int]) -> str:
     """Sizes for people: "tables 4.81 MB, ..., in all 13.20 MB"."""
     return ", ".join(f"{name} {size / 1e6:.2f} MB" for name, size in {**parts, "in all": sum(parts.values())}.items())
-
-
-def sha256(path: Path) -> str:
-    """SHA-256 of a file, in hexadecimal digits."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def read_about(release: Dataset) -> dict[str, Any]:

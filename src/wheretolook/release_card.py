@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -13,7 +12,7 @@ from typing import Any
 import pandas as pd
 import yaml
 
-from wheretolook.dataset import Dataset
+from wheretolook.dataset import Dataset, write_text
 from wheretolook.errors import TableError, WeightsError
 from wheretolook.evaluation.config import THRESHOLDS, threshold_key, threshold_label
 from wheretolook.evaluation.report import markdown_table, score_markdown
@@ -22,7 +21,8 @@ from wheretolook.evaluation.scores import ALL
 from wheretolook.figures.style import method_style
 from wheretolook.labelling.report import POSITIVE, label_summary
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.release import CARD, SHELF, read_about, sha256, size_text, sizes
+from wheretolook.release import CARD, SHELF, read_about, size_text, sizes
+from wheretolook.table import sha256
 from wheretolook.visibility import StoredOcclusion
 
 GENERALIZATION_CSV = "generalization.csv"
@@ -68,10 +68,7 @@ def write_card(release: Dataset) -> Path:
         StorageError: the release is too large.
     """
     path = release.root / CARD
-    content = release_card(release)
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(content, encoding="utf-8")
-    os.replace(partial, path)
+    write_text(path, release_card(release))
     return path
 
 

@@ -316,7 +316,9 @@ def _dataset(experiment: Experiment, needs: str) -> Dataset:
 
 
 def _refuse_release(root: Path) -> None:
-    if (root / "release.json").is_file():
+    from wheretolook.release import ABOUT
+
+    if (root / ABOUT).is_file():
         raise ConfigError(
             "a release has no meshes and maps, and would be lost if they were made anew", path=root,
             fix="Use it with train, evaluate and release alone, or give the experiment another name.",

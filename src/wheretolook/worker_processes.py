@@ -35,8 +35,16 @@ def end_with_parent() -> None:
         threading.Thread(target=_wait_and_exit, args=(parent,), daemon=True).start()
 
 
-def keep_freed_memory() -> None:
-    """Called in a worker: let the C library reuse memory that was freed instead of giving it back to the system.
+def use_one_core() -> None:
+    """Called in a worker that runs SIFT beside others, one for each core: OpenCV keeps to one thread and its memory."""
+    import cv2
+
+    cv2.setNumThreads(1)
+    _keep_freed_memory()
+
+
+def _keep_freed_memory() -> None:
+    """Let the C library reuse memory that was freed instead of giving it back to the system.
 
     SIFT takes and frees about 70 MB for each 640 x 480 image; getting it back page by page took a third of its time.
     """

@@ -118,12 +118,7 @@ def print_report(extractors: dict[str, dict[str, Any]], agreements: list[dict[st
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__.splitlines()[0],
-        epilog=__doc__.partition("\n\n")[2],
-        formatter_class=argparse.RawTextHelpFormatter,
-    )
-    bench_scenes.add_arguments(parser, views=1000)
+    parser = bench_scenes.argument_parser(__doc__, views=1000)
     parser.add_argument(
         "--timed", type=int, default=200, help="viewpoints whose extraction is timed (default: %(default)s)"
     )

@@ -20,7 +20,6 @@ is neither refined nor extended by it.
 
 from __future__ import annotations
 
-import argparse
 import shutil
 import tempfile
 import time
@@ -348,12 +347,7 @@ def report_times(clock: Stopwatch) -> dict[str, Any]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__.splitlines()[0],
-        epilog=__doc__.partition("\n\n")[2],
-        formatter_class=argparse.RawTextHelpFormatter,
-    )
-    bench_scenes.add_arguments(parser, views=200)
+    parser = bench_scenes.argument_parser(__doc__, views=200)
     parser.add_argument(
         "--extractor", choices=("opencv", "colmap"), default="opencv", help="of the map and of both sides (%(default)s)"
     )

@@ -31,8 +31,13 @@ class Scene:
     free_space: FreeSpace
 
 
-def add_arguments(parser: argparse.ArgumentParser, views: int) -> None:
-    """The options that every benchmark of labelling has."""
+def argument_parser(doc: str, views: int) -> argparse.ArgumentParser:
+    """A parser with the options that every benchmark of labelling has, explained by the benchmark's docstring."""
+    parser = argparse.ArgumentParser(
+        description=doc.splitlines()[0],
+        epilog=doc.partition("\n\n")[2],
+        formatter_class=argparse.RawTextHelpFormatter,
+    )
     parser.add_argument(
         "--scene", type=Path, help="folder with a mesh.glb, or a mesh file (z up); default: generate an apartment"
     )
@@ -43,6 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser, views: int) -> None:
     )
     parser.add_argument("--device", default="cpu", help="where images are rendered (default: %(default)s)")
     parser.add_argument("--out", type=Path, help="write all numbers to this JSON file")
+    return parser
 
 
 def open_scene(source: Path | None, folder: Path, seed: int, device: str) -> Scene:

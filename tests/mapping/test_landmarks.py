@@ -196,15 +196,19 @@ def test_long_and_short_tracks_against_a_plain_loop(tmp_path):
         np.testing.assert_allclose(landmarks.mapping_direction[p], mean / np.linalg.norm(mean), atol=1e-6)
 
 
-@pytest.mark.parametrize("with_descriptors", [False, True])
-def test_save_and_load(tmp_path, model_dir, with_descriptors):
+def hand_written_landmarks(folder, model_dir, with_descriptors):
     database = None
     if with_descriptors:
         model, keypoints = hand_written_model()
         database = write_database(
-            tmp_path / "database.db", model, keypoints, random_descriptors([len(k) for k in keypoints])
+            folder / "database.db", model, keypoints, random_descriptors([len(k) for k in keypoints])
         )
-    landmarks = load_colmap_landmarks(model_dir, database)
+    return load_colmap_landmarks(model_dir, database)
+
+
+@pytest.mark.parametrize("with_descriptors", [False, True])
+def test_save_and_load(tmp_path, model_dir, with_descriptors):
+    landmarks = hand_written_landmarks(tmp_path, model_dir, with_descriptors)
     landmarks.save(tmp_path / "a.npz")
     again = Landmarks.load(tmp_path / "a.npz")
     for name, value in vars(landmarks).items():
@@ -220,13 +224,7 @@ def test_save_and_load(tmp_path, model_dir, with_descriptors):
 
 @pytest.mark.parametrize("with_descriptors", [False, True])
 def test_compact_landmarks_keep_all_but_descriptors(tmp_path, model_dir, with_descriptors):
-    database = None
-    if with_descriptors:
-        model, keypoints = hand_written_model()
-        database = write_database(
-            tmp_path / "database.db", model, keypoints, random_descriptors([len(k) for k in keypoints])
-        )
-    landmarks = load_colmap_landmarks(model_dir, database)
+    landmarks = hand_written_landmarks(tmp_path, model_dir, with_descriptors)
     landmarks.save(tmp_path / "a.npz", compact=True)
     again = Landmarks.load(tmp_path / "a.npz")
     assert again.descriptors is None

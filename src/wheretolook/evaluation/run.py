@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -13,7 +12,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from wheretolook.dataset import Dataset, SceneFolder
+from wheretolook.dataset import Dataset, SceneFolder, write_text
 from wheretolook.errors import TableError, WeightsError
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.ranking import TestViews
@@ -225,9 +224,7 @@ def _write_results(folder: Path, table: pd.DataFrame, title: str) -> None:
 
         save_figure(occlusion_figure(table), folder / OCCLUSION_PNG)
     for name, text in ((SCORES_CSV, table.to_csv(index=False)), (SCORES_MD, score_markdown(table, title))):
-        partial = folder / f"{name}.partial"
-        partial.write_text(text, encoding="utf-8")
-        os.replace(partial, folder / name)
+        write_text(folder / name, text)
     save_figure(score_figure(table), folder / SCORES_PNG)
 
 

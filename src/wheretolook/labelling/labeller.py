@@ -25,7 +25,7 @@ from wheretolook.labelling.config import LabelConfig
 from wheretolook.labelling.shard import LabelledShard, SceneJob, Shard
 from wheretolook.mapping.extraction import ExtractorConfig
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.table import SCHEMA, fingerprint, read_table, write_table
+from wheretolook.table import SCHEMA, fingerprint, read_table, sha256, write_table
 
 MANIFEST = "manifest.json"
 """In the folder of shards while work goes on, and as `labels.json` beside a finished table."""
@@ -91,7 +91,7 @@ def label_viewpoints(
         shards: folder for finished shards.
         config: how.
         extractor: what the map was made with.
-        device: where images are rendered and descriptors matched.
+        device: where images are rendered, keypoints extracted and descriptors matched.
         progress: show a progress bar.
         description: the bar's title.
 
@@ -206,7 +206,7 @@ class _Scene:
             content = pd.util.hash_pandas_object(rows[inputs], index=False).to_numpy()
             digest = hashlib.sha256(text + content.tobytes()).hexdigest()[:16]
             shards.append(Shard(job, task.shards / f"{begin:08d}-{digest}.parquet", rows))
-        scene = cls(task, settings, shards, [shard for shard in shards if not _is_finished(shard)])
+        scene = cls(task, settings, shards, [shard for shard in shards if _finished(shard) is None])
         with storing(task.shards / MANIFEST):
             write_json(task.shards / MANIFEST, scene.manifest())
         return scene
@@ -221,12 +221,13 @@ class _Scene:
     def result(self) -> LabelledScene:
         parts = []
         for shard in self.shards:
-            if not _is_finished(shard):
+            rows = _finished(shard)
+            if rows is None:
                 raise StorageError(
                     "a finished shard was damaged or removed", path=shard.path, fix="Run again: it is made anew."
                 )
-            parts.append(read_table(shard.path))
-        contents = {shard.path.name: {"n": len(shard.rows), "sha256": _sha256(shard.path)} for shard in self.shards}
+            parts.append(rows)
+        contents = {shard.path.name: {"n": len(shard.rows), "sha256": sha256(shard.path)} for shard in self.shards}
         manifest = {**self.manifest(), "shards": contents}
         return LabelledScene(self.task, pd.concat(parts, ignore_index=True), manifest, self.seconds)
 
@@ -256,17 +257,13 @@ def storing(path: Path) -> Iterator[None]:
         ) from error  # fmt: skip
 
 
-def _is_finished(shard: Shard) -> bool:
-    """Whether a shard's file is whole; a damaged one is removed and made again."""
+def _finished(shard: Shard) -> pd.DataFrame | None:
+    """A shard's labelled rows, if its file is whole; a damaged one is removed and made again."""
     if not shard.path.exists():
-        return False
+        return None
     try:
         done = read_table(shard.path)
     except TableError:
         shard.path.unlink()
-        return False
-    return np.array_equal(done["viewpoint_id"], shard.rows["viewpoint_id"])
-
-
-def _sha256(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+        return None
+    return done if np.array_equal(done["viewpoint_id"], shard.rows["viewpoint_id"]) else None

@@ -83,7 +83,7 @@ class Localizer:
         return self.estimate(keypoints, *self.match([keypoints])[0])
 
     def extract(self, images: Sequence[NDArray[np.uint8]]) -> list[Keypoints]:
-        """Step 1: keypoints of images (H, W, 3) uint8."""
+        """Step 1: keypoints of images, each (H, W, 3) uint8 and all of one size."""
         return self.extractor.extract_batch(images)
 
     def match(self, keypoints: Sequence[Keypoints]) -> list[Matches]:
@@ -93,7 +93,7 @@ class Localizer:
     def estimate(
         self, keypoints: Keypoints, keypoint_rows: NDArray[np.int64], landmark_rows: NDArray[np.int64]
     ) -> Localization:
-        """Step 3: the pose from the matches of one image."""
+        """Step 3: the pose of one image from its matches, rows (M,) of its keypoints and rows (M,) of the landmarks."""
         n_matches = len(keypoint_rows)
         if n_matches < self.config.min_matches:
             return Localization(TOO_FEW_MATCHES, None, n_matches)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -11,7 +10,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from wheretolook.dataset import Dataset, SceneFolder, Split
+from wheretolook.dataset import Dataset, SceneFolder, Split, write_text
 from wheretolook.errors import TableError
 from wheretolook.evaluation.config import THRESHOLDS, threshold_key, threshold_label
 from wheretolook.evaluation.report import markdown_table
@@ -260,12 +259,9 @@ def log_labels(
     tables = {scene.name: _labelled_table(scene) for scene in dataset.scenes}
     summary = label_summary(tables, {scene.name: scene.split for scene in dataset.scenes})
     folder = dataset.root / "results"
-    folder.mkdir(parents=True, exist_ok=True)
     markdown = label_markdown(summary, f"Labels of {dataset.name}")
     for name, text in ((LABELS_CSV, summary.shares.to_csv(index=False)), (LABELS_MD, markdown)):
-        partial = folder / f"{name}.partial"
-        partial.write_text(text, encoding="utf-8")
-        os.replace(partial, folder / name)
+        write_text(folder / name, text)
     save_figure(label_figure(summary), folder / LABELS_PNG)
 
     params = {

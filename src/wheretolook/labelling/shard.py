@@ -16,7 +16,7 @@ from wheretolook.labelling.config import LocalizerConfig
 from wheretolook.labelling.pipeline import Step, run_pipeline
 from wheretolook.mapping.extraction import ExtractorConfig
 from wheretolook.table import poses
-from wheretolook.worker_processes import keep_freed_memory
+from wheretolook.worker_processes import use_one_core
 
 if TYPE_CHECKING:
     from wheretolook.labelling.localizer import Localization, Localizer
@@ -38,7 +38,8 @@ class SceneJob:
         camera: intrinsics of the viewpoints.
         localizer: matching and pose estimation.
         extractor: what the map was made with.
-        device: where images are rendered and descriptors matched; "cuda" is spread over all GPUs there are.
+        device: where images are rendered, keypoints extracted and descriptors matched; "cuda" is spread over all GPUs
+            there are.
     """
 
     mesh: Path
@@ -79,12 +80,10 @@ class ShardWorker:
     """
 
     def __init__(self, number: int = 0) -> None:
-        import cv2
         import torch
 
-        keep_freed_memory()
-        torch.set_num_threads(1)  # there is a worker for each core
-        cv2.setNumThreads(1)
+        use_one_core()
+        torch.set_num_threads(1)
         self.number = number
         self._scene: tuple[SceneJob, Renderer, Localizer] | None = None
 
@@ -137,7 +136,7 @@ def label_rows(
     seconds: dict[str, float] | None = None,
     tick: Tick = lambda n: None,
 ) -> pd.DataFrame:
-    """Render viewpoints, localize the images and measure the errors: three batched steps at a time in this process.
+    """Render viewpoints, localize the images and measure the errors, in batched steps that overlap in this process.
 
     Args:
         table: viewpoints.

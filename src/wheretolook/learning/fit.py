@@ -194,7 +194,7 @@ class EpochRecord(Checkpoint):
     def collect(self) -> None:
         """Take over what the process that trained has left."""
         if self.file is not None:
-            self.rows, self.kept, self._weights = torch.load(self.file, map_location="cpu")
+            self.rows, self.kept, self._weights = torch.load(self.file, map_location="cpu", weights_only=True)
 
     def restore(self, classifier: ViewpointClassifier) -> dict[str, float]:
         """Put the kept weights into the classifier and return the metrics of their epoch."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -23,6 +22,7 @@ from wheretolook.learning.fit import EpochRecord, RunLog, fit, home_device
 from wheretolook.learning.network import NetworkSpec, ViewpointNetwork
 from wheretolook.learning.weights import save_classifier
 from wheretolook.table import fingerprint as file_fingerprint
+from wheretolook.table import sha256
 from wheretolook.tracking import TrackingConfig, log, start_run
 
 if TYPE_CHECKING:
@@ -120,7 +120,7 @@ def _trained_before(path: Path, variant: str, about: dict[str, Any]) -> TrainedM
     """The model at `path` if it was trained as `about` says and has not been changed since."""
     try:
         record = json.loads(path.with_suffix(".json").read_text())
-        if record["about"] == about and record["weights_sha256"] == _sha256(path):
+        if record["about"] == about and record["weights_sha256"] == sha256(path):
             return TrainedModel(variant, path, record["run_id"], record["metrics"], reused=True)
     except (OSError, ValueError, KeyError, TypeError):
         pass  # no record, or a damaged one: train
@@ -154,7 +154,7 @@ def _train_variant(
         save_classifier(classifier.network, path, about)
         log(client, run_id, metrics={f"kept_{name}": value for name, value in metrics.items()})
         _log_artifacts(client, run_id, path, record.history, variant)
-        content = {"about": about, "weights_sha256": _sha256(path), "run_id": run_id, "metrics": metrics}
+        content = {"about": about, "weights_sha256": sha256(path), "run_id": run_id, "metrics": metrics}
         write_json(path.with_suffix(".json"), content)
     return TrainedModel(variant, path, run_id, metrics)
 
@@ -168,7 +168,3 @@ def _log_artifacts(client: MlflowClient, run_id: str, weights: Path, history: pd
         history.to_csv(Path(folder) / "history.csv", index=False)
         save_figure(training_figure({variant: history}), Path(folder) / "curves.png")
         client.log_artifacts(run_id, folder)
-
-
-def _sha256(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()

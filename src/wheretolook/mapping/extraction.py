@@ -67,6 +67,11 @@ class Keypoints:
     def __len__(self) -> int:
         return len(self.pixels)
 
+    @classmethod
+    def none(cls) -> Keypoints:
+        """No keypoints."""
+        return cls(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32), np.zeros(0, np.float32))
+
 
 def quantize_descriptors(descriptors: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
     """Unit descriptors (N, D) as COLMAP stores them, (N, D) uint8: 512 times the value, rounded, at most 255."""
@@ -150,7 +155,7 @@ class KeypointExtractor:
     def _extract_colmap(self, bitmap: Any) -> Keypoints:
         keypoints, descriptors = self._extractor.extract(bitmap)
         if len(keypoints) == 0:
-            return _no_keypoints()
+            return Keypoints.none()
         table = np.array([(k.x, k.y, k.compute_scale()) for k in keypoints], dtype=np.float32)
         # COLMAP's own cap keeps whole scale levels from the largest down, so it can overshoot; cut what is beyond.
         keep = np.argsort(-table[:, 2], kind="stable")[: self.config.max_keypoints]
@@ -159,7 +164,7 @@ class KeypointExtractor:
     def _extract_opencv(self, grey: NDArray[np.uint8]) -> Keypoints:
         found, descriptors = self._extractor.detectAndCompute(np.ascontiguousarray(grey), None)
         if len(found) == 0:
-            return _no_keypoints()
+            return Keypoints.none()
         octave = np.array([k.octave & 255 for k in found], dtype=np.uint8).view(np.int8)
         table = np.array([(*k.pt, k.size / 2, k.response, k.angle) for k in found], dtype=np.float32)
         usable = np.flatnonzero(octave >= self.config.first_octave)
@@ -181,10 +186,6 @@ def _grey(rgb: NDArray[np.uint8]) -> Any:
     if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3:
         raise ValueError(f"expected an (H, W, 3) uint8 image, got {rgb.shape} {rgb.dtype}")
     return pycolmap.Bitmap.from_array(np.ascontiguousarray(rgb)).clone_as_grey()
-
-
-def _no_keypoints() -> Keypoints:
-    return Keypoints(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32), np.zeros(0, np.float32))
 
 
 def _colmap_sift(config: ExtractorConfig) -> Any:

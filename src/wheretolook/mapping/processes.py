@@ -12,7 +12,7 @@ from types import TracebackType
 from typing import TypeVar
 
 from wheretolook.errors import WorkerError
-from wheretolook.worker_processes import end_with_parent, keep_freed_memory, spawning
+from wheretolook.worker_processes import end_with_parent, spawning, use_one_core
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -71,8 +71,5 @@ class Processes:
 
 
 def _start_worker() -> None:
-    import cv2
-
     end_with_parent()
-    keep_freed_memory()
-    cv2.setNumThreads(1)
+    use_one_core()

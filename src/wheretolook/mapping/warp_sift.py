@@ -90,7 +90,7 @@ class WarpSift:
         if 2 * max(rows, columns) > MAX_SIDE or size >= 1 << 31:
             raise ValueError(f"expected images of at most {MAX_SIDE // 2} pixels a side, got {grey.shape}")
         if n_images == 0 or min(rows, columns) <= BORDER:
-            return [_no_keypoints() for _ in range(n_images)]
+            return [Keypoints.none() for _ in range(n_images)]
         # kernels count the values of a block in 31 bits
         block = max(1, min(n_images, self.block_bytes // (4 * size), (1 << 31) // size - 1))
         space = self._space
@@ -108,10 +108,10 @@ class WarpSift:
         space.fill(grey)
         keys = _sorted_unique(space.find())
         if len(keys) == 0:
-            return [_no_keypoints() for _ in range(n_images)]
+            return [Keypoints.none() for _ in range(n_images)]
         table, place, angle, places = self._turn(space, keys)
         if len(place) == 0:
-            return [_no_keypoints() for _ in range(n_images)]
+            return [Keypoints.none() for _ in range(n_images)]
         image = (keys // KEYS_OF_IMAGE)[place]
         order = _by_response(image, table[place], angle)
         ends = np.searchsorted(image, np.arange(n_images + 1))  # `image` is sorted to begin with
@@ -197,7 +197,3 @@ def _by_response(image: NDArray[np.int64], table: NDArray[np.float32], angle: ND
     x, y, scale, _ = table[rows].T
     order[tied] = rows[np.lexsort((angle[rows], scale, y, x, key[rows]))]
     return order
-
-
-def _no_keypoints() -> Keypoints:
-    return Keypoints(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32), np.zeros(0, np.float32))

@@ -83,7 +83,7 @@ class ScaleSpace:
             command.launch()
 
     def find(self) -> NDArray[np.int64]:
-        """Keys of the extrema that pass the limits, in any order and with repetitions."""
+        """Keys (K,) int64 of the extrema that pass the limits, in any order and with repetitions (see `key_of`)."""
         while True:
             self.number.zero_()
             for octave in range(1 + self.first_octave, len(self.sizes)):

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 
 from wheretolook.errors import ConfigError, WeightsError
 from wheretolook.geometry import PinholeCamera
@@ -38,7 +38,9 @@ def save_classifier(network: ViewpointNetwork, path: str | Path, training: Mappi
     header = {"format_version": FORMAT_VERSION, **asdict(network.spec), "training": dict(training or {})}
     partial = path.with_name(path.name + ".partial")
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in network.layers.state_dict().items()}
-    save_file(tensors, partial, metadata={METADATA_KEY: json.dumps(header)})
+    partial.write_bytes(
+        save(tensors, metadata={METADATA_KEY: json.dumps(header)})
+    )  # save_file hides it from other users
     os.replace(partial, path)
 
 

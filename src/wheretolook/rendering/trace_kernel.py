@@ -1,4 +1,4 @@
-"""The Warp kernel of `WarpRenderer`: one thread a pixel. `Open3DRenderer` says the same in NumPy."""
+"""Warp kernels of `WarpRenderer` that trace rays and shade hits: one thread a pixel. `Open3DRenderer` is their twin."""
 
 # mypy: ignore-errors
 # Warp's kernel language is not Python's type system.
@@ -60,22 +60,27 @@ def _bilinear(a: Appearance, texture: wp.int32, level: wp.int32, uv: wp.vec2):
 
 
 @wp.func
-def _shade(a: Appearance, hit: wp.MeshQueryRay, direction: wp.vec3, by_x: wp.vec3, by_y: wp.vec3):
+def shade(
+    a: Appearance,
+    face: wp.int32,
+    weights: wp.vec3,
+    depth_m: wp.float32,
+    normal: wp.vec3,
+    direction: wp.vec3,
+    to_ray: wp.mat33,
+):
     """Colour of a hit, filtered over the pixel's footprint; `Open3DRenderer` says the same in NumPy."""
-    face = hit.face
-    # Warp's barycentrics weight the first and the second corner.
-    w0 = hit.u
-    w1 = hit.v
-    w2 = 1.0 - hit.u - hit.v
-    uv = w0 * a.corner_uvs[face, 0] + w1 * a.corner_uvs[face, 1] + w2 * a.corner_uvs[face, 2]
+    uv = weights[0] * a.corner_uvs[face, 0] + weights[1] * a.corner_uvs[face, 1] + weights[2] * a.corner_uvs[face, 2]
     texture = a.triangle_texture[face]
 
     # How the hit moves on the plane, in metres, as the pixel moves by one to the right and one down.
-    slant = wp.dot(hit.normal, direction)
+    by_x = wp.vec3(to_ray[0, 0], to_ray[1, 0], to_ray[2, 0])
+    by_y = wp.vec3(to_ray[0, 1], to_ray[1, 1], to_ray[2, 1])
+    slant = wp.dot(normal, direction)
     if wp.abs(slant) < 1.0e-4:
         slant = wp.where(slant < 0.0, -1.0e-4, 1.0e-4)
-    step_x = hit.t * (by_x - direction * (wp.dot(hit.normal, by_x) / slant))
-    step_y = hit.t * (by_y - direction * (wp.dot(hit.normal, by_y) / slant))
+    step_x = depth_m * (by_x - direction * (wp.dot(normal, by_x) / slant))
+    step_y = depth_m * (by_y - direction * (wp.dot(normal, by_y) / slant))
     # The same in texels: the columns of the footprint matrix J.
     grad_x = a.texel_gradients[face, 0]
     grad_y = a.texel_gradients[face, 1]
@@ -113,16 +118,33 @@ def _shade(a: Appearance, hit: wp.MeshQueryRay, direction: wp.vec3, by_x: wp.vec
 
     if a.vertex_colors.shape[0] > 0:
         tint = (
-            w0 * a.vertex_colors[a.indices[3 * face]]
-            + w1 * a.vertex_colors[a.indices[3 * face + 1]]
-            + w2 * a.vertex_colors[a.indices[3 * face + 2]]
+            weights[0] * a.vertex_colors[a.indices[3 * face]]
+            + weights[1] * a.vertex_colors[a.indices[3 * face + 1]]
+            + weights[2] * a.vertex_colors[a.indices[3 * face + 2]]
         )
         color = wp.cw_mul(color, tint)
-    return color
+    return wp.vec3ub(
+        wp.uint8(wp.clamp(color[0] + 0.5, 0.0, 255.0)),
+        wp.uint8(wp.clamp(color[1] + 0.5, 0.0, 255.0)),
+        wp.uint8(wp.clamp(color[2] + 0.5, 0.0, 255.0)),
+    )
 
 
-@wp.kernel
-def render_kernel(
+@wp.func
+def pixel_of(tile: wp.int32, within: wp.int32, width: wp.int32):
+    """Column and row of a thread. They run tile by tile: neighbouring rays visit the same nodes and texels."""
+    tiles_across = (width + TILE - 1) / TILE
+    return wp.vec2i((tile % tiles_across) * TILE + within % TILE, (tile / tiles_across) * TILE + within / TILE)
+
+
+@wp.func
+def ray_through(to_ray: wp.mat33, column: wp.int32, row: wp.int32):
+    """Direction of the ray through a pixel's centre, of length 1 along the optical axis."""
+    return to_ray * wp.vec3(wp.float32(column) + 0.5, wp.float32(row) + 0.5, 1.0)
+
+
+@wp.kernel(enable_backward=False)
+def trace_kernel(
     mesh: wp.uint64,
     appearance: Appearance,
     centers: wp.array[wp.vec3],
@@ -130,29 +152,19 @@ def render_kernel(
     rgb: wp.array3d[wp.vec3ub],
     depth_m: wp.array3d[wp.float32],
 ):
-    # Threads run tile by tile, so that neighbouring rays, which visit the same nodes and texels, run together.
     b, tile, within = wp.tid()
-    height = depth_m.shape[1]
-    width = depth_m.shape[2]
-    tiles_across = (width + TILE - 1) / TILE
-    column = (tile % tiles_across) * TILE + within % TILE
-    row = (tile / tiles_across) * TILE + within / TILE
-    if column >= width or row >= height:
+    pixel = pixel_of(tile, within, depth_m.shape[2])
+    column = pixel[0]
+    row = pixel[1]
+    if column >= depth_m.shape[2] or row >= depth_m.shape[1]:
         return
-
-    to_ray = ray_from_pixel[b]
-    direction = to_ray * wp.vec3(wp.float32(column) + 0.5, wp.float32(row) + 0.5, 1.0)
+    direction = ray_through(ray_from_pixel[b], column, row)
     hit = wp.mesh_query_ray(mesh, centers[b], direction, 1.0e6)
-    if not hit.result:
-        rgb[b, row, column] = wp.vec3ub(wp.uint8(0), wp.uint8(0), wp.uint8(0))
-        depth_m[b, row, column] = 0.0
-        return
-    by_x = wp.vec3(to_ray[0, 0], to_ray[1, 0], to_ray[2, 0])
-    by_y = wp.vec3(to_ray[0, 1], to_ray[1, 1], to_ray[2, 1])
-    color = _shade(appearance, hit, direction, by_x, by_y)
-    rgb[b, row, column] = wp.vec3ub(
-        wp.uint8(wp.clamp(color[0] + 0.5, 0.0, 255.0)),
-        wp.uint8(wp.clamp(color[1] + 0.5, 0.0, 255.0)),
-        wp.uint8(wp.clamp(color[2] + 0.5, 0.0, 255.0)),
-    )
-    depth_m[b, row, column] = hit.t
+    color = wp.vec3ub(wp.uint8(0), wp.uint8(0), wp.uint8(0))
+    depth = wp.float32(0.0)
+    if hit.result:
+        depth = hit.t
+        weights = wp.vec3(hit.u, hit.v, 1.0 - hit.u - hit.v)  # Warp's barycentrics: the first and the second corner's
+        color = shade(appearance, hit.face, weights, depth, hit.normal, direction, ray_from_pixel[b])
+    rgb[b, row, column] = color
+    depth_m[b, row, column] = depth

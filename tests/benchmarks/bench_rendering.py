@@ -79,6 +79,9 @@ def main() -> None:
     landmarks = mesh.vertices[rng.integers(0, len(mesh.vertices), 20_000)]
     n_rays = len(locations) * len(landmarks)
     print(f"Warp {args.device:6} frames    ", rate(lambda: warp.render(camera, poses), len(poses), args.repeats))
+    if warp.method != "rays":
+        rays = WarpRenderer(mesh, args.device, method="rays")
+        print("  the same, by rays   ", rate(lambda: rays.render(camera, poses), len(poses), args.repeats))
     print("Open3D frames         ", rate(lambda: open3d.render(camera, poses[:2]), 2, args.repeats))
     print(
         f"Warp {args.device:6} occlusion ", rate(lambda: raycaster.occluded(locations, landmarks), n_rays, args.repeats)

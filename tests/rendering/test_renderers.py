@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from multiprocessing import get_context
 
 import numpy as np
@@ -13,7 +14,11 @@ from wheretolook.errors import ConfigError
 from wheretolook.geometry import PinholeCamera, poses_looking_along, transform
 from wheretolook.rendering import Open3DRenderer, WarpRenderer
 
-RENDERERS = pytest.mark.parametrize("renderer", [WarpRenderer, Open3DRenderer])
+TRACING = partial(WarpRenderer, method="rays")
+RENDERERS = pytest.mark.parametrize(
+    "renderer", [WarpRenderer, TRACING, Open3DRenderer], ids=["raster", "rays", "open3d"]
+)
+METHODS = pytest.mark.parametrize("method", [None, "rays"], ids=["fastest", "rays"])
 LOOK_ALONG_Y = poses_looking_along([[0.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
 
 
@@ -40,22 +45,24 @@ def assert_same_images(a, b):
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2, 3])
-def test_warp_agrees_with_open3d_on_random_triangles(seed, device):
+@METHODS
+def test_warp_agrees_with_open3d_on_random_triangles(seed, method, device):
     rng = np.random.default_rng(seed)
     mesh, camera = random_triangles(seed), PinholeCamera(161, 120, 90.0)
     poses = poses_looking_along(rng.uniform(-2, 2, (5, 3)), rng.normal(size=(5, 3)))
-    images = WarpRenderer(mesh, device).render(camera, poses)
+    images = WarpRenderer(mesh, device, method=method).render(camera, poses)
     assert images.rgb.shape == (5, 120, 161, 3) and images.rgb.dtype == np.uint8
     assert images.depth_m.shape == (5, 120, 161) and images.depth_m.dtype == np.float32
     assert 0.2 < np.mean(images.depth_m > 0) < 1
     assert_same_images(images, Open3DRenderer(mesh).render(camera, poses))
 
 
-def test_warp_agrees_with_open3d_in_a_room(device):
+@METHODS
+def test_warp_agrees_with_open3d_in_a_room(method, device):
     rng = np.random.default_rng(5)
     mesh, camera = furnished_room(), PinholeCamera(160, 120, 80.0)
     poses = poses_looking_along(rng.uniform((0.5, 3.5, 0.5), (5.5, 4.5, 2.5), (6, 3)), rng.normal(size=(6, 3)))
-    images = WarpRenderer(mesh, device).render(camera, poses)
+    images = WarpRenderer(mesh, device, method=method).render(camera, poses)
     assert (images.depth_m > 0).all(), "a closed room has no misses"
     assert_same_images(images, Open3DRenderer(mesh).render(camera, poses))
 
@@ -164,6 +171,45 @@ def test_bad_poses_are_refused(renderer):
 def test_unknown_device_is_refused():
     with pytest.raises(ConfigError, match="no such device"):
         WarpRenderer(random_triangles(0), device="cuda:99")
+
+
+def test_rasterizing_is_refused_on_a_gpu(device):
+    if device == "cpu":
+        assert WarpRenderer(random_triangles(0)).method == "raster"
+    else:
+        assert WarpRenderer(random_triangles(0), device).method == "rays"
+        with pytest.raises(ConfigError, match="CPU alone"):
+            WarpRenderer(random_triangles(0), device, method="raster")
+
+
+@pytest.mark.parametrize("turn", range(4))
+def test_rasterizing_leaves_no_gap_on_edges_through_pixel_centres(turn):
+    # A wall cut into triangles whose corners and edges lie exactly on the centres of pixels.
+    camera = PinholeCamera(33, 33, 16.5)
+    corners = np.arange(-40, 41, 4) / 16.5 * 2.0  # multiples of 4 pixels from the centre pixel's centre, at 2 m
+    quads = [
+        np.roll([(x, 2.0, z), (x + step, 2.0, z), (x + step, 2.0, z + step), (x, 2.0, z + step)], turn, axis=0)
+        for step in [corners[1] - corners[0]]
+        for x in corners[:-1]
+        for z in corners[:-1]
+    ]
+    mesh = quads_mesh(quads, [np.full((1, 1, 3), 200, np.uint8)])
+    for method in ("raster", "rays"):
+        image = WarpRenderer(mesh, method=method).render(camera, LOOK_ALONG_Y)
+        np.testing.assert_array_equal(image.rgb, 200)
+        np.testing.assert_allclose(image.depth_m, 2.0, rtol=1e-6)
+
+
+def test_rasterizing_a_triangle_through_the_camera_plane():
+    # A floor from far behind the camera to far before it: depth is the height over the ray's slope, up to its far end.
+    camera = PinholeCamera(40, 31, 20.0)
+    floor = quads_mesh([[(-1e3, -1e3, -1.5), (1e3, -1e3, -1.5), (1e3, 1e3, -1.5), (-1e3, 1e3, -1.5)]],
+                       [np.full((1, 1, 3), 90, np.uint8)])  # fmt: skip
+    depth_m = WarpRenderer(floor).render(camera, LOOK_ALONG_Y).depth_m[0]
+    below = (np.arange(31) + 0.5 - 15.5) / 20.0
+    np.testing.assert_array_equal(depth_m[below <= 0], 0)
+    expected = np.broadcast_to(1.5 / below[below > 0, None], depth_m[below > 0].shape)
+    np.testing.assert_allclose(depth_m[below > 0], expected, rtol=1e-5)
 
 
 def _render_in_worker(seed):

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pycolmap
 import pytest
 
-from wheretolook import stages
+from wheretolook import labelling, stages
 from wheretolook.camera_models import ColmapCamera
 from wheretolook.cli import main
 from wheretolook.dataset import Dataset
 from wheretolook.geometry import PinholeCamera
+from wheretolook.labelling import report
 from wheretolook.learning.weights import load_classifier
 from wheretolook.localization_map import LocalizationMap
 from wheretolook.scoring import load_scorer
@@ -211,6 +215,39 @@ def test_a_stage_refuses_what_an_earlier_one_has_remade(copy: Path, capsys: pyte
     for stage, needed in (("label", "sample"), ("sample", "map"), ("evaluate", "label")):
         assert run(stage, copy) == 2
         assert f"Run `wheretolook {needed}`" in capsys.readouterr().err
+
+
+def test_labels_of_different_settings_are_not_used_together(
+    copy: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    original = labelling.label_scenes
+
+    def interrupted(*args: Any, **options: Any) -> Iterator[Any]:
+        with closing(original(*args, **options)) as scenes:
+            yield next(scenes)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(labelling, "label_scenes", interrupted)
+    assert run("label", copy, "--label.localizer.min_inliers", "11") == 130
+    capsys.readouterr()
+    for stage in ("train", "evaluate"):
+        assert run(stage, copy) == 2
+        assert "Run `wheretolook label`" in capsys.readouterr().err
+
+
+def test_a_report_that_could_not_be_logged_is_logged_the_next_time(
+    copy: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tracking = TrackingConfig(str(copy / "mlruns"))
+    first = newest_run(tracking, "label")
+    with monkeypatch.context() as patch:
+        patch.setattr(report, "log", lambda *args, **options: (_ for _ in ()).throw(OSError("the disk is full")))
+        assert run("label", copy, "--label.localizer.min_inliers", "11") == 2
+    assert "the disk is full" in capsys.readouterr().err
+    assert run("label", copy, "--label.localizer.min_inliers", "11") == 0
+    assert (copy / "data" / "tiny" / "results" / "labels.md").is_file()
+    last = newest_run(tracking, "label")
+    assert first is not None and last is not None and last.info.run_id != first.info.run_id
 
 
 def test_another_camera_makes_all_but_the_meshes_anew(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:

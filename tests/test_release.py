@@ -31,6 +31,7 @@ from wheretolook.tracking import TrackingConfig
 from wheretolook.visibility import StoredOcclusion
 
 TRAIN = TrainConfig(("2d", "2d+z"), epochs=3, hidden=(16,), accelerator="cpu")
+CONFIGS = Path(__file__).parents[1] / "configs"
 VERSIONS = {"numpy": "2.9.9", "pycolmap": "4.1.0"}
 
 
@@ -266,7 +267,37 @@ def test_a_damaged_manifest_is_named(folder: Path) -> None:
 
 
 def test_the_shipped_configurations_fit_each_other() -> None:
-    configs = Path(__file__).parents[1] / "configs"
-    release, paper = (parse_experiment("train", ["--config", str(configs / f"{n}.yaml")]) for n in ("release", "paper"))
+    release, paper = (parse_experiment("train", ["--config", str(CONFIGS / f"{n}.yaml")]) for n in ("release", "paper"))
     assert release is not None and paper is not None
     assert release.name == releases.RELEASE and release.camera == paper.camera
+
+
+@pytest.fixture(scope="module")
+def shipped() -> Dataset:
+    """The release in the project's `data/`."""
+    return Dataset.load(CONFIGS.parent / "data" / releases.RELEASE)
+
+
+def test_the_shipped_card_is_of_what_ships(shipped: Dataset) -> None:
+    assert (shipped.root / releases.CARD).read_text() == release_card(shipped)
+    assert sum(releases.sizes(shipped.root).values()) < releases.MAX_BYTES
+    tables = [scene.read_table() for scene in shipped.split("train")]
+    assert sum(map(len, tables)) > 200_000
+    (weights,) = releases.trained_weights(shipped)
+    training = json.loads(weights.with_suffix(".json").read_text())
+    assert training["metrics"]["val_average_precision"] > 0.8
+
+
+def test_the_shipped_weights_score_as_the_card_says(shipped: Dataset, tmp_path: Path) -> None:
+    shutil.copytree(shipped.root, tmp_path / "data" / "release")
+    experiment = parse_experiment(
+        "evaluate", ["--config", str(CONFIGS / "release.yaml"), "--data", str(tmp_path / "data"), "--device", "cpu",
+                     "--tracking.folder", str(tmp_path / "mlruns"), "--evaluate.resamples", "2"]
+    )  # fmt: skip
+    assert experiment is not None
+    scores = stages.evaluate(experiment, say=quiet)
+    said = pd.read_csv(shipped.root / "results" / "scores.csv").fillna({"inputs": ""})
+    exact = [name for name in said if not re.match("(raw|normalized)_(low|high)_", name)]
+    pd.testing.assert_frame_equal(
+        scores[exact].reset_index(drop=True), said[exact], check_dtype=False, rtol=1e-6, atol=2e-3
+    )

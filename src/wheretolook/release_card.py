@@ -108,7 +108,7 @@ def release_card(release: Dataset) -> str:
             _demoted(score_markdown(_scores(results / VARIANTS_CSV), f"Localization score on {source}")),
         ]
     if (results / GENERALIZATION_CSV).is_file():
-        lines += ["## Scores on other datasets, with the same weights"]
+        lines += ["## Scores on other datasets, with the same weights", "Scenes neither trained nor validated on."]
         for name, part in _scores(results / GENERALIZATION_CSV).groupby("dataset", sort=False):
             lines += [_demoted(score_markdown(part.drop(columns="dataset"), f"Localization score on {name}"))]
     lines += [

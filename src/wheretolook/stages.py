@@ -206,6 +206,11 @@ def label(experiment: Experiment, say: Say = print, tick: Tick = lambda work: No
         scenes[scene.name] = scene, key
         job = SceneJob(scene.mesh, scene.landmarks, dataset.camera, config.localizer, extractor, experiment.warp_device)
         tasks.append(LabelTask(scene.name, job, table, shards))
+    summary = dataset.root / "results" / LABELS_MD
+    if tasks:  # until all are labelled alike and that is logged, nothing may use the labels, or call them reported
+        summary.unlink(missing_ok=True)
+        for scene, _ in scenes.values():
+            _forget(scene, "label")
     seconds: dict[str, float] = {}
     start = time.monotonic()
     with closing(label_scenes(tasks, config, progress=bool(tasks))) as results:  # so that Ctrl-C here ends the workers
@@ -221,8 +226,12 @@ def label(experiment: Experiment, say: Say = print, tick: Tick = lambda work: No
             report(scene, labelled.table)
     if tasks:
         seconds["wall"] = time.monotonic() - start
-    if tasks or not (dataset.root / "results" / LABELS_MD).is_file():
-        log_labels(dataset, experiment.tracking, seconds)
+    if not summary.is_file():
+        try:
+            log_labels(dataset, experiment.tracking, seconds)
+        except BaseException:
+            summary.unlink(missing_ok=True)
+            raise
     if tasks:
         say("seconds: " + ", ".join(f"{step} {spent:.1f}" for step, spent in seconds.items())
             + " (workers' time in each step, added up; then the clock's)")  # fmt: skip
@@ -391,6 +400,15 @@ def _stamp(scene: SceneFolder, stage: str, key: str) -> None:
     earlier = STAGES[: STAGES.index(stage)]
     stamps = {name: stamp for name, stamp in _read_stamps(scene).items() if name in earlier}
     write_json(_stamp_path(scene), {**stamps, stage: key})
+
+
+def _forget(scene: SceneFolder, stage: str) -> None:
+    """Take a stage's stamp away, and those of later ones."""
+    earlier = STAGES[: STAGES.index(stage)]
+    stamps = _read_stamps(scene)
+    kept = {name: stamp for name, stamp in stamps.items() if name in earlier}
+    if kept != stamps:
+        write_json(_stamp_path(scene), kept)
 
 
 def _is_done(scene: SceneFolder, stage: str, key: str, *results: Path) -> bool:

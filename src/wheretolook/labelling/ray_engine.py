@@ -11,6 +11,7 @@ import os
 import socket
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -23,6 +24,9 @@ from wheretolook.labelling.shard import LabelledShard, SceneJob, Shard, ShardWor
 
 MAX_RETRIES = 5
 """How often Ray starts a shard again whose process or machine was lost."""
+
+MAX_FILES = 16
+"""Meshes and landmarks that a machine keeps."""
 
 WORKERS_A_GPU = 16
 """Shards that share one GPU."""
@@ -149,11 +153,16 @@ def _label_shard(job: SceneJob, files: tuple[bytes, bytes], rows: pd.DataFrame) 
 
 def _lay_down(folder: Path, content: bytes, suffix: str) -> Path:
     path = folder / f"{hashlib.sha256(content).hexdigest()[:32]}{suffix}"
-    if not path.is_file():
+    if path.is_file():
+        os.utime(path)
+    else:
         partial = path.with_name(f"{path.name}.{os.getpid()}.partial")  # others may be at it
         try:
             partial.write_bytes(content)
             os.replace(partial, path)
         finally:
             partial.unlink(missing_ok=True)
+        with suppress(FileNotFoundError):  # others may be at it here, too
+            for old in sorted(folder.glob("*"), key=os.path.getmtime)[:-MAX_FILES]:
+                old.unlink()  # who still needs it lays it down again
     return path

@@ -38,9 +38,8 @@ def save_classifier(network: ViewpointNetwork, path: str | Path, training: Mappi
     header = {"format_version": FORMAT_VERSION, **asdict(network.spec), "training": dict(training or {})}
     partial = path.with_name(path.name + ".partial")
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in network.layers.state_dict().items()}
-    partial.write_bytes(
-        save(tensors, metadata={METADATA_KEY: json.dumps(header)})
-    )  # save_file hides it from other users
+    # not by `save_file`, which makes a file that other users cannot read
+    partial.write_bytes(save(tensors, metadata={METADATA_KEY: json.dumps(header)}))
     os.replace(partial, path)
 
 

@@ -1,8 +1,8 @@
 """Warp kernels of `WarpRenderer` that rasterize: for one core several times faster than a ray for every pixel.
 
-Triangles are rasterized in homogeneous pixel coordinates (Olano and Greer, Triangle Scan Conversion using 2D Homogeneous
-Coordinates, 1997), in which one that reaches behind the camera needs no clipping, in double precision, and over the
-centres of pixels, so that each pixel shows the triangle that its ray meets first.
+Triangles are rasterized in homogeneous pixel coordinates (Olano and Greer, Triangle Scan Conversion using 2D
+Homogeneous Coordinates, 1997), in which one that reaches behind the camera needs no clipping, in double precision, and
+over the centres of pixels, so that each pixel shows the triangle that its ray meets first.
 """
 
 # mypy: ignore-errors

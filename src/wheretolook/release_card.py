@@ -25,8 +25,9 @@ from wheretolook.release import CARD, SHELF, read_about, size_text, sizes
 from wheretolook.table import sha256
 from wheretolook.visibility import StoredOcclusion
 
-GENERALIZATION_CSV = "generalization.csv"
-"""In `results/`: scores of the shipped weights on other datasets, as `scores.csv` with a column `dataset`."""
+GENERALIZATION_CSV, GENERALIZATION_MD = "generalization.csv", "generalization.md"
+"""In `results/`: scores on other datasets, as `scores.csv` with the columns `dataset` and `weights_sha256` (of the
+shipped weights at that time; rows with others are not shown), and where those datasets come from."""
 
 VARIANTS_CSV = "variants.csv"
 """In `results/`: scores of the networks for all inputs, as `scores.csv`, before one was chosen."""
@@ -108,8 +109,13 @@ def release_card(release: Dataset) -> str:
             _demoted(score_markdown(_scores(results / VARIANTS_CSV), f"Localization score on {source}")),
         ]
     if (results / GENERALIZATION_CSV).is_file():
-        lines += ["## Scores on other datasets, with the same weights", "Scenes neither trained nor validated on."]
-        for name, part in _scores(results / GENERALIZATION_CSV).groupby("dataset", sort=False):
+        others = _scores(results / GENERALIZATION_CSV)
+        others = others[others["weights_sha256"] == sha256(weights)].drop(columns="weights_sha256")
+        if len(others):
+            lines += ["## Scores on other datasets", "Scenes neither trained nor validated on."]
+        if len(others) and (results / GENERALIZATION_MD).is_file():
+            lines += [(results / GENERALIZATION_MD).read_text()]
+        for name, part in others.groupby("dataset", sort=False):
             lines += [_demoted(score_markdown(part.drop(columns="dataset"), f"Localization score on {name}"))]
     lines += [
         "## Data",

@@ -207,15 +207,16 @@ def label(experiment: Experiment, say: Say = print, tick: Tick = lambda work: No
         job = SceneJob(scene.mesh, scene.landmarks, dataset.camera, config.localizer, extractor, experiment.warp_device)
         tasks.append(LabelTask(scene.name, job, table, shards))
     summary = dataset.root / "results" / LABELS_MD
-    if tasks:  # until all are labelled alike and that is logged, nothing may use the labels, or call them reported
-        summary.unlink(missing_ok=True)
-        for scene, _ in scenes.values():
-            _forget(scene, "label")
     seconds: dict[str, float] = {}
-    start = time.monotonic()
+    start, replacing = time.monotonic(), False
     with closing(label_scenes(tasks, config, progress=bool(tasks))) as results:  # so that Ctrl-C here ends the workers
         for labelled in results:
             scene, key = scenes[labelled.task.name]
+            if not replacing:  # until all are labelled alike, and that is logged, nothing may use the labels
+                replacing = True
+                summary.unlink(missing_ok=True)
+                for other, _ in scenes.values():
+                    _forget(other, "label")
             with storing(scene.table):
                 write_table(labelled.table, scene.table)
                 write_json(scene.label_manifest, labelled.manifest)

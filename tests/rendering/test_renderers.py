@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from functools import partial
 from multiprocessing import get_context
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from box_scenes import furnished_room, quads_mesh, random_texture, random_triangles
-from wheretolook.errors import ConfigError
+from wheretolook.errors import ConfigError, SceneError
 from wheretolook.geometry import PinholeCamera, poses_looking_along, transform
 from wheretolook.rendering import Open3DRenderer, WarpRenderer
 
@@ -157,6 +159,41 @@ def test_blocks_do_not_change_the_images(device):
     np.testing.assert_array_equal(whole.rgb, blocks.rgb)
     np.testing.assert_array_equal(whole.depth_m, blocks.depth_m)
     assert WarpRenderer(mesh).render(camera, poses[:0]).rgb.shape == (0, 30, 40, 3)
+
+
+def test_blocks_are_smaller_where_a_mesh_has_many_vertices(monkeypatch):
+    mesh, camera = random_triangles(1), PinholeCamera(8, 6, 5.0)
+    renderer = WarpRenderer(mesh, block_bytes=3 * (8 * 6 * 15 + 24 * len(mesh.vertices)))
+    sizes = []
+    draw = renderer._rasterize
+    monkeypatch.setattr(
+        renderer, "_rasterize", lambda camera, poses, *images: (sizes.append(len(poses)), draw(camera, poses, *images))
+    )
+    renderer.render(camera, np.repeat(LOOK_ALONG_Y, 7, axis=0))
+    assert sizes == [3, 3, 1]
+
+
+@pytest.mark.parametrize("method", ["raster", "rays"])
+def test_a_mesh_without_triangles_is_refused(method):
+    mesh = random_triangles(0)
+    nothing = replace(
+        mesh, triangles=mesh.triangles[:0], corner_uvs=mesh.corner_uvs[:0], triangle_texture=mesh.triangle_texture[:0]
+    )
+    with pytest.raises(SceneError, match="no triangle"):
+        WarpRenderer(nothing, method=method)
+
+
+def test_a_plane_through_the_camera_is_not_seen():
+    # Edge-on, and in the plane of a row of pixels' rays.
+    camera = PinholeCamera(41, 31, 20.0)
+    wall = [(-9.0, 5.0, -9.0), (9.0, 5.0, -9.0), (9.0, 5.0, 9.0), (-9.0, 5.0, 9.0)]
+    level = [(-3.0, 1.0, 0.0), (3.0, 1.0, 0.0), (3.0, 4.0, 0.0), (-3.0, 4.0, 0.0)]
+    colors = [np.full((1, 1, 3), value, np.uint8) for value in (200, 50)]
+    for turn in Rotation.create_group("O").as_matrix().round():
+        mesh = quads_mesh([np.array(corners) @ turn.T for corners in (wall, level)], colors)
+        pose = LOOK_ALONG_Y.copy()
+        pose[0, :, :3] = pose[0, :, :3] @ turn.T
+        assert (WarpRenderer(mesh).render(camera, pose).rgb == 200).all()
 
 
 @RENDERERS

@@ -194,7 +194,7 @@ class _Scene:
             "localizer": asdict(job.localizer),
             "extractor": asdict(job.extractor),
             "camera": asdict(job.camera),
-            "renderer": job.device.partition(":")[0],  # a GPU rounds some pixels otherwise
+            "renderer": _renderer(job.device),
             "mesh": fingerprint(job.mesh),
             "landmarks": fingerprint(job.landmarks),
         }
@@ -230,6 +230,14 @@ class _Scene:
         contents = {shard.path.name: {"n": len(shard.rows), "sha256": sha256(shard.path)} for shard in self.shards}
         manifest = {**self.manifest(), "shards": contents}
         return LabelledScene(self.task, pd.concat(parts, ignore_index=True), manifest, self.seconds)
+
+
+def _renderer(device: str) -> str:
+    """Kind of device and method, which round some pixels otherwise."""
+    from wheretolook.rendering.warp_renderer import method_on
+
+    kind = device.partition(":")[0]
+    return f"{kind} {method_on(kind)}"
 
 
 def _run(

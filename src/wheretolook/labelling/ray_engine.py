@@ -10,6 +10,7 @@ import hashlib
 import os
 import socket
 import tempfile
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -25,8 +26,8 @@ from wheretolook.labelling.shard import LabelledShard, SceneJob, Shard, ShardWor
 MAX_RETRIES = 5
 """How often Ray starts a shard again whose process or machine was lost."""
 
-MAX_FILES = 16
-"""Meshes and landmarks that a machine keeps."""
+KEEP_S = 24 * 3600.0
+"""How long a machine keeps meshes and landmarks that no shard has asked for, in seconds."""
 
 WORKERS_A_GPU = 16
 """Shards that share one GPU."""
@@ -153,16 +154,17 @@ def _label_shard(job: SceneJob, files: tuple[bytes, bytes], rows: pd.DataFrame) 
 
 def _lay_down(folder: Path, content: bytes, suffix: str) -> Path:
     path = folder / f"{hashlib.sha256(content).hexdigest()[:32]}{suffix}"
-    if path.is_file():
+    try:
         os.utime(path)
-    else:
+    except FileNotFoundError:
         partial = path.with_name(f"{path.name}.{os.getpid()}.partial")  # others may be at it
         try:
             partial.write_bytes(content)
             os.replace(partial, path)
         finally:
             partial.unlink(missing_ok=True)
-        with suppress(FileNotFoundError):  # others may be at it here, too
-            for old in sorted(folder.glob("*"), key=os.path.getmtime)[:-MAX_FILES]:
-                old.unlink()  # who still needs it lays it down again
+        for file in folder.iterdir():
+            with suppress(FileNotFoundError):  # others may be at it here, too
+                if file.stat().st_mtime < time.time() - KEEP_S:
+                    file.unlink()
     return path

@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.errors import ConfigError
+from wheretolook.errors import ConfigError, SceneError
 from wheretolook.geometry import PinholeCamera
 from wheretolook.rendering.raster_kernels import project_kernel, raster_kernel, shade_kernel
 from wheretolook.rendering.textures import build_pyramids, texel_gradients
@@ -16,6 +16,13 @@ from wheretolook.rendering.trace_kernel import TILE, Appearance, trace_kernel
 from wheretolook.rendering.types import Rendering, camera_rays, check_poses
 from wheretolook.scenes.mesh import TexturedMesh
 from wheretolook.warp_setup import start_warp, vec3_array, warp_mesh
+
+Method = Literal["rays", "raster"]
+
+
+def method_on(device: str) -> Method:
+    """The faster method on a device."""
+    return "raster" if device == "cpu" else "rays"
 
 
 class WarpRenderer:
@@ -27,13 +34,14 @@ class WarpRenderer:
     Args:
         mesh: what to render.
         device: "cpu" (one core) or a CUDA device such as "cuda" or "cuda:1".
-        block_bytes: memory of images rendered at a time; a larger batch is rendered in blocks.
-        method: "rays" traces a ray for every pixel; "raster" rasterizes, which gives the same images up to rounding,
-            several times faster on one core, and runs on the CPU alone. None takes the faster one of the device.
+        block_bytes: memory that the poses rendered at a time take; a larger batch is rendered in blocks.
+        method: "rays" traces a ray for every pixel; "raster" rasterizes, which gives the same images up to rounding, at
+            a third of the time for 640 x 480 pixels of 100,000 triangles on one core, and runs on the CPU alone. None
+            takes `method_on` the device.
 
     Raises:
         ConfigError: if there is no such device, or the method does not run there.
-        SceneError: if the textures are too large.
+        SceneError: if the textures are too large, or there is no triangle.
     """
 
     def __init__(
@@ -41,14 +49,17 @@ class WarpRenderer:
         mesh: TexturedMesh,
         device: str = "cpu",
         block_bytes: int = 1 << 29,
-        method: Literal["rays", "raster"] | None = None,
+        method: Method | None = None,
     ) -> None:
         self.device = start_warp(device)
         self.block_bytes = block_bytes
-        self.method = method or ("raster" if self.device == "cpu" else "rays")
+        self.method = method or method_on(self.device)
         if self.method == "raster" and self.device != "cpu":
             raise ConfigError("rasterizing runs on the CPU alone", value=device, fix='Use the method "rays".')
-        self._vertices = vec3_array(mesh.vertices, self.device)
+        if len(mesh.triangles) == 0:
+            raise SceneError("there is nothing to render: the mesh has no triangle", value=0, fix="Give another mesh.")
+        if self.method == "raster":
+            self._vertices = vec3_array(mesh.vertices, self.device)
         self._mesh = warp_mesh(mesh, self.device) if self.method == "rays" else None
         self._appearance = self._upload(mesh)
 
@@ -86,7 +97,10 @@ class WarpRenderer:
         height, width = camera.height, camera.width
         rgb = np.empty((len(poses), height, width, 3), dtype=np.uint8)
         depth_m = np.empty((len(poses), height, width), dtype=np.float32)
-        block = max(1, self.block_bytes // (height * width * 7))
+        per_pose = height * width * 7
+        if self._mesh is None:
+            per_pose += height * width * 8 + self._vertices.shape[0] * 24
+        block = max(1, self.block_bytes // per_pose)
         draw = self._trace if self._mesh is not None else self._rasterize
         for start in range(0, len(poses), block):
             rows = slice(start, min(start + block, len(poses)))
@@ -137,6 +151,7 @@ class WarpRenderer:
             inputs=[projected, self._appearance.indices],
             outputs=[nearness, triangle],
             device=self.device,
+            block_dim=1,  # triangles one after the other
         )
         wp.launch(
             shade_kernel,

@@ -55,6 +55,7 @@ stages, in order; each reads what the one before it left in <data>/<name>/
   wheretolook demo                 is configs/demo.yaml unless --config names another
   wheretolook map --config configs/demo.yaml --map.n_images 120
   wheretolook label --config configs/paper.yaml --engine ray     on a Ray cluster; the default is local
+  wheretolook evaluate --list-methods    what can be compared
   wheretolook --version
 """
 
@@ -97,9 +98,21 @@ def _usage() -> str:
     return USAGE.format(stages="\n".join(f"  {name:<10}{text}" for name, text in rows))
 
 
+def _method_list() -> str:
+    """Every method that `evaluate.methods` may name, with what it is."""
+    from wheretolook.scoring.registry import describe_methods
+
+    texts = describe_methods()
+    width = max(map(len, texts))
+    return "\n".join(f"{name:<{width}}  {text}" for name, text in texts.items())
+
+
 def _run(command: str, arguments: list[str]) -> int:
     if command not in (*STAGES, "demo"):
         raise ConfigError("unknown stage", value=command, fix=f"Use one of {', '.join((*STAGES, 'demo'))}.")
+    if command == "evaluate" and "--list-methods" in arguments:
+        print(_method_list())
+        return 0
     experiment = parse_experiment(command, arguments)
     if experiment is None:
         return 0

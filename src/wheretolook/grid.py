@@ -14,7 +14,7 @@ from wheretolook.geometry import Float
 GOLDEN_ANGLE = np.pi * (1 + np.sqrt(5))
 """Azimuth between neighbours of the spiral, in radians: the paper's i * pi * (1 + sqrt 5)."""
 
-Lattice = Literal["fibonacci", "azimuth-elevation", "released"]
+Lattice = Literal["fibonacci", "azimuth-elevation", "released", "yaw-pitch"]
 
 
 @dataclass(frozen=True)
@@ -123,12 +123,28 @@ def released_lattice(n: int) -> Float:
     )
 
 
+def yaw_pitch_angles() -> Float:
+    """ActLoc's 6 pitches from -60 to 40 and 18 yaws from -180 to 160, 20 apart: (108, 2) degrees, (yaw, pitch)."""
+    pitch, yaw = np.meshgrid(np.arange(-60, 60, 20), np.arange(-180, 180, 20), indexing="ij")
+    return np.stack([yaw, pitch], axis=-1).reshape(-1, 2).astype(np.float64)
+
+
+def axes_of_angles(yaw_pitch_deg: ArrayLike) -> Float:
+    """Unit directions (..., 3) of yaws, counter-clockwise from +x, and pitches, up from level, (..., 2) degrees."""
+    yaw, pitch = np.moveaxis(np.radians(np.asarray(yaw_pitch_deg, dtype=np.float64)), -1, 0)
+    return np.stack([np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)], axis=-1)
+
+
 def direction_lattice(n: int, lattice: Lattice = "fibonacci") -> Float:
-    """Directions (m, 3) of the named lattice; m = n except for "azimuth-elevation", where it is the nearest product."""
+    """Directions (m, 3) of the named lattice.
+
+    m = n, except for "azimuth-elevation", where it is the nearest product, and "yaw-pitch", which are ActLoc's 108.
+    """
     lattices = {
         "fibonacci": fibonacci_sphere,
         "azimuth-elevation": azimuth_elevation_lattice,
         "released": released_lattice,
+        "yaw-pitch": lambda n: axes_of_angles(yaw_pitch_angles()),
     }
     if lattice not in lattices:
         raise ConfigError("unknown lattice", value=lattice, fix=f"Use one of {', '.join(lattices)}.")

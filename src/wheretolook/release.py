@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import wheretolook
 from wheretolook.dataset import Dataset, SceneFolder, write_json
 from wheretolook.errors import ConfigError, StorageError, TableError, WeightsError
-from wheretolook.features import INPUT_VARIANTS
+from wheretolook.learning.config import RELEASED, VARIANTS
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.table import sha256, write_table
 from wheretolook.visibility import StoredOcclusion
@@ -95,7 +95,7 @@ def copy_dataset(dataset: Dataset, experiment: Experiment) -> Dataset:
 
 def trained_weights(release: Dataset) -> list[Path]:
     """Weights in a release's folder, one for each input variant trained."""
-    named = (release.root / "weights" / f"mlp-{variant}.safetensors" for variant in INPUT_VARIANTS)
+    named = (release.root / "weights" / f"mlp-{variant}.safetensors" for variant in VARIANTS)
     return [path for path in named if path.is_file()]
 
 
@@ -124,7 +124,10 @@ def ship_weights(release: Dataset) -> tuple[Path, dict[str, float]]:
     if not records:
         raise WeightsError("there are no weights to ship", path=folder, fix=fix)
     precision = {path: float(record["metrics"]["val_average_precision"]) for path, record in records.items()}
-    best = max(precision, key=lambda path: precision[path])
+    shippable = [path for path in precision if path.stem != f"mlp-{RELEASED}"]  # which is there to compare with
+    if not shippable:
+        raise WeightsError("there are no weights to ship but the released code's", path=folder, fix=fix)
+    best = max(shippable, key=lambda path: precision[path])
     for path in records:
         if path != best:
             (folder / SHELF).mkdir(exist_ok=True)

@@ -29,7 +29,7 @@ class SampleConfig:
         grid: voxels along x, y and z over the scene's bounds; the paper has 8 x 8 x 8.
         directions: directions at each location; the released code has 500.
         lattice: how they are spread: "fibonacci" is even, "azimuth-elevation" is the paper's comparison, "released" is
-            what the released code does.
+            what the released code does, "yaw-pitch" are ActLoc's 6 pitches x 18 yaws, whatever `directions` says.
         keep: K, the directions kept at each location, those that see most landmarks; 0 keeps all.
         min_visible: directions that see fewer landmarks are dropped ("none or only a minimal number", Sec. 3.2).
         max_locations: a random subset of the free locations, 0 for all.

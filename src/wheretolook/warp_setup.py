@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from ctypes.util import find_library
+from functools import cache
 
 import numpy as np
 import warp as wp
@@ -16,6 +17,7 @@ from wheretolook.errors import ConfigError
 from wheretolook.scenes.mesh import TexturedMesh
 
 
+@cache  # looking for a driver takes 14 ms
 def start_warp(device: str = "cpu") -> str:
     """Initialize Warp without its banner and check that a device exists.
 

@@ -1,16 +1,17 @@
-"""Choice of views, oracle, expectation of random choice and bootstrap, by hand and by brute force."""
+"""Choice of views, oracle, expectation of random choice and the table, by hand and by brute force."""
 
 from __future__ import annotations
 
 from itertools import combinations
 
 import numpy as np
+import pandas as pd
 import pytest
 
-from wheretolook.evaluation.bootstrap import LocationBootstrap
-from wheretolook.evaluation.config import EvaluateConfig, threshold_key, threshold_label
-from wheretolook.evaluation.ranking import TestViews, choose_at_random, choose_best, choose_by_truth
-from wheretolook.evaluation.scores import score_table
+from wheretolook.errors import ConfigError
+from wheretolook.evaluation.config import EvaluateConfig, candidates_label, threshold_key, threshold_label
+from wheretolook.evaluation.ranking import TestViews, choose_at_random, choose_best, choose_by_truth, rank_views
+from wheretolook.evaluation.scores import reference_method, score_table
 
 HAND = TestViews(
     # location 0 has four views, location 1 has one, location 2 has three, in mixed order
@@ -43,7 +44,7 @@ def random_views(rng: np.random.Generator, n_locations: int = 40) -> TestViews:
     ],
 )
 def test_best_views_by_hand(n: int, chosen: list[int], good: list[list[int]]) -> None:
-    top = choose_best(HAND, HAND_SCORES, n)
+    top = choose_best(HAND, rank_views(HAND, HAND_SCORES), n)
     np.testing.assert_array_equal(top.chosen, chosen)
     np.testing.assert_array_equal(top.good, good)
     np.testing.assert_array_equal(top.any_good, np.array(good) > 0)
@@ -55,8 +56,9 @@ def test_ties_do_not_depend_on_the_order_of_rows() -> None:
     shuffled = TestViews(HAND.location[order], HAND.viewpoint_id[order], HAND.good[order], HAND.location_scene)
     for n in (1, 2, 3):
         for scores in (HAND_SCORES, np.zeros(8)):
-            expected = choose_best(HAND, scores, n).good
-            np.testing.assert_array_equal(choose_best(shuffled, scores[order], n).good, expected)
+            expected = choose_best(HAND, rank_views(HAND, scores), n).good
+            ranks = rank_views(shuffled, scores[order])
+            np.testing.assert_array_equal(choose_best(shuffled, ranks, n).good, expected)
 
 
 def test_oracle_by_hand() -> None:
@@ -70,9 +72,9 @@ def test_nothing_beats_the_oracle(seed: int) -> None:
     views = random_views(rng)
     for n in (1, 2, 5, 20):
         oracle = choose_by_truth(views, n).good
-        truth = choose_best(views, views.good.sum(1).astype(float), n).good
+        truth = choose_best(views, rank_views(views, views.good.sum(1).astype(float)), n).good
         np.testing.assert_array_equal(truth, oracle)  # nested thresholds: one order is best by all of them
-        assert np.all(choose_best(views, rng.random(len(views.location)), n).good <= oracle)
+        assert np.all(choose_best(views, rank_views(views, rng.random(len(views.location))), n).good <= oracle)
         assert np.all(choose_at_random(views, n).good <= oracle + 1e-12)
 
 
@@ -122,41 +124,185 @@ def test_without_a_good_view_shares_are_zero_and_quotients_unknown() -> None:
     assert table[table["method"] == "bins"][["average_precision", "roc_auc"]].isna().all(axis=None)
 
 
-def test_scores_that_know_nothing_do_as_random_choice() -> None:
+def test_new_columns_by_hand() -> None:
+    # location 0: 11, 13, 12, 10; location 2: 6, 7, 5
+    reference = np.array([0.1, 0.3, 0.9, 0.5, 0.2, 0.8, 0.6, 0.4])
+    scores = {("random", ""): np.zeros(8), ("bins", ""): HAND_SCORES, ("mlp", "2d"): reference}
+    config = EvaluateConfig(top_n=(1, 3), thresholds=((0.05, 0.4), (5.0, 10.0)), resamples=2000)
+    table = score_table(HAND, scores, ["a", "b"], config)
+    row = {(r["method"], r["top_n"], r["scene"]): r for r in table.to_dict("records")}
+    fine, coarse = "0.05m_0.4deg", "5m_10deg"
+
+    # the best of bins are 12, 9, 7, those of the reference 11, 9, 6
+    bins = row["bins", 1, "all"]
+    assert [bins[f"good_{key}"] for key in (fine, coarse)] == [0, 1]
+    assert bins[f"released_{coarse}"] == pytest.approx(1 / 3 / 0.527)
+    assert [bins[f"regret_{key}"] for key in (fine, coarse)] == pytest.approx([2 / 3, 1 / 3])
+    assert [bins[f"difference_{key}"] for key in (fine, coarse)] == pytest.approx([-1 / 3, -1 / 3])
+    # within scene a locations 0 and 1 are resampled: each twice in a quarter of the draws
+    assert (bins[f"regret_low_{fine}"], bins[f"regret_high_{fine}"]) == pytest.approx((1 / 3, 1))
+    assert (bins[f"difference_low_{fine}"], bins[f"difference_high_{fine}"]) == pytest.approx((-2 / 3, 0))
+    assert bins[f"p_{fine}"] == 1  # one location that differs may as well differ the other way
+
+    # three of each: bins 12, 10, 11, 9, 7, 5, 6; the reference 11, 13, 12, 9, 6, 7, 5
+    bins = row["bins", 3, "all"]
+    assert [bins[f"good_{key}"] for key in (fine, coarse)] == [2, 4]
+    assert [bins[f"regret_{key}"] for key in (fine, coarse)] == pytest.approx([1 / 7, 1 / 7])
+    assert [bins[f"difference_{key}"] for key in (fine, coarse)] == pytest.approx([-1 / 7, -1 / 7])
+    assert row["mlp", 3, "all"][f"regret_{fine}"] == 0
+    assert [row["mlp", 3, "all"][f"difference_{key}"] for key in (fine, coarse)] == [0, 0]
+
+    chance = row["random", 1, "all"]  # of location 0 2 and 3 of 4 views are good, of location 2 1 and 2 of 3
+    assert [chance[f"good_{key}"] for key in (fine, coarse)] == pytest.approx([1 / 2 + 1 / 3, 3 / 4 + 2 / 3])
+    assert [chance[f"regret_{key}"] for key in (fine, coarse)] == pytest.approx([7 / 18, 7 / 36])
+    assert [chance[f"difference_{key}"] for key in (fine, coarse)] == pytest.approx([-1 / 18, -7 / 36])
+
+    # by scene: b has location 2 alone
+    bins = row["bins", 1, "b"]
+    assert (bins["n_locations"], bins["n_views"], bins[f"good_{coarse}"]) == (1, 1, 0)
+    assert [bins[f"regret_{key}"] for key in (fine, coarse)] == [1, 1]
+    assert [bins[f"difference_{key}"] for key in (fine, coarse)] == [0, -1]
+    assert row["oracle", 1, "all"][f"difference_{fine}"] == pytest.approx(1 / 3)
+
+
+def pooled_rows(table: pd.DataFrame) -> dict[tuple[str, str, int], dict[str, float]]:
+    rows = table[table["scene"] == "all"].to_dict("records")
+    return {(row["method"], row["inputs"], row["top_n"]): row for row in rows}  # type: ignore[misc]
+
+
+def test_regret_is_never_negative_and_that_of_the_oracle_is_zero() -> None:
+    rng = np.random.default_rng(3)
+    views = random_views(rng)
+    scores = {("random", ""): rng.random(len(views.location)), ("bins", ""): rng.random(len(views.location))}
+    config = EvaluateConfig(thresholds=((0.05, 0.4), (5.0, 10.0)), resamples=100)
+    table = score_table(views, scores, ["a", "b", "c"], config)
+    regrets = [name for name in table if name.startswith("regret_")]
+    assert len(regrets) == 2 * 3
+    assert (table[regrets] > -1e-12).all(axis=None)
+    assert (table.loc[table["method"] == "oracle", regrets] == 0).all(axis=None)
+    assert (table.loc[table["method"] == "bins", regrets].max() > 0).all()
+    for key in ("0.05m_0.4deg", "5m_10deg"):
+        best = table[table["method"] == "oracle"].set_index(["top_n", "scene"])[f"raw_{key}"]
+        rows = table[table["method"] == "bins"].set_index(["top_n", "scene"])
+        np.testing.assert_allclose(rows[f"regret_{key}"], (best - rows[f"raw_{key}"]).to_numpy(), atol=1e-12)
+
+
+def test_a_method_that_chooses_alike_does_not_differ() -> None:
+    rng = np.random.default_rng(4)
+    views = random_views(rng)
+    values = rng.random(len(views.location))
+    scores = {("mlp", "2d"): values / 2, ("mlp", "2d+3d"): values, ("bins", ""): rng.random(len(values))}
+    config = EvaluateConfig(thresholds=((0.05, 0.4), (5.0, 10.0)), resamples=200)
+    table = score_table(views, scores, ["a", "b", "c"], config)
+    same, other = table[table["method"] == "mlp"], table[table["method"] == "bins"]
+    assert (same[[name for name in table if name.startswith("difference_")]] == 0).all(axis=None)
+    assert (same[[name for name in table if name.startswith("p_")]] == 1).all(axis=None)
+    assert (other["difference_5m_10deg"] != 0).any() and (other["p_5m_10deg"] < 1).any()
+    against = score_table(views, scores, ["a", "b", "c"], EvaluateConfig(
+        thresholds=((0.05, 0.4), (5.0, 10.0)), resamples=200, reference="bins"))  # fmt: skip
+    mirrored = -against.loc[against["method"] == "mlp", "difference_5m_10deg"]
+    assert sorted(mirrored) == sorted([*other["difference_5m_10deg"], *other["difference_5m_10deg"]])
+
+
+def test_who_is_compared_with() -> None:
+    methods = [("random", ""), ("mlp", "2d"), ("mlp", "2d+3d"), ("fisher", "trace gp")]
+    assert reference_method(methods, "") == ("mlp", "2d+3d")
+    assert reference_method(methods[:2], "") == ("mlp", "2d")
+    assert reference_method(methods[:1], "") is None
+    assert reference_method(methods, "random") == ("random", "")
+    assert reference_method(methods, "mlp 2d") == ("mlp", "2d")
+    assert reference_method(methods, "fisher trace gp") == ("fisher", "trace gp")
+    with pytest.raises(ConfigError, match=r"'mlp 2d\+z'.*random, mlp 2d, mlp 2d\+3d, fisher trace gp"):
+        reference_method(methods, "mlp 2d+z")
+    table = score_table(HAND, {("bins", ""): HAND_SCORES}, ["a", "b"], EvaluateConfig(
+        thresholds=((0.05, 0.4), (5.0, 10.0)), resamples=10))  # fmt: skip
+    columns = [name for name in table if name.startswith(("difference_", "p_"))]
+    assert len(columns) == 2 * 4 and table[columns].isna().all(axis=None)
+
+
+def test_intervals_of_differences_are_the_normal_ones_of_many_locations() -> None:
+    rng = np.random.default_rng(5)
+    quality = rng.random((1500, 6))
+    views = TestViews(
+        np.repeat(np.arange(1500), 6), np.arange(9000), (quality < 0.4).reshape(-1, 1), np.zeros(1500, int)
+    )
+    scores = {
+        ("bins", ""): (rng.random((1500, 6)) - 0.3 * quality).reshape(-1),
+        ("mlp", "2d"): (rng.random((1500, 6)) - 0.6 * quality).reshape(-1),
+    }
+    config = EvaluateConfig(top_n=(1,), thresholds=((0.05, 0.4),), resamples=4000)
+    row = pooled_rows(score_table(views, scores, ["a"], config))["bins", "", 1]
+    good = {method: (quality < 0.4)[np.arange(1500), values.reshape(1500, 6).argmax(1)].astype(float)
+            for method, values in scores.items()}  # fmt: skip
+    difference = good["bins", ""] - good["mlp", "2d"]
+    error = difference.std() / np.sqrt(1500)
+    assert row["difference_0.05m_0.4deg"] == pytest.approx(difference.mean())
+    assert row["difference_low_0.05m_0.4deg"] == pytest.approx(difference.mean() - 1.96 * error, abs=0.1 * error)
+    assert row["difference_high_0.05m_0.4deg"] == pytest.approx(difference.mean() + 1.96 * error, abs=0.1 * error)
+    regret = 1.0 * (quality < 0.4).any(1) - good["bins", ""]
+    error = regret.std() / np.sqrt(1500)
+    assert row["regret_low_0.05m_0.4deg"] == pytest.approx(regret.mean() - 1.96 * error, abs=0.1 * error)
+    assert row["regret_high_0.05m_0.4deg"] == pytest.approx(regret.mean() + 1.96 * error, abs=0.1 * error)
+
+
+def test_with_shuffled_labels_every_method_is_as_good_as_chance() -> None:
     rng = np.random.default_rng(0)
     views = random_views(rng, 3000)
-    config = EvaluateConfig(resamples=200)
-    scores = {("random", ""): rng.random(len(views.location)), ("mlp", "2d"): rng.random(len(views.location))}
-    table = score_table(TestViews(views.location, views.viewpoint_id, views.good.repeat(2, 1), views.location_scene),
-                        scores, ["a", "b", "c"], config)  # fmt: skip
-    pooled = table[table["scene"] == "all"].set_index(["method", "top_n"])
+    informed = views.good[:, 0] + rng.normal(size=len(views.location))
+    shuffled = TestViews(views.location, views.viewpoint_id, rng.permutation(views.good), views.location_scene)
+    scores = {
+        ("random", ""): rng.random(len(informed)),
+        ("bins", ""): informed,
+        ("mlp", "2d"): rng.random(len(informed)),
+    }
+    config = EvaluateConfig(thresholds=((0.05, 0.4), (5.0, 10.0)), resamples=1000, reference="random")
+    table = pooled_rows(score_table(shuffled, scores, ["a", "b", "c"], config))
     for n in config.top_n:
-        drawn, exact = pooled.loc[("mlp", n)], pooled.loc[("random", n)]
-        assert drawn["raw_0.05m_0.4deg"] == pytest.approx(exact["raw_0.05m_0.4deg"], abs=0.03)
-        assert drawn["any_0.05m_0.4deg"] == pytest.approx(exact["any_0.05m_0.4deg"], abs=0.03)
-    assert pooled.loc[("mlp", 1)]["roc_auc"] == pytest.approx(0.5, abs=0.02)
-    assert pooled.loc[("mlp", 1)]["average_precision"] == pytest.approx(views.good[:, 0].mean(), abs=0.02)
+        chance = table["random", "", n]
+        for method in (("bins", ""), ("mlp", "2d")):
+            row = table[*method, n]
+            for key in ("0.05m_0.4deg", "5m_10deg"):
+                assert row[f"raw_low_{key}"] < chance[f"raw_{key}"] < row[f"raw_high_{key}"]
+                assert row[f"difference_low_{key}"] < 0 < row[f"difference_high_{key}"]
+                assert row[f"p_{key}"] > 0.05
+            assert row["any_0.05m_0.4deg"] == pytest.approx(chance["any_0.05m_0.4deg"], abs=0.03)
+            assert row["roc_auc"] == pytest.approx(0.5, abs=0.02)
+            assert row["average_precision"] == pytest.approx(views.good[:, 0].mean(), abs=0.02)
+    row = pooled_rows(score_table(views, scores, ["a", "b", "c"], config))["bins", "", 1]  # the labels it knows
+    assert row["difference_low_0.05m_0.4deg"] > 0.1 and row["p_0.05m_0.4deg"] == 1 / 1001
 
 
-def test_bootstrap_interval_is_the_binomial_one_where_locations_count_alike() -> None:
-    good = np.zeros((400, 1))
-    good[:120] = 1
-    bootstrap = LocationBootstrap(np.zeros(400, dtype=int), 4000, seed=0)
-    low, high = bootstrap.ratio(good, np.ones((400, 1)))
-    error = np.sqrt(0.3 * 0.7 / 400)
-    assert low[0] == pytest.approx(0.3 - 1.96 * error, abs=0.006)
-    assert high[0] == pytest.approx(0.3 + 1.96 * error, abs=0.006)
-    again = LocationBootstrap(np.zeros(400, dtype=int), 4000, seed=0).ratio(good, np.ones((400, 1)))
-    assert (low[0], high[0]) == (again[0][0], again[1][0])
+def test_only_some_views_by_hand() -> None:
+    some = HAND.only(np.array([True, False, True, False, False, True, True, False]))  # 5, 11, 6, 13: not location 1
+    np.testing.assert_array_equal(some.location, [1, 0, 1, 0])
+    np.testing.assert_array_equal(some.viewpoint_id, [5, 11, 6, 13])
+    np.testing.assert_array_equal(some.good, [[1, 1], [1, 1], [0, 1], [1, 1]])
+    np.testing.assert_array_equal(some.location_scene, [0, 1])
+    assert [candidates_label(best) for best in (0, 100)] == ["all", "best 100"]
 
 
-def test_bootstrap_resamples_within_scenes() -> None:
-    scene = np.repeat([0, 1], [30, 70])
-    good = (scene == 0).astype(float)[:, None]  # a scene is all good or all bad: resampling within it changes nothing
-    low, high = LocationBootstrap(scene, 500, seed=1).ratio(good, np.ones((100, 1)))
-    assert (low[0], high[0]) == (0.3, 0.3)
-    alone = LocationBootstrap(np.array([0, 1]), 500, seed=1).ratio(np.ones((2, 1)), np.ones((2, 1)))
-    assert np.isnan(alone).all()
+def test_a_scene_without_candidates_has_no_shares() -> None:
+    config = EvaluateConfig(top_n=(1,), thresholds=((0.05, 0.4), (5.0, 10.0)), resamples=50)
+    in_a = HAND.only(HAND.location < 2)
+    table = score_table(in_a, {("mlp", "2d"): HAND_SCORES[HAND.location < 2]}, ["a", "b"], config)
+    rows = table.set_index(["method", "scene"])
+    assert rows.loc[("mlp", "b"), "n_locations"] == 0
+    names = [name for name in table if name.endswith("deg") and not name.startswith("good_")]
+    assert rows.loc[("mlp", "b"), names].isna().all()
+    assert rows.loc[("mlp", "all"), "raw_5m_10deg"] == rows.loc[("mlp", "a"), "raw_5m_10deg"] == 1 / 2
+
+
+def test_calibration_columns_of_learned_methods() -> None:
+    # predicted 0.8 for all, of which 3 in 8 are good; at temperature 2 it says sigmoid(log(4) / 2) = 2/3
+    flat = np.full(8, 0.8)
+    scores = {("bins", ""): flat, ("mlp", "2d"): flat, ("mlp", "2d+z"): flat}
+    config = EvaluateConfig(top_n=(1, 3), thresholds=((0.05, 0.4), (5.0, 10.0)), resamples=10)
+    table = score_table(HAND, scores, ["a", "b"], config, temperatures={("mlp", "2d"): 2.0, ("mlp", "2d+z"): np.nan})
+    rows = table[table["top_n"] == 3].set_index(["method", "inputs", "scene"])[["ece", "ece_scaled", "temperature"]]
+    np.testing.assert_allclose(rows.loc[("mlp", "2d", "all")], [0.8 - 3 / 8, 2 / 3 - 3 / 8, 2])
+    np.testing.assert_allclose(rows.loc[("mlp", "2d", "b")], [0.8 - 1 / 3, 2 / 3 - 1 / 3, 2])
+    np.testing.assert_allclose(rows.loc[("mlp", "2d+z", "all")], [0.8 - 3 / 8, np.nan, np.nan])
+    assert rows.loc[["bins", "oracle"]].isna().all(axis=None)
 
 
 def test_threshold_names() -> None:

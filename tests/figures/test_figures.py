@@ -7,16 +7,15 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.colors import to_rgb
 
-from wheretolook.evaluation.config import EvaluateConfig
-from wheretolook.evaluation.ranking import TestViews
-from wheretolook.evaluation.scores import score_table
 from wheretolook.figures.lattices import covering_radius_deg, fibonacci_figure, nearest_angles_deg
-from wheretolook.figures.scores import score_figure
 from wheretolook.figures.sphere import viewpoint_sphere_figure
-from wheretolook.figures.style import method_style, save_figure
+from wheretolook.figures.style import method_group, method_style, save_figure
 from wheretolook.figures.training import training_figure
 from wheretolook.grid import fibonacci_sphere, released_lattice
+from wheretolook.scoring.fisher import FISHER_METHODS
+from wheretolook.scoring.registry import PROBES
 
 
 def test_covering_radius_of_platonic_solids() -> None:
@@ -48,25 +47,6 @@ def test_fibonacci_figure_tells_the_radii(tmp_path: Path) -> None:
     _assert_draws(figure, tmp_path)
 
 
-def test_score_figure_has_a_bar_for_every_method_and_threshold(tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    location = np.repeat(np.arange(10), 6)
-    views = TestViews(location, np.arange(60), rng.random((60, 1)) < [0.2, 0.4, 0.5, 0.6], np.zeros(10, dtype=int))
-    methods = [("random", ""), ("bins", ""), ("mlp", "2d"), ("a new one", "")]
-    config = EvaluateConfig(top_n=(1, 5), resamples=50)
-    scores = score_table(views, {method: rng.random(60) for method in methods}, ["a"], config)
-    figure = score_figure(scores)
-    assert len(figure.axes) == 2
-    row = scores[(scores["scene"] == "all") & (scores["method"] == "bins") & (scores["top_n"] == 5)].iloc[0]
-    for axes in figure.axes:
-        assert len(axes.patches) == 4 * 4
-    heights = [patch.get_height() for patch in figure.axes[1].patches[4:8]]
-    expected = [100 * row[name] for name in scores.columns if name.startswith("normalized_") and name.count("_") == 2]
-    np.testing.assert_allclose(heights, expected)
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == [method_style(*m).label for m in methods]
-    _assert_draws(figure, tmp_path)
-
-
 def test_training_figure_marks_the_best_epoch(tmp_path: Path) -> None:
     history = pd.DataFrame({"epoch": range(5), "train_bce": 0.5, "val_bce": 0.6, "train_average_precision": 0.9,
                             "val_average_precision": [0.1, 0.4, 0.8, 0.7, 0.8]})  # fmt: skip
@@ -87,12 +67,35 @@ def test_sphere_figure_stars_the_best_direction(tmp_path: Path) -> None:
 
 
 def test_methods_look_different() -> None:
-    methods = [("oracle", ""), ("random", ""), ("visible", ""), ("bins", ""), ("mlp", "2d"), ("mlp", "2d+z"),
-               ("mlp", "2d+3d")]  # fmt: skip
+    methods = [("oracle", ""), ("random", ""), ("forward", ""), ("visible", ""), ("bins", ""), ("max-visibility", ""),
+               ("max-visibility-swapped", ""), *((name, "") for name in PROBES), ("mlp", "2d"), ("mlp", "2d+z"),
+               ("mlp", "2d+3d"), ("mlp", "released")]  # fmt: skip
     styles = [method_style(*method) for method in methods]
     for name in ("label", "color", "marker"):
         assert len({getattr(style, name) for style in styles}) == len(methods)
     assert method_style("new") == method_style("new")
+    assert {method_group(name) for name, _ in methods[:7]} == {"rules"}
+
+
+def test_fisher_rows_are_one_family() -> None:
+    """A marker for each metric, a shade for each approximation, dark to light also in greyscale."""
+    styles = {
+        f"{metric} {approximation}": method_style("fisher", f"{metric} {approximation}")
+        for metric, approximation in FISHER_METHODS.values()
+    }
+    assert len({style.label for style in styles.values()}) == len(styles) == 9
+    for name, style in styles.items():
+        metric, approximation = name.split()
+        assert style.marker == styles[f"{metric} exact"].marker
+        assert style.color == styles[f"mineig {approximation}"].color
+    assert len({style.marker for style in styles.values()}) == len({style.color for style in styles.values()}) == 3
+    weights = np.array([0.299, 0.587, 0.114])
+    greys = [weights @ to_rgb(styles[f"trace {one}"].color) for one in ("exact", "quadratic", "gp")]
+    assert np.diff(greys).min() > 0.15
+    assert styles["mineig exact"].label == "Fisher, min. eigenvalue, exact"
+    assert method_group("fisher") == "Fisher"
+    assert {method_group(name) for name in PROBES} == {"probes"}
+    assert method_group("mlp") == "learned"
 
 
 def _assert_draws(figure, folder: Path) -> None:  # type: ignore[no-untyped-def]

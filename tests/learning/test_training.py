@@ -21,6 +21,7 @@ from wheretolook.learning.fit import EpochRecord
 from wheretolook.learning.network import InputStatistics
 from wheretolook.learning.training import train
 from wheretolook.learning.weights import load_classifier
+from wheretolook.scoring import load_scorer
 from wheretolook.table import LOCALIZED, NO_POSE, UNLABELLED, is_good, write_table
 from wheretolook.tracking import TrackingConfig, client
 
@@ -315,3 +316,20 @@ def test_an_interrupted_training_is_reported_as_such(
     (run,) = client(tracking).search_runs([experiment.experiment_id])
     assert run.info.status == "KILLED"
     assert not (dataset.root / "weights").exists()
+
+
+def test_the_released_variant_trains_as_the_released_code(dataset: Dataset, store: str) -> None:
+    config = replace(SMALL, variants=("2d+3d", "released"), epochs=2, hidden=(16,))
+    ours, released = train(dataset, config, TrackingConfig(store), progress=False)
+    assert released.path.name == "mlp-released.safetensors"
+    spec = load_classifier(released.path).spec
+    assert (spec.variant, spec.layout, spec.input_dropout, spec.hidden) == ("2d+3d", "compact", 0.5, (300, 300))
+    params = client(TrackingConfig(store)).get_run(released.run_id).data.params
+    expected = {"learning_rate": "0.0001", "l2": "0.0", "balance": "True", "keep": "last", "epochs": "2"}
+    assert {name: params[name] for name in expected} == expected
+    assert float(params["positives_train"]) == 0.5  # so that no class weighs more than the other
+    assert released.metrics["epoch"] == 1  # the last, whichever was best
+    assert load_classifier(ours.path).spec.layout == "in_place"
+    assert all(model.reused for model in train(dataset, config, TrackingConfig(store), progress=False))
+    localization_map = dataset.scenes[0].localization_map(dataset.camera)
+    assert [load_scorer(model.path, localization_map).inputs for model in (ours, released)] == ["2d+3d", "released"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -13,24 +13,36 @@ THRESHOLDS = ((0.05, 0.4), (0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
 """Error limits in metres and degrees: the Long-Term Visual Localization benchmark's and the paper's finer one."""
 
 
+def _all_methods() -> tuple[str, ...]:
+    from wheretolook.scoring.registry import SCORERS
+
+    return tuple(SCORERS)
+
+
 @dataclass(frozen=True)
 class EvaluateConfig:
     """Options of evaluation.
 
     Args:
-        methods: methods to compare, keys of `wheretolook.scoring.SCORERS`; "mlp" stands for every weights file.
+        methods: methods to compare, keys of `wheretolook.scoring.SCORERS`; all of them if not named. "mlp" stands for
+            every weights file.
         weights: weights to evaluate; empty for all in the dataset's `weights` folder.
         split: whose scenes to evaluate on: "test", "val" or "train".
         top_n: how many of a location's best-scored viewpoints count; every value gives a row of the table.
         thresholds: pairs of limits, in metres and degrees, that both errors of a good viewpoint stay strictly under.
             The first pair is the label.
-        seed: seed of the random method and of the bootstrap.
-        resamples: bootstrap resamples of the locations, for 95 % intervals.
+        seed: seed of the random method, of the bootstrap and of the paired test.
+        resamples: bootstrap resamples of the locations, for 95 % intervals, and sign flips of the paired test.
         occlusions: occlusion models to see the landmarks by, each scored apart: "mesh", "tsdf", "hidden-points",
             "none". Empty for the one that the viewpoints were sampled with, which is stored.
+        candidates: sets of views to choose from, each tabulated apart. 0 is for all labelled directions of a location,
+            as a planner meets them, K > 0 for those among the K that see most landmarks (of all directions, labelled or
+            not), as in the paper.
+        reference: method that every other is compared with, by name and inputs as in the table, such as "bins" or
+            "mlp 2d+z". Empty for the learned one with the inputs "2d+3d", or else the first learned one.
     """
 
-    methods: tuple[str, ...] = ("random", "visible", "bins", "mlp")
+    methods: tuple[str, ...] = field(default_factory=_all_methods)
     weights: tuple[Path, ...] = ()
     split: Literal["train", "val", "test"] = "test"
     top_n: tuple[int, ...] = (1, 5, 10)
@@ -38,6 +50,8 @@ class EvaluateConfig:
     seed: int = 0
     resamples: int = 2000
     occlusions: tuple[OcclusionName, ...] = ()
+    candidates: tuple[int, ...] = (0,)
+    reference: str = ""
 
     def __post_init__(self) -> None:
         from wheretolook.scoring.registry import SCORERS
@@ -54,7 +68,17 @@ class EvaluateConfig:
             raise ConfigError("thresholds needs pairs of positive limits", value=self.thresholds)
         if self.resamples < 1:
             raise ConfigError("resamples must be at least 1", value=self.resamples)
+        if not self.candidates or min(self.candidates) < 0 or len(set(self.candidates)) < len(self.candidates):
+            raise ConfigError(
+                "candidates needs different numbers of at least 0", value=self.candidates,
+                fix="0 is for all directions, 100 for the 100 that see most landmarks.",
+            )  # fmt: skip
         check_occlusion_names(self.occlusions)
+
+
+def candidates_label(best: int) -> str:
+    """Name of a candidate set in the column `candidates`: "all" for 0, else such as "best 100"."""
+    return f"best {best}" if best else "all"
 
 
 def threshold_key(threshold: tuple[float, float]) -> str:

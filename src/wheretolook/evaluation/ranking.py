@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +34,14 @@ class TestViews:
         """L."""
         return len(self.location_scene)
 
+    def only(self, mask: NDArray[np.bool_]) -> TestViews:
+        """The views where `mask` (B,) is set, in the same order.
+
+        Locations without any are left out and the others renumbered, in the same order; scenes keep their numbers.
+        """
+        kept, location = np.unique(self.location[mask], return_inverse=True)
+        return TestViews(location, self.viewpoint_id[mask], self.good[mask], self.location_scene[kept])
+
 
 @dataclass(frozen=True, eq=False)
 class TopN:
@@ -51,25 +58,36 @@ class TopN:
     any_good: Float
 
 
-def choose_best(views: TestViews, scores: Float, n: int) -> TopN:
-    """Choose the N views of every location with the highest scores; the smaller viewpoint_id wins a tie.
+def rank_views(views: TestViews, scores: Float) -> NDArray[np.int64]:
+    """Rank (B,) of every view within its location: 0 has the highest score; the smaller viewpoint_id wins a tie.
 
     Args:
         views: the candidates.
         scores: (B,).
-        n: N. A location with fewer views contributes all it has.
     """
     order = np.lexsort((views.viewpoint_id, -scores, views.location))
     location = views.location[order]
     first = np.searchsorted(location, np.arange(views.n_locations))
-    chosen = np.arange(len(order)) - first[location] < n
-    good = _sum_by_location(views, views.good[order] & chosen[:, None], location)
+    ranks = np.empty(len(order), dtype=np.int64)
+    ranks[order] = np.arange(len(order)) - first[location]
+    return ranks
+
+
+def choose_best(views: TestViews, ranks: NDArray[np.int64], n: int) -> TopN:
+    """Choose the N views of every location that rank first.
+
+    Args:
+        views: the candidates.
+        ranks: (B,), see `rank_views`.
+        n: N. A location with fewer views contributes all it has.
+    """
+    good = _sum_by_location(views, views.good & (ranks < n)[:, None])
     return TopN(np.minimum(_n_views(views), n), good, (good > 0).astype(np.float64))
 
 
 def choose_by_truth(views: TestViews, n: int) -> TopN:
     """The oracle: for each threshold the N views of every location that are best by it. No choice of N does better."""
-    good = np.minimum(_sum_by_location(views, views.good, views.location), n)
+    good = np.minimum(_sum_by_location(views, views.good), n)
     return TopN(np.minimum(_n_views(views), n), good, (good > 0).astype(np.float64))
 
 
@@ -79,7 +97,7 @@ def choose_at_random(views: TestViews, n: int) -> TopN:
     With g good views of m, min(N, m) g / m of the chosen ones are good, and at least one is with probability
     1 - C(m - g, N) / C(m, N) (hypergeometric).
     """
-    total, good = _n_views(views)[:, None], _sum_by_location(views, views.good, views.location)
+    total, good = _n_views(views)[:, None], _sum_by_location(views, views.good)
     chosen = np.minimum(total, n)
     none_possible = total - good >= chosen
     bad = np.where(none_possible, total - good, chosen)
@@ -92,6 +110,6 @@ def _n_views(views: TestViews) -> Float:
     return np.bincount(views.location, minlength=views.n_locations).astype(np.float64)
 
 
-def _sum_by_location(views: TestViews, flags: NDArray[np.bool_], location: NDArray[np.integer[Any]]) -> Float:
-    columns = [np.bincount(location, weights=column, minlength=views.n_locations) for column in flags.T]
+def _sum_by_location(views: TestViews, flags: NDArray[np.bool_]) -> Float:
+    columns = [np.bincount(views.location, weights=column, minlength=views.n_locations) for column in flags.T]
     return np.stack(columns, axis=-1)

@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import pandas as pd
 
 from wheretolook.evaluation.config import threshold_label
-from wheretolook.evaluation.scores import ALL
-from wheretolook.figures.style import method_style
+from wheretolook.evaluation.scores import ALL, RELEASED_DIVISOR, Method
+from wheretolook.figures.style import method_group, method_style
+
+Row = Mapping[Any, Any]
+"""A row of a score table by its columns' names."""
+
+Column = tuple[str, str, Callable[[Row], str]]
+"""Header of a Markdown table's column, the score table's column that it needs, and the text of a row."""
+
+SCENES_ABREAST = 8
+"""Scenes in one table; more make another below."""
 
 
 def threshold_keys(scores: pd.DataFrame) -> list[str]:
@@ -17,75 +27,283 @@ def threshold_keys(scores: pd.DataFrame) -> list[str]:
     return [name.removeprefix("any_") for name in scores.columns if name.startswith("any_")]
 
 
+def main_rows(scores: pd.DataFrame, columns: Sequence[str] = ("occlusion", "candidates")) -> pd.DataFrame:
+    """Rows of a table's first occlusion model and first set of candidates; an older table may name neither."""
+    for name in columns:
+        if name in scores:
+            scores = scores[scores[name] == scores[name].iloc[0]]
+    return scores
+
+
+def methods_of(scores: pd.DataFrame) -> list[Method]:
+    """The methods of a score table with their inputs, in order."""
+    return list(dict.fromkeys(zip(scores["method"], scores["inputs"], strict=True)))
+
+
+def reference_of(scores: pd.DataFrame) -> Method | None:
+    """The method that a score table compares the others with: the one that never differs. None if there is none."""
+    pooled = scores[scores["scene"] == ALL]
+    keys = [key for key in threshold_keys(scores) if f"difference_{key}" in scores]
+    if not keys:
+        return None
+    ends = [name for key in keys for name in (f"difference_low_{key}", f"difference_high_{key}") if name in scores]
+    # of few locations there is no interval
+    same = (pooled[[f"difference_{key}" for key in keys]] == 0).all(axis=1) & (pooled[ends].fillna(0) == 0).all(axis=1)
+    differing = {*methods_of(pooled[~same])}
+    return next((method for method in methods_of(pooled) if method not in differing), None)
+
+
 def score_markdown(scores: pd.DataFrame, title: str = "Localization score") -> str:
-    """Tables of a score table (`wheretolook.evaluation.scores.score_table`): one for each N, then one by scene.
+    """A score table (`wheretolook.evaluation.scores.score_table`) as text and tables.
+
+    The first N with all that is known; other N; the share of locations with a good view; by scene; by occlusion model
+    and by set of candidates if there are several (the tables above are of the first); shares divided by the released
+    code's constant; calibration; probes apart. What an older table lacks is left out.
 
     Args:
-        scores: the table.
+        scores: the table, with columns `occlusion` and `candidates` or without.
         title: first line.
     """
-    occlusions = list(scores["occlusion"].unique()) if "occlusion" in scores else []
-    comparison = _occlusion_table(scores, occlusions) if len(occlusions) > 1 else []
-    if occlusions:
-        scores = scores[scores["occlusion"] == occlusions[0]]
-    pooled = scores[scores["scene"] == ALL]
-    scenes = [name for name in scores["scene"].unique() if name != ALL]
-    keys = threshold_keys(scores)
-    parts = [
-        f"# {title}",
-        f"Scenes: {', '.join(scenes)}; {pooled['n_locations'].iloc[0]:,} locations. "
-        "Share in % of the chosen viewpoints that localize within both limits, divided by the oracle's share "
-        "[95 % bootstrap interval over locations], and "
-        "undivided in round brackets. AP and AUC (ROC) of the scores are against the first limits. Random is an exact "
-        "expectation, its AP and AUC are one draw.",
+    main = main_rows(scores)
+    probe = main["method"].map(method_group) == "probes"
+    methods, probes = main[~probe], main[probe]
+    pooled = methods[methods["scene"] == ALL]
+    keys, counts = threshold_keys(scores), list(pooled["top_n"].unique())
+    first = pooled[pooled["top_n"] == counts[0]]
+    parts = [f"# {title}", _about(main), *_explained(first, keys[0])]
+    parts += [
+        f"## {_best(counts[0])} of each location ({first['n_views'].iloc[0]:,} in all)",
+        _table(first, [*_score_columns(keys, len(keys)), *_certainty_columns(first, keys[0]), *_RANKING]),
     ]
-    for n, rows in pooled.groupby("top_n", sort=False):
-        chosen = "viewpoint" if n == 1 else f"{n} viewpoints"
-        parts.append(f"## Best {chosen} of each location ({rows['n_views'].iloc[0]:,} in all)")
-        lines = []
-        for row in rows.to_dict("records"):
-            shares = [_share(row, key, interval=index == 0) for index, key in enumerate(keys)]
-            metrics = [_number(row["average_precision"]), _number(row["roc_auc"])]
-            lines.append([method_style(row["method"], row["inputs"]).label, *shares, *metrics])
-        parts.append(markdown_table(["method", *map(threshold_label, keys), "AP", "AUC"], lines))
-    first = scores[(scores["top_n"] == scores["top_n"].iloc[0]) & (scores["scene"] != ALL)]
-    if len(scenes) > 1:
-        parts.append(f"## By scene: best {scores['top_n'].iloc[0]} of each location, within {threshold_label(keys[0])}")
-        methods = list(dict.fromkeys(zip(first["method"], first["inputs"], strict=True)))
-        by_key = {(row["scene"], row["method"], row["inputs"]): row for row in first.to_dict("records")}
-        lines = []
-        for method in methods:
-            shares = [_share(by_key[(scene, *method)], keys[0], interval=True) for scene in scenes]
-            lines.append([method_style(*method).label, *shares])
-        parts.append(markdown_table(["method", *scenes], lines))
-    return "\n\n".join([*parts, *comparison]) + "\n"
+    for n in counts[1:]:
+        rows = pooled[pooled["top_n"] == n]
+        parts += [f"## {_best(n)} of each location ({rows['n_views'].iloc[0]:,} in all)"]
+        parts += [_table(rows, _score_columns(keys, 1))]
+    parts += _any_table(pooled, keys[0], counts)
+    parts += _scene_tables(methods, keys[0], counts[0])
+    parts += _comparison(scores, "occlusion", "occlusion model", "", keys[0])
+    parts += _comparison(scores, "candidates", "set of candidates", _CANDIDATES, keys[0])
+    parts += _released_table(first, keys)
+    parts += _calibration(first)
+    if len(probes):
+        rows = probes[(probes["scene"] == ALL) & (probes["top_n"] == counts[0])]
+        parts += [
+            "## Probes",
+            "Rows of the paper's table that are no methods: they look along the direction that a Fisher field says is "
+            f"worst (least trace, or where the trace is stationary). {_best(counts[0])} of each location.",
+            _table(rows, [*_score_columns(keys, 1), *_RANKING], "probe"),
+        ]
+    return "\n\n".join(parts) + "\n"
 
 
-def _occlusion_table(scores: pd.DataFrame, occlusions: Sequence[str]) -> list[str]:
-    """Average precision and the best view's share of every method, by occlusion model."""
-    key, n = threshold_keys(scores)[0], scores["top_n"].iloc[0]
-    pooled = scores[(scores["scene"] == ALL) & (scores["top_n"] == n) & (scores["method"] != "oracle")]
-    by_key = {(row["method"], row["inputs"], row["occlusion"]): row for row in pooled.to_dict("records")}
-    methods = list(dict.fromkeys(zip(pooled["method"], pooled["inputs"], strict=True)))
+def _about(main: pd.DataFrame) -> str:
+    scenes = [name for name in main["scene"].unique() if name != ALL]
+    n_locations = main.loc[main["scene"] == ALL, "n_locations"].iloc[0]
+    text = f"Scenes: {', '.join(scenes)}; {n_locations:,} locations"
+    candidates = main["candidates"].iloc[0] if "candidates" in main else ALL
+    if candidates != ALL:
+        text += f"; to choose from there are the {candidates} directions of a location by the landmarks they see"
+    return f"{text}."
+
+
+def _explained(first: pd.DataFrame, key: str) -> list[str]:
+    """What the numbers mean, one line for each that is there."""
+    limits, reference = threshold_label(key), reference_of(first)
+    lines = [
+        "score: share in % of the chosen viewpoints that localize within both limits, divided by the oracle's share "
+        "[95 % bootstrap interval over locations] (undivided). Random is an exact expectation, its AP and AUC are one "
+        "draw."
+    ]
+    if f"regret_{key}" in first:
+        lines.append(
+            f"regret: the oracle's undivided share within {limits} less the method's, in percentage points [interval]; "
+            "lower is better."
+        )
+    if reference is not None:
+        lines.append(
+            f"difference: the method's undivided share within {limits} less that of {method_style(*reference).label}, "
+            "in percentage points [interval, paired by location], and the p-value of a paired permutation test over "
+            "locations."
+        )
+    lines.append(f"AP, AUC: average precision and area under the ROC curve over all candidates, within {limits}.")
+    return ["\n".join(f"- {line}" for line in lines)]
+
+
+def _score_columns(keys: Sequence[str], n_intervals: int) -> list[Column]:
+    """Scores at each threshold, the first few with their intervals."""
+    return [
+        (threshold_label(key), f"normalized_{key}", partial(_score, key=key, interval=index < n_intervals))
+        for index, key in enumerate(keys)
+    ]
+
+
+def _certainty_columns(first: pd.DataFrame, key: str) -> list[Column]:
+    return [
+        ("regret", f"regret_{key}", lambda row: _percent(row[f"regret_{key}"]) + _ends(row, "regret", key)),
+        ("difference", f"difference_{key}", partial(_difference, key=key, reference=reference_of(first))),
+    ]
+
+
+_RANKING: list[Column] = [
+    ("AP", "average_precision", lambda row: _number(row["average_precision"])),
+    ("AUC", "roc_auc", lambda row: _number(row["roc_auc"])),
+]
+
+
+def _table(rows: pd.DataFrame, columns: Sequence[Column], first: str = "method") -> str:
+    """A row for each method; columns of which nothing is known are left out."""
+    shown = [(header, text) for header, needs, text in columns if needs in rows and rows[needs].notna().any()]
+    lines = [
+        [method_style(row["method"], row["inputs"]).label, *(text(row) for _, text in shown)]
+        for row in rows.to_dict("records")
+    ]
+    return markdown_table([first, *(header for header, _ in shown)], lines)
+
+
+def _any_table(pooled: pd.DataFrame, key: str, counts: Sequence[int]) -> list[str]:
+    """The share of locations where at least one of the chosen views is good; of one view that is its score."""
+    if max(counts) == 1:
+        return []
+    by_key = {(row["method"], row["inputs"], row["top_n"]): row for row in pooled.to_dict("records")}
+    lines = [
+        [method_style(*method).label, *(_percent(by_key[(*method, n)][f"any_{key}"]) for n in counts)]
+        for method in methods_of(pooled)
+    ]
+    return [
+        "## At least one good",
+        f"Share in % of locations where at least one of the N chosen viewpoints localizes within "
+        f"{threshold_label(key)}; the oracle's is that of locations that have such a viewpoint.",
+        markdown_table(["method", *(f"best {n}" for n in counts)], lines),
+    ]
+
+
+def _scene_tables(methods: pd.DataFrame, key: str, n: int) -> list[str]:
+    scenes = [name for name in methods["scene"].unique() if name != ALL]
+    if len(scenes) < 2:
+        return []
+    rows = methods[methods["top_n"] == n]
+    by_key = {(row["scene"], row["method"], row["inputs"]): row for row in rows.to_dict("records")}
+    parts = [
+        f"## By scene: {_best(n).lower()} of each location, within {threshold_label(key)}",
+        "Score [interval], good of chosen viewpoints.",
+    ]
+    for begin in range(0, len(scenes), SCENES_ABREAST):
+        some = scenes[begin : begin + SCENES_ABREAST]
+        lines = [
+            [method_style(*method).label, *(_counted(by_key[(scene, *method)], key) for scene in some)]
+            for method in methods_of(rows)
+        ]
+        parts.append(markdown_table(["method", *some], lines))
+    return parts
+
+
+_CANDIDATES = (
+    "To choose from there are all labelled directions of a location, or those of them that are among its best K by the "
+    "number of landmarks they see; the oracle chooses from the same. "
+)
+
+
+def _comparison(scores: pd.DataFrame, column: str, name: str, about: str, key: str) -> list[str]:
+    """Average precision and the score of every method by the values of a column, if there are several."""
+    values = list(scores[column].unique()) if column in scores else []
+    if len(values) < 2:
+        return []
+    n, others = scores["top_n"].iloc[0], [name for name in ("occlusion", "candidates") if name != column]
+    rows = main_rows(scores[(scores["scene"] == ALL) & (scores["top_n"] == n)], others)
+    rows = rows[(rows["method"] != "oracle") & (rows["method"].map(method_group) != "probes")]
+    by_key = {(row["method"], row["inputs"], row[column]): row for row in rows.to_dict("records")}
+
+    def cell(row: Row | None) -> str:
+        return "–" if row is None else f"{_number(row['average_precision'])}, {_score(row, key, True)}"
+
+    lines = [
+        [method_style(*method).label, *(cell(by_key.get((*method, value))) for value in values)]
+        for method in methods_of(rows)
+    ]
+    return [
+        f"## By {name}: AP, and {_best(n).lower()} of each location within {threshold_label(key)}",
+        f"{about}The other tables are of the first, {values[0]}.",
+        markdown_table(["method", *values], lines),
+    ]
+
+
+def _released_table(first: pd.DataFrame, keys: Sequence[str]) -> list[str]:
+    if f"released_{keys[0]}" not in first:
+        return []
+    columns: list[Column] = [
+        (threshold_label(key), f"released_{key}", partial(_share, name=f"released_{key}")) for key in keys
+    ]
+    return [
+        f"## Divided by {RELEASED_DIVISOR}",
+        f"{_best(first['top_n'].iloc[0])} of each location, for comparison with the paper's numbers only: its released "
+        f"code divides the share in % by {RELEASED_DIVISOR} at all thresholds and on all scenes, so 100 is no limit.",
+        _table(first, columns),
+    ]
+
+
+def _calibration(first: pd.DataFrame) -> list[str]:
+    if "ece" not in first or not first["ece"].notna().any():
+        return []
     lines = []
-    for method in methods:
-        rows = [by_key[(*method, occlusion)] for occlusion in occlusions]
-        cells = [f"{_number(row['average_precision'])}, {_share(row, key, interval=True)}" for row in rows]
-        lines.append([method_style(*method).label, *cells])
-    title = f"## By occlusion model: AP, and best {n} of each location within {threshold_label(key)}"
-    note = f"The tables above are with {occlusions[0]}."
-    return [title, note, markdown_table(["method", *occlusions], lines)]
+    for row in first[first["ece"].notna()].to_dict("records"):
+        text = f"- {method_style(row['method'], row['inputs']).label}: {_number(row['ece'])}"
+        if pd.notna(row["temperature"]):
+            text += f" → {_number(row['ece_scaled'])} with T = {row['temperature']:.2f}"
+        lines.append(text)
+    return [
+        "## Calibration",
+        "Expected calibration error of the predicted probabilities, before → after their logits are divided by a "
+        "temperature T, which keeps their order.",
+        "\n".join(lines),
+    ]
 
 
-def _share(row: dict[Any, Any], key: str, interval: bool) -> str:
-    normalized, raw = row[f"normalized_{key}"], row[f"raw_{key}"]
-    low, high = row[f"normalized_low_{key}"], row[f"normalized_high_{key}"]
-    ends = f" [{100 * low:.1f}, {100 * high:.1f}]" if interval and pd.notna(low) and low < high else ""
-    return f"{_percent(normalized)}{ends} ({_percent(raw)})"
+def _best(n: int) -> str:
+    return "Best viewpoint" if n == 1 else f"Best {n} viewpoints"
+
+
+def _score(row: Row, key: str, interval: bool) -> str:
+    text = _percent(row[f"normalized_{key}"]) + (_ends(row, "normalized", key) if interval else "")
+    return f"{text} ({_percent(row[f'raw_{key}'])})" if f"raw_{key}" in row else text
+
+
+def _share(row: Row, name: str) -> str:
+    return _percent(row[name])
+
+
+def _difference(row: Row, key: str, reference: Method | None) -> str:
+    if (row["method"], row["inputs"]) == reference:
+        return "reference"
+    if pd.isna(row[f"difference_{key}"]):
+        return "–"
+    text = f"{_signed(row[f'difference_{key}'])}{_ends(row, 'difference', key)}"
+    p = row.get(f"p_{key}", float("nan"))
+    return text if pd.isna(p) else f"{text}, p {'< 0.001' if p < 0.001 else f'{p:.3f}'}"
+
+
+def _counted(row: Row, key: str) -> str:
+    """Score of a scene with the numbers behind it; an expected number has a decimal place."""
+    text = f"{_percent(row[f'normalized_{key}'])}{_ends(row, 'normalized', key)}"
+    if f"raw_{key}" not in row or pd.isna(row[f"raw_{key}"]):
+        return text
+    good = row[f"raw_{key}"] * row["n_views"]
+    digits = 0 if abs(good - round(good)) < 1e-6 else 1
+    return f"{text}, {good:,.{digits}f} of {row['n_views']:,}"
+
+
+def _ends(row: Row, name: str, key: str) -> str:
+    """Interval of a share, with a space in front; nothing where it is not known or has no width."""
+    low, high = (row.get(f"{name}_{end}_{key}", float("nan")) for end in ("low", "high"))
+    as_text = _signed if name == "difference" else _percent
+    return f" [{as_text(low)}, {as_text(high)}]" if pd.notna(low) and low < high else ""
 
 
 def _percent(value: float) -> str:
     return "–" if pd.isna(value) else f"{100 * value:.1f}"
+
+
+def _signed(value: float) -> str:
+    return f"{round(100 * value, 1) + 0.0:+.1f}"  # + 0.0 makes -0.0 positive
 
 
 def _number(value: float) -> str:

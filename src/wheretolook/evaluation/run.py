@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,16 +15,18 @@ from tqdm.auto import tqdm
 
 from wheretolook.dataset import Dataset, SceneFolder, write_text
 from wheretolook.errors import TableError, WeightsError
-from wheretolook.evaluation.config import EvaluateConfig
+from wheretolook.evaluation.calibration import calibration_rows, fit_temperature
+from wheretolook.evaluation.config import EvaluateConfig, candidates_label, threshold_key
+from wheretolook.evaluation.paper_tables import write_paper_tables
 from wheretolook.evaluation.ranking import TestViews
 from wheretolook.evaluation.report import score_markdown
-from wheretolook.evaluation.scores import ALL, Method, score_table
-from wheretolook.features import INPUT_VARIANTS
+from wheretolook.evaluation.scores import ALL, LEARNED, Choices, Method, choose, reference_method, score_table
 from wheretolook.geometry import Float
+from wheretolook.learning.config import VARIANTS
 from wheretolook.localization_map import LocalizationMap
 from wheretolook.scene_occlusion import scene_occlusion
 from wheretolook.scoring import Scorer, make_scorer
-from wheretolook.table import fingerprint, is_good, poses
+from wheretolook.table import UNLABELLED, fingerprint, is_good, poses
 from wheretolook.tracking import TrackingConfig, log, start_run
 from wheretolook.visibility.config import OcclusionConfig
 
@@ -34,7 +37,47 @@ BLOCK = 4096
 """Views binned and scored at a time."""
 
 SCORES_CSV, SCORES_MD, SCORES_PNG, OCCLUSION_PNG = "scores.csv", "scores.md", "scores.png", "occlusion.png"
+CALIBRATION_CSV, CALIBRATION_PNG, REGRET_PNG = "calibration.csv", "calibration.png", "regret.png"
 """Files of an evaluation, in `<dataset>/results/` and as artifacts of its run."""
+
+LOCATIONS_PARQUET = "locations.parquet"
+"""Artifact of each nested run: what was chosen at each location."""
+
+
+@dataclass(frozen=True, eq=False)
+class CandidateSet:
+    """Views to choose from.
+
+    Attributes:
+        name: as in the column `candidates`: "all", or such as "best 100".
+        mask: (B,) which of all labelled views they are.
+        views: the views.
+        location_id: (L,) of their locations, unique within a scene.
+    """
+
+    name: str
+    mask: NDArray[np.bool_]
+    views: TestViews
+    location_id: NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class ScoredSet:
+    """One candidate set with the scores by one occlusion model.
+
+    Attributes:
+        occlusion: name of the occlusion model.
+        candidates: the views.
+        scores: (B,) scores of these views, by method.
+        choices: what each method chooses.
+        table: the score table, with columns `occlusion` and `candidates`.
+    """
+
+    occlusion: str
+    candidates: CandidateSet
+    scores: Mapping[Method, Float]
+    choices: Choices
+    table: pd.DataFrame
 
 
 def evaluate(
@@ -48,9 +91,13 @@ def evaluate(
 ) -> pd.DataFrame:
     """Compare all methods on the scenes of one split.
 
-    Writes the table as `<dataset>/results/scores.csv` and `scores.md`, a figure `scores.png`, and an MLflow run with
-    one nested run for each method, inputs, N and occlusion model. With several occlusion models `scores.md` and
-    `scores.png` show the first, and `occlusion.png` compares them.
+    Writes the table as `<dataset>/results/scores.csv` and `scores.md`, a figure `scores.png`, the reliability curves of
+    learned methods as `calibration.csv`, and an MLflow run with one nested run for each method, inputs, N, occlusion
+    model and candidate set, each with a table of what was chosen at each location, `locations.parquet`. With several
+    occlusion models `occlusion.png` compares them.
+
+    The temperatures of learned methods are fitted on the labelled views of the val scenes, seen by the first occlusion
+    model, and hold for all rows; without val scenes, or when these are evaluated, they are not known.
 
     Args:
         dataset: labelled scenes; they need not be of the dataset the models were trained on.
@@ -62,12 +109,15 @@ def evaluate(
         occlusion: settings of the models that `config.occlusions` names.
 
     Returns:
-        The tables of `wheretolook.evaluation.scores.score_table`, one below the other, with a column `occlusion`.
+        The tables of `wheretolook.evaluation.scores.score_table`, one below the other, with columns `occlusion` and
+        `candidates`.
 
     Raises:
-        TableError: there is no scene of the split, or a viewpoint has no label.
+        TableError: there is no scene of the split, a viewpoint has no label, or all labels of a candidate set are of
+            one class.
         WeightsError: weights are missing, or were trained for another field of view.
         MapError: a scene has no landmarks.
+        ConfigError: the reference is none of the methods.
     """
     scenes = dataset.split(config.split)
     if not scenes:
@@ -77,17 +127,27 @@ def evaluate(
     if config.split == "test":
         _check_unseen(scenes, weights)
     tables = [scene.read_table() for scene in scenes]
-    views = _test_views(scenes, tables, config)
-    parts = []
-    for name in config.occlusions or (None,):
-        model = None if name is None else replace(occlusion, model=name)
+    views, location_id = _test_views(scenes, tables, config)
+    candidate_sets = _candidate_sets(views, location_id, scenes, tables, config)
+    occlusions = [None if name is None else replace(occlusion, model=name) for name in config.occlusions or (None,)]
+    temperatures, n_val = _fit_temperatures(dataset, config, weights, device, progress, occlusions[0])
+    scored: list[ScoredSet] = []
+    calibration = pd.DataFrame()
+    for model in occlusions:
         scores, used = _score_scenes(dataset, scenes, tables, config, weights, device, progress, model)
-        part = score_table(views, scores, [scene.name for scene in scenes], config)
-        part.insert(2, "occlusion", used)
-        parts.append(part)
-    table = pd.concat(parts, ignore_index=True)
-    _write_results(dataset.root / "results", table, f"Localization score on {dataset.name}")
-    _log(dataset, scenes, config, tracking, weights, views, table, occlusion)
+        if not scored:
+            calibration = _calibration(scores, views.good[:, 0], temperatures, n_val)
+        for candidates in candidate_sets:
+            subset = {method: values[candidates.mask] for method, values in scores.items()}
+            choices = choose(candidates.views, subset, config.top_n)
+            names = [scene.name for scene in scenes]
+            part = score_table(candidates.views, subset, names, config, temperatures, choices)
+            part.insert(2, "occlusion", used)
+            part.insert(3, "candidates", candidates.name)
+            scored.append(ScoredSet(used, candidates, subset, choices, part))
+    table = pd.concat([one.table for one in scored], ignore_index=True)
+    _write_results(dataset.root / "results", table, calibration, f"Localization score on {dataset.name}")
+    _log(dataset, scenes, config, tracking, weights, views, scored, occlusion)
     if progress:
         print(score_markdown(table, f"Localization score on {dataset.name}"))
     return table
@@ -113,7 +173,7 @@ def _own_weights(dataset: Dataset) -> list[Path]:
     from wheretolook.learning.training import training_fingerprint
     from wheretolook.learning.weights import read_training
 
-    named = (dataset.root / "weights" / f"mlp-{variant}.safetensors" for variant in INPUT_VARIANTS)
+    named = (dataset.root / "weights" / f"mlp-{variant}.safetensors" for variant in VARIANTS)
     weights = [path for path in named if path.is_file()]
     now = training_fingerprint(dataset)
     for path in weights:
@@ -139,9 +199,13 @@ def _check_unseen(scenes: Sequence[SceneFolder], weights: Sequence[Path]) -> Non
                 )  # fmt: skip
 
 
-def _test_views(scenes: Sequence[SceneFolder], tables: Sequence[pd.DataFrame], config: EvaluateConfig) -> TestViews:
+def _test_views(
+    scenes: Sequence[SceneFolder], tables: Sequence[pd.DataFrame], config: EvaluateConfig
+) -> tuple[TestViews, NDArray[np.int64]]:
+    """All labelled views, in the order of the tables, and the location_id (L,) of each of their locations."""
     location: list[NDArray[np.int64]] = []
     location_scene: list[NDArray[np.int64]] = []
+    location_id: list[NDArray[np.int64]] = []
     good: list[NDArray[np.bool_]] = []
     for number, (scene, table) in enumerate(zip(scenes, tables, strict=True)):
         if table.empty:
@@ -150,18 +214,79 @@ def _test_views(scenes: Sequence[SceneFolder], tables: Sequence[pd.DataFrame], c
             good.append(np.stack([is_good(table, *limits) for limits in config.thresholds], axis=-1))
         except TableError as error:
             raise TableError(error.problem, path=scene.table, value=error.value, fix=error.fix) from None
-        names, rows = np.unique(table["location_id"].to_numpy(np.int64), return_inverse=True)
-        location.append(rows + sum(len(part) for part in location_scene))
-        location_scene.append(np.full(len(names), number))
-    if len(np.unique(np.concatenate(good)[:, 0])) < 2:
-        metres, degrees = config.thresholds[0]
-        raise TableError(
-            f"labels of one class only: of {sum(map(len, good))} viewpoints all or none are within {metres:g} m and "
-            f"{degrees:g} degrees", path=scenes[0].table, value=bool(good[0][0, 0]),
-            fix="Label more viewpoints, or give other evaluate.thresholds.",
-        )  # fmt: skip
-    ids = np.concatenate([table["viewpoint_id"].to_numpy(np.int64) for table in tables])
-    return TestViews(np.concatenate(location), ids, np.concatenate(good), np.concatenate(location_scene))
+        ids, rows = np.unique(table["location_id"].to_numpy(np.int64), return_inverse=True)
+        location.append(rows + sum(map(len, location_id)))
+        location_id.append(ids)
+        location_scene.append(np.full(len(ids), number))
+    viewpoint_id = np.concatenate([table["viewpoint_id"].to_numpy(np.int64) for table in tables])
+    views = TestViews(np.concatenate(location), viewpoint_id, np.concatenate(good), np.concatenate(location_scene))
+    return views, np.concatenate(location_id)
+
+
+def _candidate_sets(
+    views: TestViews,
+    location_id: NDArray[np.int64],
+    scenes: Sequence[SceneFolder],
+    tables: Sequence[pd.DataFrame],
+    config: EvaluateConfig,
+) -> list[CandidateSet]:
+    rank = np.concatenate([table["visibility_rank"].to_numpy(np.int64) for table in tables])
+    found = []
+    for best in config.candidates:
+        mask = rank < best if best else np.ones(len(rank), dtype=bool)
+        labels = views.good[mask, 0]
+        if len(np.unique(labels)) < 2:
+            metres, degrees = config.thresholds[0]
+            which = f" among the {candidates_label(best)} candidates of each location" if best else ""
+            raise TableError(
+                f"labels of one class only{which}: of {len(labels)} viewpoints all or none are within {metres:g} m and "
+                f"{degrees:g} degrees", path=scenes[0].table, value=bool(labels.any()),
+                fix="Label more viewpoints, or give other evaluate.thresholds or evaluate.candidates.",
+            )  # fmt: skip
+        kept = np.unique(views.location[mask])
+        found.append(CandidateSet(candidates_label(best), mask, views.only(mask), location_id[kept]))
+    return found
+
+
+def _fit_temperatures(
+    dataset: Dataset,
+    config: EvaluateConfig,
+    weights: Sequence[Path],
+    device: str,
+    progress: bool,
+    occlusion: OcclusionConfig | None,
+) -> tuple[dict[Method, float], int]:
+    """Temperature of each learned method, and the number of labelled views of the val scenes it was fitted on."""
+    labelled: list[tuple[SceneFolder, pd.DataFrame]] = []
+    if weights and config.split != "val":  # fitted on what it is judged by, it would flatter
+        for scene in dataset.split("val"):
+            table = scene.read_table() if scene.table.is_file() else None
+            if table is not None and (table["status"] != UNLABELLED).any():
+                labelled.append((scene, table[table["status"] != UNLABELLED]))
+    if not labelled:
+        return {}, 0
+    scenes, tables = zip(*labelled, strict=True)
+    learned = replace(config, methods=(LEARNED,), reference="")
+    scores, _ = _score_scenes(dataset, scenes, tables, learned, weights, device, progress, occlusion)
+    good = np.concatenate([is_good(table, *config.thresholds[0]) for table in tables])
+    return {method: fit_temperature(values, good) for method, values in scores.items()}, len(good)
+
+
+def _calibration(
+    scores: Mapping[Method, Float], good: NDArray[np.bool_], temperatures: Mapping[Method, float], n_val: int
+) -> pd.DataFrame:
+    """Reliability curves of the learned methods over all labelled views, one below the other; empty without any.
+
+    Columns: method, inputs, temperature, n_val (views that it was fitted on), then those of `calibration_rows`.
+    """
+    parts = []
+    for (name, inputs), values in scores.items():
+        if name == LEARNED:
+            temperature = temperatures.get((name, inputs), float("nan"))
+            about = {"method": name, "inputs": inputs, "temperature": temperature, "n_val": n_val}
+            curves = calibration_rows(values, good, temperature)
+            parts.append(pd.DataFrame({**about, **{str(column): curves[column] for column in curves}}))
+    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
 
 
 def _score_scenes(
@@ -180,7 +305,7 @@ def _score_scenes(
     """
     scores: dict[Method, list[Float]] = {}
     used: set[str] = set()
-    text = "score views" if occlusion is None else f"score views, {occlusion.model}"
+    text = f"score {scenes[0].split} views" + ("" if occlusion is None else f", {occlusion.model}")
     with tqdm(total=sum(map(len, tables)), desc=text, unit="view", disable=not progress) as bar:
         for scene, table in zip(scenes, tables, strict=True):
             localization_map = scene.localization_map(dataset.camera, device)
@@ -189,6 +314,7 @@ def _score_scenes(
                 localization_map = replace(localization_map, occlusion=model)
             used.add(localization_map.occlusion.name)
             scorers = _scorers(localization_map, config, weights)
+            reference_method(scorers, config.reference)  # an unknown one is told before the work
             cam_from_world = poses(table)
             for begin in range(0, len(table), BLOCK):
                 block = cam_from_world[begin : begin + BLOCK]
@@ -213,19 +339,28 @@ def _scorers(
     return scorers
 
 
-def _write_results(folder: Path, table: pd.DataFrame, title: str) -> None:
-    from wheretolook.figures.scores import score_figure
+def _write_results(folder: Path, table: pd.DataFrame, calibration: pd.DataFrame, title: str) -> None:
+    from wheretolook.figures.calibration import calibration_figure
+    from wheretolook.figures.occlusion import occlusion_figure
+    from wheretolook.figures.scores import regret_figure, score_figure
     from wheretolook.figures.style import save_figure
 
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / OCCLUSION_PNG).unlink(missing_ok=True)
-    if table["occlusion"].nunique() > 1:
-        from wheretolook.figures.occlusion import occlusion_figure
-
-        save_figure(occlusion_figure(table), folder / OCCLUSION_PNG)
     for name, text in ((SCORES_CSV, table.to_csv(index=False)), (SCORES_MD, score_markdown(table, title))):
         write_text(folder / name, text)
+    write_paper_tables(table, folder)
     save_figure(score_figure(table), folder / SCORES_PNG)
+    save_figure(regret_figure(table), folder / REGRET_PNG)
+    if table["occlusion"].nunique() > 1:
+        save_figure(occlusion_figure(table), folder / OCCLUSION_PNG)
+    else:
+        (folder / OCCLUSION_PNG).unlink(missing_ok=True)
+    if len(calibration):
+        write_text(folder / CALIBRATION_CSV, calibration.to_csv(index=False))
+        save_figure(calibration_figure(calibration), folder / CALIBRATION_PNG)
+    else:
+        for name in (CALIBRATION_CSV, CALIBRATION_PNG):
+            (folder / name).unlink(missing_ok=True)
 
 
 def _log(
@@ -235,7 +370,7 @@ def _log(
     tracking: TrackingConfig,
     weights: Sequence[Path],
     views: TestViews,
-    table: pd.DataFrame,
+    scored: Sequence[ScoredSet],
     occlusion: OcclusionConfig,
 ) -> None:
     params: dict[str, Any] = {
@@ -251,19 +386,50 @@ def _log(
         "weights": " ".join(f"{path.stem}:{fingerprint(path)}" for path in weights),
     }
     positives = float(views.good[:, 0].mean())
+    metrics = {"n_locations": views.n_locations, "n_views": len(views.good), "positives": positives}
     tags = {"dataset": dataset.name}
-    with start_run(tracking, f"evaluate {dataset.name}", "evaluate", params, tags=tags) as (client, run):
-        metrics = {"n_locations": views.n_locations, "n_views": len(views.good), "positives": positives}
+    with (
+        TemporaryDirectory() as folder,
+        start_run(tracking, f"evaluate {dataset.name}", "evaluate", params, tags=tags) as (client, run),
+    ):
         log(client, run, metrics=metrics)
         client.log_artifacts(run, str(dataset.root / "results"))
-        for row in table[table["scene"] == ALL].to_dict("records"):
-            named = ("method", "inputs", "occlusion", "top_n")
-            shown = (row["method"], row["inputs"], f"best {row['top_n']}", f"({row['occlusion']})")
-            name = " ".join(part for part in shown if part)
-            child_params = {"dataset": dataset.name, **{key: row[key] for key in named}}
-            numbers = {str(key): float(value) for key, value in row.items() if key not in (*named, "scene")}
-            with start_run(tracking, name, "evaluate", child_params, parent=run) as (_, child):
-                log(client, child, metrics=numbers)
+        for one in scored:
+            for row in one.table[one.table["scene"] == ALL].to_dict("records"):
+                named = ("method", "inputs", "occlusion", "candidates", "top_n")
+                seen = (row["occlusion"], *([row["candidates"]] if row["candidates"] != ALL else []))
+                shown = (row["method"], row["inputs"], f"best {row['top_n']}", f"({', '.join(seen)})")
+                name = " ".join(part for part in shown if part)
+                child_params = {"dataset": dataset.name, **{key: row[key] for key in named}}
+                numbers = {str(key): float(value) for key, value in row.items() if key not in (*named, "scene")}
+                chosen = _location_table(one, (row["method"], row["inputs"]), row["top_n"], scenes, config)
+                chosen.to_parquet(Path(folder) / LOCATIONS_PARQUET, index=False)
+                with start_run(tracking, name, "evaluate", child_params, parent=run) as (_, child):
+                    log(client, child, metrics=numbers)
+                    client.log_artifact(child, str(Path(folder) / LOCATIONS_PARQUET))
+
+
+def _location_table(
+    scored: ScoredSet, method: Method, n: int, scenes: Sequence[SceneFolder], config: EvaluateConfig
+) -> pd.DataFrame:
+    """What a method chooses at each location, one row each.
+
+    Columns: scene, location_id, chosen (views), for each threshold good_* (how many of them are good) and any_*
+    (whether one is; for random choice both are expectations), and best_score, that of the view chosen first; NaN for
+    random choice and the oracle, which choose by no score.
+    """
+    views, top = scored.candidates.views, scored.choices[method, n]
+    columns: dict[str, Any] = {
+        "scene": [scenes[number].name for number in views.location_scene],
+        "location_id": scored.candidates.location_id,
+        "chosen": top.chosen.astype(np.int64),
+    }
+    for index, key in enumerate(map(threshold_key, config.thresholds)):
+        columns |= {f"good_{key}": top.good[:, index], f"any_{key}": top.any_good[:, index]}
+    best = np.full(views.n_locations, np.nan)
+    if method in scored.scores and method[0] != "random":
+        np.fmax.at(best, views.location, scored.scores[method])
+    return pd.DataFrame({**columns, "best_score": best})
 
 
 def latest_scores(tracking: TrackingConfig, dataset: str | None = None) -> pd.DataFrame | None:

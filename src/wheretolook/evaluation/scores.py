@@ -2,33 +2,95 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 from sklearn.metrics import average_precision_score, roc_auc_score
 
+from wheretolook.errors import ConfigError
 from wheretolook.evaluation.bootstrap import LocationBootstrap
+from wheretolook.evaluation.calibration import expected_calibration_error, scale_probability
 from wheretolook.evaluation.config import EvaluateConfig, threshold_key
-from wheretolook.evaluation.ranking import TestViews, TopN, choose_at_random, choose_best, choose_by_truth
+from wheretolook.evaluation.ranking import (
+    TestViews,
+    TopN,
+    choose_at_random,
+    choose_best,
+    choose_by_truth,
+    rank_views,
+)
 from wheretolook.geometry import Float
 
 ALL = "all"
 """Value of the column `scene` in rows over all scenes."""
 
+RELEASED_DIVISOR = 0.527
+"""What the paper's released code divides every share by, whatever the threshold, the scenes and N."""
+
 Method = tuple[str, str]
 """Name of a method and its input variant ("" if it has none)."""
 
+ORACLE: Method = ("oracle", "")
+"""The method that knows the labels."""
+
+LEARNED = "mlp"
+"""Name of the methods whose scores are probabilities: `LearnedScorer.name`, without loading PyTorch."""
+
+_PAIRED = ("difference", "difference_low", "difference_high", "p")
+_CALIBRATION = ("ece", "ece_scaled", "temperature")
+
+Choices = Mapping[tuple[Method, int], TopN]
+"""What each method, the oracle too, chooses for each N."""
+
+
+def choose(views: TestViews, scores: Mapping[Method, Float], top_n: Sequence[int]) -> Choices:
+    """Let every method choose N views of every location; see `score_table`, whose rows come in the same order.
+
+    Args:
+        views: the candidates.
+        scores: (B,) scores by method and inputs.
+        top_n: values of N.
+    """
+    choices: dict[tuple[Method, int], TopN] = {}
+    for method, values in scores.items():
+        if method[0] == "random":
+            choices |= {(method, n): choose_at_random(views, n) for n in top_n}
+        else:
+            ranks = rank_views(views, values)
+            choices |= {(method, n): choose_best(views, ranks, n) for n in top_n}
+    return choices | {(ORACLE, n): choose_by_truth(views, n) for n in top_n}
+
+
+def reference_method(methods: Iterable[Method], name: str) -> Method | None:
+    """The method that the others are compared with: see `EvaluateConfig.reference`. None if there is none.
+
+    Raises:
+        ConfigError: no method has that name.
+    """
+    named = {" ".join(filter(None, method)): method for method in methods}
+    if name and name not in named:
+        known = f"There are {', '.join(named)}."
+        raise ConfigError("the reference is none of the methods evaluated", value=name, fix=known)
+    learned = [method for method in named.values() if method[0] == LEARNED]
+    first = (LEARNED, "2d+3d") if (LEARNED, "2d+3d") in learned else next(iter(learned), None)
+    return named[name] if name else first
+
 
 def score_table(
-    views: TestViews, scores: Mapping[Method, Float], scenes: Sequence[str], config: EvaluateConfig
+    views: TestViews,
+    scores: Mapping[Method, Float],
+    scenes: Sequence[str],
+    config: EvaluateConfig,
+    temperatures: Mapping[Method, float] | None = None,
+    choices: Choices | None = None,
 ) -> pd.DataFrame:
     """Compare methods (paper, Sec. 4.1 and its tables 2 and 3).
 
     At every location the N views with the highest score are chosen, and the chosen views of all locations are pooled.
     A location with fewer than N views contributes what it has. The paper divides all shares by one constant, 0.527;
-    here each is divided by the oracle's at the same threshold, scenes and N.
+    here each is also divided by the oracle's at the same threshold, scenes and N.
 
     Choosing at random is not drawn but computed: its rows hold exact expectations. Its average precision and ROC AUC
     are those of one seeded draw.
@@ -37,63 +99,111 @@ def score_table(
         views: the candidates.
         scores: (B,) scores by method and inputs.
         scenes: names of the scenes, by their number in `views`.
-        config: values of N, thresholds, bootstrap.
+        config: values of N, thresholds, bootstrap, reference.
+        temperatures: of learned methods, as far as known; see `wheretolook.evaluation.calibration`.
+        choices: what `choose` gives for the same views, scores and N, if that is known already.
 
     Returns:
         One row for each method (and the oracle), N and scene, `scene` being "all" in rows over all scenes. Columns:
         method, inputs, top_n, scene, n_locations, n_views (chosen views), and for each threshold, such as
-        "0.05m_0.4deg": raw_* (share of good views), normalized_* (divided by the oracle's share; NaN if that is 0),
-        any_* (share of locations with at least one good view), and low_* and high_* of raw_ and normalized_ (bootstrap
-        interval over locations, see `LocationBootstrap`); then average_precision and roc_auc of the scores against the
-        first threshold, NaN where all views are of one class. All shares lie in [0, 1].
+        "0.05m_0.4deg":
+
+        - good_*: number of chosen views that are good.
+        - raw_*: share of good views. normalized_*: divided by the oracle's share; NaN if that is 0. released_*: divided
+          by `RELEASED_DIVISOR`, which can give more than 1.
+        - any_*: share of locations with at least one good view.
+        - regret_*: the oracle's raw share less the method's, at least 0.
+        - difference_*: the method's raw share less the reference's (`EvaluateConfig.reference`), and p_*, the p-value
+          of `LocationBootstrap.paired_p`; NaN without a reference.
+        - low_* and high_* of raw_, normalized_, regret_ and difference_, such as raw_low_*: bootstrap interval over
+          locations, paired where two methods meet (`LocationBootstrap.ratio`).
+
+        Then average_precision and roc_auc of the scores against the first threshold, NaN where all views are of one
+        class; and for learned methods, NaN for others, ece (expected calibration error, against the first threshold),
+        ece_scaled (with logits divided by the temperature) and temperature, both NaN where it is not known. A scene
+        without candidates has rows with 0 locations and NaN.
+
+    Raises:
+        ConfigError: the reference is none of the methods.
     """
     pools: list[tuple[str, NDArray[np.bool_]]] = [(ALL, np.ones(views.n_locations, dtype=bool))]
     if len(scenes) > 1:
         pools += [(name, views.location_scene == number) for number, name in enumerate(scenes)]
     else:
         pools += [(scenes[0], pools[0][1])]
-    methods: list[Method] = [*scores, ("oracle", "")]
+    reference = reference_method(scores, config.reference)
+    choices = choose(views, scores, config.top_n) if choices is None else choices
     rows = []
     for name, locations in pools:
         inside = locations[views.location]
         bootstrap = LocationBootstrap(views.location_scene[locations], config.resamples, config.seed)
-        ranked = {method: _ranking_metrics(views.good[inside, 0], values[inside]) for method, values in scores.items()}
-        for method in methods:
+        good = views.good[inside, 0]
+        metrics = {ORACLE: {"average_precision": 1.0, "roc_auc": 1.0, **dict.fromkeys(_CALIBRATION, float("nan"))}}
+        for method, values in scores.items():
+            metrics[method] = _ranking_metrics(good, values[inside])
+            metrics[method] |= _calibration_metrics(method, good, values[inside], (temperatures or {}).get(method))
+        shares = {n: _shares(_only(choices, n, locations), reference, bootstrap, config) for n in config.top_n}
+        for method in [*scores, ORACLE]:
             for n in config.top_n:
-                oracle = _only(choose_by_truth(views, n), locations)
-                if method[0] == "oracle":
-                    top = oracle
-                elif method[0] == "random":
-                    top = _only(choose_at_random(views, n), locations)
-                else:
-                    top = _only(choose_best(views, scores[method], n), locations)
                 row = {"method": method[0], "inputs": method[1], "top_n": n, "scene": name}
-                row |= _shares(top, oracle, bootstrap, config)
-                row |= ranked.get(method, {"average_precision": 1.0, "roc_auc": 1.0})
-                rows.append(row)
+                rows.append(row | shares[n][method] | metrics[method])
     return pd.DataFrame(rows)
 
 
-def _only(top: TopN, locations: NDArray[np.bool_]) -> TopN:
-    return TopN(top.chosen[locations], top.good[locations], top.any_good[locations])
+def _only(choices: Choices, n: int, locations: NDArray[np.bool_]) -> dict[Method, TopN]:
+    """What the methods choose for one N at some of the locations."""
+    return {
+        method: TopN(top.chosen[locations], top.good[locations], top.any_good[locations])
+        for (method, number), top in choices.items()
+        if number == n
+    }
 
 
-def _shares(top: TopN, oracle: TopN, bootstrap: LocationBootstrap, config: EvaluateConfig) -> dict[str, float]:
-    columns: dict[str, float] = {"n_locations": len(top.chosen), "n_views": int(top.chosen.sum())}
-    chosen, best = top.chosen[:, None], oracle.good.sum(0)
-    raw = top.good.sum(0) / chosen.sum()
-    normalized = np.divide(top.good.sum(0), best, out=np.full(len(best), np.nan), where=best > 0)
-    raw_ends, normalized_ends = bootstrap.ratio(top.good, chosen), bootstrap.ratio(top.good, oracle.good)
-    for index, threshold in enumerate(config.thresholds):
-        key = threshold_key(threshold)
-        columns[f"raw_{key}"] = float(raw[index])
-        columns[f"raw_low_{key}"], columns[f"raw_high_{key}"] = (float(end[index]) for end in raw_ends)
-        columns[f"normalized_{key}"] = float(normalized[index])
-        columns[f"normalized_low_{key}"], columns[f"normalized_high_{key}"] = (
-            float(end[index]) for end in normalized_ends
-        )
-        columns[f"any_{key}"] = float(top.any_good[:, index].mean())
-    return columns
+def _shares(
+    tops: Mapping[Method, TopN], reference: Method | None, bootstrap: LocationBootstrap, config: EvaluateConfig
+) -> dict[Method, dict[str, float]]:
+    """Columns of all methods for one N and one pool of locations; M methods are computed together."""
+    good = np.stack([top.good for top in tops.values()], axis=1)  # (L, M, T)
+    any_good = np.stack([top.any_good for top in tops.values()], axis=1)
+    chosen = tops[ORACLE].chosen[:, None]  # (L, 1): every method chooses as many
+    best = np.broadcast_to(tops[ORACLE].good[:, None], good.shape)
+    n_locations, n_views = len(good), float(chosen.sum())
+    columns = {"good": good.sum(0), "raw": _quotient(good.sum(0), n_views)}
+    columns["raw_low"], columns["raw_high"] = _interval(bootstrap, good, chosen)
+    columns["normalized"] = _quotient(good.sum(0), best.sum(0))
+    columns["normalized_low"], columns["normalized_high"] = _interval(bootstrap, good, best)
+    columns["any"] = _quotient(any_good.sum(0), n_locations)
+    columns["released"] = columns["raw"] / RELEASED_DIVISOR
+    columns["regret"] = _quotient((best - good).sum(0), n_views)
+    columns["regret_low"], columns["regret_high"] = _interval(bootstrap, best - good, chosen)
+    if reference is None:
+        columns |= dict.fromkeys(_PAIRED, np.full(good.shape[1:], np.nan))
+    else:
+        difference = good - tops[reference].good[:, None]
+        columns["difference"] = _quotient(difference.sum(0), n_views)
+        columns["difference_low"], columns["difference_high"] = _interval(bootstrap, difference, chosen)
+        columns["p"] = bootstrap.paired_p(_flat(difference)).reshape(good.shape[1:])
+    keys = list(enumerate(map(threshold_key, config.thresholds)))
+    return {
+        method: {"n_locations": n_locations, "n_views": int(n_views)}
+        | {f"{name}_{key}": float(values[row, index]) for index, key in keys for name, values in columns.items()}
+        for row, method in enumerate(tops)
+    }
+
+
+def _flat(values: Float) -> Float:
+    return values.reshape(len(values), values.shape[1] * values.shape[2])
+
+
+def _interval(bootstrap: LocationBootstrap, numerator: Float, denominator: Float) -> tuple[Float, Float]:
+    """Interval of the ratio of sums over locations, (M, T) each end, of (L, M, T) and (L, M, T) or (L, 1)."""
+    low, high = bootstrap.ratio(_flat(numerator), denominator if denominator.ndim == 2 else _flat(denominator))
+    return low.reshape(numerator.shape[1:]), high.reshape(numerator.shape[1:])
+
+
+def _quotient(top: Float, bottom: Float | float) -> Float:
+    """Their quotient, NaN where the bottom is 0."""
+    return np.asarray(np.divide(top, bottom, out=np.full(top.shape, np.nan), where=np.asarray(bottom) > 0))
 
 
 def _ranking_metrics(good: NDArray[np.bool_], scores: Float) -> dict[str, float]:
@@ -103,3 +213,15 @@ def _ranking_metrics(good: NDArray[np.bool_], scores: Float) -> dict[str, float]
         "average_precision": float(average_precision_score(good, scores)),
         "roc_auc": float(roc_auc_score(good, scores)),
     }
+
+
+def _calibration_metrics(
+    method: Method, good: NDArray[np.bool_], scores: Float, temperature: float | None
+) -> dict[str, float]:
+    metrics = dict.fromkeys(_CALIBRATION, float("nan"))
+    if method[0] == LEARNED:
+        metrics["ece"] = expected_calibration_error(scores, good)
+        if temperature is not None and np.isfinite(temperature):
+            scaled = scale_probability(scores, temperature)
+            metrics |= {"ece_scaled": expected_calibration_error(scaled, good), "temperature": temperature}
+    return metrics

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.style import context
 
 from wheretolook.evaluation.config import threshold_label
-from wheretolook.evaluation.report import threshold_keys
+from wheretolook.evaluation.report import main_rows, threshold_keys
 from wheretolook.evaluation.scores import ALL
 from wheretolook.figures.style import INK, RC, method_style, new_figure
 
@@ -21,13 +21,14 @@ def occlusion_figure(scores: pd.DataFrame) -> Figure:
 
     Args:
         scores: tables of `wheretolook.evaluation.scores.score_table`, one below the other, with a column `occlusion`;
-            the rows over all scenes of the first N are drawn.
+            the rows over all scenes of the first N, and of the first set of candidates, are drawn.
 
     Returns:
         Two panels with the occlusion models side by side, in their order in the table: average precision, and the share
         at the first threshold, in % of the oracle's, with bootstrap intervals. Choosing at random looks at no landmark
         and is a line, the oracle a line at 100 %.
     """
+    scores = main_rows(scores, ("candidates",))
     key, n = threshold_keys(scores)[0], scores["top_n"].iloc[0]
     pooled = scores[(scores["scene"] == ALL) & (scores["top_n"] == n) & (scores["method"] != "oracle")]
     models = list(pooled["occlusion"].unique())

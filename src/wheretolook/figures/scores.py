@@ -1,63 +1,249 @@
-"""The score figure: methods against thresholds."""
+"""The score figures: how well every method chooses, how much is lost, and what differs from the learned one."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.style import context
+from matplotlib.ticker import MaxNLocator
 
 from wheretolook.evaluation.config import threshold_label
-from wheretolook.evaluation.report import threshold_keys
-from wheretolook.evaluation.scores import ALL
-from wheretolook.figures.style import INK, RC, method_style, new_figure
+from wheretolook.evaluation.report import main_rows, methods_of, reference_of, threshold_keys
+from wheretolook.evaluation.scores import ALL, Method
+from wheretolook.figures.style import GROUPS, INK, RC, method_group, method_style, new_figure
+
+_GAP = 0.6
+"""Between groups of methods, in rows."""
+
+_OTHER_MARKERS = ("o", "D", "s", "^")
+"""Of the second and further N."""
+
+_WRAP = 36
+"""Letters of a method's name on one line."""
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """What the panels of a figure share: rows of the table by method and N, and where they are drawn."""
+
+    rows: dict[tuple[Method, int], dict[str, float]]
+    y: dict[Method, float]
+    top_n: Sequence[int]
+    near: Sequence[Method]
+    """Methods nearer to the oracle than to chance, whose values the axes hold."""
+
+    def others(self) -> list[tuple[int, str, float]]:
+        """The second and further N, their markers, and how far below the first they are drawn, in rows."""
+        others = self.top_n[1:]
+        return [
+            (n, _OTHER_MARKERS[number % len(_OTHER_MARKERS)], 0.3 + 0.5 * number / max(2, len(others)))
+            for number, n in enumerate(others)
+        ]
+
+    def value(self, method: Method, n: int, column: str) -> float:
+        """In percent; NaN where it is not known."""
+        return 100 * self.rows.get((method, n), {}).get(column, float("nan"))
+
+    def ends(self, method: Method, n: int, column: str) -> tuple[float, float]:
+        """Of the interval, in percent; NaN where it is not known."""
+        name, _, key = column.partition("_")
+        return self.value(method, n, f"{name}_low_{key}"), self.value(method, n, f"{name}_high_{key}")
+
+    def limits(self, columns: Sequence[str]) -> tuple[float, float]:
+        """Ends of an axis that holds the columns, such as "regret_0.05m_0.4deg", and their intervals."""
+        values = [
+            value
+            for method in self.near
+            for n in self.top_n
+            for column in columns
+            for value in (self.value(method, n, column), *self.ends(method, n, column))
+        ]
+        known = [value for value in values if np.isfinite(value)]
+        return min(known, default=0.0), max(known, default=0.0)
 
 
 def score_figure(scores: pd.DataFrame) -> Figure:
-    """Localization score of each method at each threshold, one panel for each N.
+    """Localization score of each method at each threshold, for each N.
 
     Args:
         scores: a table of `wheretolook.evaluation.scores.score_table`; its rows over all scenes are drawn, those of the
-            first occlusion model if there are several.
+            first occlusion model and the first set of candidates if there are several.
 
     Returns:
-        Bars of the normalized share with bootstrap intervals, the oracle a line at 100 %; a dark line across each bar
-        tells the raw share.
+        One panel for each threshold, one row for each method, groups set apart: a filled mark for the first N, small
+        open ones below it for the others, with bootstrap intervals; the oracle a line at 100 %. The axis above a panel
+        tells the share before division by the oracle's, for the first N. The axes hold the methods that come at least
+        halfway from chance to the oracle; of others that lie beyond, an arrow and numbers tell how far.
     """
-    if "occlusion" in scores:
-        scores = scores[scores["occlusion"] == scores["occlusion"].iloc[0]]
-    pooled = scores[(scores["scene"] == ALL) & (scores["method"] != "oracle")]
-    top_n, keys = list(pooled["top_n"].unique()), threshold_keys(scores)
-    methods = list(dict.fromkeys(zip(pooled["method"], pooled["inputs"], strict=True)))
-    rows = {(row["top_n"], row["method"], row["inputs"]): row for row in pooled.to_dict("records")}
-    width = 0.84 / len(methods)
+    scores = main_rows(scores)
+    pooled, keys = scores[scores["scene"] == ALL], threshold_keys(scores)
+    layout = _layout(pooled, keys[0])
+    columns = [f"normalized_{key}" for key in keys]
+    low = min(layout.limits(columns)[0], 95.0)
+    margin = 0.05 * (100 - low)
     with context(RC):
-        figure = new_figure(9.5, 0.9 + 2.1 * len(top_n))
-        panels = figure.subplots(len(top_n), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
-        for panel, n in zip(panels, top_n, strict=True):
-            for slot, method in enumerate(methods):
-                row = rows[(n, *method)]
-                style = method_style(*method)
-                x = np.arange(len(keys)) + (slot - (len(methods) - 1) / 2) * width
-                value, low, high, raw = (
-                    100 * np.array([row[f"{name}_{key}"] for key in keys])
-                    for name in ("normalized", "normalized_low", "normalized_high", "raw")
-                )
-                panel.bar(x, value, 0.92 * width, color=style.color, hatch=style.hatch, edgecolor="white", linewidth=0,
-                          label=style.label)  # fmt: skip
-                panel.errorbar(x, value, np.clip(np.nan_to_num([value - low, high - value]), 0, None), fmt="none",
-                               ecolor=INK, elinewidth=1, capsize=2)  # fmt: skip
-                panel.hlines(raw, x - 0.46 * width, x + 0.46 * width, color=INK, linewidth=1.4)
-            panel.axhline(100, color=INK, linewidth=1, linestyle="--")
-            chosen = "best view" if n == 1 else f"best {n} views"
-            panel.set_ylabel(f"{chosen}\n% of the oracle's")
-            panel.set(xticks=np.arange(len(keys)), xticklabels=[f"within {threshold_label(key)}" for key in keys])
-            panel.grid(axis="x", visible=False)
-            panel.tick_params(axis="x", length=0)
-            panel.set_ylim(0, 108)
-        handles, labels = panels[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper center", ncols=min(len(methods), 6), columnspacing=1.2,
-                      handlelength=1.6)  # fmt: skip
-        note = "whiskers: 95 % bootstrap interval over locations; dark line: share before division by the oracle's"
-        panels[-1].annotate(note, (0, -0.24), xycoords="axes fraction", fontsize=8, color=INK)
+        figure = new_figure(2.8 + 2.15 * len(keys), _height(layout))
+        panels = figure.subplots(1, len(keys), sharex=True, sharey=True, squeeze=False)[0]
+        panels[0].set_xlim(low - margin, 100 + margin)
+        for axes, key, column in zip(panels, keys, columns, strict=True):
+            axes.axvline(100, color=INK, linewidth=1, linestyle="--")
+            _draw(axes, layout, column)
+            axes.set_title(f"within {threshold_label(key)}", fontsize=10)
+            best = pooled.loc[(pooled["method"] == "oracle") & (pooled["top_n"] == layout.top_n[0]), f"raw_{key}"]
+            if len(best) and best.iloc[0] > 0:
+                _add_raw_axis(axes, best.iloc[0])
+        _name_rows(panels[0], layout)
+        figure.supxlabel(
+            f"% of the oracle's share; above each panel: % of the chosen views, {_best(layout.top_n[0])}\n"
+            "whiskers: 95 % bootstrap interval over locations", fontsize=9,
+        )  # fmt: skip
+        _add_legend(figure, layout, [Line2D([], [], color=INK, linewidth=1, linestyle="--", label="oracle")])
         return figure
+
+
+def regret_figure(scores: pd.DataFrame) -> Figure:
+    """What each method loses against the oracle and against the reference, at the finest threshold, for each N.
+
+    Args:
+        scores: as for `score_figure`.
+
+    Returns:
+        Rows as in `score_figure`. Left the regret, right the paired difference to the reference if the table has one,
+        with bootstrap intervals, in percentage points of the chosen views.
+
+    Raises:
+        ValueError: the table is of an older version and knows no regret.
+    """
+    scores = main_rows(scores)
+    pooled, key = scores[scores["scene"] == ALL], threshold_keys(scores)[0]
+    if f"regret_{key}" not in scores:
+        raise ValueError("the score table has no regret: evaluate again")
+    layout, reference = _layout(pooled, key), reference_of(pooled)
+    columns = {f"regret_{key}": "regret: oracle minus method"}
+    if reference is not None:
+        columns[f"difference_{key}"] = f"method minus {method_style(*reference).label}"
+    with context(RC):
+        figure = new_figure(3.0 + 3.1 * len(columns), _height(layout))
+        panels = figure.subplots(1, len(columns), sharey=True, squeeze=False)[0]
+        for axes, (column, title) in zip(panels, columns.items(), strict=True):
+            low, high = layout.limits([column])
+            low, high = min(low, 0.0), max(high, 0.0)
+            margin = 0.06 * max(high - low, 1.0)
+            axes.set_xlim(low - margin, high + margin)
+            axes.axvline(0, color=INK, linewidth=1, linestyle="--")
+            _draw(axes, layout, column)
+            axes.set_title(title, fontsize=10)
+        panels[0].set_xlabel("percentage points, lower is better", fontsize=9)
+        if reference is not None:
+            panels[1].set_xlabel("percentage points, higher is better", fontsize=9)
+        figure.supxlabel(
+            f"shares of chosen views within {threshold_label(key)}\n"
+            "whiskers: 95 % bootstrap interval over locations", fontsize=9,
+        )  # fmt: skip
+        _name_rows(panels[0], layout)
+        _add_legend(figure, layout, [])
+        return figure
+
+
+def _layout(pooled: pd.DataFrame, key: str) -> _Layout:
+    """Rows by groups from top to bottom, in the table's order within each."""
+    shown = pooled[pooled["method"] != "oracle"]
+    methods = sorted(methods_of(shown), key=lambda method: GROUPS.index(method_group(method[0])))
+    groups = [method_group(method[0]) for method in methods]
+    gaps = np.cumsum([0.0] + [_GAP * (one != other) for one, other in zip(groups[1:], groups, strict=False)])
+    rows = {
+        ((row["method"], row["inputs"]), row["top_n"]): {str(name): row[name] for name in row}
+        for row in shown.to_dict("records")
+    }
+    top_n = [int(n) for n in shown["top_n"].unique()]
+    y = {method: float(row + gap) for row, (method, gap) in enumerate(zip(methods, gaps, strict=True))}
+    everything = _Layout(rows, y, top_n, methods)
+    chance = np.nan_to_num(everything.value(("random", ""), top_n[0], f"normalized_{key}"))
+    near = [
+        method
+        for method in methods
+        if everything.value(method, top_n[0], f"normalized_{key}") >= (100 + chance) / 2
+        and method_group(method[0]) != "probes"
+    ]
+    return _Layout(rows, y, top_n, near or methods)
+
+
+def _height(layout: _Layout) -> float:
+    n_rows = max(layout.y.values()) + 1
+    return 1.6 + n_rows * (0.31 if n_rows > 8 else 0.4)
+
+
+def _draw(axes: Axes, layout: _Layout, column: str) -> None:
+    """Marks of all methods for one column of the table; those beyond the axis' ends as arrows and numbers."""
+    low, high = axes.get_xlim()
+    for method, y in layout.y.items():
+        style = method_style(*method)
+        values = [layout.value(method, n, column) for n in layout.top_n]
+        if low <= values[0] <= high:
+            axes.hlines(y, *layout.ends(method, layout.top_n[0], column), color=INK, linewidth=1.2)
+            filled = style.marker in Line2D.filled_markers
+            axes.plot(values[0], y, style.marker, color=style.color, markersize=7, label=style.label,
+                      markeredgecolor=INK if filled else style.color,
+                      markeredgewidth=0.5 if filled else 1.6)  # fmt: skip
+        for value, (n, marker, below) in zip(values[1:], layout.others(), strict=True):
+            if low <= value <= high:
+                axes.hlines(y + below, *layout.ends(method, n, column), color=style.color, linewidth=0.8)
+                axes.plot(value, y + below, marker, color=style.color, markersize=3.4, markerfacecolor="white",
+                          markeredgewidth=1)  # fmt: skip
+        for beyond, edge, text, side in (
+            ([value for value in values if value < low], low, "◂ {}", "left"),
+            ([value for value in values if value > high], high, "{} ▸", "right"),
+        ):
+            if beyond and not low <= values[0] <= high:  # the best view's own mark stands where the text would
+                numbers = " · ".join(f"{value:.0f}" for value in beyond).replace("-", "−")
+                shift = 2 if side == "left" else -2
+                axes.annotate(text.format(numbers), (edge, y), (shift, 0), textcoords="offset points", fontsize=7.5,
+                              va="center", ha=side, zorder=1.9,
+                              bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.5})  # fmt: skip
+
+
+def _add_raw_axis(axes: Axes, best: float) -> None:
+    """An axis above that tells undivided shares, by the oracle's."""
+    above = axes.secondary_xaxis(
+        "top", functions=(lambda share: np.multiply(share, best), lambda share: np.divide(share, best))
+    )
+    above.tick_params(labelsize=8, length=2)
+    above.spines["top"].set_visible(True)
+
+
+def _name_rows(axes: Axes, layout: _Layout) -> None:
+    labels = [method_style(*method).label for method in layout.y]
+    labels = [",\n".join(label.rsplit(", ", 1)) if len(label) > _WRAP else label for label in labels]
+    axes.set_yticks(list(layout.y.values()), labels, fontsize=9)
+    axes.set_ylim(max(layout.y.values()) + 0.8, -0.6)
+    for panel in axes.figure.axes:
+        panel.tick_params(axis="y", length=0)
+        panel.tick_params(axis="x", labelsize=9)
+        panel.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
+
+
+def _best(n: int) -> str:
+    return "best view" if n == 1 else f"best {n} views"
+
+
+def _add_legend(figure: Figure, layout: _Layout, more: Sequence[Line2D]) -> None:
+    handles = [Line2D([], [], color=INK, linewidth=1.2, marker="o", markersize=7, label=_best(layout.top_n[0]))]
+    handles += [
+        Line2D([], [], color=INK, linewidth=0.8, marker=marker, markersize=3.4, markerfacecolor="white", label=_best(n))
+        for n, marker, _ in layout.others()
+    ]  # fmt: skip
+    handles += more
+    if any(axes.texts for axes in figure.axes):
+        numbers = ", ".join(map(str, layout.top_n))
+        handles += [
+            Line2D(
+                [], [], color=INK, linestyle="none", marker="$◂$", markersize=5, label=f"beyond the axis, N = {numbers}"
+            )
+        ]
+    figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), columnspacing=1.4, handlelength=1.6)

@@ -45,30 +45,66 @@ class MethodStyle:
 
     Attributes:
         label: name for people.
-        color: from the palette of Okabe and Ito (2008).
+        color: from the palette of Okabe and Ito (2008), or a shade of one of its colours.
         marker: Matplotlib marker.
-        hatch: Matplotlib hatch of bars.
         dashes: Matplotlib line style.
     """
 
     label: str
     color: str
     marker: str
-    hatch: str
     dashes: Any
 
 
+_FISHER_METRICS = {"mineig": ("min. eigenvalue", "P"), "logdet": ("log det", "X"), "trace": ("trace", "h")}
+"""Name for people, marker."""
+
+_FISHER_APPROXIMATIONS = {
+    "exact": ("exact", "#5E2750", "-"),
+    "quadratic": ("quadratic", "#B65C93", (0, (5, 1))),
+    "gp": ("GP", "#DDA3C6", (0, (2, 1))),
+}
+"""Name for people, shade of one colour (the exact one darkest), line style."""
+
 _STYLES = {
-    ("oracle", ""): MethodStyle("oracle", "#000000", "*", "", "-"),
-    ("random", ""): MethodStyle("random", "#999999", "x", "..", ":"),
-    ("visible", ""): MethodStyle("most visible landmarks", "#E69F00", "s", "//", "--"),
-    ("bins", ""): MethodStyle("reprojections with bins", "#009E73", "D", "\\\\", "-."),
-    ("mlp", "2d"): MethodStyle("MLP, 2d", "#56B4E9", "v", "--", (0, (5, 1))),
-    ("mlp", "2d+z"): MethodStyle("MLP, 2d + z", "#0072B2", "^", "xx", (0, (3, 1, 1, 1))),
-    ("mlp", "2d+3d"): MethodStyle("MLP, 2d + 3d", "#D55E00", "o", "", "-"),
+    ("oracle", ""): MethodStyle("oracle", "#000000", "*", "-"),
+    ("random", ""): MethodStyle("random", "#999999", "x", ":"),
+    ("forward", ""): MethodStyle("forward", "#6B6B6B", ">", (0, (6, 2))),
+    ("visible", ""): MethodStyle("most visible landmarks", "#E69F00", "s", "--"),
+    ("bins", ""): MethodStyle("reprojections with bins", "#009E73", "D", "-."),
+    ("max-visibility", ""): MethodStyle("max visibility (ActLoc)", "#8F8500", "<", (0, (4, 1, 1, 1))),
+    ("max-visibility-swapped", ""): MethodStyle(
+        "max visibility, angles swapped (as shipped)", "#D6CA1E", "d", (0, (4, 1, 1, 1, 1, 1))
+    ),
+    **{
+        ("fisher", f"{metric} {approximation}"): MethodStyle(f"Fisher, {name}, {kind}", color, marker, dashes)
+        for metric, (name, marker) in _FISHER_METRICS.items()
+        for approximation, (kind, color, dashes) in _FISHER_APPROXIMATIONS.items()
+    },
+    ("fisher-worst-trace", ""): MethodStyle("probe: worst trace", "#4D4D4D", "1", (0, (1, 2))),
+    ("fisher-stationary-trace", ""): MethodStyle("probe: stationary trace", "#7A7A7A", "2", (0, (1, 3))),
+    ("mlp", "2d"): MethodStyle("MLP, 2d", "#56B4E9", "v", (0, (5, 1))),
+    ("mlp", "2d+z"): MethodStyle("MLP, 2d + z", "#0072B2", "^", (0, (3, 1, 1, 1))),
+    ("mlp", "2d+3d"): MethodStyle("MLP, 2d + 3d", "#D55E00", "o", "-"),
+    ("mlp", "released"): MethodStyle("MLP, trained as the released code", "#F0A070", "p", (0, (2, 2))),
 }
 
-_SPARE = (("#CC79A7", "P", "++", (0, (1, 1))), ("#F0E442", "X", "oo", (0, (4, 2))), ("#7F3C8D", "h", "OO", (0, (2, 1))))
+_SPARE = (("#CC79A7", "8", (0, (1, 1))), ("#F0E442", "H", (0, (4, 2))), ("#7F3C8D", "3", (0, (2, 1))))
+
+GROUPS = ("learned", "rules", "Fisher", "probes")
+"""Kinds of methods, in the order of figures. Probes are no methods: they choose what a Fisher field says not to."""
+
+_GROUPS = {
+    "mlp": "learned",
+    "fisher": "Fisher",
+    "fisher-worst-trace": "probes",
+    "fisher-stationary-trace": "probes",
+}
+
+
+def method_group(method: str) -> str:
+    """Which of `GROUPS` a method belongs to; one that is not listed is a rule."""
+    return _GROUPS.get(method, "rules")
 
 
 def method_style(method: str, inputs: str = "") -> MethodStyle:

@@ -2,11 +2,33 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 from wheretolook.errors import ConfigError
 from wheretolook.features import INPUT_VARIANTS, Layout
+
+RELEASED = "released"
+"""The variant that trains as the paper's released code does, on the inputs of "2d+3d"."""
+
+VARIANTS = (*INPUT_VARIANTS, RELEASED)
+"""Networks that can be trained."""
+
+RELEASED_OPTIONS: dict[str, Any] = {
+    "learning_rate": 1e-4,
+    "schedule": "constant",
+    "l2": 0.0,
+    "dropout": 0.5,
+    "input_dropout": 0.5,
+    "hidden": (300, 300),
+    "layout": "compact",
+    "noise_px": 1.0,
+    "noise_m": 0.02,
+    "balance": True,  # half of each class, so that both have the weight 1
+    "keep": "last",
+    "patience": None,
+}
+"""Options of the released code where they can differ from the paper's; batch size and epochs stay as configured."""
 
 
 @dataclass(frozen=True)
@@ -14,7 +36,8 @@ class TrainConfig:
     """Options of training. The defaults are the paper's where it says something (Sec. 3.3 and 4).
 
     Args:
-        variants: inputs to train a network for, of "2d", "2d+z" and "2d+3d".
+        variants: networks to train: by their inputs "2d", "2d+z" and "2d+3d", and "released", which has the inputs
+            "2d+3d" and learns with the options of the paper's released code instead of those here.
         epochs: passes over the training viewpoints (paper: 300).
         batch_size: viewpoints a step, shared out over the devices (the paper gives none; 128 is the released code's).
         learning_rate: Adam's initial learning rate (paper: 1e-3; released code: 1e-4).
@@ -69,9 +92,9 @@ class TrainConfig:
     devices: int = 1
 
     def __post_init__(self) -> None:
-        unknown = [name for name in self.variants if name not in INPUT_VARIANTS]
+        unknown = [name for name in self.variants if name not in VARIANTS]
         if unknown or not self.variants or len(set(self.variants)) < len(self.variants):
-            known = f"There are {', '.join(INPUT_VARIANTS)}."
+            known = f"There are {', '.join(VARIANTS)}."
             raise ConfigError("variants must be known and named once", value=self.variants, fix=known)
         for name, choices in (
             ("schedule", ("constant", "cosine")),
@@ -99,3 +122,12 @@ class TrainConfig:
             raise ConfigError("hidden layers must be at least one unit wide", value=self.hidden)
         if self.patience is not None and self.patience < 1:
             raise ConfigError("patience must be at least 1 epoch, or null", value=self.patience)
+
+    def of_variant(self, variant: str) -> TrainConfig:
+        """The options that a variant is trained with."""
+        return replace(self, **RELEASED_OPTIONS) if variant == RELEASED else self
+
+
+def inputs_of(variant: str) -> str:
+    """The key in `wheretolook.features.INPUT_VARIANTS` of what a variant looks at."""
+    return "2d+3d" if variant == RELEASED else variant

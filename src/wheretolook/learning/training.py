@@ -16,7 +16,7 @@ import wheretolook
 from wheretolook.dataset import Dataset, write_json
 from wheretolook.features import INPUT_VARIANTS
 from wheretolook.learning.classifier import ViewpointClassifier
-from wheretolook.learning.config import TrainConfig
+from wheretolook.learning.config import TrainConfig, inputs_of
 from wheretolook.learning.data import ViewpointDataModule
 from wheretolook.learning.fit import EpochRecord, RunLog, fit, home_device
 from wheretolook.learning.network import NetworkSpec, ViewpointNetwork
@@ -81,13 +81,16 @@ def train(
         ConfigError: there are fewer GPUs than asked for, or the views do not fit into memory shared by processes.
     """
     fingerprint = training_fingerprint(dataset)
-    data = ViewpointDataModule(dataset, config, home_device(config), progress)
+    data: ViewpointDataModule | None = None
     models = []
     for variant in config.variants:
         path = dataset.root / "weights" / f"mlp-{variant}.safetensors"
-        about = _about(dataset, config, fingerprint, variant)
+        options = config.of_variant(variant)
+        about = _about(dataset, options, fingerprint, variant)
         model = None if force else _trained_before(path, variant, about)
         if model is None:
+            if data is None or data.config != options:
+                data = ViewpointDataModule(dataset, options, home_device(options), progress)
             data.setup()
             model = _train_variant(data, variant, path, about, tracking, progress)
         models.append(model)
@@ -141,10 +144,10 @@ def _train_variant(
     }
     with start_run(tracking, f"train mlp {variant}", "train", params) as (client, run_id), isolate_rng():
         seed_everything(config.seed, verbose=False)
-        channels = INPUT_VARIANTS[variant]
+        channels = INPUT_VARIANTS[inputs_of(variant)]
         spec = NetworkSpec(
-            variant, data.dataset.camera, data.statistics.select(channels), config.bins, config.layout, config.hidden,
-            config.dropout, config.input_dropout,
+            inputs_of(variant), data.dataset.camera, data.statistics.select(channels), config.bins, config.layout,
+            config.hidden, config.dropout, config.input_dropout,
         )  # fmt: skip
         classifier = ViewpointClassifier(ViewpointNetwork(spec), config, data.class_weights)
         record = EpochRecord(f"train {variant}", config, progress, RunLog(tracking, run_id))

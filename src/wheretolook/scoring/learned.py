@@ -13,7 +13,7 @@ from wheretolook.errors import WeightsError
 from wheretolook.features import CHANNELS, BinnedViews
 from wheretolook.geometry import Float, PinholeCamera
 from wheretolook.learning.network import ViewpointNetwork
-from wheretolook.learning.weights import load_classifier
+from wheretolook.learning.weights import load_classifier, read_training
 from wheretolook.localization_map import LocalizationMap
 from wheretolook.scoring.base import BLOCK, BinnedScorer
 
@@ -30,13 +30,14 @@ class LearnedScorer(BinnedScorer):
     Args:
         localization_map: the map.
         network: a trained network.
+        inputs: name of its variant, if it is not that of its inputs.
     """
 
     name: ClassVar[str] = "mlp"
 
-    def __init__(self, localization_map: LocalizationMap, network: ViewpointNetwork) -> None:
+    def __init__(self, localization_map: LocalizationMap, network: ViewpointNetwork, inputs: str | None = None) -> None:
         super().__init__(localization_map, network.spec.bins)
-        self.inputs = network.spec.variant
+        self.inputs = network.spec.variant if inputs is None else inputs
         self.device = localization_map.device
         self.network = network.to(self.device).eval()
         trained, camera = network.spec.camera, localization_map.camera
@@ -58,7 +59,7 @@ class LearnedScorer(BinnedScorer):
         """
         network = load_classifier(weights)
         try:
-            return cls(localization_map, network)
+            return cls(localization_map, network, read_training(weights).get("variant"))
         except WeightsError as error:
             raise WeightsError(error.problem, path=weights, value=error.value, fix=error.fix) from None
 

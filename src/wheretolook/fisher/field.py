@@ -1,0 +1,155 @@
+"""The Fisher Information Field: for every location, what gives the information in any direction by one product."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from wheretolook.errors import MapError
+from wheretolook.fisher.field_sums import field_sums
+from wheretolook.fisher.information import N_NUMBERS, TRACE
+from wheretolook.fisher.metrics import metric_of
+from wheretolook.fisher.soft_visibility import GaussianProcessVisibility, QuadraticVisibility, SoftVisibility
+from wheretolook.geometry import Float
+
+FORMAT_VERSION = 1
+
+
+@dataclass(frozen=True, eq=False)
+class FisherField:
+    """Information at L locations, as factors of a soft visibility (Zhang and Scaramuzza 2020, Sec. V).
+
+    Attributes:
+        locations: (L, 3) metres.
+        visibility: the approximation of what is in view.
+        factors: (L, F, 15), see `wheretolook.fisher.information` for the 15 numbers.
+    """
+
+    locations: Float
+    visibility: SoftVisibility
+    factors: Float
+
+    @classmethod
+    def build(
+        cls,
+        locations: ArrayLike,
+        points: ArrayLike,
+        visibility: SoftVisibility,
+        unoccluded: NDArray[np.bool_] | None = None,
+        device: str = "cpu",
+    ) -> FisherField:
+        """Sum up what all landmarks tell each location.
+
+        Args:
+            locations: (L, 3) metres.
+            points: (N, 3) landmarks, metres.
+            visibility: the approximation of what is in view.
+            unoccluded: (L, N), True where the line of sight is free; None where every one is.
+            device: "cpu" (all cores) or a CUDA device.
+
+        Raises:
+            ConfigError: no such device.
+        """
+        at = np.asarray(locations, dtype=np.float64).reshape(-1, 3)
+        landmarks = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+        return cls(at, visibility, visibility.finish(field_sums(at, landmarks, visibility, unoccluded, device)))
+
+    def information(self, row: int, axes: ArrayLike) -> Float:
+        """Information at location `row` along optical axes (D, 3) of unit length; (D, 15)."""
+        return np.asarray(self.visibility.of_axes(np.asarray(axes, dtype=np.float64)) @ self.factors[row])
+
+    def information_of_views(self, rows: NDArray[np.int64], axes: Float) -> Float:
+        """Information of many views at once.
+
+        Args:
+            rows: (B,) of their locations.
+            axes: (B, 3) their optical axes, of unit length.
+
+        Returns:
+            (B, 15).
+        """
+        order = np.argsort(rows, kind="stable")
+        starts = np.searchsorted(rows[order], np.arange(len(self.locations) + 1))
+        numbers = np.empty((len(rows), N_NUMBERS))
+        for row in range(len(self.locations)):
+            here = order[starts[row] : starts[row + 1]]
+            numbers[here] = self.information(row, axes[here])
+        return numbers
+
+    def metric(self, row: int, axes: ArrayLike, metric: str, about_origin: bool = False) -> Float:
+        """A metric of the information at location `row` along optical axes (D, 3); (D,).
+
+        Args:
+            row: of the location.
+            axes: (D, 3) of unit length.
+            metric: "mineig", "logdet" or "trace".
+            about_origin: take turns about the world's origin, as the released code of the Fisher Information Field.
+
+        Raises:
+            ConfigError: no such metric.
+        """
+        numbers = self.information(row, axes)
+        pivots = np.broadcast_to(-self.locations[row], (len(numbers), 3)) if about_origin else None
+        return metric_of(numbers, metric, pivots)
+
+    def best_axis(self, row: int, axes: ArrayLike, metric: str) -> int:
+        """The one of the optical axes (D, 3) that a metric likes best at location `row`."""
+        return int(np.argmax(self.metric(row, axes, metric)))
+
+    def save(self, path: Path) -> None:
+        """Write an uncompressed NPZ, atomically: locations, factors, and the approximation as JSON text."""
+        about = {"format_version": FORMAT_VERSION, "kind": type(self.visibility).__name__, **vars_of(self.visibility)}
+        partial = path.with_name(path.name + ".partial")
+        with open(partial, "wb") as file:
+            np.savez(file, locations=self.locations, factors=self.factors, about=json.dumps(about))
+        os.replace(partial, path)
+
+    @classmethod
+    def load(cls, path: Path) -> FisherField:
+        """Read what `save` wrote.
+
+        Raises:
+            MapError: the file is missing, damaged or of another version.
+        """
+        try:
+            with np.load(path) as data:
+                about = json.loads(str(data["about"]))
+                if about.pop("format_version") != FORMAT_VERSION:
+                    raise ValueError("another version of the format")
+                kind = {kind.__name__: kind for kind in (QuadraticVisibility, GaussianProcessVisibility)}
+                return cls(data["locations"], kind[about.pop("kind")](**about), data["factors"])
+        except Exception as error:  # a damaged zip raises many kinds of errors
+            raise MapError(f"not a Fisher Information Field: {error}", path=path, fix="Build it again.") from error
+
+
+def vars_of(visibility: SoftVisibility) -> dict[str, Any]:
+    """The arguments of a soft visibility, as JSON values."""
+    return {name: getattr(visibility, name) for name in getattr(visibility, "__dataclass_fields__", {})}
+
+
+def worst_axis_of_trace(field: FisherField, row: int, axes: ArrayLike) -> Float:
+    """The one of the axes (D, 3) with the least trace: a probe of the field, the opposite of a choice; (3,)."""
+    axes = np.asarray(axes, dtype=np.float64)
+    return np.asarray(axes[np.argmin(field.metric(row, axes, "trace"))])
+
+
+def stationary_axis_of_trace(field: FisherField, row: int) -> Float:
+    """Where the gradient of the quadratic field's trace by the axis is zero, (3,) of unit length.
+
+    The axis is not held to unit length before. The trace is z^T Q z + q . z + constant, so that is z = -Q^-1 q / 2.
+    With the landmarks' squares behind Q and their mean behind q, both positive, it points away from them: the released
+    code calls it the direction of the minimum and turns it round where it wants the best one.
+    """
+    assert isinstance(field.visibility, QuadraticVisibility)
+    k1, k2, _ = field.visibility.coefficients
+    xx, xy, xz, yy, yz, zz, x, y, z, _ = field.factors[row] @ TRACE
+    curvature = k1 * np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    axis = -np.linalg.pinv(curvature) @ (k2 * np.array([x, y, z])) / 2
+    length = np.linalg.norm(axis)
+    return np.asarray(axis / length if length > 0 else np.array([0.0, 0.0, 1.0]))

@@ -1,0 +1,105 @@
+"""Sums over all landmarks that a Fisher Information Field is made of."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from wheretolook.fisher import field_kernel
+from wheretolook.fisher.field_kernel import numbers_kernel, process_kernel, quadratic_kernel, vec16
+from wheretolook.fisher.information import N_NUMBERS, bearing_numbers
+from wheretolook.fisher.parts import run_in_parts
+from wheretolook.fisher.soft_visibility import GaussianProcessVisibility, SoftVisibility
+from wheretolook.geometry import Float
+from wheretolook.visibility.frustum import offsets_from
+from wheretolook.warp_setup import start_warp
+
+NEAREST_M = 1e-3
+"""Landmarks nearer to a location than this are left out: their information has no bound."""
+
+AT_ONCE = 512
+"""Landmarks that are summed up in single precision."""
+
+GPU_LOCATIONS = 32
+"""Locations that a GPU takes at a time: about 60 MB for 25,000 landmarks."""
+
+
+def field_sums(
+    locations: Float,
+    points: Float,
+    visibility: SoftVisibility,
+    unoccluded: NDArray[np.bool_] | None = None,
+    device: str = "cpu",
+) -> Float:
+    """Sums over landmarks of information times what `visibility.of_bearings` gives, in single precision.
+
+    Args:
+        locations: (L, 3) metres.
+        points: (N, 3) landmarks, metres.
+        visibility: quadratic, or a Gaussian process.
+        unoccluded: (L, N), True where the line of sight is free; None where every one is.
+        device: "cpu" (all cores) or a CUDA device.
+
+    Returns:
+        (L, F, 15), see `wheretolook.fisher.information`.
+    """
+    device = start_warp(device)
+    wp.load_module(field_kernel, device=device)  # only one thread may do that
+    landmarks: Any = wp.array(points, dtype=wp.vec3d, device=device)
+    n_parts = -(-len(points) // AT_ONCE)
+    nothing: Any = wp.empty((0, 0), dtype=wp.bool, device=device)
+    planes: Any = None
+    if isinstance(visibility, GaussianProcessVisibility):
+        planes = wp.array(_planes(visibility), dtype=vec16, device=device)
+    result = np.empty((len(locations), visibility.n_factors, N_NUMBERS))
+
+    def work(rows: slice) -> None:
+        at: Any = wp.array(locations[rows], dtype=wp.vec3d, device=device)
+        shape = (len(at), len(points))
+        mask = nothing
+        if unoccluded is not None:
+            mask = wp.array(np.ascontiguousarray(unoccluded[rows]), dtype=wp.bool, device=device, copy=False)
+        bearings: Any = wp.empty(shape, dtype=wp.vec3, device=device)
+        numbers: Any = wp.empty(shape, dtype=vec16, device=device)
+        inputs = [at, landmarks, unoccluded is not None, mask, NEAREST_M]
+        wp.launch(numbers_kernel, shape, inputs, [bearings, numbers], device=device)
+        if planes is None:
+            shape = (len(at), n_parts, visibility.n_factors)
+            sums: Any = wp.empty(shape, dtype=vec16, device=device)
+            wp.launch(quadratic_kernel, shape[:2], [bearings, numbers, AT_ONCE], [sums], device=device)
+            result[rows] = sums.numpy().sum(1, dtype=np.float64)[..., :N_NUMBERS]
+        else:
+            shape = (len(at), n_parts, len(planes))
+            sums = wp.empty((*shape, N_NUMBERS), dtype=vec16, device=device)
+            wp.launch(process_kernel, shape, [bearings, numbers, planes, AT_ONCE], [sums], device=device)
+            by_axes = np.moveaxis(sums.numpy().sum(1, dtype=np.float64), -1, 2).reshape(len(at), -1, N_NUMBERS)
+            result[rows] = by_axes[:, : visibility.n_factors]
+
+    run_in_parts(len(locations), 1 if device == "cpu" else GPU_LOCATIONS, work, device)
+    return result
+
+
+def field_sums_plain(
+    locations: Float, points: Float, visibility: SoftVisibility, unoccluded: NDArray[np.bool_] | None = None
+) -> Float:
+    """What `field_sums` computes, in NumPy and double precision."""
+    result = np.empty((len(locations), visibility.n_factors, N_NUMBERS))
+    for row, location in enumerate(locations):
+        offsets = offsets_from(location, points if unoccluded is None else points[unoccluded[row]]).astype(np.float64)
+        distance = np.linalg.norm(offsets, axis=1, keepdims=True)
+        kept = distance[:, 0] > NEAREST_M
+        bearings = offsets[kept] / distance[kept]
+        result[row] = visibility.of_bearings(bearings).T @ bearing_numbers(offsets[kept])
+    return result
+
+
+def _planes(visibility: GaussianProcessVisibility) -> NDArray[np.float32]:
+    """Axes and edge as `process_kernel` wants them, (A, 4, 16): sixteen axes at a time, the last ones zero."""
+    planes = np.zeros((-(-visibility.n_factors // 16) * 16, 4), dtype=np.float32)
+    planes[: visibility.n_factors, :3] = visibility.axes
+    planes[: visibility.n_factors, 3] = -np.cos(visibility.half_angle_rad)
+    planes *= visibility.steepness / 2
+    return np.ascontiguousarray(planes.reshape(-1, 16, 4).transpose(0, 2, 1))

@@ -1,0 +1,83 @@
+"""The Fisher information of a camera's pose in the bearings of landmarks.
+
+A landmark at the offset r = n f from the camera (unit bearing f, distance n) is measured as the bearing f with
+isotropic noise of one radian. With the pose perturbed by (rho, theta), a shift and a turn about the camera's centre,
+both along the world's axes, the landmark's information on the pose is (Zhang and Scaramuzza, Fisher Information Field,
+2020, eq. 6; here in closed form, with P = I - f f^T)
+
+    [   P / n^2    -[f]x / n ]
+    [   [f]x / n       P     ]
+
+The camera's rotation cancels: it decides which landmarks are seen, not what each of them tells. Sums over landmarks are
+kept as the 15 numbers that differ: P / n^2 (xx, xy, xz, yy, yz, zz), f / n (x, y, z), P (xx, xy, xz, yy, yz, zz).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from wheretolook.geometry import Float
+
+N_NUMBERS = 15
+"""Numbers that a sum of informations is kept as."""
+
+TRACE = np.zeros(N_NUMBERS)
+"""Weights (15,) whose product with the numbers is the trace."""
+TRACE[[0, 3, 5, 9, 12, 14]] = 1
+
+_UPPER = np.triu_indices(3)
+
+
+def bearing_numbers(offsets: ArrayLike) -> Float:
+    """Each landmark's information as 15 numbers.
+
+    Args:
+        offsets: (..., 3) from the camera's centre to landmarks, in the world, metres, none of them zero.
+
+    Returns:
+        (..., 15) in the precision of the offsets.
+    """
+    offsets = np.asarray(offsets)
+    distance = np.linalg.norm(offsets, axis=-1, keepdims=True)
+    bearing = offsets / distance
+    across = np.eye(3, dtype=offsets.dtype) - bearing[..., :, None] * bearing[..., None, :]
+    numbers = across[..., _UPPER[0], _UPPER[1]]
+    return np.concatenate([numbers / distance**2, bearing / distance, numbers], axis=-1)
+
+
+def information_matrices(numbers: ArrayLike, pivots: ArrayLike | None = None) -> Float:
+    """Matrices (..., 6, 6) of sums kept as numbers (..., 15); shift first, turn second.
+
+    Args:
+        numbers: as `bearing_numbers` gives them, summed over landmarks.
+        pivots: (..., 3) offsets from the camera's centre to the points that the pose is turned about, metres: minus
+            the camera's centre turns it about the world's origin, as the released code of the Fisher Information Field
+            does. None for the camera's centre. The determinant does not depend on it.
+    """
+    numbers = np.asarray(numbers, dtype=np.float64)
+    matrices = np.empty((*numbers.shape[:-1], 6, 6))
+    matrices[..., :3, :3] = _symmetric(numbers[..., :6])
+    matrices[..., 3:, 3:] = _symmetric(numbers[..., 9:])
+    matrices[..., 3:, :3] = _cross(numbers[..., 6:9])
+    matrices[..., :3, 3:] = -matrices[..., 3:, :3]
+    if pivots is not None:  # the centre moves by theta x (centre - pivot)
+        turn = np.broadcast_to(np.eye(6), matrices.shape).copy()
+        turn[..., :3, 3:] = _cross(np.broadcast_to(np.asarray(pivots, dtype=np.float64), (*matrices.shape[:-2], 3)))
+        matrices = np.swapaxes(turn, -1, -2) @ matrices @ turn
+    return matrices
+
+
+def _symmetric(upper: Float) -> Float:
+    matrices = np.empty((*upper.shape[:-1], 3, 3))
+    matrices[..., _UPPER[0], _UPPER[1]] = upper
+    matrices[..., _UPPER[1], _UPPER[0]] = upper
+    return matrices
+
+
+def _cross(vectors: NDArray[np.float64]) -> Float:
+    """Matrices (..., 3, 3) that multiply as the cross product with vectors (..., 3)."""
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    zero = np.zeros_like(x)
+    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)

@@ -1,0 +1,93 @@
+"""Single numbers made of the information on a pose."""
+
+from __future__ import annotations
+
+from typing import Any, Literal, get_args
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike
+
+from wheretolook.errors import ConfigError
+from wheretolook.fisher import metrics_kernel
+from wheretolook.fisher.information import N_NUMBERS, TRACE, information_matrices
+from wheretolook.fisher.metrics_kernel import eigenvalues_kernel
+from wheretolook.fisher.parts import run_in_parts
+from wheretolook.geometry import Float
+from wheretolook.warp_setup import start_warp
+
+Metric = Literal["mineig", "logdet", "trace"]
+METRICS: tuple[str, ...] = get_args(Metric)
+
+ROWS_AT_ONCE = 4096
+"""Matrices that a thread of a CPU takes at a time: a few milliseconds."""
+
+
+def metric_of(numbers: ArrayLike, metric: str, pivots: ArrayLike | None = None, device: str = "cpu") -> Float:
+    """One number for each sum of informations; more is better.
+
+    Args:
+        numbers: (B, 15), see `wheretolook.fisher.information`.
+        metric: "trace"; "logdet", the logarithm of one plus the determinant (log(1 + d), and -log(1 - d) where an
+            approximation makes d negative), so that it is finite without landmarks and keeps the determinant's order;
+            "mineig", the smallest absolute eigenvalue, which is the smallest singular value the released code takes.
+        pivots: (B, 3) as in `information_matrices`.
+        device: "cpu" or a CUDA device.
+
+    Returns:
+        (B,).
+
+    Raises:
+        ConfigError: no such metric, or no such device.
+    """
+    if metric not in METRICS:
+        raise ConfigError("unknown metric of information", value=metric, fix=f"There are {', '.join(METRICS)}.")
+    numbers = np.asarray(numbers, dtype=np.float64)
+    if metric == "trace" and pivots is None:
+        return np.asarray(numbers @ TRACE)
+    values = eigenvalues(numbers, pivots, device)
+    if metric == "trace":
+        return np.asarray(values.sum(-1))
+    if metric == "mineig":
+        return np.asarray(np.abs(values).min(-1))
+    with np.errstate(divide="ignore"):
+        log_of_absolute = np.log(np.abs(values)).sum(-1)
+    return np.asarray(np.sign(values).prod(-1) * np.logaddexp(0, log_of_absolute))
+
+
+def eigenvalues(numbers: ArrayLike, pivots: ArrayLike | None = None, device: str = "cpu") -> Float:
+    """Eigenvalues (B, 6), in no order, of the informations kept as numbers (B, 15).
+
+    Their errors are some 1e-16 of the matrix's norm.
+
+    Args:
+        numbers: (B, 15).
+        pivots: (B, 3) as in `information_matrices`.
+        device: "cpu" (all cores, if there are many) or a CUDA device.
+
+    Raises:
+        ConfigError: no such device.
+    """
+    numbers = np.ascontiguousarray(numbers, dtype=np.float64).reshape(-1, N_NUMBERS)
+    arms = np.empty((0, 3)) if pivots is None else np.ascontiguousarray(pivots, dtype=np.float64).reshape(-1, 3)
+    device = start_warp(device)
+    values = np.empty((len(numbers), 6))
+
+    def work(part: slice) -> None:
+        inputs = [
+            wp.array(numbers[part], dtype=wp.float64, device=device),
+            pivots is not None,
+            wp.array(arms[part], dtype=wp.vec3d, device=device),
+        ]
+        found: Any = wp.empty((part.stop - part.start, 6), dtype=wp.float64, device=device)
+        wp.launch(eigenvalues_kernel, found.shape[0], inputs, [found], device=device)
+        values[part] = found.numpy()
+
+    wp.load_module(metrics_kernel, device=device)  # only one thread may do that
+    run_in_parts(len(numbers), ROWS_AT_ONCE if device == "cpu" else max(1, len(numbers)), work, device)
+    return values
+
+
+def eigenvalues_plain(numbers: ArrayLike, pivots: ArrayLike | None = None) -> Float:
+    """What `eigenvalues` computes, in NumPy, ascending."""
+    return np.asarray(np.linalg.eigvalsh(information_matrices(numbers, pivots)))

@@ -1,0 +1,170 @@
+"""Visibility as a product of what depends on the camera's axis and what depends on the landmark (Zhang and Scaramuzza,
+Fisher Information Field, 2020, Sec. V).
+
+A landmark's visibility v from a camera with the optical axis z is taken to depend on the angle between z and the
+landmark's bearing f alone, and approximated by v(z, f) = a(z) . b(f) with F factors. Sums over landmarks of
+(information x b) can then be stored for a location; times a(z), they give the information in any direction.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import numpy as np
+
+from wheretolook.camera_models import Camera, ColmapCamera
+from wheretolook.geometry import Float
+from wheretolook.grid import fibonacci_sphere
+
+
+class SoftVisibility(ABC):
+    """v(z, f) = a(z) . b(f)."""
+
+    n_factors: int
+
+    @abstractmethod
+    def of_axes(self, axes: Float) -> Float:
+        """a of optical axes (D, 3), of unit length; (D, F)."""
+
+    @abstractmethod
+    def of_bearings(self, bearings: Float) -> Float:
+        """What is summed for bearings (N, 3) of unit length, (N, F): b, but for `finish`."""
+
+    def finish(self, sums: Float) -> Float:
+        """Turn sums (..., F, K) over what `of_bearings` gives into sums over b. Linear, so it can wait to the end."""
+        return sums
+
+
+@dataclass(frozen=True)
+class QuadraticVisibility(SoftVisibility):
+    """k1 c^2 + k2 c + k3 of the cosine c between axis and bearing: 10 factors.
+
+    Args:
+        half_angle_rad: of the cone that stands for the field of view.
+        boundary: v at the cone's edge.
+        boundary_to_mid: v at the cone's edge as a share of v straight ahead.
+    """
+
+    half_angle_rad: float
+    boundary: float = 0.5
+    boundary_to_mid: float = 0.5
+    n_factors = 10
+
+    @cached_property
+    def coefficients(self) -> tuple[float, float, float]:
+        """k1, k2, k3: v(-1) = 0, v(cos half angle) = boundary, v(1) = boundary / boundary_to_mid."""
+        cosine = np.cos(self.half_angle_rad)
+        rows = [[1, -1, 1], [cosine**2, cosine, 1], [1, 1, 1]]
+        k1, k2, k3 = np.linalg.solve(rows, [0, self.boundary, self.boundary / self.boundary_to_mid])
+        return float(k1), float(k2), float(k3)
+
+    def of_axes(self, axes: Float) -> Float:
+        """(D, 10)."""
+        k1, k2, k3 = self.coefficients
+        weights = np.array([k1, 2 * k1, 2 * k1, k1, 2 * k1, k1, k2, k2, k2, k3])  # mixed products come twice in c^2
+        return np.asarray(self.of_bearings(axes) * weights)
+
+    def of_bearings(self, bearings: Float) -> Float:
+        """(N, 10): xx, xy, xz, yy, yz, zz, the bearing, one."""
+        x, y, z = bearings.T
+        return np.stack([x * x, x * y, x * z, y * y, y * z, z * z, x, y, z, np.ones_like(x)], axis=-1)
+
+
+@dataclass(frozen=True)
+class GaussianProcessVisibility(SoftVisibility):
+    """A Gaussian process over axes, seen at F of them: v there is a soft step at the edge of the cone.
+
+    v(z, f) = k(z, Z) K^-1 s(Z . f) with the sampled axes Z, the kernel k(z, z') = exp(-|z - z'|^2 / 2 l^2),
+    K = k(Z, Z), and s(c) = 1 / (1 + exp(-steepness (c - cos half angle))).
+
+    Args:
+        half_angle_rad: of the cone that stands for the field of view.
+        length: l, without unit (a chord of the unit sphere).
+        n_factors: F; axes are a Fibonacci lattice.
+        steepness: of the soft step.
+        jitter: added to K's diagonal.
+    """
+
+    half_angle_rad: float
+    length: float
+    n_factors: int = 70
+    steepness: float = 15.0
+    jitter: float = 1e-10
+
+    @classmethod
+    def fitted(
+        cls, half_angle_rad: float, n_factors: int = 70, steepness: float = 15.0, jitter: float = 1e-10
+    ) -> GaussianProcessVisibility:
+        """The one whose length has the greatest marginal likelihood of the step seen at the axes, for many bearings."""
+        return _fitted(float(half_angle_rad), n_factors, float(steepness), float(jitter))
+
+    @cached_property
+    def axes(self) -> Float:
+        """Z, (F, 3)."""
+        return fibonacci_sphere(self.n_factors)
+
+    @cached_property
+    def inverse(self) -> Float:
+        """K^-1, (F, F)."""
+        return np.asarray(np.linalg.inv(self.of_axes(self.axes) + self.jitter * np.eye(self.n_factors)))
+
+    def of_axes(self, axes: Float) -> Float:
+        """k(z, Z), (D, F)."""
+        return np.asarray(np.exp((axes @ self.axes.T - 1) / self.length**2))  # |z - z'|^2 = 2 - 2 z . z'
+
+    def of_bearings(self, bearings: Float) -> Float:
+        """s(Z . f), (N, F); K^-1 comes in `finish`."""
+        return self.step(bearings @ self.axes.T)
+
+    def finish(self, sums: Float) -> Float:
+        """K^-1 of sums (..., F, K)."""
+        return np.asarray(self.inverse @ sums)
+
+    def step(self, cosines: Float) -> Float:
+        """s of cosines between axis and bearing."""
+        return np.asarray(0.5 * (1 + np.tanh(0.5 * self.steepness * (cosines - np.cos(self.half_angle_rad)))))
+
+    def held_out_error(self, n_bearings: int = 1000, n_axes: int = 1000, seed: int = 1) -> float:
+        """Root mean square of v(z, f) - s(z . f) over random bearings and axes, neither of which the fit has seen."""
+        rng = np.random.default_rng(seed)
+        bearings, axes = (_unit(rng.normal(size=(n, 3))) for n in (n_bearings, n_axes))
+        predicted = self.of_axes(axes) @ self.finish(self.of_bearings(bearings).T)
+        return float(np.sqrt(np.mean((predicted - self.step(axes @ bearings.T)) ** 2)))
+
+
+@lru_cache
+def _fitted(half_angle_rad: float, n_factors: int, steepness: float, jitter: float) -> GaussianProcessVisibility:
+    from scipy.optimize import minimize_scalar
+
+    bearings = _unit(np.random.default_rng(0).normal(size=(1000, 3)))
+
+    def negative_log_likelihood(log_length: float) -> float:
+        process = GaussianProcessVisibility(half_angle_rad, float(np.exp(log_length)), n_factors, steepness, jitter)
+        kernel = process.of_axes(process.axes) + jitter * np.eye(n_factors)
+        seen = process.step(process.axes @ bearings.T)  # (F, 1000)
+        sign, log_determinant = np.linalg.slogdet(kernel)
+        if sign <= 0:
+            return np.inf
+        # the kernel's variance that is best for this length is known in closed form
+        variance = float(np.mean(seen * np.linalg.solve(kernel, seen)))
+        return float(np.inf if variance <= 0 else n_factors * np.log(variance) + log_determinant)
+
+    found = minimize_scalar(negative_log_likelihood, bounds=np.log([0.05, 1.2]), method="bounded")
+    return GaussianProcessVisibility(half_angle_rad, float(np.exp(found.x)), n_factors, steepness, jitter)
+
+
+def cone_half_angle(camera: Camera) -> float:
+    """Half the opening angle, in radians, of the cone with the solid angle of a camera's field of view."""
+    if isinstance(camera, ColmapCamera):
+        directions = fibonacci_sphere(20_000)
+        share = float(np.mean(camera.sees(directions)))
+        return float(np.arccos(np.clip(1 - 2 * share, -1, 1)))
+    a, b = camera.width / 2 / camera.focal_px, camera.height / 2 / camera.focal_px
+    solid_angle = 4 * np.arcsin(a * b / np.sqrt((1 + a * a) * (1 + b * b)))
+    return float(np.arccos(1 - solid_angle / (2 * np.pi)))
+
+
+def _unit(vectors: Float) -> Float:
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))

@@ -1,0 +1,100 @@
+"""Reliability, calibration error and temperature against closed forms and scikit-learn."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.special import expit
+from sklearn.calibration import calibration_curve
+from sklearn.metrics import log_loss
+
+from wheretolook.evaluation.calibration import (
+    BINS,
+    calibration_rows,
+    expected_calibration_error,
+    fit_temperature,
+    negative_log_likelihood,
+    reliability,
+    scale_probability,
+)
+from wheretolook.geometry import Float
+
+
+def draw(rng: np.random.Generator, chance: Float) -> np.ndarray:
+    return rng.random(len(chance)) < chance
+
+
+def test_reliability_by_hand() -> None:
+    curve = reliability(np.array([0.0, 0.1, 0.25, 0.3, 1.0]), np.array([False, True, True, False, True]), bins=4)
+    np.testing.assert_allclose(curve["bin_low"], [0, 0.25, 0.5, 0.75])
+    np.testing.assert_allclose(curve["bin_high"], [0.25, 0.5, 0.75, 1])
+    assert list(curve["n"]) == [2, 2, 0, 1]
+    np.testing.assert_allclose(curve["mean_predicted"], [0.05, 0.275, np.nan, 1])
+    np.testing.assert_allclose(curve["share_good"], [0.5, 0.5, np.nan, 1])
+    # (2 x 0.45 + 2 x 0.225 + 0) / 5
+    error = expected_calibration_error(np.array([0.0, 0.1, 0.25, 0.3, 1.0]), np.array([0, 1, 1, 0, 1], dtype=bool), 4)
+    assert error == pytest.approx(0.27)
+
+
+def test_reliability_is_that_of_scikit_learn() -> None:
+    rng = np.random.default_rng(0)
+    probability = rng.beta(0.5, 0.7, 5000)
+    good = draw(rng, probability**1.5)
+    curve = reliability(probability, good)
+    share, predicted = calibration_curve(good, probability, n_bins=BINS)
+    np.testing.assert_allclose(curve["share_good"], share)
+    np.testing.assert_allclose(curve["mean_predicted"], predicted)
+    assert curve["n"].sum() == 5000
+    assert negative_log_likelihood(probability, good) == pytest.approx(log_loss(good, probability))
+
+
+def test_calibration_error_of_what_is_calibrated_and_of_what_is_not() -> None:
+    rng = np.random.default_rng(1)
+    probability = rng.random(400_000)
+    # a bin's share is off by about its standard deviation, which averages sqrt(15 / 400,000) x E|N(0, 1)| x pi / 8
+    assert expected_calibration_error(probability, draw(rng, probability)) < 0.004
+    # predicted p where p^2 is true: too sure everywhere, by the integral of p - p^2
+    assert expected_calibration_error(probability, draw(rng, probability**2)) == pytest.approx(1 / 6, abs=0.004)
+    assert expected_calibration_error(np.full(10, 0.9), np.arange(10) < 4) == pytest.approx(0.5)
+    assert np.isnan(expected_calibration_error(np.empty(0), np.empty(0, dtype=bool)))
+
+
+@pytest.mark.parametrize("factor", [0.5, 1.0, 3.0])
+def test_temperature_is_recovered(factor: float) -> None:
+    rng = np.random.default_rng(2)
+    logits = rng.normal(0.5, 2, 200_000)
+    good = draw(rng, expit(logits))
+    sure = expit(factor * logits)
+    temperature = fit_temperature(sure, good)
+    assert temperature == pytest.approx(factor, rel=0.02)
+    scaled = scale_probability(sure, temperature)
+    np.testing.assert_allclose(scaled, expit(factor * logits / temperature), atol=1e-6)
+    assert expected_calibration_error(scaled, good) < 0.01
+    # where the likelihood is greatest its derivative by 1/T vanishes
+    assert np.mean((scaled - good) * factor * logits) == pytest.approx(0, abs=1e-4)
+    if factor != 1:
+        assert expected_calibration_error(sure, good) > 0.04
+        assert negative_log_likelihood(scaled, good) < negative_log_likelihood(sure, good)
+
+
+def test_temperature_of_what_cannot_tell() -> None:
+    for labels in (np.ones(5, dtype=bool), np.zeros(5, dtype=bool), np.empty(0, dtype=bool)):
+        assert np.isnan(fit_temperature(np.linspace(0, 1, len(labels)), labels))
+    certain = np.array([0.0, 1.0, 1.0, 0.0])  # logits beyond all bounds
+    assert 1 < fit_temperature(certain, np.array([False, True, False, True])) < np.inf
+    assert np.isfinite(negative_log_likelihood(certain, np.array([True, False, True, False])))
+
+
+def test_rows_before_and_after() -> None:
+    rng = np.random.default_rng(3)
+    logits = rng.normal(0, 2, 20_000)
+    good = draw(rng, expit(logits))
+    sure = expit(2 * logits)
+    rows = calibration_rows(sure, good, 2.0)
+    assert list(rows["when"]) == ["before"] * BINS + ["after"] * BINS
+    for when, probability in (("before", sure), ("after", expit(logits))):
+        part = rows[rows["when"] == when]
+        assert part["n"].sum() == len(good) and (part["n_views"] == len(good)).all()
+        assert part["ece"].iloc[0] == pytest.approx(expected_calibration_error(probability, good), abs=1e-9)
+        assert part["nll"].iloc[0] == pytest.approx(log_loss(good, probability))
+    assert set(calibration_rows(sure, good, np.nan)["when"]) == {"before"}

@@ -1,0 +1,135 @@
+"""The paper's tables hold its numbers and ours, and LaTeX can read them."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from synthetic_scores import EVERY_METHOD, KEYS, make_scores, older
+from wheretolook.evaluation.paper_tables import PAPER, paper_tables, write_paper_tables
+
+PRINTED = {
+    ("vs_others", "random"): (54.7, 60.9, 60.9, 61.1),
+    ("vs_others", "FIF mineig exact"): (60.1, 67.7, 69.0, 69.6),
+    ("vs_others", "FIF det app"): (60.7, 67.5, 69.1, 69.4),
+    ("vs_others", "FIF trace appr worst"): (17.8, 23.3, 23.3, 23.3),
+    ("vs_others", "reprojections with bins"): (68.7, 71.7, 71.7, 71.9),
+    ("vs_others", "proposed"): (72.9, 80.4, 81.2, 81.7),
+    ("input_variants", "ours (pts 2d)"): (70.2, 75.7, 76.2, 76.2),
+    ("input_variants", "ours (pts 2d + z)"): (74.6, 80.3, 80.4, 80.6),
+    ("input_variants", "ours (pts 2d + pts 3d)"): (72.9, 80.4, 81.2, 81.7),
+}
+HERE = {
+    "FIF mineig exact": "Fisher, min. eigenvalue, exact",
+    "FIF mineig app": "Fisher, min. eigenvalue, quadratic",
+    "FIF det GP app": "Fisher, log det, GP",
+    "FIF trace appr worst": "probe: worst trace",
+    "FIF trace appr zero deriv labels": "probe: stationary trace",
+    "proposed": "MLP, 2d + 3d",
+}
+
+
+@pytest.fixture(scope="module")
+def scores() -> pd.DataFrame:
+    return make_scores()
+
+
+def test_the_papers_numbers_are_those_printed(scores: pd.DataFrame) -> None:
+    tables = {name: table.set_index("paper_row") for name, table in paper_tables(scores).items()}
+    assert {name: len(table) for name, table in tables.items()} == {"vs_others": 14, "input_variants": 3}
+    for (name, row), numbers in PRINTED.items():
+        np.testing.assert_array_equal(tables[name].loc[row, [f"paper_{key}" for key in KEYS]].astype(float), numbers)
+    blank = tables["vs_others"].loc[["FIF trace GP app", "FIF trace exact"], [f"paper_{key}" for key in KEYS]]
+    assert blank.isna().all(axis=None)
+    assert tables["vs_others"].notna().all(axis=1).sum() == 12
+
+
+def test_ours_stand_beside_them(scores: pd.DataFrame) -> None:
+    tables = paper_tables(scores)
+    names = dict(zip(tables["vs_others"]["paper_row"], tables["vs_others"]["method"], strict=True))
+    assert {row: names[row] for row in HERE} == HERE
+    pooled = scores[(scores["scene"] == "all") & (scores["top_n"] == 1)].set_index(["method", "inputs"])
+    for name, paper in PAPER.items():
+        for one, (_, line) in zip(paper, tables[name].iterrows(), strict=True):
+            row = pooled.loc[one.method]
+            for key in KEYS:
+                assert line[f"score_{key}"] == pytest.approx(100 * row[f"normalized_{key}"])
+                assert line[f"score_low_{key}"] == pytest.approx(100 * row[f"normalized_low_{key}"])
+                assert line[f"score_high_{key}"] == pytest.approx(100 * row[f"normalized_high_{key}"])
+                assert line[f"released_{key}"] == pytest.approx(100 * row[f"raw_{key}"] / 0.527)
+
+
+def test_what_is_missing_stays_blank(scores: pd.DataFrame) -> None:
+    few = older(make_scores((*EVERY_METHOD[:4], ("mlp", "2d+z")), reference=None))
+    table = paper_tables(few)["vs_others"].set_index("paper_row")
+    assert table.loc["proposed", "method"] == "MLP, 2d + z (in place of 2d+3d)"
+    assert table.loc[["random", "proposed"], f"score_{KEYS[0]}"].notna().all()
+    assert table.loc["FIF det app", [f"score_{key}" for key in KEYS]].isna().all()
+    assert table[f"released_{KEYS[0]}"].isna().all()
+    variants = paper_tables(few)["input_variants"].set_index("paper_row")
+    assert [*variants[f"score_{KEYS[0]}"].notna()] == [False, True, False]
+    assert [*variants[f"paper_{KEYS[0]}"].notna()] == [True] * 3
+    rules = paper_tables(make_scores(EVERY_METHOD[:4], reference=None, top_n=(5,)))["vs_others"]
+    assert rules[f"score_{KEYS[0]}"].isna().all()  # the paper's tables are of the best view
+
+
+def test_files_say_where_the_numbers_are_from(scores: pd.DataFrame, tmp_path: Path) -> None:
+    paths = write_paper_tables(scores, tmp_path / "new")
+    names = [f"table_{name}.{ending}" for name in PAPER for ending in ("csv", "tex", "md")]
+    assert [path.name for path in paths] == names
+    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == sorted(names)
+    for path in paths:
+        text = path.read_text()
+        for said in ("other scenes", "12 Habitat-Matterport meshes", "one constant, 0.527, at all thresholds"):
+            assert said in text
+        assert "nan" not in text
+    read = pd.read_csv(paths[0])
+    expected = paper_tables(scores)["vs_others"]
+    pd.testing.assert_frame_equal(read, expected, atol=0.0051, rtol=0)
+    before = [path.read_bytes() for path in paths]
+    write_paper_tables(scores, tmp_path / "new")
+    assert [path.read_bytes() for path in paths] == before
+
+
+@pytest.mark.parametrize("name", PAPER)
+def test_latex_is_well_formed(scores: pd.DataFrame, tmp_path: Path, name: str) -> None:
+    write_paper_tables(scores, tmp_path)
+    text = (tmp_path / f"table_{name}.tex").read_text()
+    code = "\n".join(line for line in text.splitlines() if not line.startswith("%"))
+    opened: list[str] = []
+    for kind, environment in re.findall(r"\\(begin|end)\{([^}]*)\}", code):
+        if kind == "begin":
+            opened.append(environment)
+        else:
+            assert opened.pop() == environment
+    assert not opened
+    assert code.count("{") == code.count("}")
+    assert code.count("$") % 2 == 0
+    assert not re.search(r"(?<!\\)[%#]", code)
+    assert code.isascii()
+
+    columns = re.search(r"\\begin\{tabular\}\{(\w+)\}", code)
+    assert columns is not None and len(columns[1]) == 13
+    body = code.split(r"\toprule")[1].split(r"\bottomrule")[0]
+    rows = [line for line in body.splitlines() if line.endswith(r"\\")]
+    assert len(rows) == 2 + len(PAPER[name])
+    for row in rows:
+        spanned = sum(int(number) - 1 for number in re.findall(r"\\multicolumn\{(\d+)\}", row))
+        assert row.count("&") + 1 + spanned == 13
+    line = next(row for row in rows if row.startswith("MLP, 2d + 3d"))
+    assert line.split(" & ")[3] == "72.9"
+    assert re.fullmatch(r"\$\d+\.\d_\{\d+\.\d\}\^\{\d+\.\d\}\$", line.split(" & ")[1])
+
+
+def test_markdown_tables_are_narrow(scores: pd.DataFrame, tmp_path: Path) -> None:
+    write_paper_tables(scores, tmp_path)
+    lines = [line for line in (tmp_path / "table_vs_others.md").read_text().splitlines() if line.startswith("|")]
+    assert len(lines) == 2 * (14 + 2)
+    assert {line.count("|") - 1 for line in lines} == {8}
+    cells = [cell.strip() for cell in next(line for line in lines if "FIF trace exact" in line)[1:-1].split("|")]
+    assert cells[1] == "Fisher, trace, exact"
+    assert [cells[4], cells[7]] == ["–", "–"]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF
 
@@ -14,7 +13,6 @@ from wheretolook.fisher.soft_visibility import (
     QuadraticVisibility,
     SoftVisibility,
     cone_half_angle,
-    homogeneous,
 )
 from wheretolook.geometry import Float, PinholeCamera
 
@@ -31,7 +29,7 @@ def random_directions(n: int, seed: int) -> Float:
 
 def values(visibility: SoftVisibility, axes: Float, bearings: Float) -> Float:
     """v of axes (D, 3) and bearings (N, 3); (D, N)."""
-    return visibility.of_axes(axes) @ visibility.finish(visibility.of_bearings(homogeneous(bearings)).T)
+    return visibility.of_axes(axes) @ visibility.finish(visibility.of_bearings(bearings).T)
 
 
 @pytest.mark.parametrize(
@@ -86,16 +84,6 @@ def test_the_soft_step() -> None:
     visibility = GaussianProcessVisibility(QUARTER, 0.45, steepness=15)
     cosine = np.cos(QUARTER)
     np.testing.assert_allclose(visibility.step(np.array([cosine, cosine + 1 / 15])), [0.5, 1 / (1 + np.exp(-1))])
-
-
-@pytest.mark.parametrize("visibility", [QuadraticVisibility(0.7), GaussianProcessVisibility(0.7, 0.45)])
-def test_pytorch_computes_what_numpy_does(visibility: SoftVisibility) -> None:
-    axes, bearings = random_directions(60, 0), homogeneous(random_directions(60, 1))
-    np.testing.assert_allclose(visibility.of_axes(torch.from_numpy(axes), torch), visibility.of_axes(axes), atol=1e-12)
-    expected = visibility.of_bearings(bearings)
-    assert expected.shape == (60, visibility.n_factors)
-    found = visibility.of_bearings(torch.from_numpy(bearings).reshape(3, 20, 4), torch)
-    np.testing.assert_allclose(found.reshape(60, -1), expected, atol=1e-12)
 
 
 def test_the_cone_has_the_solid_angle_of_the_field_of_view() -> None:

@@ -12,7 +12,7 @@ from wheretolook.fisher import field_kernel
 from wheretolook.fisher.field_kernel import numbers_kernel, process_kernel, quadratic_kernel, vec16
 from wheretolook.fisher.information import N_NUMBERS, bearing_numbers
 from wheretolook.fisher.parts import run_in_parts
-from wheretolook.fisher.soft_visibility import GaussianProcessVisibility, SoftVisibility
+from wheretolook.fisher.soft_visibility import GaussianProcessVisibility, QuadraticVisibility, SoftVisibility
 from wheretolook.geometry import Float
 from wheretolook.visibility.frustum import offsets_from
 from wheretolook.warp_setup import start_warp
@@ -49,32 +49,31 @@ def field_sums(
     device = start_warp(device)
     wp.load_module(field_kernel, device=device)  # only one thread may do that
     landmarks: Any = wp.array(points, dtype=wp.vec3d, device=device)
-    n_parts = -(-len(points) // AT_ONCE)
     nothing: Any = wp.empty((0, 0), dtype=wp.bool, device=device)
     planes: Any = None
     if isinstance(visibility, GaussianProcessVisibility):
         planes = wp.array(_planes(visibility), dtype=vec16, device=device)
+    else:
+        assert isinstance(visibility, QuadraticVisibility)  # there is a kernel for each
     result = np.empty((len(locations), visibility.n_factors, N_NUMBERS))
 
     def work(rows: slice) -> None:
         at: Any = wp.array(locations[rows], dtype=wp.vec3d, device=device)
-        shape = (len(at), len(points))
         mask = nothing
         if unoccluded is not None:
             mask = wp.array(np.ascontiguousarray(unoccluded[rows]), dtype=wp.bool, device=device, copy=False)
-        bearings: Any = wp.empty(shape, dtype=wp.vec3, device=device)
-        numbers: Any = wp.empty(shape, dtype=vec16, device=device)
+        bearings: Any = wp.empty((len(at), len(points)), dtype=wp.vec3, device=device)
+        numbers: Any = wp.empty(bearings.shape, dtype=vec16, device=device)
         inputs = [at, landmarks, unoccluded is not None, mask, NEAREST_M]
-        wp.launch(numbers_kernel, shape, inputs, [bearings, numbers], device=device)
+        wp.launch(numbers_kernel, bearings.shape, inputs, [bearings, numbers], device=device)
+        parts = len(at), -(-len(points) // AT_ONCE)
         if planes is None:
-            shape = (len(at), n_parts, visibility.n_factors)
-            sums: Any = wp.empty(shape, dtype=vec16, device=device)
-            wp.launch(quadratic_kernel, shape[:2], [bearings, numbers, AT_ONCE], [sums], device=device)
+            sums: Any = wp.empty((*parts, visibility.n_factors), dtype=vec16, device=device)
+            wp.launch(quadratic_kernel, parts, [bearings, numbers, AT_ONCE], [sums], device=device)
             result[rows] = sums.numpy().sum(1, dtype=np.float64)[..., :N_NUMBERS]
         else:
-            shape = (len(at), n_parts, len(planes))
-            sums = wp.empty((*shape, N_NUMBERS), dtype=vec16, device=device)
-            wp.launch(process_kernel, shape, [bearings, numbers, planes, AT_ONCE], [sums], device=device)
+            sums = wp.empty((*parts, len(planes), N_NUMBERS), dtype=vec16, device=device)
+            wp.launch(process_kernel, sums.shape[:3], [bearings, numbers, planes, AT_ONCE], [sums], device=device)
             by_axes = np.moveaxis(sums.numpy().sum(1, dtype=np.float64), -1, 2).reshape(len(at), -1, N_NUMBERS)
             result[rows] = by_axes[:, : visibility.n_factors]
 

@@ -189,11 +189,17 @@ def test_the_card_tells_what_lies_there(folder: Path, monkeypatch: pytest.Monkey
     exec(example[1], names)
     assert len(names["scores"]) == 14 * 16  # type: ignore[arg-type]
 
+    (weights,) = releases.trained_weights(release)
     elsewhere = pd.concat([scores.assign(dataset="scans"), scores.assign(dataset="halls")])
-    elsewhere.to_csv(root / "results" / "generalization.csv", index=False)
+    table = root / "results" / "generalization.csv"
+    elsewhere.assign(weights_sha256=releases.sha256(weights)).to_csv(table, index=False)
+    (root / "results" / "generalization.md").write_text("Scans are from here, halls from there.\n")
     longer = release_card(release)
     assert "Localization score on scans" in longer and "Localization score on halls" in longer
+    assert "Scans are from here" in longer
     assert "on other datasets" not in card
+    elsewhere.assign(weights_sha256="0" * 64).to_csv(table, index=False)  # of weights that shipped before
+    assert release_card(release) == card
 
 
 def test_scenes_made_by_others_keep_their_licence(folder: Path) -> None:

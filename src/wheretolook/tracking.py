@@ -154,10 +154,17 @@ def newest_run(tracking: TrackingConfig, stage: str, tags: Mapping[str, str] | N
         return None
     wanted = {STAGE_TAG: stage, **(tags or {})}
     clauses = [f"tags.{key} = '{value}'" for key, value in wanted.items()] + ["attributes.status = 'FINISHED'"]
-    runs = mlflow_client.search_runs(
-        [experiment.experiment_id], " and ".join(clauses), order_by=["attributes.start_time DESC"], max_results=100
-    )
-    return next((run for run in runs if "mlflow.parentRunId" not in run.data.tags), None)
+    token: str | None = ""
+    while token is not None:  # an evaluation may have hundreds of children, all newer than itself
+        runs = mlflow_client.search_runs(
+            [experiment.experiment_id], " and ".join(clauses), order_by=["attributes.start_time DESC"],
+            max_results=100, page_token=token or None,
+        )  # fmt: skip
+        for run in runs:
+            if "mlflow.parentRunId" not in run.data.tags:
+                return run
+        token = runs.token or None
+    return None
 
 
 def artifact(tracking: TrackingConfig, run_id: str, path: str) -> Path:

@@ -7,7 +7,15 @@ import pytest
 from scipy.spatial import cKDTree
 
 from wheretolook.errors import ConfigError
-from wheretolook.grid import VoxelGrid, azimuth_elevation_lattice, direction_lattice, fibonacci_sphere, released_lattice
+from wheretolook.grid import (
+    VoxelGrid,
+    axes_of_angles,
+    azimuth_elevation_lattice,
+    direction_lattice,
+    fibonacci_sphere,
+    released_lattice,
+    yaw_pitch_angles,
+)
 
 
 def covering_radius_deg(directions: np.ndarray) -> float:
@@ -52,6 +60,19 @@ def test_azimuth_elevation_steps_are_equal() -> None:
     elevation = np.unique(np.degrees(np.arcsin(directions[:, 2])).round(6))
     assert len(directions) == 512
     np.testing.assert_allclose(np.diff(elevation), 180 / 16)
+
+
+def test_the_benchmarks_yaws_and_pitches() -> None:
+    directions = direction_lattice(500, "yaw-pitch")
+    assert directions.shape == (108, 3)
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1)
+    assert len(np.unique(directions.round(9), axis=0)) == 108
+    pitches = np.degrees(np.arcsin(directions[:, 2])).round(9)
+    assert np.unique(pitches).tolist() == [-60, -40, -20, 0, 20, 40]
+    yaws = np.degrees(np.arctan2(directions[:, 1], directions[:, 0])).round(6) % 360
+    assert np.unique(yaws % 360).tolist() == list(range(0, 360, 20))
+    np.testing.assert_allclose(axes_of_angles([[0, 0], [90, 0], [0, 90]]), np.eye(3), atol=1e-15)
+    np.testing.assert_allclose(axes_of_angles(yaw_pitch_angles()), directions)
 
 
 def test_centres_and_ids_are_inverse() -> None:

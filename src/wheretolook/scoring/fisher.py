@@ -111,7 +111,9 @@ class FisherScorer(Scorer):
         approximation: "exact" sums over the landmarks in view; "quadratic" (10 factors) and "gp" (70) over all that
             have a free line of sight, weighted by a soft visibility of the optical axis, as a field stores them.
         about_origin: take turns of the pose about the world's origin, as the released code of the Fisher Information
-            Field does, instead of about the camera. The determinant stays the same.
+            Field does, instead of about the camera. The determinant stays the same. About the camera is the default as
+            the better one for the paper's rows on our validation scene (by trace 85 to 88 % of the oracle's score
+            against 63 to 69; by min. eigenvalue alike, but for the quadratic's 51 against 75).
     """
 
     name: ClassVar[str] = "fisher"

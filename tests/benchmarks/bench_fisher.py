@@ -1,0 +1,122 @@
+"""Fisher information: building fields, asking them, and exact sums over a whole grid of viewpoints.
+
+    python tests/benchmarks/bench_fisher.py [--device cuda]
+
+Landmarks lie on the walls of a room; half of them, at random, are hidden from each location. Prints the median of the
+repeats and their range, and beside each kernel its NumPy twin on a small part, scaled up.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from wheretolook.fisher.exact import exact_information, exact_information_plain
+from wheretolook.fisher.field import FisherField
+from wheretolook.fisher.field_sums import field_sums_plain
+from wheretolook.fisher.metrics import METRICS, eigenvalues, eigenvalues_plain, metric_of
+from wheretolook.fisher.soft_visibility import (
+    GaussianProcessVisibility,
+    QuadraticVisibility,
+    SoftVisibility,
+    cone_half_angle,
+)
+from wheretolook.geometry import Float, PinholeCamera, poses_looking_along
+from wheretolook.grid import VoxelGrid, fibonacci_sphere
+from wheretolook.visibility import VisibleSets
+
+ROOM_M = ((-5.0, -4.0, 0.0), (5.0, 4.0, 2.6))
+
+
+def room_landmarks(n: int, seed: int = 0) -> Float:
+    """(n, 3) on walls, floor and ceiling."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(*ROOM_M, (n, 3))
+    axis = rng.integers(0, 3, n)
+    points[np.arange(n), axis] = np.array(ROOM_M)[rng.integers(0, 2, n), axis]
+    return points
+
+
+def timed(label: str, work: Callable[[], object], repeats: int, unit: float = 1.0, units: str = "s") -> float:
+    """Print the median and the range of the repeats, after one that is not counted; the median in seconds."""
+    work()
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        work()
+        times.append(time.perf_counter() - start)
+    middle = float(np.median(times))
+    print(f"{label:62} {middle * unit:9.3f} {units} [{min(times) * unit:.3f}, {max(times) * unit:.3f}]", flush=True)
+    return middle
+
+
+def ask(locations: Float, points: Float, visibilities: dict[str, SoftVisibility], axes: Float) -> None:
+    """A planner's query: every direction at one location, on the CPU."""
+    print(f"asking a field for {len(axes)} directions at one location")
+    for name, visibility in visibilities.items():
+        field = FisherField.build(locations, points, visibility)
+        for metric in METRICS:
+            timed(f"  {name} {metric}", lambda f=field, m=metric: f.metric(3, axes, m), 200, 1e3, "ms")
+        numbers = field.information(3, axes)
+        timed(f"  {name} eigenvalues alone", lambda n=numbers: eigenvalues(n), 200, 1e3, "ms")
+        timed(f"  {name} eigenvalues, NumPy", lambda n=numbers: eigenvalues_plain(n), 200, 1e3, "ms")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--device", default="cpu", help="Warp's device")
+    parser.add_argument("--landmarks", type=int, default=25_000)
+    parser.add_argument("--repeats", type=int, default=5)
+    args = parser.parse_args()
+    rng, repeats, device = np.random.default_rng(0), args.repeats, args.device
+
+    camera, points = PinholeCamera(), room_landmarks(args.landmarks)
+    visibilities: dict[str, SoftVisibility] = {
+        "quadratic": QuadraticVisibility(cone_half_angle(camera)),
+        "gp": GaussianProcessVisibility.fitted(cone_half_angle(camera)),
+    }
+
+    voxels = VoxelGrid(*map(np.array, ROOM_M), (8, 8, 8)).centers()
+    free = rng.random((len(voxels), len(points))) < 0.5
+    print(f"fields of {len(voxels)} voxels and {len(points):,} landmarks, on {device}")
+    for name, visibility in visibilities.items():
+        for label, mask in (("none hidden", None), ("half hidden", free)):
+            timed(f"  {name} ({visibility.n_factors} factors), {label}",
+                  lambda v=visibility, m=mask: FisherField.build(voxels, points, v, m, device), repeats)  # fmt: skip
+        start = time.perf_counter()
+        field_sums_plain(voxels[:2], points, visibility)
+        print(f"  {'  NumPy, from two voxels':60} {(time.perf_counter() - start) * len(voxels) / 2:9.1f} s")
+
+    axes = fibonacci_sphere(500)
+    if device == "cpu":
+        ask(voxels[:8], points, visibilities, axes)
+
+    locations = VoxelGrid(*map(np.array, ROOM_M), (9, 9, 8)).centers()
+    views = poses_looking_along(np.repeat(locations, 500, axis=0), np.tile(axes, (len(locations), 1)))
+    rows = np.repeat(np.arange(len(locations)), 500)
+    print(f"exact, {len(views):,} viewpoints")
+    for label, mask in (
+        ("none hidden", np.ones((len(locations), len(points)), bool)),
+        ("half hidden", rng.random((len(locations), len(points))) < 0.5),
+    ):
+        sets = VisibleSets.from_mask(mask)
+        few = max(1, repeats // 2)
+        timed(f"  sums, {label}", lambda s=sets: exact_information(camera, views, points, s, rows, device), few)
+
+        def all_rows(s: VisibleSets = sets) -> None:
+            numbers = exact_information(camera, views, points, s, rows, device)
+            for metric in METRICS:
+                metric_of(numbers, metric, None, device)
+
+        timed(f"  the three metrics, {label}", all_rows, few)
+        start = time.perf_counter()
+        exact_information_plain(camera, views[:200], points, sets, rows[:200])
+        print(f"  {'  sums by NumPy, from 200 viewpoints':60} "
+              f"{(time.perf_counter() - start) * len(views) / 200:9.0f} s")  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()

@@ -139,6 +139,10 @@ def test_the_best_on_validation_ships(finished: Path) -> None:
     assert {shipped.name, other.name} == {"mlp-2d.safetensors", "mlp-2d+z.safetensors"}
     best, rest = (json.loads(path.with_suffix(".json").read_text())["metrics"] for path in (shipped, other))
     assert best["val_average_precision"] >= rest["val_average_precision"]
+    # the paper's table by inputs has both, the one on the shelf too
+    table = pd.read_csv(finished / "data" / "release" / "results" / "table_input_variants.csv")
+    measured = table["score_0.05m_0.4deg"].notna()
+    assert measured.tolist() == [True, True, False] and table["method"].tolist()[:2] == ["MLP, 2d", "MLP, 2d + z"]
     # the record still fits, so that training again reuses what ships
     models = train(
         Dataset.load(finished / "data" / "release"),

@@ -17,7 +17,7 @@ from wheretolook.errors import TableError, WeightsError
 from wheretolook.evaluation.config import THRESHOLDS, threshold_key, threshold_label
 from wheretolook.evaluation.report import markdown_table, score_markdown
 from wheretolook.evaluation.run import SCORES_CSV
-from wheretolook.evaluation.scores import ALL
+from wheretolook.evaluation.scores import ALL, read_scores
 from wheretolook.figures.style import method_style
 from wheretolook.labelling.report import POSITIVE, label_summary
 from wheretolook.mapping.landmarks import Landmarks
@@ -100,16 +100,16 @@ def release_card(release: Dataset) -> str:
         _HOW_TO_USE.format(root=root, weights=weights.name),
         "## Scores",
         f"On the test scenes, of which the network has learnt nothing. The weights are {weights.name}.",
-        _demoted(score_markdown(_scores(results / SCORES_CSV), f"Localization score on {source}")),
+        _demoted(score_markdown(read_scores(results / SCORES_CSV), f"Localization score on {source}")),
     ]
     if (results / VARIANTS_CSV).is_file():
         lines += [
             "## Scores of the networks for all inputs",
             "Before one was chosen by its validation metrics (see Training), in full precision.",
-            _demoted(score_markdown(_scores(results / VARIANTS_CSV), f"Localization score on {source}")),
+            _demoted(score_markdown(read_scores(results / VARIANTS_CSV), f"Localization score on {source}")),
         ]
     if (results / GENERALIZATION_CSV).is_file():
-        others = _scores(results / GENERALIZATION_CSV)
+        others = read_scores(results / GENERALIZATION_CSV)
         others = others[others["weights_sha256"] == sha256(weights)].drop(columns="weights_sha256")
         if len(others):
             lines += ["## Scores on other datasets", "Scenes neither trained nor validated on."]
@@ -165,11 +165,6 @@ def _weights(release: Dataset) -> Path:
             value=[path.name for path in found], fix=f"Run `wheretolook release --config configs/{release.name}.yaml`.",
         )  # fmt: skip
     return found[0]
-
-
-def _scores(path: Path) -> pd.DataFrame:
-    table = pd.read_csv(path, keep_default_na=False, na_values=[""])
-    return table.assign(inputs=table["inputs"].fillna(""))
 
 
 def _demoted(markdown: str) -> str:

@@ -276,7 +276,11 @@ def release(experiment: Experiment, say: Say = print, tick: Tick = lambda work: 
         StorageError: it is not smaller than 16 MB.
         ConfigError: another dataset lies where the copy belongs.
     """
+    import pandas as pd
+
+    from wheretolook.evaluation.paper_tables import write_paper_tables
     from wheretolook.evaluation.run import SCORES_CSV
+    from wheretolook.evaluation.scores import LEARNED, read_scores
     from wheretolook.release import copy_dataset, is_release, ship_weights, size_text, sizes, trained_weights
     from wheretolook.release_card import VARIANTS_CSV, write_card
 
@@ -292,15 +296,19 @@ def release(experiment: Experiment, say: Say = print, tick: Tick = lambda work: 
         return copy
     # on the CPU, as those who have no GPU will do it
     on_cpu = replace(experiment, device="cpu", evaluate=replace(experiment.evaluate, weights=()))
+    results = dataset.root / "results"
     if len(trained_weights(dataset)) > 1:  # all that were trained, before only the best is left
-        evaluate(on_cpu, say)
-        results = dataset.root / "results"
+        evaluate(replace(on_cpu, evaluate=replace(on_cpu.evaluate, methods=(LEARNED,), reference="")), say)
         shutil.copyfile(results / SCORES_CSV, results / VARIANTS_CSV)
     weights, precisions = ship_weights(dataset)
     compared = ", ".join(f"{variant} {value:.4f}" for variant, value in precisions.items())
     say(f"validation average precision: {compared}; ships in half precision: {weights}")
     sizes(dataset.root)  # too large? then before the evaluation
-    evaluate(on_cpu, say, tick)
+    scores = evaluate(on_cpu, say, tick)
+    if (results / VARIANTS_CSV).is_file():  # the paper's tables have a row for each of the inputs
+        variants = read_scores(results / VARIANTS_CSV)
+        both = [scores[scores["method"] != LEARNED], variants[variants["method"] == LEARNED]]
+        write_paper_tables(pd.concat(both, ignore_index=True), results)
     say(f"the card -> {write_card(dataset)}")
     say(size_text(sizes(dataset.root)))
     return dataset

@@ -20,7 +20,16 @@ from wheretolook.evaluation.config import EvaluateConfig, candidates_label, thre
 from wheretolook.evaluation.paper_tables import write_paper_tables
 from wheretolook.evaluation.ranking import TestViews
 from wheretolook.evaluation.report import score_markdown
-from wheretolook.evaluation.scores import ALL, LEARNED, Choices, Method, choose, reference_method, score_table
+from wheretolook.evaluation.scores import (
+    ALL,
+    LEARNED,
+    Choices,
+    Method,
+    choose,
+    read_scores,
+    reference_method,
+    score_table,
+)
 from wheretolook.geometry import Float
 from wheretolook.learning.config import VARIANTS
 from wheretolook.localization_map import LocalizationMap
@@ -444,5 +453,4 @@ def latest_scores(tracking: TrackingConfig, dataset: str | None = None) -> pd.Da
     run = newest_run(tracking, "evaluate", {"dataset": dataset} if dataset else None)
     if run is None:
         return None
-    table = pd.read_csv(artifact(tracking, run.info.run_id, SCORES_CSV), keep_default_na=False, na_values=[""])
-    return table.assign(inputs=table["inputs"].fillna(""))
+    return read_scores(artifact(tracking, run.info.run_id, SCORES_CSV))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -43,6 +44,12 @@ _CALIBRATION = ("ece", "ece_scaled", "temperature")
 
 Choices = Mapping[tuple[Method, int], TopN]
 """What each method, the oracle too, chooses for each N."""
+
+
+def read_scores(path: Path) -> pd.DataFrame:
+    """A score table from its CSV file. Methods without inputs have "", as when it was made."""
+    table = pd.read_csv(path, keep_default_na=False, na_values=[""])
+    return table.assign(inputs=table["inputs"].fillna(""))
 
 
 def choose(views: TestViews, scores: Mapping[Method, Float], top_n: Sequence[int]) -> Choices:

@@ -55,11 +55,14 @@ def make_scores(
                     row |= {f"raw_low_{key}": share - 0.02, f"raw_high_{key}": share + 0.02}
                     row |= {f"normalized_{key}": share / 0.9, f"normalized_low_{key}": share / 0.9 - 0.02}
                     row |= {f"normalized_high_{key}": min(1.0, share / 0.9 + 0.02)}
-                    row |= {f"any_{key}": min(1.0, share + 0.01 * n), f"released_{key}": share / RELEASED_DIVISOR}
+                    some = min(1.0, share + 0.01 * n)
+                    row |= {f"any_{key}": some, f"any_low_{key}": some - 0.03, f"any_high_{key}": min(1.0, some + 0.03)}
+                    row |= {f"released_{key}": share / RELEASED_DIVISOR}
                     row |= {f"regret_{key}": 0.9 - share, f"regret_low_{key}": 0.88 - share}
                     row |= {f"regret_high_{key}": 0.92 - share, f"difference_{key}": difference}
                     row |= {f"difference_low_{key}": difference - width, f"difference_high_{key}": difference + width}
                     row |= {f"p_{key}": 0.04 if width else 1.0}
+                row |= {"reference": "" if reference is None else " ".join(reference).strip()}
                 row |= {"average_precision": rng.random(), "roc_auc": rng.random()}
                 row |= {"ece": 0.0712 if learned else np.nan, "ece_scaled": 0.0234 if learned else np.nan}
                 rows.append({**row, "temperature": 1.375 if learned else np.nan})
@@ -68,5 +71,6 @@ def make_scores(
 
 def older(scores: pd.DataFrame) -> pd.DataFrame:
     """The columns that tables had before regrets, differences and calibration."""
-    new = ("good_", "released_", "regret_", "difference_", "p_", "candidates", "ece", "temperature")
+    new = ("good_", "released_", "regret_", "difference_", "p_", "candidates", "ece", "temperature", "reference",
+           "any_low_", "any_high_")  # fmt: skip
     return scores[[name for name in scores.columns if not name.startswith(new)]]

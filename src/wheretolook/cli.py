@@ -213,7 +213,8 @@ def _help(parser: ArgumentParser, command: str) -> str:
 
     for group in parser._action_groups:
         group._group_actions = [action for action in group._group_actions if belongs(action.dest)]
-    return str(parser.format_help())
+    more = "\nWhat evaluate.methods may name: wheretolook evaluate --list-methods\n" if command == "evaluate" else ""
+    return str(parser.format_help()) + more
 
 
 _SHORT = {"--engine": "--label.engine"}

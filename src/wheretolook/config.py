@@ -39,7 +39,7 @@ class MeshSource:
 
     def __post_init__(self) -> None:
         name = self.scene_name
-        if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9._-]*", name) or name in ("weights", "results"):
+        if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9._-]*", name) or name in ("weights", "results", "all"):
             raise ConfigError(
                 "a scene's name becomes a folder's",
                 value=name,

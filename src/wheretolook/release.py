@@ -50,7 +50,7 @@ def copy_dataset(dataset: Dataset, experiment: Experiment) -> Dataset:
 
     Tables are written compact (`wheretolook.table.COMPACT_SCHEMA`), landmarks without descriptors and in half
     precision, and what labels were made with without the list of shards. Weights and results that lie there stay; the
-    card goes if the data changed.
+    card and the scores of networks that do not ship go if the data changed.
 
     Args:
         dataset: what to copy.
@@ -89,7 +89,8 @@ def copy_dataset(dataset: Dataset, experiment: Experiment) -> Dataset:
             if scene.name not in {copy.name for copy in release.scenes}:
                 shutil.rmtree(scene.folder, ignore_errors=True)
     if release.fingerprint() != fingerprint:
-        (root / CARD).unlink(missing_ok=True)
+        for outdated in (CARD, "results/variants.csv"):
+            (root / outdated).unlink(missing_ok=True)
     return release
 
 

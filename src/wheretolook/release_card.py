@@ -16,7 +16,7 @@ from wheretolook.dataset import Dataset, write_text
 from wheretolook.errors import TableError, WeightsError
 from wheretolook.evaluation.config import THRESHOLDS, threshold_key, threshold_label
 from wheretolook.evaluation.report import markdown_table, score_markdown
-from wheretolook.evaluation.run import SCORES_CSV
+from wheretolook.evaluation.run import SCORES_CSV, VARIANTS_CSV
 from wheretolook.evaluation.scores import ALL, read_scores
 from wheretolook.figures.style import method_style
 from wheretolook.labelling.report import POSITIVE, label_summary
@@ -28,9 +28,6 @@ from wheretolook.visibility import StoredOcclusion
 GENERALIZATION_CSV, GENERALIZATION_MD = "generalization.csv", "generalization.md"
 """In `results/`: scores on other datasets, as `scores.csv` with the columns `dataset` and `weights_sha256` (of the
 shipped weights at that time; rows with others are not shown), and where those datasets come from."""
-
-VARIANTS_CSV = "variants.csv"
-"""In `results/`: scores of the networks for all inputs, as `scores.csv`, before one was chosen."""
 
 _HOW_TO_USE = """\
 ```python

@@ -276,13 +276,10 @@ def release(experiment: Experiment, say: Say = print, tick: Tick = lambda work: 
         StorageError: it is not smaller than 16 MB.
         ConfigError: another dataset lies where the copy belongs.
     """
-    import pandas as pd
-
-    from wheretolook.evaluation.paper_tables import write_paper_tables
-    from wheretolook.evaluation.run import SCORES_CSV
-    from wheretolook.evaluation.scores import LEARNED, read_scores
+    from wheretolook.evaluation.run import SCORES_CSV, VARIANTS_CSV
+    from wheretolook.evaluation.scores import LEARNED
     from wheretolook.release import copy_dataset, is_release, ship_weights, size_text, sizes, trained_weights
-    from wheretolook.release_card import VARIANTS_CSV, write_card
+    from wheretolook.release_card import write_card
 
     dataset = _dataset(experiment, "label")
     if not is_release(dataset):
@@ -304,11 +301,7 @@ def release(experiment: Experiment, say: Say = print, tick: Tick = lambda work: 
     compared = ", ".join(f"{variant} {value:.4f}" for variant, value in precisions.items())
     say(f"validation average precision: {compared}; ships in half precision: {weights}")
     sizes(dataset.root)  # too large? then before the evaluation
-    scores = evaluate(on_cpu, say, tick)
-    if (results / VARIANTS_CSV).is_file():  # the paper's tables have a row for each of the inputs
-        variants = read_scores(results / VARIANTS_CSV)
-        both = [scores[scores["method"] != LEARNED], variants[variants["method"] == LEARNED]]
-        write_paper_tables(pd.concat(both, ignore_index=True), results)
+    evaluate(on_cpu, say, tick)
     say(f"the card -> {write_card(dataset)}")
     say(size_text(sizes(dataset.root)))
     return dataset

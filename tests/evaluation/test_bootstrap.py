@@ -71,3 +71,21 @@ def test_paired_p_is_never_zero_and_the_same_again() -> None:
     np.testing.assert_array_equal(bootstrap.paired_p(differences), bootstrap.paired_p(differences))
     np.testing.assert_array_equal(bootstrap.paired_p(-differences), bootstrap.paired_p(differences))
     assert np.isnan(LocationBootstrap(np.empty(0, dtype=int), 10, seed=0).paired_p(np.empty((0, 2)))).all()
+
+
+def test_copies_of_a_location_in_its_block_tell_nothing_new() -> None:
+    rng = np.random.default_rng(3)
+    good, chosen, scene = rng.random((80, 2)), rng.integers(1, 4, (80, 1)).astype(float), np.repeat([0, 1], 40)
+    alone = LocationBootstrap(scene, 1000, 0)
+    copies = np.repeat(np.arange(80), 3)
+    together = LocationBootstrap(scene[copies], 1000, 0, copies % 40)  # numbers of blocks need not differ by scene
+    np.testing.assert_allclose(together.ratio(good[copies], chosen[copies]), alone.ratio(good, chosen))
+    np.testing.assert_allclose(together.paired_p(good[copies] - 0.5), alone.paired_p(good - 0.5))
+    apart = LocationBootstrap(scene[copies], 1000, 0)
+    narrow, wide = (np.subtract(*b.ratio(good[copies], chosen[copies])[::-1]) for b in (apart, together))
+    np.testing.assert_allclose(wide / narrow, np.sqrt(3), rtol=0.15)
+
+
+def test_one_block_has_no_interval() -> None:
+    bootstrap = LocationBootstrap(np.zeros(5, int), 100, 0, np.full(5, 7))
+    assert np.isnan(bootstrap.ratio(np.ones((5, 1)), np.ones((5, 1)))).all()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -13,11 +14,11 @@ from scipy.special import expit, logit
 
 from synthetic_dataset import make_dataset
 from wheretolook.dataset import Dataset
-from wheretolook.errors import ConfigError, TableError, WeightsError
+from wheretolook.errors import ConfigError, SceneError, TableError, WeightsError
 from wheretolook.evaluation import EvaluateConfig, evaluate, latest_scores
 from wheretolook.learning.config import TrainConfig
 from wheretolook.learning.training import train
-from wheretolook.scoring import load_scorer
+from wheretolook.scoring import VisibleScorer, load_scorer
 from wheretolook.table import UNLABELLED, is_good, poses, write_table
 from wheretolook.tracking import TrackingConfig, client, newest_run, ui_command
 
@@ -91,6 +92,22 @@ def test_evaluation_writes_prints_and_logs(
         assert chosen["best_score"].isna().all() == (params["method"] in ("random", "oracle"))
         assert run.data.metrics["regret_0.25m_2deg"] == pytest.approx(row["regret_0.25m_2deg"])
         assert params["candidates"] == "all"
+        assert {"split", "seed", "thresholds", "weights", "reference", "dataset_fingerprint"} <= set(params)
+        for scene in ("scene-2", "scene-3"):
+            (part,) = table[
+                (table[["method", "inputs"]] == [params["method"], params["inputs"]]).all(axis=1)
+                & (table["top_n"] == int(params["top_n"])) & (table["scene"] == scene)
+            ].to_dict("records")  # fmt: skip
+            assert run.data.metrics[f"good_0.05m_0.4deg/{scene}"] == pytest.approx(part["good_0.05m_0.4deg"])
+    # the README's search finds the best of them, which is no oracle
+    readme = (Path(__file__).parents[2] / "README.md").read_text()
+    (query,) = re.findall(r"`(tags\.stage = \"evaluate\"[^`]*)`", readme)
+    query = query.replace('params.dataset = "release"', 'params.dataset = "tiny"')
+    (best,) = client(tracking).search_runs(
+        [parent.info.experiment_id], query, order_by=["metrics.`regret_0.05m_0.4deg`"], max_results=1
+    )
+    assert best.data.params["method"] != "oracle" and best.data.params["top_n"] == "1"
+    assert best.data.metrics["regret_0.05m_0.4deg"] == pooled.loc["bins", "", 1]["regret_0.05m_0.4deg"] == 0
     artifacts = Path(parent.info.artifact_uri)
     assert {path.name for path in artifacts.iterdir()} == {path.name for path in results.iterdir()}
     assert not list(cwd.iterdir())
@@ -142,7 +159,11 @@ def test_learned_methods_are_calibrated_on_the_val_scenes(dataset: Dataset, tmp_
     table = evaluate(dataset, replace(config, split="val"), tracking, models=[model], progress=False)
     rows = table[table["method"] == "mlp"]
     assert rows["ece"].notna().all() and rows[["ece_scaled", "temperature"]].isna().all(axis=None)
-    assert {*pd.read_csv(dataset.root / "results" / "calibration.csv")["when"]} == {"before"}
+    results = dataset.root / "results"
+    assert {*pd.read_csv(results / "val" / "calibration.csv")["when"]} == {"before"}
+    assert "tiny, val scenes" in (results / "val" / "scores.md").read_text()
+    assert {*pd.read_csv(results / "calibration.csv")["when"]} == {"before", "after"}  # that of the test scenes stays
+    shutil.rmtree(results / "val")
     evaluate(dataset, replace(config, methods=("bins",)), tracking, progress=False)
     assert not (dataset.root / "results" / "calibration.csv").exists()
     # without labels on val scenes it is not known
@@ -151,6 +172,37 @@ def test_learned_methods_are_calibrated_on_the_val_scenes(dataset: Dataset, tmp_
         write_table(scene.read_table().assign(status=UNLABELLED), scene.table)
     table = evaluate(unlabelled, config, tracking, models=[model], progress=False)
     assert table["temperature"].isna().all() and table.loc[table["method"] == "mlp", "ece"].notna().all()
+
+
+def test_what_a_location_sees_by_the_mesh_needs_no_mesh_where_it_is_stored(dataset: Dataset, tmp_path: Path) -> None:
+    tracking = TrackingConfig(str(tmp_path / "mlruns"))
+    stored = evaluate(dataset, RULES, tracking, progress=False)
+    both = evaluate(dataset, replace(RULES, occlusions=("mesh", "none")), tracking, progress=False)
+    first = both[both["occlusion"] == "mesh"].reset_index(drop=True)
+    pd.testing.assert_frame_equal(first, stored)
+    assert {*both["occlusion"]} == {"mesh", "none"} and len(both) == 2 * len(first)
+    with pytest.raises(SceneError, match="occlusion by tsdf needs the scene's mesh"):
+        evaluate(dataset, replace(RULES, occlusions=("tsdf",)), tracking, progress=False)
+
+
+def test_neighbours_are_resampled_together(dataset: Dataset, tmp_path: Path) -> None:
+    tracking, key = TrackingConfig(str(tmp_path / "mlruns")), "0.05m_0.4deg"
+    tables = [
+        evaluate(dataset, replace(RULES, block_m=block_m, methods=("random",)), tracking, progress=False).iloc[0]
+        for block_m in (0.0, 1e-6, 1.0, 1e3)
+    ]
+    assert len({table[f"raw_{key}"] for table in tables}) == 1
+    ends = [(table[f"raw_low_{key}"], table[f"raw_high_{key}"]) for table in tables]
+    assert ends[0][0] < ends[0][1] and ends[2] != ends[0]
+    assert np.isnan(ends[3]).all()  # all of a scene are neighbours
+
+
+def test_scores_that_are_not_finite_are_named(
+    dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(VisibleScorer, "score_binned", lambda self, views, binned: np.full(len(views), np.nan))
+    with pytest.raises(TableError, match=r"scene-2.*not finite.*visible"):
+        evaluate(dataset, RULES, TrackingConfig(str(tmp_path / "mlruns")), progress=False)
 
 
 def test_candidates_are_chosen_by_visibility(tmp_path: Path) -> None:
@@ -226,6 +278,12 @@ def test_bad_input_is_named(dataset: Dataset, tmp_path: Path) -> None:
     for candidates in ((), (-1,), (100, 100)):
         with pytest.raises(ConfigError, match="candidates"):
             EvaluateConfig(candidates=candidates)
+    for wrong in (
+        {"seed": -1}, {"thresholds": ((0.05, float("nan")),)}, {"thresholds": ((0.05, 0.4), (0.05, 0.4))},
+        {"block_m": -1.0}, {"heading": ((0.0, 0, 0),)}, {"heading": ((1.0, 0, 0), (1.0, 0, 0))},
+    ):  # fmt: skip
+        with pytest.raises(ConfigError, match=next(iter(wrong))):
+            EvaluateConfig(**wrong)  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match=r"reference.*'mlp 2d'.*random, visible, bins"):
         evaluate(dataset, replace(RULES, reference="mlp 2d"), tracking, progress=False)
     untrained = make_dataset(tmp_path / "untrained", ("test",), n_locations=2, n_directions=4)

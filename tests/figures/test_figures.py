@@ -81,7 +81,7 @@ def test_fisher_rows_are_one_family() -> None:
     """A marker for each metric, a shade for each approximation, dark to light also in greyscale."""
     styles = {
         f"{metric} {approximation}": method_style("fisher", f"{metric} {approximation}")
-        for metric, approximation in FISHER_METHODS.values()
+        for metric, approximation, _ in FISHER_METHODS.values()
     }
     assert len({style.label for style in styles.values()}) == len(styles) == 9
     for name, style in styles.items():

@@ -229,3 +229,9 @@ def test_damaged_fields_are_named(tmp_path: Path) -> None:
     np.savez(path, locations=field.locations, factors=field.factors, about='{"format_version": 2}')
     with pytest.raises(MapError, match="another version"):
         FisherField.load(path)
+
+
+@pytest.mark.parametrize("shape", [(2, 20), (1, 30), (3, 30), (30, 2)])
+def test_masks_of_another_shape_are_refused(shape: tuple[int, int]) -> None:
+    with pytest.raises(ValueError, match=r"shape \(2, 30\)"):
+        FisherField.build(np.zeros((2, 3)), np.ones((30, 3)), VISIBILITIES[0], np.ones(shape, bool))

@@ -9,6 +9,7 @@ from synthetic_dataset import make_landmarks
 from wheretolook.geometry import Float, PinholeCamera, poses_looking_along
 from wheretolook.grid import axes_of_angles, fibonacci_sphere, yaw_pitch_angles
 from wheretolook.localization_map import LocalizationMap
+from wheretolook.scoring import make_scorer
 from wheretolook.scoring.forward import ForwardScorer
 from wheretolook.scoring.max_visibility import VIEWS_AT_ONCE, MaxVisibilityScorer, SwappedMaxVisibilityScorer
 
@@ -75,10 +76,31 @@ def test_forward_prefers_the_heading(localization_map: LocalizationMap) -> None:
         np.testing.assert_array_equal(np.argsort(-scores), np.argsort(-directions @ unit))
         assert 0 <= scores.min() < 0.01 and 0.99 < scores.max() <= 1
     straight = poses_looking_along(np.zeros((3, 3)), [[1.0, 0, 0], [0, 1, 0], [-1, 0, 0]])
-    np.testing.assert_allclose(ForwardScorer(localization_map).score(straight), [1, 0.5, 0])
+    np.testing.assert_allclose(ForwardScorer(localization_map, (1, 0, 0)).score(straight), [1, 0.5, 0])
 
 
-@pytest.mark.parametrize("heading", [(0.0, 0, 0), (np.nan, 0, 1), (np.inf, 0, 0), (1.0, 0)])
+def test_forward_follows_a_path(localization_map: LocalizationMap) -> None:
+    path = [[0.0, 0, 1], [4, 0, 1], [4, 3, 1], [4, 3, 2]]
+    scorer = ForwardScorer(localization_map, path)
+    at = [[-5.0, 0, 1], [1, 0.5, 1], [3.5, 2, 1], [5, 2.9, 3]]
+    np.testing.assert_allclose(scorer.headings(at), [[1, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    np.testing.assert_allclose(scorer.score(poses_looking_along(at, np.tile([0.0, 1, 0], (4, 1)))), [0.5, 0.5, 1, 0.5])
+    by_name = make_scorer("forward", localization_map, heading=tuple(map(tuple, path)))  # type: ignore[arg-type]
+    np.testing.assert_allclose(by_name.headings(at), scorer.headings(at))  # type: ignore[attr-defined]
+
+
+def test_without_a_heading_one_is_drawn_for_each_location(localization_map: LocalizationMap) -> None:
+    at = np.random.default_rng(0).uniform(-5, 5, (4000, 3))
+    headings = ForwardScorer(localization_map, seed=1).headings(at)
+    np.testing.assert_allclose(np.linalg.norm(headings, axis=1), 1)
+    assert not headings[:, 2].any() and np.abs(headings.mean(0)).max() < 0.05  # in every direction alike
+    np.testing.assert_array_equal(ForwardScorer(localization_map, seed=1).headings(at[7:9]), headings[7:9])
+    assert np.abs(ForwardScorer(localization_map, seed=2).headings(at) - headings).max(1).mean() > 0.5
+
+
+@pytest.mark.parametrize(
+    "heading", [(0.0, 0, 0), (np.nan, 0, 1), (np.inf, 0, 0), (1.0, 0), [[1.0, 0, 0]], [[1.0, 0, 0], [1, 0, 0]]]
+)
 def test_headings_that_are_none(heading: tuple[float, ...], localization_map: LocalizationMap) -> None:
     with pytest.raises(ValueError, match="a heading is a direction"):
         ForwardScorer(localization_map, heading)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
+
+import numpy as np
 
 from wheretolook.errors import ConfigError
 from wheretolook.visibility.config import OcclusionName, check_occlusion_names
@@ -14,9 +17,9 @@ THRESHOLDS = ((0.05, 0.4), (0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
 
 
 def _all_methods() -> tuple[str, ...]:
-    from wheretolook.scoring.registry import SCORERS
+    from wheretolook.scoring.registry import OPTIONAL, SCORERS
 
-    return tuple(SCORERS)
+    return tuple(name for name in SCORERS if name not in OPTIONAL)
 
 
 @dataclass(frozen=True)
@@ -24,7 +27,8 @@ class EvaluateConfig:
     """Options of evaluation.
 
     Args:
-        methods: methods to compare, keys of `wheretolook.scoring.SCORERS`; all of them if not named. "mlp" stands for
+        methods: methods to compare, keys of `wheretolook.scoring.SCORERS`; if not named, all but
+            `wheretolook.scoring.registry.OPTIONAL`. "mlp" stands for
             every weights file.
         weights: weights to evaluate; empty for all in the dataset's `weights` folder.
         split: whose scenes to evaluate on: "test", "val" or "train".
@@ -38,6 +42,10 @@ class EvaluateConfig:
         candidates: sets of views to choose from, each tabulated apart. 0 is for all labelled directions of a location,
             as a planner meets them, K > 0 for those among the K that see most landmarks (of all directions, labelled or
             not), as in the paper.
+        block_m: intervals and tests resample locations in squares of so many metres on the floor together, as
+            neighbours see the same landmarks; 0 takes each location for independent.
+        heading: of the method "forward", in the world: one direction, or the waypoints of a path, whose direction of
+            travel nearest to a location is the heading there. Empty for a horizontal heading drawn for each location.
         reference: method that every other is compared with, by name and inputs as in the table, such as "bins" or
             "mlp 2d+z". Empty for the learned one with the inputs "2d+3d", or else the first learned one.
     """
@@ -51,6 +59,8 @@ class EvaluateConfig:
     resamples: int = 2000
     occlusions: tuple[OcclusionName, ...] = ()
     candidates: tuple[int, ...] = (0,)
+    block_m: float = 1.0
+    heading: tuple[tuple[float, float, float], ...] = ()
     reference: str = ""
 
     def __post_init__(self) -> None:
@@ -64,8 +74,16 @@ class EvaluateConfig:
             raise ConfigError("unknown split", value=self.split, fix="Use train, val or test.")
         if not self.top_n or min(self.top_n) < 1 or len(set(self.top_n)) < len(self.top_n):
             raise ConfigError("top_n needs different numbers of at least 1", value=self.top_n)
-        if not self.thresholds or min(limit for pair in self.thresholds for limit in pair) <= 0:
+        limits = [limit for pair in self.thresholds for limit in pair]
+        if not limits or not all(0 < limit < float("inf") for limit in limits):
             raise ConfigError("thresholds needs pairs of positive limits", value=self.thresholds)
+        if len(set(map(threshold_key, self.thresholds))) < len(self.thresholds):
+            raise ConfigError("thresholds needs different pairs", value=self.thresholds)
+        if self.seed < 0:
+            raise ConfigError("seed must not be negative", value=self.seed)
+        if not 0 <= self.block_m < float("inf"):
+            raise ConfigError("block_m must not be negative", value=self.block_m)
+        check_heading(self.heading)
         if self.resamples < 1:
             raise ConfigError("resamples must be at least 1", value=self.resamples)
         if not self.candidates or min(self.candidates) < 0 or len(set(self.candidates)) < len(self.candidates):
@@ -74,6 +92,17 @@ class EvaluateConfig:
                 fix="0 is for all directions, 100 for the 100 that see most landmarks.",
             )  # fmt: skip
         check_occlusion_names(self.occlusions)
+
+
+def check_heading(heading: Sequence[Sequence[float]]) -> None:
+    """Raise a ConfigError unless it is empty, one direction, or waypoints of which no two in a row are the same."""
+    values = np.asarray(heading, dtype=np.float64).reshape(-1, 3)
+    steps = np.diff(values, axis=0) if len(values) > 1 else values
+    if not np.isfinite(values).all() or (np.abs(steps).sum(1) == 0).any():
+        raise ConfigError(
+            "a heading is one direction, or waypoints that differ", value=tuple(map(tuple, values.tolist())),
+            fix="Give such as [[1, 0, 0]], or [[0, 0, 1], [2, 0, 1], [2, 3, 1]].",
+        )  # fmt: skip
 
 
 def candidates_label(best: int) -> str:

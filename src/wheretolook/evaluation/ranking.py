@@ -20,6 +20,8 @@ class TestViews:
         viewpoint_id: (B,) int64, unique within a location.
         good: (B, T) bool, whether the view localizes within each of T thresholds.
         location_scene: (L,) int64, number of each location's scene.
+        location_block: (L,) int64, number of the block of neighbouring locations that each is resampled with, see
+            `wheretolook.evaluation.bootstrap.LocationBootstrap`; None for each by itself.
     """
 
     __test__ = False  # no test class, whatever its name says
@@ -28,6 +30,7 @@ class TestViews:
     viewpoint_id: NDArray[np.int64]
     good: NDArray[np.bool_]
     location_scene: NDArray[np.int64]
+    location_block: NDArray[np.int64] | None = None
 
     @property
     def n_locations(self) -> int:
@@ -40,7 +43,8 @@ class TestViews:
         Locations without any are left out and the others renumbered, in the same order; scenes keep their numbers.
         """
         kept, location = np.unique(self.location[mask], return_inverse=True)
-        return TestViews(location, self.viewpoint_id[mask], self.good[mask], self.location_scene[kept])
+        block = None if self.location_block is None else self.location_block[kept]
+        return TestViews(location, self.viewpoint_id[mask], self.good[mask], self.location_scene[kept], block)
 
 
 @dataclass(frozen=True, eq=False)

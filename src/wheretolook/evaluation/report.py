@@ -24,7 +24,8 @@ SCENES_ABREAST = 8
 
 def threshold_keys(scores: pd.DataFrame) -> list[str]:
     """Thresholds of a score table, by the names its columns use."""
-    return [name.removeprefix("any_") for name in scores.columns if name.startswith("any_")]
+    return [name.removeprefix("normalized_") for name in scores.columns if name.startswith("normalized_")
+            and not name.startswith(("normalized_low_", "normalized_high_"))]  # fmt: skip
 
 
 def main_rows(scores: pd.DataFrame, columns: Sequence[str] = ("occlusion", "candidates")) -> pd.DataFrame:
@@ -41,16 +42,9 @@ def methods_of(scores: pd.DataFrame) -> list[Method]:
 
 
 def reference_of(scores: pd.DataFrame) -> Method | None:
-    """The method that a score table compares the others with: the one that never differs. None if there is none."""
-    pooled = scores[scores["scene"] == ALL]
-    keys = [key for key in threshold_keys(scores) if f"difference_{key}" in scores]
-    if not keys:
-        return None
-    ends = [name for key in keys for name in (f"difference_low_{key}", f"difference_high_{key}") if name in scores]
-    # of few locations there is no interval
-    same = (pooled[[f"difference_{key}" for key in keys]] == 0).all(axis=1) & (pooled[ends].fillna(0) == 0).all(axis=1)
-    differing = {*methods_of(pooled[~same])}
-    return next((method for method in methods_of(pooled) if method not in differing), None)
+    """The method that a score table compares the others with. None if there is none."""
+    name = scores["reference"].iloc[0] if "reference" in scores else ""
+    return next((method for method in methods_of(scores) if name and " ".join(method).strip() == name), None)
 
 
 def score_markdown(scores: pd.DataFrame, title: str = "Localization score") -> str:
@@ -111,8 +105,8 @@ def _explained(first: pd.DataFrame, key: str) -> list[str]:
     limits, reference = threshold_label(key), reference_of(first)
     lines = [
         "score: share in % of the chosen viewpoints that localize within both limits, divided by the oracle's share "
-        "[95 % bootstrap interval over locations] (undivided). Random is an exact expectation, its AP and AUC are one "
-        "draw."
+        "[95 % bootstrap interval over locations, neighbours resampled together] (undivided). Random is an exact "
+        "expectation, its AP and AUC are one draw."
     ]
     if f"regret_{key}" in first:
         lines.append(
@@ -123,7 +117,7 @@ def _explained(first: pd.DataFrame, key: str) -> list[str]:
         lines.append(
             f"difference: the method's undivided share within {limits} less that of {method_style(*reference).label}, "
             "in percentage points [interval, paired by location], and the p-value of a paired permutation test over "
-            "locations."
+            "neighbourhoods of locations (none for random's expectation)."
         )
     lines.append(f"AP, AUC: average precision and area under the ROC curve over all candidates, within {limits}.")
     return ["\n".join(f"- {line}" for line in lines)]
@@ -166,7 +160,7 @@ def _any_table(pooled: pd.DataFrame, key: str, counts: Sequence[int]) -> list[st
         return []
     by_key = {(row["method"], row["inputs"], row["top_n"]): row for row in pooled.to_dict("records")}
     lines = [
-        [method_style(*method).label, *(_percent(by_key[(*method, n)][f"any_{key}"]) for n in counts)]
+        [method_style(*method).label, *(_any(by_key[(*method, n)], key) for n in counts)]
         for method in methods_of(pooled)
     ]
     return [
@@ -175,6 +169,10 @@ def _any_table(pooled: pd.DataFrame, key: str, counts: Sequence[int]) -> list[st
         f"{threshold_label(key)}; the oracle's is that of locations that have such a viewpoint.",
         markdown_table(["method", *(f"best {n}" for n in counts)], lines),
     ]
+
+
+def _any(row: Row, key: str) -> str:
+    return _percent(row[f"any_{key}"]) + _ends(row, "any", key)
 
 
 def _scene_tables(methods: pd.DataFrame, key: str, n: int) -> list[str]:

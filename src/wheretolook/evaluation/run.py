@@ -19,7 +19,7 @@ from wheretolook.evaluation.calibration import calibration_rows, fit_temperature
 from wheretolook.evaluation.config import EvaluateConfig, candidates_label, threshold_key
 from wheretolook.evaluation.paper_tables import write_paper_tables
 from wheretolook.evaluation.ranking import TestViews
-from wheretolook.evaluation.report import score_markdown
+from wheretolook.evaluation.report import main_rows, score_markdown
 from wheretolook.evaluation.scores import (
     ALL,
     LEARNED,
@@ -30,7 +30,8 @@ from wheretolook.evaluation.scores import (
     reference_method,
     score_table,
 )
-from wheretolook.geometry import Float
+from wheretolook.fisher.soft_visibility import GaussianProcessVisibility, cone_half_angle
+from wheretolook.geometry import Float, camera_centers
 from wheretolook.learning.config import VARIANTS
 from wheretolook.localization_map import LocalizationMap
 from wheretolook.scene_occlusion import scene_occlusion
@@ -48,6 +49,9 @@ BLOCK = 4096
 SCORES_CSV, SCORES_MD, SCORES_PNG, OCCLUSION_PNG = "scores.csv", "scores.md", "scores.png", "occlusion.png"
 CALIBRATION_CSV, CALIBRATION_PNG, REGRET_PNG = "calibration.csv", "calibration.png", "regret.png"
 """Files of an evaluation, in `<dataset>/results/` and as artifacts of its run."""
+
+VARIANTS_CSV = "variants.csv"
+"""In a release's `results/`: scores of the networks for all inputs, as `scores.csv`, before one was chosen to ship."""
 
 LOCATIONS_PARQUET = "locations.parquet"
 """Artifact of each nested run: what was chosen at each location."""
@@ -155,11 +159,19 @@ def evaluate(
             part.insert(3, "candidates", candidates.name)
             scored.append(ScoredSet(used, candidates, subset, choices, part))
     table = pd.concat([one.table for one in scored], ignore_index=True)
-    _write_results(dataset.root / "results", table, calibration, f"Localization score on {dataset.name}")
-    _log(dataset, scenes, config, tracking, weights, views, scored, occlusion)
+    title = f"Localization score on {dataset.name}" + (f", {config.split} scenes" if config.split != "test" else "")
+    folder = results_folder(dataset, config)
+    _write_results(folder, table, calibration, title)
+    _log(dataset, scenes, config, tracking, weights, views, scored, occlusion, folder)
     if progress:
-        print(score_markdown(table, f"Localization score on {dataset.name}"))
+        print(score_markdown(table, title))
     return table
+
+
+def results_folder(dataset: Dataset, config: EvaluateConfig) -> Path:
+    """Where an evaluation's files go: `<dataset>/results/`, or for scenes of another split than test a folder there."""
+    folder = dataset.root / "results"
+    return folder if config.split == "test" else folder / config.split
 
 
 def _weights(dataset: Dataset, config: EvaluateConfig, models: Sequence[TrainedModel | Path] | None) -> list[Path]:
@@ -215,6 +227,7 @@ def _test_views(
     location: list[NDArray[np.int64]] = []
     location_scene: list[NDArray[np.int64]] = []
     location_id: list[NDArray[np.int64]] = []
+    location_block: list[NDArray[np.int64]] = []
     good: list[NDArray[np.bool_]] = []
     for number, (scene, table) in enumerate(zip(scenes, tables, strict=True)):
         if table.empty:
@@ -223,12 +236,20 @@ def _test_views(
             good.append(np.stack([is_good(table, *limits) for limits in config.thresholds], axis=-1))
         except TableError as error:
             raise TableError(error.problem, path=scene.table, value=error.value, fix=error.fix) from None
-        ids, rows = np.unique(table["location_id"].to_numpy(np.int64), return_inverse=True)
+        ids, first, rows = np.unique(table["location_id"].to_numpy(np.int64), return_index=True, return_inverse=True)
+        if config.block_m:
+            squares = np.floor(camera_centers(poses(table)[first])[:, :2] / config.block_m)
+            location_block.append(np.unique(squares, axis=0, return_inverse=True)[1].reshape(-1))
+        else:
+            location_block.append(np.arange(len(ids)))
         location.append(rows + sum(map(len, location_id)))
         location_id.append(ids)
         location_scene.append(np.full(len(ids), number))
     viewpoint_id = np.concatenate([table["viewpoint_id"].to_numpy(np.int64) for table in tables])
-    views = TestViews(np.concatenate(location), viewpoint_id, np.concatenate(good), np.concatenate(location_scene))
+    views = TestViews(
+        np.concatenate(location), viewpoint_id, np.concatenate(good), np.concatenate(location_scene),
+        np.concatenate(location_block),
+    )  # fmt: skip
     return views, np.concatenate(location_id)
 
 
@@ -318,7 +339,8 @@ def _score_scenes(
     with tqdm(total=sum(map(len, tables)), desc=text, unit="view", disable=not progress) as bar:
         for scene, table in zip(scenes, tables, strict=True):
             localization_map = scene.localization_map(dataset.camera, device)
-            if occlusion is not None:
+            # a release has no mesh, but what each location sees by it
+            if occlusion is not None and (scene.mesh.is_file() or occlusion.model != localization_map.occlusion.name):
                 model = scene_occlusion(scene, dataset.camera, occlusion, device, progress=progress)
                 localization_map = replace(localization_map, occlusion=model)
             used.add(localization_map.occlusion.name)
@@ -329,7 +351,13 @@ def _score_scenes(
                 block = cam_from_world[begin : begin + BLOCK]
                 binned = localization_map.bin_views(block)
                 for method, scorer in scorers.items():
-                    scores.setdefault(method, []).append(scorer.score_binned(block, binned))
+                    values = scorer.score_binned(block, binned)
+                    if not np.isfinite(values).all():
+                        raise TableError(
+                            "a method gives scores that are not finite", path=scene.folder, value=" ".join(method),
+                            fix="Check the scene's landmarks and poses, and the weights; or leave the method out.",
+                        )  # fmt: skip
+                    scores.setdefault(method, []).append(values)
                 bar.update(len(block))
     return {method: np.concatenate(parts) for method, parts in scores.items()}, " ".join(sorted(used))
 
@@ -340,7 +368,7 @@ def _scorers(
     scorers: dict[Method, Scorer] = {}
     for name in config.methods:
         for path in weights if name == "mlp" else [None]:
-            scorer = make_scorer(name, localization_map, config.seed, path)
+            scorer = make_scorer(name, localization_map, config.seed, path, config.heading)
             key = (scorer.name, scorer.inputs)
             if key in scorers:  # two files of one variant: told apart by their names
                 key = (scorer.name, f"{scorer.inputs} {path}")
@@ -357,7 +385,15 @@ def _write_results(folder: Path, table: pd.DataFrame, calibration: pd.DataFrame,
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in ((SCORES_CSV, table.to_csv(index=False)), (SCORES_MD, score_markdown(table, title))):
         write_text(folder / name, text)
-    write_paper_tables(table, folder)
+    variants = folder / VARIANTS_CSV
+    if variants.is_file():  # the paper's tables have a row for each of the network's inputs, which a release knows
+        known = {*zip(table["method"], table["inputs"], strict=True)}
+        others = read_scores(variants)
+        methods = zip(others["method"], others["inputs"], strict=True)
+        others = others[[method not in known for method in methods]]
+        write_paper_tables(pd.concat([table, main_rows(others)], ignore_index=True), folder)
+    else:
+        write_paper_tables(table, folder)
     save_figure(score_figure(table), folder / SCORES_PNG)
     save_figure(regret_figure(table), folder / REGRET_PNG)
     if table["occlusion"].nunique() > 1:
@@ -381,6 +417,7 @@ def _log(
     views: TestViews,
     scored: Sequence[ScoredSet],
     occlusion: OcclusionConfig,
+    results: Path,
 ) -> None:
     params: dict[str, Any] = {
         "dataset": dataset.name,
@@ -394,6 +431,10 @@ def _log(
         ),
         "weights": " ".join(f"{path.stem}:{fingerprint(path)}" for path in weights),
     }
+    if any(name.startswith("fisher") and "gp" in name for name in config.methods):
+        process = GaussianProcessVisibility.fitted(cone_half_angle(dataset.camera))
+        params |= {"gp_factors": process.n_factors, "gp_length": round(process.length, 4)}
+        params["gp_held_out_rmse"] = round(process.held_out_error(), 4)
     positives = float(views.good[:, 0].mean())
     metrics = {"n_locations": views.n_locations, "n_views": len(views.good), "positives": positives}
     tags = {"dataset": dataset.name}
@@ -402,15 +443,24 @@ def _log(
         start_run(tracking, f"evaluate {dataset.name}", "evaluate", params, tags=tags) as (client, run),
     ):
         log(client, run, metrics=metrics)
-        client.log_artifacts(run, str(dataset.root / "results"))
+        for file in results.iterdir():
+            if file.is_file():
+                client.log_artifact(run, str(file))
         for one in scored:
+            by_scene = one.table[one.table["scene"] != ALL]
             for row in one.table[one.table["scene"] == ALL].to_dict("records"):
                 named = ("method", "inputs", "occlusion", "candidates", "top_n")
                 seen = (row["occlusion"], *([row["candidates"]] if row["candidates"] != ALL else []))
                 shown = (row["method"], row["inputs"], f"best {row['top_n']}", f"({', '.join(seen)})")
                 name = " ".join(part for part in shown if part)
-                child_params = {"dataset": dataset.name, **{key: row[key] for key in named}}
-                numbers = {str(key): float(value) for key, value in row.items() if key not in (*named, "scene")}
+                child_params = {**params, **{key: row[key] for key in named}}
+                texts = (*named, "scene", "reference")
+                numbers = {str(key): float(value) for key, value in row.items() if key not in texts}
+                same = by_scene[["method", "inputs", "top_n"]] == [row[key] for key in ("method", "inputs", "top_n")]
+                for scene in by_scene[same.all(axis=1)].to_dict("records"):
+                    for key, value in scene.items():
+                        if str(key).startswith(("good_", "n_views", "normalized_", "regret_")):
+                            numbers[f"{key}/{scene['scene']}"] = float(value)
                 chosen = _location_table(one, (row["method"], row["inputs"]), row["top_n"], scenes, config)
                 chosen.to_parquet(Path(folder) / LOCATIONS_PARQUET, index=False)
                 with start_run(tracking, name, "evaluate", child_params, parent=run) as (_, child):

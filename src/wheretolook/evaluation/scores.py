@@ -49,7 +49,8 @@ Choices = Mapping[tuple[Method, int], TopN]
 def read_scores(path: Path) -> pd.DataFrame:
     """A score table from its CSV file. Methods without inputs have "", as when it was made."""
     table = pd.read_csv(path, keep_default_na=False, na_values=[""])
-    return table.assign(inputs=table["inputs"].fillna(""))
+    texts = [name for name in ("inputs", "reference") if name in table]
+    return table.assign(**{name: table[name].fillna("") for name in texts})
 
 
 def choose(views: TestViews, scores: Mapping[Method, Float], top_n: Sequence[int]) -> Choices:
@@ -121,14 +122,15 @@ def score_table(
         - any_*: share of locations with at least one good view.
         - regret_*: the oracle's raw share less the method's, at least 0.
         - difference_*: the method's raw share less the reference's (`EvaluateConfig.reference`), and p_*, the p-value
-          of `LocationBootstrap.paired_p`; NaN without a reference.
-        - low_* and high_* of raw_, normalized_, regret_ and difference_, such as raw_low_*: bootstrap interval over
-          locations, paired where two methods meet (`LocationBootstrap.ratio`).
+          of `LocationBootstrap.paired_p`; NaN without a reference, p_* also for random choice, an expectation.
+        - low_* and high_* of raw_, normalized_, any_, regret_ and difference_, such as raw_low_*: bootstrap interval
+          over blocks of locations, paired where two methods meet (`LocationBootstrap.ratio`).
 
-        Then average_precision and roc_auc of the scores against the first threshold, NaN where all views are of one
-        class; and for learned methods, NaN for others, ece (expected calibration error, against the first threshold),
-        ece_scaled (with logits divided by the temperature) and temperature, both NaN where it is not known. A scene
-        without candidates has rows with 0 locations and NaN.
+        Then reference (name and inputs of what differences are from, "" for none); average_precision and roc_auc of the
+        scores against the first threshold, NaN where all views are of one class; and for learned methods, NaN for
+        others, ece (expected calibration error, against the first threshold), ece_scaled (with logits divided by the
+        temperature) and temperature, both NaN where it is not known. A scene without candidates has rows with 0
+        locations and NaN.
 
     Raises:
         ConfigError: the reference is none of the methods.
@@ -140,10 +142,12 @@ def score_table(
         pools += [(scenes[0], pools[0][1])]
     reference = reference_method(scores, config.reference)
     choices = choose(views, scores, config.top_n) if choices is None else choices
-    rows = []
+    compared = {"reference": " ".join(reference or ()).strip()}
+    rows: list[dict[str, object]] = []
     for name, locations in pools:
         inside = locations[views.location]
-        bootstrap = LocationBootstrap(views.location_scene[locations], config.resamples, config.seed)
+        block = None if views.location_block is None else views.location_block[locations]
+        bootstrap = LocationBootstrap(views.location_scene[locations], config.resamples, config.seed, block)
         good = views.good[inside, 0]
         metrics = {ORACLE: {"average_precision": 1.0, "roc_auc": 1.0, **dict.fromkeys(_CALIBRATION, float("nan"))}}
         for method, values in scores.items():
@@ -153,7 +157,7 @@ def score_table(
         for method in [*scores, ORACLE]:
             for n in config.top_n:
                 row = {"method": method[0], "inputs": method[1], "top_n": n, "scene": name}
-                rows.append(row | shares[n][method] | metrics[method])
+                rows.append(row | shares[n][method] | compared | metrics[method])
     return pd.DataFrame(rows)
 
 
@@ -180,6 +184,7 @@ def _shares(
     columns["normalized"] = _quotient(good.sum(0), best.sum(0))
     columns["normalized_low"], columns["normalized_high"] = _interval(bootstrap, good, best)
     columns["any"] = _quotient(any_good.sum(0), n_locations)
+    columns["any_low"], columns["any_high"] = _interval(bootstrap, any_good, np.ones((n_locations, 1)))
     columns["released"] = columns["raw"] / RELEASED_DIVISOR
     columns["regret"] = _quotient((best - good).sum(0), n_views)
     columns["regret_low"], columns["regret_high"] = _interval(bootstrap, best - good, chosen)
@@ -190,6 +195,8 @@ def _shares(
         columns["difference"] = _quotient(difference.sum(0), n_views)
         columns["difference_low"], columns["difference_high"] = _interval(bootstrap, difference, chosen)
         columns["p"] = bootstrap.paired_p(_flat(difference)).reshape(good.shape[1:])
+        expected = [reference[0] == "random" or method[0] == "random" for method in tops]
+        columns["p"][expected] = np.nan  # an expectation is no draw
     keys = list(enumerate(map(threshold_key, config.thresholds)))
     return {
         method: {"n_locations": n_locations, "n_views": int(n_views)}

@@ -77,9 +77,12 @@ _STYLES = {
         "max visibility, angles swapped (as shipped)", "#D6CA1E", "d", (0, (4, 1, 1, 1, 1, 1))
     ),
     **{
-        ("fisher", f"{metric} {approximation}"): MethodStyle(f"Fisher, {name}, {kind}", color, marker, dashes)
+        ("fisher", f"{metric} {approximation}{about}"): MethodStyle(
+            f"Fisher, {name}, {kind}{about.replace(' ', ', about the ')}", color, marker, dashes
+        )
         for metric, (name, marker) in _FISHER_METRICS.items()
         for approximation, (kind, color, dashes) in _FISHER_APPROXIMATIONS.items()
+        for about in ("", " origin")
     },
     ("fisher-worst-trace", ""): MethodStyle("probe: worst trace", "#4D4D4D", "1", (0, (1, 2))),
     ("fisher-stationary-trace", ""): MethodStyle("probe: stationary trace", "#7A7A7A", "2", (0, (1, 3))),

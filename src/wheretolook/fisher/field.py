@@ -55,9 +55,12 @@ class FisherField:
 
         Raises:
             ConfigError: no such device.
+            ValueError: the mask has another shape.
         """
         at = np.asarray(locations, dtype=np.float64).reshape(-1, 3)
         landmarks = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+        if unoccluded is not None and unoccluded.shape != (len(at), len(landmarks)):
+            raise ValueError(f"unoccluded must be of shape {(len(at), len(landmarks))}, got {unoccluded.shape}")
         return cls(at, visibility, visibility.finish(field_sums(at, landmarks, visibility, unoccluded, device)))
 
     def information(self, row: int, axes: ArrayLike) -> Float:
@@ -144,7 +147,8 @@ def stationary_axis_of_trace(field: FisherField, row: int) -> Float:
 
     The axis is not held to unit length before. The trace is z^T Q z + q . z + constant, so that is z = -Q^-1 q / 2.
     With the landmarks' squares behind Q and their mean behind q, both positive, it points away from them: the released
-    code calls it the direction of the minimum and turns it round where it wants the best one.
+    code calls it the direction of the minimum and turns it round where it wants the best one. (With the default
+    visibility, cones wider than 53 degrees to a side make Q negative, and then it is the best one already.)
     """
     assert isinstance(field.visibility, QuadraticVisibility)
     k1, k2, _ = field.visibility.coefficients

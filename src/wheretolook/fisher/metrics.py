@@ -45,7 +45,11 @@ def metric_of(numbers: ArrayLike, metric: str, pivots: ArrayLike | None = None, 
     numbers = np.asarray(numbers, dtype=np.float64)
     if metric == "trace" and pivots is None:
         return np.asarray(numbers @ TRACE)
-    values = eigenvalues(numbers, pivots, device)
+    return metric_of_eigenvalues(eigenvalues(numbers, pivots, device), metric)
+
+
+def metric_of_eigenvalues(values: Float, metric: str) -> Float:
+    """As `metric_of`, (B,), from eigenvalues (B, 6) that are known already."""
     if metric == "trace":
         return np.asarray(values.sum(-1))
     if metric == "mineig":

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from wheretolook.fisher.exact import exact_information
 from wheretolook.fisher.field import FisherField, stationary_axis_of_trace, worst_axis_of_trace
-from wheretolook.fisher.metrics import METRICS, metric_of
+from wheretolook.fisher.metrics import METRICS, eigenvalues, metric_of, metric_of_eigenvalues
 from wheretolook.fisher.soft_visibility import (
     GaussianProcessVisibility,
     QuadraticVisibility,
@@ -67,6 +67,15 @@ class PoseInformation:
         if approximation not in self._known:
             self._known[approximation] = self._numbers(approximation)
         return np.asarray(self._known[approximation])
+
+    def eigenvalues(self, cam_from_world: Float, approximation: Approximation, about_origin: bool) -> Float:
+        """(B, 6) of the informations of poses (B, 3, 4)."""
+        numbers = self.numbers(cam_from_world, approximation)
+        name = f"{approximation} eigenvalues about {'the origin' if about_origin else 'the camera'}"
+        if name not in self._known:
+            pivots = -split_poses(self._poses)[1] if about_origin else None
+            self._known[name] = eigenvalues(numbers, pivots, self.device)
+        return np.asarray(self._known[name])
 
     def field(self, cam_from_world: Float, approximation: Approximation) -> tuple[FisherField, NDArray[np.int64]]:
         """The field at the locations of poses (B, 3, 4), and each pose's row in it, (B,)."""
@@ -127,14 +136,15 @@ class FisherScorer(Scorer):
     ) -> None:
         super().__init__(localization_map)
         self.metric, self.approximation, self.about_origin = metric, approximation, about_origin
-        self.inputs = f"{metric} {approximation}" + (" about origin" if about_origin else "")
+        self.inputs = f"{metric} {approximation}" + (" origin" if about_origin else "")
         self._information = PoseInformation.of_map(localization_map)
 
     def score(self, cam_from_world: Float) -> Float:
         """(B,), not bounded by 1."""
-        numbers = self._information.numbers(cam_from_world, self.approximation)
-        pivots = -split_poses(np.asarray(cam_from_world))[1] if self.about_origin else None
-        return metric_of(numbers, self.metric, pivots, self.localization_map.device)
+        if self.metric == "trace" and not self.about_origin:
+            return metric_of(self._information.numbers(cam_from_world, self.approximation), "trace")
+        values = self._information.eigenvalues(cam_from_world, self.approximation, self.about_origin)
+        return metric_of_eigenvalues(values, self.metric)
 
 
 class ProbeScorer(Scorer):
@@ -179,9 +189,16 @@ class StationaryTraceScorer(ProbeScorer):
         return stationary_axis_of_trace(field, row)
 
 
-FISHER_METHODS: dict[str, tuple[str, Approximation]] = {
-    f"fisher-{metric}-{approximation}": (metric, approximation)
+FISHER_METHODS: dict[str, tuple[str, Approximation, bool]] = {
+    f"fisher-{metric}-{approximation}": (metric, approximation, False)
     for metric in METRICS
     for approximation in APPROXIMATIONS
 }
-"""Metric and approximation of the paper's nine rows, by the names of the methods."""
+"""Metric, approximation and `about_origin` of the paper's nine rows, by the names of the methods."""
+
+ORIGIN_METHODS: dict[str, tuple[str, Approximation, bool]] = {
+    f"{name}-origin": (metric, approximation, True)
+    for name, (metric, approximation, _) in FISHER_METHODS.items()
+    if metric != "logdet"  # which is the same
+}
+"""The rows that differ when the pose is turned about the world's origin."""

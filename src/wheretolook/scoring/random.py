@@ -31,11 +31,16 @@ class RandomScorer(Scorer):
 
     def score(self, cam_from_world: Float) -> Float:
         """(B,) in [0, 1)."""
-        numbers = np.round(np.asarray(cam_from_world, dtype=np.float64) * 10**POSE_DECIMALS).astype(np.int64)
-        state = np.full(len(numbers), self.seed, dtype=np.uint64)
-        for column in numbers.reshape(len(numbers), 12).T:
-            state = _splitmix64(state ^ column.astype(np.uint64))
-        return (state >> np.uint64(11)).astype(np.float64) * 2.0**-53
+        return uniform(np.asarray(cam_from_world, dtype=np.float64).reshape(len(cam_from_world), 12), self.seed)
+
+
+def uniform(values: Float, seed: int) -> Float:
+    """Uniform numbers (B,) in [0, 1), a function of rows (B, K), up to `POSE_DECIMALS`, and the seed."""
+    numbers = np.round(values * 10**POSE_DECIMALS).astype(np.int64)
+    state = np.full(len(numbers), seed, dtype=np.uint64)
+    for column in numbers.T:
+        state = _splitmix64(state ^ column.astype(np.uint64))
+    return np.asarray((state >> np.uint64(11)).astype(np.float64) * 2.0**-53)
 
 
 def _splitmix64(state: NDArray[np.uint64]) -> NDArray[np.uint64]:

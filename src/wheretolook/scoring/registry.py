@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 from wheretolook.errors import ConfigError
 from wheretolook.localization_map import LocalizationMap
 from wheretolook.scoring.base import Scorer
 from wheretolook.scoring.bins import BinsScorer
-from wheretolook.scoring.fisher import FISHER_METHODS, FisherScorer, StationaryTraceScorer, WorstTraceScorer
+from wheretolook.scoring.fisher import (
+    FISHER_METHODS,
+    ORIGIN_METHODS,
+    FisherScorer,
+    StationaryTraceScorer,
+    WorstTraceScorer,
+)
 from wheretolook.scoring.forward import ForwardScorer
 from wheretolook.scoring.max_visibility import MaxVisibilityScorer, SwappedMaxVisibilityScorer
 from wheretolook.scoring.random import RandomScorer
@@ -24,24 +31,42 @@ def _learned(localization_map: LocalizationMap, weights: str | Path | None) -> S
     return load_scorer(weights, localization_map)
 
 
-def _fisher(name: str) -> Callable[[LocalizationMap, int, str | Path | None], Scorer]:
-    metric, approximation = FISHER_METHODS[name]
-    return lambda localization_map, seed, weights: FisherScorer(localization_map, metric, approximation)
+@dataclass(frozen=True)
+class ScorerOptions:
+    """What some methods need beside the map; see `make_scorer`."""
+
+    seed: int = 0
+    weights: str | Path | None = None
+    heading: tuple[tuple[float, float, float], ...] = ()
 
 
-SCORERS: dict[str, Callable[[LocalizationMap, int, str | Path | None], Scorer]] = {
-    "random": lambda localization_map, seed, weights: RandomScorer(localization_map, seed),
-    "forward": lambda localization_map, seed, weights: ForwardScorer(localization_map),
-    "visible": lambda localization_map, seed, weights: VisibleScorer(localization_map),
-    "bins": lambda localization_map, seed, weights: BinsScorer(localization_map),
-    "max-visibility": lambda localization_map, seed, weights: MaxVisibilityScorer(localization_map),
-    "max-visibility-swapped": lambda localization_map, seed, weights: SwappedMaxVisibilityScorer(localization_map),
-    **{name: _fisher(name) for name in FISHER_METHODS},
-    "fisher-worst-trace": lambda localization_map, seed, weights: WorstTraceScorer(localization_map),
-    "fisher-stationary-trace": lambda localization_map, seed, weights: StationaryTraceScorer(localization_map),
-    "mlp": lambda localization_map, seed, weights: _learned(localization_map, weights),
+def _fisher(name: str) -> Callable[[LocalizationMap, ScorerOptions], Scorer]:
+    return lambda localization_map, options: FisherScorer(localization_map, *_ALL_FISHER[name])
+
+
+def _forward(localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
+    heading = None if not options.heading else options.heading[0] if len(options.heading) == 1 else options.heading
+    return ForwardScorer(localization_map, heading, options.seed)
+
+
+_ALL_FISHER = {**FISHER_METHODS, **ORIGIN_METHODS}
+
+SCORERS: dict[str, Callable[[LocalizationMap, ScorerOptions], Scorer]] = {
+    "random": lambda localization_map, options: RandomScorer(localization_map, options.seed),
+    "forward": _forward,
+    "visible": lambda localization_map, options: VisibleScorer(localization_map),
+    "bins": lambda localization_map, options: BinsScorer(localization_map),
+    "max-visibility": lambda localization_map, options: MaxVisibilityScorer(localization_map),
+    "max-visibility-swapped": lambda localization_map, options: SwappedMaxVisibilityScorer(localization_map),
+    **{name: _fisher(name) for name in _ALL_FISHER},
+    "fisher-worst-trace": lambda localization_map, options: WorstTraceScorer(localization_map),
+    "fisher-stationary-trace": lambda localization_map, options: StationaryTraceScorer(localization_map),
+    "mlp": lambda localization_map, options: _learned(localization_map, options.weights),
 }
-"""How each method is built from a map, a seed and weights."""
+"""How each method is built from a map and options."""
+
+OPTIONAL = tuple(ORIGIN_METHODS)
+"""Methods that an evaluation has only if it names them: no rows of the paper."""
 
 PROBES = ("fisher-worst-trace", "fisher-stationary-trace")
 """Methods that show the worst side of a field; tables show them apart."""
@@ -56,8 +81,9 @@ def describe_methods() -> dict[str, str]:
         WorstTraceScorer, StationaryTraceScorer, LearnedScorer,
     )  # fmt: skip
     texts = {scorer.name: _first_line(scorer) for scorer in scorers}
-    for name, (metric, approximation) in FISHER_METHODS.items():
-        texts[name] = f"{_first_line(FisherScorer).removesuffix('.')}: {metric}, {approximation}."
+    for name, (metric, approximation, about_origin) in _ALL_FISHER.items():
+        about = ", turned about the world's origin (only if named)" if about_origin else ""
+        texts[name] = f"{_first_line(FisherScorer).removesuffix('.')}: {metric}, {approximation}{about}."
     return {name: texts[name] for name in SCORERS}
 
 
@@ -66,7 +92,11 @@ def _first_line(scorer: type[Scorer]) -> str:
 
 
 def make_scorer(
-    name: str, localization_map: LocalizationMap, seed: int = 0, weights: str | Path | None = None
+    name: str,
+    localization_map: LocalizationMap,
+    seed: int = 0,
+    weights: str | Path | None = None,
+    heading: tuple[tuple[float, float, float], ...] = (),
 ) -> Scorer:
     """Build a method by its name.
 
@@ -75,6 +105,7 @@ def make_scorer(
         localization_map: the map and the camera that will look.
         seed: for methods with randomness.
         weights: for learned methods.
+        heading: for "forward": one direction, or the waypoints of a path; empty for one drawn for each location.
 
     Raises:
         ConfigError: no such method, or it needs weights.
@@ -82,4 +113,4 @@ def make_scorer(
     """
     if name not in SCORERS:
         raise ConfigError("unknown method", value=name, fix=f"There are {', '.join(SCORERS)}.")
-    return SCORERS[name](localization_map, seed, weights)
+    return SCORERS[name](localization_map, ScorerOptions(seed, weights, heading))

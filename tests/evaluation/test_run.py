@@ -205,6 +205,26 @@ def test_scores_that_are_not_finite_are_named(
         evaluate(dataset, RULES, TrackingConfig(str(tmp_path / "mlruns")), progress=False)
 
 
+def test_the_papers_tables_have_networks_that_do_not_ship(dataset: Dataset, tmp_path: Path) -> None:
+    tracking, results = TrackingConfig(str(tmp_path / "mlruns")), dataset.root / "results"
+    both = train(dataset, TrainConfig(("2d", "2d+z"), epochs=2, hidden=(16,), accelerator="cpu"), tracking, False)
+    config = replace(CONFIG, occlusions=("mesh", "none"))
+    evaluate(dataset, config, tracking, models=both, progress=False)
+    tables = {path.name: path.read_bytes() for path in results.glob("table_*")}
+    shutil.copyfile(results / "scores.csv", results / "variants.csv")
+    try:
+        for models in (both, both[:1]):
+            evaluate(dataset, config, tracking, models=models, progress=False)
+            if models is both:
+                assert {path.name: path.read_bytes() for path in results.glob("table_*")} == tables
+            else:
+                for kind in ("csv", "md", "tex"):
+                    name = f"table_input_variants.{kind}"
+                    assert (results / name).read_bytes() == tables[name]
+    finally:
+        (results / "variants.csv").unlink()
+
+
 def test_candidates_are_chosen_by_visibility(tmp_path: Path) -> None:
     dataset = make_dataset(tmp_path / "ranked", ("test", "test"), n_locations=14, n_directions=16)
     tables = []

@@ -238,7 +238,8 @@ def _test_views(
             raise TableError(error.problem, path=scene.table, value=error.value, fix=error.fix) from None
         ids, first, rows = np.unique(table["location_id"].to_numpy(np.int64), return_index=True, return_inverse=True)
         if config.block_m:
-            squares = np.floor(camera_centers(poses(table)[first])[:, :2] / config.block_m)
+            floor = camera_centers(poses(table)[first])[:, :2]
+            squares = np.floor((floor - floor.min(0)) / config.block_m)
             location_block.append(np.unique(squares, axis=0, return_inverse=True)[1].reshape(-1))
         else:
             location_block.append(np.arange(len(ids)))
@@ -388,10 +389,10 @@ def _write_results(folder: Path, table: pd.DataFrame, calibration: pd.DataFrame,
     variants = folder / VARIANTS_CSV
     if variants.is_file():  # the paper's tables have a row for each of the network's inputs, which a release knows
         known = {*zip(table["method"], table["inputs"], strict=True)}
-        others = read_scores(variants)
+        others = main_rows(read_scores(variants))
         methods = zip(others["method"], others["inputs"], strict=True)
         others = others[[method not in known for method in methods]]
-        write_paper_tables(pd.concat([table, main_rows(others)], ignore_index=True), folder)
+        write_paper_tables(pd.concat([table, others], ignore_index=True), folder)
     else:
         write_paper_tables(table, folder)
     save_figure(score_figure(table), folder / SCORES_PNG)

@@ -15,7 +15,6 @@ VARIANTS = (*INPUT_VARIANTS, RELEASED)
 """Networks that can be trained."""
 
 RELEASED_OPTIONS: dict[str, Any] = {
-    "batch_size": 128,
     "learning_rate": 1e-4,
     "schedule": "constant",
     "l2": 0.0,
@@ -29,7 +28,8 @@ RELEASED_OPTIONS: dict[str, Any] = {
     "keep": "last",
     "patience": None,
 }
-"""Options of the released code where they can differ from the paper's; epochs stay as configured."""
+"""Options of the released code where they can differ from the paper's; batch size (128 there) and epochs stay as
+configured."""
 
 
 @dataclass(frozen=True)

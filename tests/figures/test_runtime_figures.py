@@ -189,32 +189,33 @@ def scores() -> pd.DataFrame:
 def test_occlusion_figure_draws_every_method_by_model(scores: pd.DataFrame, tmp_path: Path) -> None:
     figure = occlusion_figure(scores)
     left, right = figure.axes
-    for axes in figure.axes:
-        labels = [label.get_text().replace("\n", " ") for label in axes.get_xticklabels()]
-        assert labels == ["mesh rays", "hidden-point removal", "none"]
+    assert [label.get_text() for label in left.get_yticklabels()] == ["MLP, 2d", "reprojections with bins"]
+    (legend,) = figure.legends
+    names = [text.get_text() for text in legend.get_texts()]
+    assert names == ["mesh rays", "hidden-point removal", "none", "random", "oracle"]
     first = scores[(scores["scene"] == "all") & (scores["top_n"] == 1)]
     for method, inputs in METHODS[1:3]:
         rows = first[(first["method"] == method) & (first["inputs"] == inputs)]
         style = method_style(method, inputs)
-        np.testing.assert_allclose(_line(left, style.label).get_ydata(), rows["average_precision"])
+        np.testing.assert_allclose(_line(left, style.label).get_xdata(), rows["average_precision"])
         drawn = _line(right, style.label)
-        np.testing.assert_allclose(drawn.get_ydata(), 100 * rows["normalized_0.05m_0.4deg"])
-        assert np.abs(np.asarray(drawn.get_xdata()) - [0, 1, 2]).max() < 0.5
-        assert (drawn.get_color(), drawn.get_marker()) == (style.color, style.marker)
-    ends = [segment[:, 1] for collection in right.collections for segment in collection.get_segments()]  # type: ignore[attr-defined]
-    shown = first[first["method"].isin(["bins", "mlp"])].sort_values("method", kind="stable")
+        np.testing.assert_allclose(drawn.get_xdata(), 100 * rows["normalized_0.05m_0.4deg"])
+        row = {"mlp": 0, "bins": 1.6}[method]
+        assert np.abs(np.asarray(drawn.get_ydata()) - row).max() < 0.5 and drawn.get_color() == style.color
+    ends = [segment[:, 0] for collection in right.collections for segment in collection.get_segments()]  # type: ignore[attr-defined]
+    shown = first[first["method"].isin(["bins", "mlp"])].sort_values("method", kind="stable", ascending=False)
     columns = ["normalized_low_0.05m_0.4deg", "normalized_high_0.05m_0.4deg"]
     np.testing.assert_allclose(ends, 100 * shown[columns].to_numpy())
-    assert set(_line(left, "random").get_ydata()) == {0.25}
-    assert set(_line(right, "random").get_ydata()) == {30.0}
-    assert "best view within 5 cm, 0.4°" in right.get_ylabel()
+    assert set(_line(left, "random").get_xdata()) == {0.25}
+    assert set(_line(right, "random").get_xdata()) == {30.0}
+    assert "best view within 5 cm, 0.4°" in right.get_xlabel()
     _assert_draws(figure, tmp_path)
 
 
 def test_occlusion_figure_of_one_model(scores: pd.DataFrame, tmp_path: Path) -> None:
     part = scores[(scores["occlusion"] == "none") & (scores["method"] != "random") & (scores["top_n"] == 5)]
     figure = occlusion_figure(part)
-    assert "best 5 views" in figure.axes[1].get_ylabel()
+    assert "best 5 views" in figure.axes[1].get_xlabel()
     _assert_draws(figure, tmp_path)
 
 

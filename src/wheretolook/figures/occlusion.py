@@ -6,14 +6,18 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.style import context
 
 from wheretolook.evaluation.config import threshold_label
-from wheretolook.evaluation.report import main_rows, threshold_keys
-from wheretolook.evaluation.scores import ALL
-from wheretolook.figures.style import INK, RC, method_style, new_figure
+from wheretolook.evaluation.report import main_rows, methods_of, threshold_keys
+from wheretolook.evaluation.scores import ALL, Method
+from wheretolook.figures.style import GROUPS, INK, RC, method_group, method_style, new_figure
 
-_LABELS = {"mesh": "mesh\nrays", "tsdf": "TSDF", "hidden-points": "hidden-point\nremoval", "none": "none"}
+_LABELS = {"mesh": "mesh rays", "tsdf": "TSDF", "hidden-points": "hidden-point removal", "none": "none"}
+_MARKERS = ("o", "s", "^", "D")
+_GAP = 0.6
+"""Between groups of methods, in rows."""
 
 
 def occlusion_figure(scores: pd.DataFrame) -> Figure:
@@ -24,53 +28,67 @@ def occlusion_figure(scores: pd.DataFrame) -> Figure:
             the rows over all scenes of the first N, and of the first set of candidates, are drawn.
 
     Returns:
-        Two panels with the occlusion models side by side, in their order in the table: average precision, and the share
-        at the first threshold, in % of the oracle's, with bootstrap intervals. Choosing at random looks at no landmark
-        and is a line, the oracle a line at 100 %.
+        Two panels with a row for each method, groups set apart, and a mark for each occlusion model, the first one
+        filled: average precision, and the share at the first threshold, in % of the oracle's, with bootstrap
+        intervals. Choosing at random looks at no landmark and is a line, the oracle a line at 100 %.
     """
     scores = main_rows(scores, ("candidates",))
     key, n = threshold_keys(scores)[0], scores["top_n"].iloc[0]
     pooled = scores[(scores["scene"] == ALL) & (scores["top_n"] == n) & (scores["method"] != "oracle")]
     models = list(pooled["occlusion"].unique())
     chosen = "best view" if n == 1 else f"best {n} views"
+    methods = [method for method in methods_of(pooled) if method[0] != "random"]
+    methods.sort(key=lambda method: GROUPS.index(method_group(method[0])))
+    groups = [method_group(method[0]) for method in methods]
+    gaps = np.cumsum([0.0] + [_GAP * (one != other) for one, other in zip(groups[1:], groups, strict=False)])
+    y = {method: float(row + gap) for row, (method, gap) in enumerate(zip(methods, gaps, strict=False))}
     with context(RC):
-        figure = new_figure(7.4, 4.0)
-        left, right = figure.subplots(1, 2)
-        _draw_methods(left, pooled, models, "average_precision", 1.0)
+        figure = new_figure(8.0, 1.5 + 0.3 * (max(y.values(), default=0) + 1))
+        left, right = figure.subplots(1, 2, sharey=True)
+        _draw(left, pooled, models, y, "average_precision", 1.0)
         ends = (f"normalized_low_{key}", f"normalized_high_{key}")
-        _draw_methods(right, pooled, models, f"normalized_{key}", 100.0, ends)
-        left.set(ylabel=f"average precision, {threshold_label(key)}", ylim=(0, 1.03))
-        right.set(ylabel=f"{chosen} within {threshold_label(key)},\n% of the oracle's", ylim=(0, 108))
-        right.axhline(100, color=INK, linewidth=1, linestyle="--", label=method_style("oracle").label)
-        right.set_title("whiskers: 95 % bootstrap interval over locations", fontsize=8)
+        _draw(right, pooled, models, y, f"normalized_{key}", 100.0, ends)
+        left.set(xlabel=f"average precision\n{threshold_label(key)}", xlim=(0, 1.02))
+        right.set(xlabel=f"{chosen} within {threshold_label(key)}\n% of the oracle's share", xlim=(0, 104))
+        figure.supxlabel("whiskers: 95 % bootstrap interval over locations", fontsize=8)
+        right.axvline(100, color=INK, linewidth=1, linestyle="--", label=method_style("oracle").label)
+        left.set_yticks(list(y.values()), [method_style(*method).label for method in y], fontsize=9)
+        left.set_ylim(max(y.values(), default=0) + 0.7, -0.7)
         for axes in (left, right):
-            axes.set(xticks=range(len(models)), xticklabels=[_LABELS.get(model, model) for model in models])
-            axes.set(xlim=(-0.5, len(models) - 0.5), xlabel="occlusion model")
-            axes.grid(axis="x", visible=False)
-            axes.tick_params(axis="x", length=0)
-        handles, labels = right.get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper center", ncols=4, columnspacing=1.2, handlelength=2.6)
+            axes.tick_params(axis="y", length=0)
+        handles: list[Line2D] = [
+            Line2D([], [], linestyle="none", marker=_MARKERS[place % len(_MARKERS)], color=INK, markersize=6,
+                   markerfacecolor=INK if place == 0 else "white", label=_LABELS.get(model, model))
+            for place, model in enumerate(models)
+        ]  # fmt: skip
+        handles += [line for line in right.lines if line.get_label() in ("random", "oracle")]
+        figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), columnspacing=1.4)
         return figure
 
 
-def _draw_methods(
-    axes: Axes, pooled: pd.DataFrame, models: list[str], column: str, scale: float, ends: tuple[str, ...] = ()
+def _draw(
+    axes: Axes,
+    pooled: pd.DataFrame,
+    models: list[str],
+    y: dict[Method, float],
+    column: str,
+    scale: float,
+    ends: tuple[str, ...] = (),
 ) -> None:
-    """Marks of each method at each occlusion model, side by side; `ends` names the columns of its whiskers."""
-    methods = list(dict.fromkeys(zip(pooled["method"], pooled["inputs"], strict=True)))
-    side_by_side = [method for method in methods if method[0] != "random"]
-    for method in methods:
+    """A line from model to model for each method, and their marks; `ends` names the columns of whiskers."""
+    for method, place in y.items():
         style = method_style(*method)
         rows = pooled[(pooled["method"] == method[0]) & (pooled["inputs"] == method[1])]
         by_model = scale * rows.set_index("occlusion").reindex(models)[[column, *ends]]
-        value = by_model[column].to_numpy()
-        if method[0] == "random":
-            axes.axhline(value[0], color=style.color, linestyle=style.dashes, label=style.label)
-            continue
-        x = np.arange(len(models)) + 0.62 * ((side_by_side.index(method) + 0.5) / len(side_by_side) - 0.5)
-        axes.plot(x, value, color=style.color, linestyle=style.dashes, linewidth=1, marker=style.marker, markersize=6,
-                  label=style.label)  # fmt: skip
-        if ends:
-            low, high = (by_model[end].to_numpy() for end in ends)
-            spread = np.clip(np.nan_to_num([value - low, high - value]), 0, None)
-            axes.errorbar(x, value, spread, fmt="none", ecolor=style.color, elinewidth=1, capsize=2)
+        shift = 0.16 * (np.arange(len(models)) - (len(models) - 1) / 2) if ends else np.zeros(len(models))
+        axes.plot(by_model[column], place + shift, color=style.color, linewidth=1, label=style.label)
+        for number, value in enumerate(by_model[column]):
+            if ends:
+                low, high = (by_model[end].iloc[number] for end in ends)
+                axes.hlines(place + shift[number], low, high, color=style.color, linewidth=0.9)
+            axes.plot(value, place + shift[number], _MARKERS[number % len(_MARKERS)], color=style.color, markersize=6,
+                      markerfacecolor=style.color if number == 0 else "white")  # fmt: skip
+    random = pooled.loc[pooled["method"] == "random", column]
+    if len(random):
+        style = method_style("random")
+        axes.axvline(scale * random.iloc[0], color=style.color, linestyle=style.dashes, label=style.label, zorder=1)

@@ -6,13 +6,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from wheretolook.camera_models import Camera
 from wheretolook.features import BinnedViews, bin_views
 from wheretolook.geometry import Float, PinholeCamera, camera_centers
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
 from wheretolook.rendering.types import check_poses
-from wheretolook.visibility import NoOcclusion, OcclusionModel, VisibleSets
+from wheretolook.visibility import NoOcclusion, OcclusionModel, VisibleSets, visible_landmarks
 
 SAME_LOCATION_DECIMALS = 6
 """Camera centres that agree to this many decimals of a metre share one visibility test."""
@@ -80,9 +81,23 @@ class LocalizationMap:
             ValueError: the poses have another shape, or entries that are not finite.
         """
         cam_from_world = check_poses(cam_from_world)
+        unoccluded, rows = self._unoccluded(cam_from_world)
+        return bin_views(
+            self.camera, cam_from_world, self.landmarks.points, unoccluded, rows, bins=bins, device=self.device
+        )
+
+    def visible_landmarks(self, cam_from_world: Float) -> VisibleSets:
+        """The landmarks that each of the views (B, 3, 4) sees. Views that share a location share its occlusion test.
+
+        Raises:
+            ValueError: the poses have another shape, or entries that are not finite.
+        """
+        cam_from_world = check_poses(cam_from_world)
+        unoccluded, rows = self._unoccluded(cam_from_world)
+        return visible_landmarks(self.camera, cam_from_world, self.landmarks.points, unoccluded, rows, self.device)
+
+    def _unoccluded(self, cam_from_world: Float) -> tuple[VisibleSets, NDArray[np.int64]]:
+        """Landmarks with a free line of sight from each location of poses, and each pose's row among these."""
         centers = np.round(camera_centers(cam_from_world), SAME_LOCATION_DECIMALS)
         locations, rows = np.unique(centers, axis=0, return_inverse=True)
-        visible = VisibleSets.from_mask(self.occlusion.unoccluded(locations, self.landmarks.points))
-        return bin_views(
-            self.camera, cam_from_world, self.landmarks.points, visible, rows.reshape(-1), bins=bins, device=self.device
-        )
+        return VisibleSets.from_mask(self.occlusion.unoccluded(locations, self.landmarks.points)), rows.reshape(-1)

@@ -1,0 +1,204 @@
+"""What is known of each landmark that a view sees: where it lies in the image, and how it was mapped.
+
+The paper's network is told where landmarks are. Whether they will be found again depends as much on what they are like:
+from where they were mapped, how well, and how unlike others. All of it is known from the map and the pose alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from wheretolook.camera_models import Camera, ColmapCamera
+from wheretolook.geometry import Float, split_poses
+from wheretolook.localization_map import LocalizationMap
+from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.visibility import VisibleSets
+
+POSE_ATTRIBUTES = ("across", "down", "distance", "mapped_angle", "distance_ratio")
+"""Of a landmark in a view: x/z and y/z in the camera; the distance in metres, its logarithm; the cosine between the ray
+from the camera and the mean direction it was mapped from; the logarithm of the distance over the mean mapping one."""
+
+MAP_ATTRIBUTES = (
+    "track_length", "reprojection_error", "triangulation_angle", "direction_spread", "ambiguity", "mapped_distance",
+)  # fmt: skip
+"""Of a landmark in its map: the logarithm of the number of observations; the mean error in pixels; the logarithm of the
+largest angle between two rays, in degrees; 1 - |mean mapping direction|; the cosine between its descriptor and the
+nearest other one, NaN where that is not known; the logarithm of the mean mapping distance, in metres."""
+
+ATTRIBUTES = POSE_ATTRIBUTES + MAP_ATTRIBUTES
+
+
+@dataclass(frozen=True, eq=False)
+class ViewLandmarks:
+    """The landmarks that B views see, E in all, one view after the other.
+
+    Attributes:
+        starts: (B + 1,) int64; view b has entries `starts[b]` to `starts[b + 1]`.
+        rows: (E,) int64, rows of the landmarks in the map.
+        values: (E, len(ATTRIBUTES)) float32.
+    """
+
+    starts: Tensor
+    rows: Tensor
+    values: Tensor
+
+    def __len__(self) -> int:
+        return len(self.starts) - 1
+
+    @property
+    def counts(self) -> Tensor:
+        """Landmarks of each view, (B,) int64."""
+        return self.starts.diff()
+
+    @property
+    def views(self) -> Tensor:
+        """View of each entry, (E,) int64."""
+        return torch.arange(len(self), device=self.starts.device).repeat_interleave(self.counts)
+
+
+def map_attributes(landmarks: Landmarks) -> Float:
+    """`MAP_ATTRIBUTES` of landmarks; (N, 6) float32."""
+    return np.stack(
+        [
+            np.log(np.maximum(landmarks.track_length, 1)),
+            landmarks.reprojection_error_px,
+            np.log(np.maximum(landmarks.triangulation_angle_deg, 0.01)),
+            landmarks.mapping_direction_spread,
+            landmarks.ambiguity,
+            np.log(np.maximum(landmarks.mapping_distance_m, 1e-3)),
+        ],
+        axis=1,
+    ).astype(np.float32)
+
+
+class LandmarkDescriber:
+    """Describes the landmarks that views of a map see.
+
+    Args:
+        localization_map: landmarks, camera, occlusion, and the device to work on.
+    """
+
+    def __init__(self, localization_map: LocalizationMap) -> None:
+        self.localization_map = localization_map
+        landmarks, device = localization_map.landmarks, localization_map.device
+        self._points = torch.from_numpy(landmarks.points).to(device)
+        self._directions = torch.from_numpy(landmarks.mapping_direction).to(device)
+        self._attributes = torch.from_numpy(map_attributes(landmarks)).to(device)
+
+    def describe(self, cam_from_world: Float, visible: VisibleSets | None = None) -> ViewLandmarks:
+        """What views see.
+
+        Args:
+            cam_from_world: (B, 3, 4).
+            visible: the landmarks each of them sees, if that is known already.
+
+        Returns:
+            On the map's device.
+        """
+        if visible is None:
+            visible = self.localization_map.visible_landmarks(cam_from_world)
+        device = self._points.device
+        starts = torch.from_numpy(visible.starts).to(device, torch.int64)
+        rows = torch.from_numpy(visible.indices).to(device, torch.int64)
+        views = torch.arange(len(visible), device=device).repeat_interleave(starts.diff())
+        rotations, centers = split_poses(np.asarray(cam_from_world, dtype=np.float64))
+        offsets = (self._points[rows] - torch.from_numpy(centers).to(device)[views]).float()
+        distance = offsets.norm(dim=1)
+        axes = torch.from_numpy(rotations).to(device, torch.float32)
+        x, y, z = torch.einsum("eij,ej->ei", axes[views], offsets).unbind(1)
+        of_map = self._attributes[rows]
+        log_distance = distance.log()
+        of_pose = torch.stack(
+            [
+                x / z,
+                y / z,
+                log_distance,
+                (offsets * self._directions[rows]).sum(1) / distance,
+                log_distance - of_map[:, MAP_ATTRIBUTES.index("mapped_distance")],
+            ],
+            dim=1,
+        )
+        return ViewLandmarks(starts, rows, torch.cat([of_pose, of_map], dim=1))
+
+
+FILLED = 30
+"""Bins along each side of the image, of which the filled ones are counted, as in the paper."""
+
+COARSE = 4
+"""Bins along each side of the coarse grid."""
+
+QUANTILES = (0.1, 0.5, 0.9)
+
+POOLED = (
+    "log_visible", "log_filled", "coarse_filled", "log_coarse_lower_half", "axis_height",
+    *(f"{name}_{kind}" for name in ATTRIBUTES for kind in ("mean", "std", *(f"q{100 * q:.0f}" for q in QUANTILES))),
+)  # fmt: skip
+"""What `pool` tells of a view: log(1 + landmarks), log(1 + filled bins of 30 x 30), filled bins of 4 x 4, the sum of
+log(1 + landmarks) over the fuller half of those, the height of the optical axis; and of each attribute its mean,
+standard deviation and quantiles over the landmarks."""
+
+
+def pool(landmarks: ViewLandmarks, cam_from_world: Float, camera: Camera) -> Tensor:
+    """Statistics of the landmarks of each view, (B, len(POOLED)) float32; NaN where a view has none to tell of.
+
+    Args:
+        landmarks: of the views.
+        cam_from_world: (B, 3, 4), for the height of the axis.
+        camera: whose image the bins divide.
+    """
+    n, views, device = len(landmarks), landmarks.views, landmarks.values.device
+    counts = landmarks.counts.float()
+    fine, coarse = (_occupied(landmarks, views, camera, bins) for bins in (FILLED, COARSE))
+    fuller = coarse.sort(dim=1).values[:, COARSE**2 // 2 :]
+    axis = torch.from_numpy(np.asarray(cam_from_world, dtype=np.float32)[:, 2, 2]).to(device)
+    parts = [
+        counts.log1p(), (fine > 0).sum(1).float().log1p(), (coarse > 0).sum(1).float(), fuller.log1p().sum(1), axis,
+    ]  # fmt: skip
+    some = counts.clamp(min=1)
+    middle = torch.where(counts > 0, 1.0, torch.nan)  # of nothing there is no mean
+    for column in range(len(ATTRIBUTES)):
+        values = landmarks.values[:, column].double()
+        mean = _sums(values, views, n) / some
+        spread = (_sums((values - mean[views]) ** 2, views, n) / some).sqrt()
+        parts += [(mean * middle).float(), (spread * middle).float()]
+        parts += _quantiles(values, landmarks, views)
+    return torch.stack(parts, dim=1)
+
+
+def _sums(values: Tensor, views: Tensor, n: int) -> Tensor:
+    return torch.zeros(n, dtype=torch.float64, device=values.device).index_add_(0, views, values)
+
+
+def _occupied(landmarks: ViewLandmarks, views: Tensor, camera: Camera, bins: int) -> Tensor:
+    """Landmarks in each bin of the image, (B, bins^2) float32."""
+    rays = landmarks.values[:, :2]
+    if isinstance(camera, ColmapCamera):
+        along = torch.cat([rays, torch.ones_like(rays[:, :1])], dim=1)
+        pixels = torch.from_numpy(camera.project(along.cpu().double().numpy())).to(rays)
+    else:
+        pixels = rays * camera.focal_px + torch.tensor([camera.cx, camera.cy]).to(rays)
+    column = (pixels[:, 0] * (bins / camera.width)).long().clamp(0, bins - 1)
+    row = (pixels[:, 1] * (bins / camera.height)).long().clamp(0, bins - 1)
+    cells = (views * bins + row) * bins + column
+    return torch.bincount(cells, minlength=len(landmarks) * bins**2).view(len(landmarks), bins**2).float()
+
+
+def _quantiles(values: Tensor, landmarks: ViewLandmarks, views: Tensor) -> list[Tensor]:
+    """Nearest-rank quantiles of each view's values, (B,) each."""
+    unknown = values.isnan()
+    # one sort for all views: the view is the key's whole part, the value's place in it the fraction
+    key = views.double() + (values.nan_to_num().atan() / torch.pi + 0.5) * 0.999
+    ordered = values[key.argsort()]
+    counts, starts = landmarks.counts, landmarks.starts[:-1]
+    blank = (counts == 0) | (_sums(unknown.double(), views, len(landmarks)) > 0)
+    found = []
+    for q in QUANTILES:
+        rank = (q * (counts - 1).clamp(min=0) + 0.5).long()
+        at = (starts + rank).clamp(max=max(0, len(values) - 1))
+        value = ordered[at] if len(values) else torch.zeros(len(landmarks), dtype=torch.float64, device=values.device)
+        found.append(torch.where(blank, torch.nan, value).float())
+    return found

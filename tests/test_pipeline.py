@@ -18,6 +18,7 @@ from wheretolook import labelling, stages
 from wheretolook.camera_models import ColmapCamera
 from wheretolook.cli import main
 from wheretolook.dataset import Dataset
+from wheretolook.errors import TableError
 from wheretolook.geometry import PinholeCamera
 from wheretolook.labelling import report
 from wheretolook.learning.weights import load_classifier
@@ -109,6 +110,30 @@ def test_a_changed_setting_remakes_what_depends_on_it(copy: Path) -> None:
     assert (scene.read_table()["status"] == "unlabelled").all()
     assert run("sample", copy) == 0 and run("label", copy) == 0
     pd.testing.assert_frame_equal(scene.read_table(), table)
+
+
+def test_matches_are_stored_when_asked_for_and_go_with_the_labels_they_belong_to(copy: Path) -> None:
+    scenes = Dataset.load(copy / "data" / "tiny").scenes
+    before = {scene: scene.table.read_bytes() for scene in scenes}
+    stored = ("label", copy, "--label.store_matches", "true")
+    assert run(*stored) == 0  # the finished labels do not have them
+    for scene in scenes:
+        table = read_table(scene.table, matches=True)
+        assert (table["inlier_rows"].map(len) == table["n_inliers"]).all()
+        assert all(np.isin(*rows).all() for rows in table[["inlier_rows", "matched_rows"]].itertuples(index=False))
+        assert np.concatenate(table["matched_rows"].to_list()).max() < len(np.load(scene.landmarks)["ids"])
+        write_table(scene.read_table(), copy / "labels.parquet")
+        assert (copy / "labels.parquet").read_bytes() == before[scene]
+    after = {scene: scene.table.stat().st_mtime_ns for scene in scenes}
+    assert run(*stored) == 0
+    assert {scene: scene.table.stat().st_mtime_ns for scene in scenes} == after
+
+    assert run("label", copy) == 0
+    assert {scene: scene.table.read_bytes() for scene in scenes} == before
+    assert run(*stored) == 0 and run("sample", copy, "--sample.seed", "5") == 0
+    for scene in scenes:
+        with pytest.raises(TableError, match="store_matches"):
+            read_table(scene.table, matches=True)
 
 
 def test_three_lines_score_viewpoints_of_a_colmap_model(demo: Path) -> None:

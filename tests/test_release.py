@@ -27,6 +27,7 @@ from wheretolook.learning.training import train
 from wheretolook.learning.weights import load_classifier
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.release_card import release_card
+from wheretolook.table import write_table
 from wheretolook.tracking import TrackingConfig
 from wheretolook.visibility import StoredOcclusion
 
@@ -101,6 +102,21 @@ def test_every_reader_reads_a_release_as_the_original(finished: Path) -> None:
     # single precision may move a landmark over the border of a bin
     assert (views[0].filled != views[1].filled).float().mean() < 1e-4
     assert np.quantile((views[0].means - views[1].means).abs().numpy(), 0.999) < 1e-3
+
+
+def test_a_release_leaves_matches_out(tmp_path: Path) -> None:
+    """The same labels with and without them give the same files, but for the fingerprint of what they came from."""
+    releases_of: list[dict[str, bytes]] = []
+    for name, with_matches in (("without", False), ("with", True)):
+        dataset = label_stamped(tmp_path / name / "data" / "tiny")
+        for scene in dataset.scenes if with_matches else ():
+            table = scene.read_table()
+            rows = [np.arange(n, dtype=np.int32) for n in table["n_inliers"]]
+            write_table(table.assign(matched_rows=rows, inlier_rows=rows), scene.table)
+            write_json(scene.label_manifest, {**json.loads(scene.label_manifest.read_text()), "store_matches": True})
+        copy = releases.copy_dataset(dataset, experiment_of(tmp_path / name))
+        releases_of.append({name: content for name, content in contents(copy.root).items() if name != releases.ABOUT})
+    assert releases_of[0] == releases_of[1]
 
 
 def test_a_release_scores_as_the_original(finished: Path, tmp_path: Path) -> None:

@@ -10,7 +10,16 @@ import pytest
 
 from wheretolook.errors import TableError
 from wheretolook.geometry import camera_centers, poses_looking_along
-from wheretolook.table import SCHEMA, fingerprint, is_good, pose_columns, poses, read_table, write_table
+from wheretolook.table import (
+    MATCH_FIELDS,
+    SCHEMA,
+    fingerprint,
+    is_good,
+    pose_columns,
+    poses,
+    read_table,
+    write_table,
+)
 
 
 @pytest.fixture
@@ -41,6 +50,69 @@ def test_round_trip_and_equal_bytes(table: pd.DataFrame, tmp_path: Path) -> None
     np.testing.assert_allclose(poses(back), poses(table), atol=1e-15)
     assert fingerprint(tmp_path / "a.parquet") == fingerprint(tmp_path / "b.parquet")
     assert not list(tmp_path.glob("*.partial"))
+
+
+@pytest.fixture
+def matched(table: pd.DataFrame) -> pd.DataFrame:
+    """Views with many matches, one, and none; of two, all are inliers."""
+    matches = [np.arange(0, 90, 3), np.arange(30), np.arange(7, 20), np.array([1_000_000]), np.zeros(0)]
+    inliers = [np.arange(0, 60, 3), np.arange(30), np.arange(8, 20), np.zeros(0), np.zeros(0)]
+    columns = {"matched_rows": matches, "inlier_rows": inliers}
+    return table.assign(**{name: [one.astype(np.int32) for one in rows] for name, rows in columns.items()})
+
+
+def test_matches_are_read_when_asked_for(matched: pd.DataFrame, tmp_path: Path) -> None:
+    paths = [tmp_path / f"{name}.parquet" for name in ("a", "again", "shuffled")]
+    write_table(matched, paths[0])
+    back = read_table(paths[0], matches=True)
+    assert list(back.columns) == [*SCHEMA.names, *MATCH_FIELDS.names]
+    for name in MATCH_FIELDS.names:
+        assert all(isinstance(rows, np.ndarray) and rows.dtype == np.int32 for rows in back[name])
+        assert [rows.tolist() for rows in back[name]] == [rows.tolist() for rows in matched[name]]
+    write_table(back, paths[1])
+    write_table(matched.iloc[::-1].iloc[::-1], paths[2])
+    assert len({path.read_bytes() for path in paths}) == 1
+    assert list(read_table(paths[0]).columns) == SCHEMA.names
+
+
+def test_who_does_not_ask_for_matches_reads_the_same(
+    table: pd.DataFrame, matched: pd.DataFrame, tmp_path: Path
+) -> None:
+    write_table(table, tmp_path / "without.parquet")
+    write_table(matched, tmp_path / "with.parquet")
+    pd.testing.assert_frame_equal(read_table(tmp_path / "with.parquet"), read_table(tmp_path / "without.parquet"))
+
+
+@pytest.mark.parametrize("n", [0, 5])
+def test_rows_of_equal_lengths_stay_apart(n: int, table: pd.DataFrame, tmp_path: Path) -> None:
+    """Arrays that would fit one matrix."""
+    rows = [np.arange(n, dtype=np.int32) + view for view in range(5)]
+    write_table(table.assign(matched_rows=rows, inlier_rows=rows), tmp_path / "a.parquet")
+    back = read_table(tmp_path / "a.parquet", matches=True)
+    assert [one.tolist() for one in back["inlier_rows"]] == [one.tolist() for one in rows]
+    assert {one.dtype for one in back["matched_rows"]} == {np.dtype(np.int32)}
+
+
+def test_matches_that_are_not_stored_are_named_with_what_stores_them(
+    table: pd.DataFrame, matched: pd.DataFrame, tmp_path: Path
+) -> None:
+    path = tmp_path / "viewpoints.parquet"
+    for one, compact in ((table, False), (matched.drop(columns="inlier_rows"), False), (matched, True)):
+        write_table(one, path, compact)
+        with pytest.raises(TableError, match=r"viewpoints\.parquet.*matched_rows.*--label\.store_matches true"):
+            read_table(path, matches=True)
+    matched.drop(columns="inlier_rows").to_parquet(path)  # by others
+    with pytest.raises(TableError, match=r"\['inlier_rows'\].*--label\.store_matches true"):
+        read_table(path, matches=True)
+    matched.assign(matched_rows="many").to_parquet(path)
+    with pytest.raises(TableError, match="another type"):
+        read_table(path, matches=True)
+
+
+def test_a_compact_table_leaves_matches_out(table: pd.DataFrame, matched: pd.DataFrame, tmp_path: Path) -> None:
+    write_table(table, tmp_path / "without.parquet", compact=True)
+    write_table(matched, tmp_path / "with.parquet", compact=True)
+    assert fingerprint(tmp_path / "with.parquet") == fingerprint(tmp_path / "without.parquet")
 
 
 def test_labels_are_strict_at_both_limits(table: pd.DataFrame) -> None:

@@ -48,9 +48,9 @@ def is_release(dataset: Dataset) -> bool:
 def copy_dataset(dataset: Dataset, experiment: Experiment) -> Dataset:
     """Write a compact copy of a labelled dataset to `<data>/release/`. The same dataset gives the same bytes.
 
-    Tables are written compact (`wheretolook.table.COMPACT_SCHEMA`), landmarks without descriptors and in half
-    precision, and what labels were made with without the list of shards. Weights and results that lie there stay; the
-    card and the scores of networks that do not ship go if the data changed.
+    Tables are written compact (`wheretolook.table.COMPACT_SCHEMA`), without matches, landmarks without descriptors and
+    in half precision, and what labels were made with without the list of shards. Weights and results that lie there
+    stay; the card and the scores of networks that do not ship go if the data changed.
 
     Args:
         dataset: what to copy.
@@ -198,9 +198,10 @@ def _release_of(root: Path, source: str) -> Dataset | None:
 
 
 def _manifest(path: Path) -> dict[str, Any]:
-    """What labels were made with, but for the shards, of which there are thousands."""
+    """What labels were made with, but for the shards, of which there are thousands, and the matches, which stay."""
     try:
-        return {name: value for name, value in json.loads(path.read_text()).items() if name != "shards"}
+        content = json.loads(path.read_text())
+        return {name: value for name, value in content.items() if name not in ("shards", "store_matches")}
     except (ValueError, AttributeError) as error:
         raise TableError(
             f"not what the label stage wrote: {error}", path=path, fix="Remove it, or label the scene again."

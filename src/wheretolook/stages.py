@@ -197,14 +197,16 @@ def label(experiment: Experiment, say: Say = print, tick: Tick = lambda work: No
         table, extractor = scene.read_table(), _extractor_of(scene)
         key = _key("label", [asdict(config.localizer), asdict(extractor), asdict(dataset.camera),
                              _existing(scene.mesh, SceneError, "scenes"),
-                             _existing(scene.landmarks, MapError, "map"), _read_stamp(scene, "sample")])  # fmt: skip
+                             _existing(scene.landmarks, MapError, "map"), _read_stamp(scene, "sample"),
+                             *(["store_matches"] if config.store_matches else [])])  # fmt: skip
         shards = scene.folder / "shards"
         if _is_done(scene, "label", key, scene.table):
             shutil.rmtree(shards, ignore_errors=True)  # killed before it could remove them
             report(scene, table)
             continue
         scenes[scene.name] = scene, key
-        job = SceneJob(scene.mesh, scene.landmarks, dataset.camera, config.localizer, extractor, experiment.warp_device)
+        job = SceneJob(scene.mesh, scene.landmarks, dataset.camera, config.localizer, extractor, experiment.warp_device,
+                       config.store_matches)  # fmt: skip
         tasks.append(LabelTask(scene.name, job, table, shards))
     summary = dataset.root / "results" / LABELS_MD
     seconds: dict[str, float] = {}

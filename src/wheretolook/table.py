@@ -1,6 +1,7 @@
 """The table of viewpoints: one Parquet file a scene, one row a viewpoint, joined by ids and never by file order.
 
-A compact table holds the same rows in a third of the space; `read_table` reads both alike.
+A compact table holds the same rows in a third of the space; `read_table` reads both alike. Which landmarks a view
+matched can be stored beside its label, see `MATCH_FIELDS`.
 """
 
 from __future__ import annotations
@@ -50,6 +51,11 @@ COMPACT_SCHEMA = pa.schema(
 """Columns of a compact table: in place of the translation, which differs in every row, the camera's centre in the world
 (metres), which the viewpoints of a location share. The translation follows: t = -R c."""
 
+MATCH_FIELDS = pa.schema([("matched_rows", pa.list_(pa.int32())), ("inlier_rows", pa.list_(pa.int32()))])
+"""Two ragged columns that a table may have besides those of `SCHEMA`, if labelling was asked for them: the landmarks
+that were matched in each view, and those of them that agree with the pose found, as rows of the scene's
+`landmarks.npz`, ascending. A view without matches has two empty lists. Compact tables leave them out."""
+
 CENTER_DECIMALS = 12
 """Decimals of a metre that are kept of centres; those of a location, each computed from its pose, differ by less."""
 
@@ -94,15 +100,18 @@ def write_table(table: pd.DataFrame, path: Path, compact: bool = False) -> None:
     """Write a table atomically as zstd Parquet with checksums. The same rows give the same bytes.
 
     Args:
-        table: viewpoints, see `SCHEMA`.
+        table: viewpoints, see `SCHEMA`; with both columns of `MATCH_FIELDS`, these are written, too.
         path: file to write; its folder is made when needed.
         compact: write `COMPACT_SCHEMA`, about 18 bytes a row; read back, poses agree to 1e-12 and all else exactly.
+            `MATCH_FIELDS` are left out.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".partial")
     schema, options = (COMPACT_SCHEMA, _COMPACT_FORMAT) if compact else (SCHEMA, {})
     if compact:
         table = table.assign(**dict(zip(CENTER_COLUMNS, _shared_centers(table).T, strict=True)))
+    elif set(MATCH_FIELDS.names) <= set(table.columns):
+        schema = pa.schema([*SCHEMA, *MATCH_FIELDS])
     content = pa.Table.from_pandas(table, schema=schema, preserve_index=False)
     content = content.replace_schema_metadata(None)  # it tells of the data frame, not of the rows
     try:
@@ -122,20 +131,27 @@ def _shared_centers(table: pd.DataFrame) -> Float:
     return np.round(np.where(apart, centers, shared), CENTER_DECIMALS) + 0.0  # no negative zero
 
 
-def read_table(path: Path) -> pd.DataFrame:
+def read_table(path: Path, matches: bool = False) -> pd.DataFrame:
     """Read a table of viewpoints, compact or not.
 
+    Args:
+        path: file to read.
+        matches: read `MATCH_FIELDS`, too.
+
     Returns:
-        The columns of `SCHEMA`.
+        The columns of `SCHEMA`. With `matches` also those of `MATCH_FIELDS`: in each row two int32 arrays, (M,) of the
+        landmarks matched and (I,) of the inliers among them.
 
     Raises:
-        TableError: the file is missing, truncated, no Parquet file, or lacks columns.
+        TableError: the file is missing, truncated, no Parquet file, or lacks columns; also those of `MATCH_FIELDS`, if
+            they are asked for.
     """
     if not path.is_file():
         raise TableError("there is no table of viewpoints", path=path, fix="Run the sample stage first.")
     try:
-        table = pq.read_table(path, page_checksum_verification=True)
-        names = table.column_names
+        with pq.ParquetFile(path, page_checksum_verification=True) as file:
+            names = file.schema_arrow.names  # who does not ask for the matches need not wait for them
+            table = file.read([name for name in names if matches or name not in MATCH_FIELDS.names])
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise TableError(
             f"not a readable Parquet file: {error}",
@@ -147,6 +163,11 @@ def read_table(path: Path) -> pd.DataFrame:
     missing = [name for name in schema.names if name not in names]
     if missing:
         raise TableError("columns are missing", path=path, value=missing, fix="Run the sample stage again.")
+    if matches:
+        schema = pa.schema([*schema, *MATCH_FIELDS])
+        if missing := [name for name in MATCH_FIELDS.names if name not in names]:
+            fix = "Label again with `--label.store_matches true`; compact tables never hold them."
+            raise TableError("it is not stored which landmarks were matched", path=path, value=missing, fix=fix)
     try:
         frame: pd.DataFrame = table.select(schema.names).cast(schema).to_pandas()
     except pa.ArrowException as error:
@@ -165,7 +186,8 @@ def read_table(path: Path) -> pd.DataFrame:
     if compact:
         rotation = rotation_from_quaternion(frame[list(POSE_COLUMNS[:4])].to_numpy())
         translation = -(rotation @ position[..., None])[..., 0]
-        frame = frame.assign(**dict(zip(POSE_COLUMNS[4:], translation.T, strict=True)))[SCHEMA.names]
+        frame = frame.assign(**dict(zip(POSE_COLUMNS[4:], translation.T, strict=True)))
+        frame = frame[[*SCHEMA.names, *(MATCH_FIELDS.names if matches else [])]]
     return frame
 
 

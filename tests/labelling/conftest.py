@@ -40,6 +40,19 @@ def expected(room: MappedRoom, views: pd.DataFrame, tmp_path_factory: pytest.Tem
     return file_bytes(labelled, tmp_path_factory.mktemp("expected"))
 
 
+@pytest.fixture(scope="session")
+def matched(room: MappedRoom, views: pd.DataFrame) -> pd.DataFrame:
+    """Their labels with the landmarks that were matched."""
+    localizer = Localizer(Landmarks.load(room.landmarks), CAMERA)
+    return label_rows(views, WarpRenderer(load_mesh(room.mesh)), localizer, CAMERA, store_matches=True)
+
+
+@pytest.fixture(scope="session")
+def expected_matches(matched: pd.DataFrame, tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """The file that any engine must end with when it stores matches."""
+    return file_bytes(matched, tmp_path_factory.mktemp("matched"))
+
+
 @pytest.fixture
 def in_this_process(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Shards are labelled here one after the other: quicker, for what the workers have no part in."""

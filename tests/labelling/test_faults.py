@@ -166,11 +166,15 @@ def test_a_shard_that_is_damaged_while_others_are_made_is_an_error(
     assert [path.name[:8] for path in times(tmp_path)] == ["00000002"]  # the next run makes the other anew
 
 
-def test_no_flipped_bit_of_a_table_goes_unnoticed(expected: bytes, tmp_path: Path) -> None:
+@pytest.mark.parametrize("matches", [False, True])
+def test_no_flipped_bit_of_a_table_goes_unnoticed(
+    matches: bool, expected: bytes, expected_matches: bytes, tmp_path: Path
+) -> None:
     """At 40 places of each column's pages and 300 of the footer: an error, or a bit that nothing depends on."""
     path = tmp_path / "table.parquet"
+    expected = expected_matches if matches else expected
     path.write_bytes(expected)
-    whole, pages = read_table(path), pq.ParquetFile(path).metadata.row_group(0)
+    whole, pages = read_table(path, matches), pq.ParquetFile(path).metadata.row_group(0)
     rng = np.random.default_rng(0)
     footer = len(expected) - 8 - int.from_bytes(expected[-8:-4], "little")
     places = list(rng.integers(footer, len(expected), 300))
@@ -181,7 +185,7 @@ def test_no_flipped_bit_of_a_table_goes_unnoticed(expected: bytes, tmp_path: Pat
     for place in places:
         path.write_bytes(with_flipped_bit(expected, place, bit=rng.integers(8)))
         try:
-            pd.testing.assert_frame_equal(read_table(path), whole)
+            pd.testing.assert_frame_equal(read_table(path, matches), whole)
         except TableError:
             noticed += 1
     assert noticed > len(places) / 2
@@ -208,10 +212,10 @@ def test_shards_of_another_mesh_or_of_other_viewpoints_are_not_used(
     assert (read_table(tmp_path / "shards-labelled.parquet")["status"] == "too_few_matches").all()
 
 
-@pytest.mark.parametrize("n_finished", [0, 3])
+@pytest.mark.parametrize(("n_finished", "matches"), [(0, False), (3, False), (3, True)])
 def test_killed_at_any_moment_it_resumes_to_the_same_table(
-    room: MappedRoom, views: pd.DataFrame, expected: bytes, tmp_path: Path, n_finished: int,
-    request: pytest.FixtureRequest,
+    room: MappedRoom, views: pd.DataFrame, expected: bytes, expected_matches: bytes, tmp_path: Path, n_finished: int,
+    matches: bool, request: pytest.FixtureRequest,
 ) -> None:  # fmt: skip
     write_table(views, tmp_path / "table.parquet")
     script = tmp_path / "run.py"
@@ -222,7 +226,8 @@ def test_killed_at_any_moment_it_resumes_to_the_same_table(
         "if __name__ == '__main__':\n"
         "    folder, mesh, landmarks = map(Path, sys.argv[1:])\n"
         "    table = read_table(folder / 'table.parquet')\n"
-        "    label(table, MappedRoom(mesh, landmarks), folder / 'shards', workers=2, shard_size=2)\n"
+        f"    options = dict(workers=2, shard_size=2, store_matches={matches})\n"
+        "    label(table, MappedRoom(mesh, landmarks), folder / 'shards', **options)\n"
     )
     run = subprocess.Popen(
         [sys.executable, str(script), str(tmp_path), str(room.mesh), str(room.landmarks)],
@@ -238,7 +243,8 @@ def test_killed_at_any_moment_it_resumes_to_the_same_table(
     assert times(tmp_path / "shards") == finished
 
     request.getfixturevalue("in_this_process")
-    assert label(views, room, tmp_path / "shards", shard_size=2) == expected
+    labelled = label(views, room, tmp_path / "shards", shard_size=2, store_matches=matches)
+    assert labelled == (expected_matches if matches else expected)
     assert finished.items() <= times(tmp_path / "shards").items()
 
 

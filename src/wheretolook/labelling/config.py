@@ -48,6 +48,8 @@ class LabelConfig:
             (which needs `pip install 'ray[client]'`); empty starts one on this machine.
         workers: processes of the local engine; 0 means one for each CPU core this process may use.
         shard_size: viewpoints a shard, the unit of work and of what an interruption can lose.
+        store_matches: keep the rows of the landmarks that each view matched, and which agree with its pose, in the
+            columns matched_rows and inlier_rows; needed to learn matchability.
     """
 
     localizer: LocalizerConfig = field(default_factory=LocalizerConfig)
@@ -55,6 +57,7 @@ class LabelConfig:
     ray_address: str = ""
     workers: int = 0
     shard_size: int = 256
+    store_matches: bool = False
 
     def __post_init__(self) -> None:
         if self.engine not in ("local", "ray"):

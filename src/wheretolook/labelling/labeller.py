@@ -58,7 +58,7 @@ class LabelledScene:
     Attributes:
         task: what was asked.
         table: the viewpoints with status, error_m, error_deg and n_inliers; the paper's label y follows from them by
-            `wheretolook.table.is_good`.
+            `wheretolook.table.is_good`. If the job stores matches, also `wheretolook.table.MATCH_FIELDS`.
         manifest: what the labels were made with: versions, settings, fingerprints, and each shard's name and content.
         seconds: workers' time in each step, of the shards made in this run.
     """
@@ -96,13 +96,14 @@ def label_viewpoints(
         description: the bar's title.
 
     Returns:
-        The table with its labels.
+        The table with its labels, see `LabelledScene`.
 
     Raises:
         As `label_scenes`.
     """
     config = config or LabelConfig()
-    job = SceneJob(mesh, landmarks, camera, config.localizer, extractor or ExtractorConfig(), device)
+    extractor = extractor or ExtractorConfig()
+    job = SceneJob(mesh, landmarks, camera, config.localizer, extractor, device, config.store_matches)
     (scene,) = label_scenes([LabelTask(description, job, table, shards)], config, progress, description)
     return scene.table
 
@@ -189,7 +190,7 @@ class _Scene:
         if Landmarks.load(job.landmarks).descriptors is None:
             fix = "Build the map again."
             raise MapError("landmarks without descriptors cannot be matched", path=job.landmarks, fix=fix)
-        settings = {
+        settings: dict[str, Any] = {
             "versions": versions(),
             "localizer": asdict(job.localizer),
             "extractor": asdict(job.extractor),
@@ -198,6 +199,8 @@ class _Scene:
             "mesh": fingerprint(job.mesh),
             "landmarks": fingerprint(job.landmarks),
         }
+        if job.store_matches:  # shards without matches keep the names they always had
+            settings["store_matches"] = True
         text = json.dumps(settings, sort_keys=True).encode()
         inputs = [name for name in SCHEMA.names if name not in LABELS]  # a shard's file holds them all
         shards = []
@@ -270,7 +273,7 @@ def _finished(shard: Shard) -> pd.DataFrame | None:
     if not shard.path.exists():
         return None
     try:
-        done = read_table(shard.path)
+        done = read_table(shard.path, shard.job.store_matches)
     except TableError:
         shard.path.unlink()
         return None

@@ -27,13 +27,15 @@ class Localization:
         cam_from_world: (3, 4) estimated pose, None if RANSAC found none. A pose with too few inliers is kept for the
             record, but its status is "no_pose".
         n_matches: 2D-3D matches.
-        inlier_rows: rows of the landmarks that were matched and agree with the pose.
+        inlier_rows: (I,) rows of the landmarks that were matched and agree with the pose.
+        matched_rows: (M,) rows of all landmarks that were matched, whatever the status.
     """
 
     status: str
     cam_from_world: Float | None
     n_matches: int
     inlier_rows: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    matched_rows: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
 
 class Localizer:
@@ -96,7 +98,7 @@ class Localizer:
         """Step 3: the pose of one image from its matches, rows (M,) of its keypoints and rows (M,) of the landmarks."""
         n_matches = len(keypoint_rows)
         if n_matches < self.config.min_matches:
-            return Localization(TOO_FEW_MATCHES, None, n_matches)
+            return Localization(TOO_FEW_MATCHES, None, n_matches, matched_rows=landmark_rows)
         estimate = pycolmap.estimate_and_refine_absolute_pose(
             keypoints.pixels[keypoint_rows].astype(np.float64),
             self.landmarks.points[landmark_rows],
@@ -105,7 +107,8 @@ class Localizer:
             self._refinement,
         )
         if estimate is None:
-            return Localization(NO_POSE, None, n_matches)
+            return Localization(NO_POSE, None, n_matches, matched_rows=landmark_rows)
         pose = np.asarray(estimate["cam_from_world"].matrix())
         status = LOCALIZED if estimate["num_inliers"] >= self.config.min_inliers else NO_POSE
-        return Localization(status, pose, n_matches, landmark_rows[np.asarray(estimate["inlier_mask"], dtype=bool)])
+        inlier_rows = landmark_rows[np.asarray(estimate["inlier_mask"], dtype=bool)]
+        return Localization(status, pose, n_matches, inlier_rows, landmark_rows)

@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from wheretolook.errors import WhereToLookError, WorkerError
 from wheretolook.geometry import Float, PinholeCamera, pose_error
 from wheretolook.labelling.config import LocalizerConfig
 from wheretolook.labelling.pipeline import Step, run_pipeline
 from wheretolook.mapping.extraction import ExtractorConfig
-from wheretolook.table import poses
+from wheretolook.table import MATCH_FIELDS, poses
 from wheretolook.worker_processes import use_one_core
 
 if TYPE_CHECKING:
@@ -40,6 +41,7 @@ class SceneJob:
         extractor: what the map was made with.
         device: where images are rendered, keypoints extracted and descriptors matched; "cuda" is spread over all GPUs
             there are.
+        store_matches: whether labelled rows get the columns of `wheretolook.table.MATCH_FIELDS`.
     """
 
     mesh: Path
@@ -48,6 +50,7 @@ class SceneJob:
     localizer: LocalizerConfig = LocalizerConfig()
     extractor: ExtractorConfig = ExtractorConfig()
     device: str = "cpu"
+    store_matches: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +105,8 @@ class ShardWorker:
         try:
             seconds: dict[str, float] = {}
             renderer, localizer = self._open(job)
-            return LabelledShard(label_rows(rows, renderer, localizer, job.camera, seconds, tick), seconds)
+            labelled = label_rows(rows, renderer, localizer, job.camera, seconds, tick, job.store_matches)
+            return LabelledShard(labelled, seconds)
         except WhereToLookError:
             raise
         except Exception as error:
@@ -135,6 +139,7 @@ def label_rows(
     camera: PinholeCamera,
     seconds: dict[str, float] | None = None,
     tick: Tick = lambda n: None,
+    store_matches: bool = False,
 ) -> pd.DataFrame:
     """Render viewpoints, localize the images and measure the errors, in batched steps that overlap in this process.
 
@@ -145,9 +150,11 @@ def label_rows(
         camera: intrinsics of the viewpoints.
         seconds: gets the time spent in each step added: render, extract, match, pose.
         tick: called with the number of viewpoints just finished.
+        store_matches: also tell which landmarks were matched.
 
     Returns:
-        The table with status, error_m, error_deg and n_inliers filled in.
+        The table with status, error_m, error_deg and n_inliers filled in, and with `store_matches` the columns of
+        `wheretolook.table.MATCH_FIELDS`. Those it had before, of earlier labels, go in any case.
     """
     true_poses = poses(table)
 
@@ -168,12 +175,23 @@ def label_rows(
     none: Float = np.full((3, 4), np.nan)
     estimates = np.stack([none if one.cam_from_world is None else one.cam_from_world for one in found])
     error_m, error_deg = pose_error(estimates, true_poses)
-    return table.assign(
+    labelled = table.drop(columns=MATCH_FIELDS.names, errors="ignore").assign(
         status=[one.status for one in found],
         error_m=error_m.astype(np.float32),
         error_deg=error_deg.astype(np.float32),
         n_inliers=np.array([len(one.inlier_rows) for one in found], dtype=np.int32),
     )
+    if not store_matches:
+        return labelled
+    return labelled.assign(
+        matched_rows=[_ascending(one.matched_rows) for one in found],
+        inlier_rows=[_ascending(one.inlier_rows) for one in found],
+    )
+
+
+def _ascending(rows: NDArray[np.int64]) -> NDArray[np.int32]:
+    """Rows of landmarks as a table holds them."""
+    return np.sort(rows).astype(np.int32)
 
 
 def _device(device: str, number: int) -> str:

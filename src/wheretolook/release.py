@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import wheretolook
 from wheretolook.dataset import Dataset, SceneFolder, write_json
 from wheretolook.errors import ConfigError, StorageError, TableError, WeightsError
-from wheretolook.learning.config import RELEASED, VARIANTS
+from wheretolook.learning.config import NETWORKS, RELEASED
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.table import sha256, write_table
 from wheretolook.visibility import StoredOcclusion
@@ -96,7 +96,7 @@ def copy_dataset(dataset: Dataset, experiment: Experiment) -> Dataset:
 
 def trained_weights(release: Dataset) -> list[Path]:
     """Weights in a release's folder, one for each input variant trained."""
-    named = (release.root / "weights" / f"mlp-{variant}.safetensors" for variant in VARIANTS)
+    named = (release.root / "weights" / f"mlp-{variant}.safetensors" for variant in NETWORKS)
     return [path for path in named if path.is_file()]
 
 

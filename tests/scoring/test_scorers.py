@@ -9,10 +9,13 @@ import pytest
 import torch
 
 from synthetic_dataset import CAMERA, make_landmarks
+from wheretolook.attributes import LandmarkDescriber, pool
 from wheretolook.errors import ConfigError, WeightsError
 from wheretolook.features import CHANNELS, INPUT_VARIANTS, BinnedViews
 from wheretolook.geometry import Float, PinholeCamera, poses_looking_along
+from wheretolook.learning.config import TreesConfig
 from wheretolook.learning.network import InputStatistics, NetworkSpec, ViewpointNetwork
+from wheretolook.learning.trees import BoostedTrees, PooledViews, fit_trees
 from wheretolook.learning.weights import save_classifier
 from wheretolook.localization_map import LocalizationMap
 from wheretolook.scoring import SCORERS, BinsScorer, Scorer, VisibleScorer, load_scorer, make_scorer
@@ -40,10 +43,23 @@ def weights(tmp_path: Path) -> Path:
     return path
 
 
+def some_trees(localization_map: LocalizationMap) -> BoostedTrees:
+    """Trees whose scores differ from view to view."""
+    rng = np.random.default_rng(2)
+    directions = poses_looking_along(rng.uniform((-1, -1, 1), (1, 1, 2), (300, 3)), rng.normal(size=(300, 3)))
+    values = pool(LandmarkDescriber(localization_map).describe(directions), directions, CAMERA).numpy()
+    labels = np.nan_to_num(values[:, 0] + values[:, 10]) + rng.normal(size=300) > 3
+    views = PooledViews(values, labels, np.zeros(300, int), np.arange(300))
+    return fit_trees(views, views, CAMERA, TreesConfig(max_trees=10, max_leaves=15, min_leaf=3))[0]
+
+
 @pytest.mark.parametrize("name", SCORERS)
 def test_scorers_keep_their_contract(
     name: str, localization_map: LocalizationMap, views: Float, weights: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    if name == "trees":
+        weights = weights.with_name("trees.safetensors")
+        some_trees(localization_map).save(weights)
     scorer = make_scorer(name, localization_map, seed=3, weights=weights)
     assert isinstance(scorer, Scorer)
     assert name in (scorer.name, f"{scorer.name}-{scorer.inputs.replace(' ', '-')}")

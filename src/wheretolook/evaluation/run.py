@@ -22,7 +22,7 @@ from wheretolook.evaluation.ranking import TestViews
 from wheretolook.evaluation.report import main_rows, score_markdown
 from wheretolook.evaluation.scores import (
     ALL,
-    LEARNED,
+    WITH_WEIGHTS,
     Choices,
     Method,
     choose,
@@ -32,7 +32,8 @@ from wheretolook.evaluation.scores import (
 )
 from wheretolook.fisher.soft_visibility import GaussianProcessVisibility, cone_half_angle
 from wheretolook.geometry import Float, camera_centers
-from wheretolook.learning.config import VARIANTS
+from wheretolook.learning.config import VARIANTS, weights_name
+from wheretolook.learning.weights import weights_kind
 from wheretolook.localization_map import LocalizationMap
 from wheretolook.scene_occlusion import scene_occlusion
 from wheretolook.scoring import Scorer, make_scorer
@@ -175,7 +176,7 @@ def results_folder(dataset: Dataset, config: EvaluateConfig) -> Path:
 
 
 def _weights(dataset: Dataset, config: EvaluateConfig, models: Sequence[TrainedModel | Path] | None) -> list[Path]:
-    if "mlp" not in config.methods:
+    if not {*WITH_WEIGHTS} & {*config.methods}:
         return []
     if models is not None:
         weights = [model if isinstance(model, Path) else model.path for model in models]
@@ -186,7 +187,15 @@ def _weights(dataset: Dataset, config: EvaluateConfig, models: Sequence[TrainedM
             "there are no weights to evaluate", path=dataset.root / "weights",
             fix="Run the train stage first, name weights, or leave mlp out of the methods.",
         )  # fmt: skip
-    return weights
+    kinds = {path: weights_kind(path) for path in weights}
+    for kind in WITH_WEIGHTS:
+        # who asks for all methods gets those that have been trained
+        if kind in config.methods and kind not in kinds.values() and config.methods != EvaluateConfig().methods:
+            raise WeightsError(
+                f"there are no weights of {kind} to evaluate", path=dataset.root / "weights",
+                fix=f"Run the train stage first, name weights, or leave {kind} out of the methods.",
+            )  # fmt: skip
+    return [path for path in weights if kinds[path] in config.methods]
 
 
 def _own_weights(dataset: Dataset) -> list[Path]:
@@ -194,7 +203,7 @@ def _own_weights(dataset: Dataset) -> list[Path]:
     from wheretolook.learning.training import training_fingerprint
     from wheretolook.learning.weights import read_training
 
-    named = (dataset.root / "weights" / f"mlp-{variant}.safetensors" for variant in VARIANTS)
+    named = (dataset.root / "weights" / weights_name(variant) for variant in VARIANTS)
     weights = [path for path in named if path.is_file()]
     now = training_fingerprint(dataset)
     for path in weights:
@@ -297,7 +306,8 @@ def _fit_temperatures(
     if not labelled:
         return {}, 0
     scenes, tables = zip(*labelled, strict=True)
-    learned = replace(config, methods=(LEARNED,), reference="")
+    kinds = tuple(dict.fromkeys(map(weights_kind, weights)))
+    learned = replace(config, methods=kinds, reference="")
     scores, _ = _score_scenes(dataset, scenes, tables, learned, weights, device, progress, occlusion)
     good = np.concatenate([is_good(table, *config.thresholds[0]) for table in tables])
     return {method: fit_temperature(values, good) for method, values in scores.items()}, len(good)
@@ -312,7 +322,7 @@ def _calibration(
     """
     parts = []
     for (name, inputs), values in scores.items():
-        if name == LEARNED:
+        if name in WITH_WEIGHTS:
             temperature = temperatures.get((name, inputs), float("nan"))
             about = {"method": name, "inputs": inputs, "temperature": temperature, "n_val": n_val}
             curves = calibration_rows(values, good, temperature)
@@ -368,7 +378,8 @@ def _scorers(
 ) -> dict[Method, Scorer]:
     scorers: dict[Method, Scorer] = {}
     for name in config.methods:
-        for path in weights if name == "mlp" else [None]:
+        of_kind = [path for path in weights if weights_kind(path) == name]
+        for path in of_kind if name in WITH_WEIGHTS else [None]:
             scorer = make_scorer(name, localization_map, config.seed, path, config.heading)
             key = (scorer.name, scorer.inputs)
             if key in scorers:  # two files of one variant: told apart by their names

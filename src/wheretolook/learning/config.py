@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from wheretolook.errors import ConfigError
@@ -11,8 +11,14 @@ from wheretolook.features import INPUT_VARIANTS, Layout
 RELEASED = "released"
 """The variant that trains as the paper's released code does, on the inputs of "2d+3d"."""
 
-VARIANTS = (*INPUT_VARIANTS, RELEASED)
+TREES = "trees"
+"""The variant that is no network: boosted trees on pooled statistics of what landmarks are like."""
+
+NETWORKS = (*INPUT_VARIANTS, RELEASED)
 """Networks that can be trained."""
+
+VARIANTS = (*NETWORKS, TREES)
+"""All that can be trained."""
 
 RELEASED_OPTIONS: dict[str, Any] = {
     "learning_rate": 1e-4,
@@ -33,12 +39,43 @@ configured."""
 
 
 @dataclass(frozen=True)
+class TreesConfig:
+    """Options of boosted trees (scikit-learn's HistGradientBoostingClassifier).
+
+    Args:
+        max_trees: rounds of boosting; those up to the best validation average precision are kept.
+        learning_rate: shrinkage of each tree.
+        max_leaves: leaves of a tree.
+        min_leaf: viewpoints of a leaf.
+        l2: penalty on the leaves' values.
+    """
+
+    max_trees: int = 400
+    learning_rate: float = 0.06
+    max_leaves: int = 31
+    min_leaf: int = 50
+    l2: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.max_trees < 1 or self.max_leaves < 2 or self.min_leaf < 1:
+            raise ConfigError(
+                "trees need max_trees >= 1, max_leaves >= 2 and min_leaf >= 1",
+                value=(self.max_trees, self.max_leaves, self.min_leaf),
+            )
+        if not self.learning_rate > 0 or not self.l2 >= 0:
+            raise ConfigError(
+                "trees need a positive learning_rate and no negative l2", value=(self.learning_rate, self.l2)
+            )
+
+
+@dataclass(frozen=True)
 class TrainConfig:
     """Options of training. The defaults are the paper's where it says something (Sec. 3.3 and 4).
 
     Args:
-        variants: networks to train: by their inputs "2d", "2d+z" and "2d+3d", and "released", which has the inputs
-            "2d+3d" and learns with the options of the paper's released code instead of those here.
+        variants: what to train: networks by their inputs, "2d", "2d+z" and "2d+3d"; "released", which has the inputs
+            "2d+3d" and learns with the options of the paper's released code instead of those here; and "trees",
+            boosted trees that know what landmarks are like, with the options in `trees` and none of the network's.
         epochs: passes over the training viewpoints (paper: 300).
         batch_size: viewpoints a step, shared out over the devices (the paper gives none; 128 is the released code's).
         learning_rate: Adam's initial learning rate (paper: 1e-3; released code: 1e-4).
@@ -67,6 +104,7 @@ class TrainConfig:
         accelerator: where to train: "auto", "cpu" or "gpu".
         devices: GPUs, or processes on the CPU, to train with. One step of many is one step of one: each takes its share
             of the same batch. Dropout and noise draw other numbers, though.
+        trees: options of "trees".
     """
 
     variants: tuple[str, ...] = tuple(INPUT_VARIANTS)
@@ -91,6 +129,7 @@ class TrainConfig:
     seed: int = 0
     accelerator: Literal["auto", "cpu", "gpu"] = "auto"
     devices: int = 1
+    trees: TreesConfig = field(default_factory=TreesConfig)
 
     def __post_init__(self) -> None:
         unknown = [name for name in self.variants if name not in VARIANTS]
@@ -127,6 +166,11 @@ class TrainConfig:
     def of_variant(self, variant: str) -> TrainConfig:
         """The options that a variant is trained with."""
         return replace(self, **RELEASED_OPTIONS) if variant == RELEASED else self
+
+
+def weights_name(variant: str) -> str:
+    """File in a dataset's `weights` folder of what a variant has learnt."""
+    return "trees.safetensors" if variant == TREES else f"mlp-{variant}.safetensors"
 
 
 def inputs_of(variant: str) -> str:

@@ -14,10 +14,11 @@ from lightning.pytorch.utilities.seed import isolate_rng
 
 import wheretolook
 from wheretolook.dataset import Dataset, write_json
+from wheretolook.errors import TableError
 from wheretolook.features import INPUT_VARIANTS
 from wheretolook.learning.classifier import ViewpointClassifier
-from wheretolook.learning.config import TrainConfig, inputs_of
-from wheretolook.learning.data import ViewpointDataModule
+from wheretolook.learning.config import TREES, TrainConfig, inputs_of, weights_name
+from wheretolook.learning.data import ViewpointDataModule, hold_out_locations
 from wheretolook.learning.fit import EpochRecord, RunLog, fit, home_device
 from wheretolook.learning.network import NetworkSpec, ViewpointNetwork
 from wheretolook.learning.weights import save_classifier
@@ -28,8 +29,11 @@ from wheretolook.tracking import TrackingConfig, log, start_run
 if TYPE_CHECKING:
     from mlflow import MlflowClient
 
-NOT_DECIDING = ("variants", "accelerator", "devices")
-"""Options that do not decide what a variant learns: only where, and with which random numbers."""
+NOT_DECIDING = ("variants", "accelerator", "devices", "trees")
+"""Options that do not decide what a network learns: only where, and with which random numbers."""
+
+OF_TREES = ("trees", "max_error_m", "max_error_deg", "val_fraction", "seed")
+"""Options that decide what boosted trees learn."""
 
 
 @dataclass(frozen=True)
@@ -58,12 +62,12 @@ def train(
     progress: bool = True,
     force: bool = False,
 ) -> list[TrainedModel]:
-    """Train the paper's classifier for each input variant.
+    """Train the paper's classifier for each input variant, and boosted trees if they are among the variants.
 
-    Writes `<dataset>/weights/mlp-<variant>.safetensors` and, beside it, a JSON file that tells what it was trained on.
-    A variant already trained with the same options on the same train and val scenes is not trained again. With
-    `config.keep == "best"`, the weights kept are those of the epoch with the best average precision on the validation
-    views, the earliest one on ties.
+    Writes `<dataset>/weights/mlp-<variant>.safetensors` or `trees.safetensors` and, beside it, a JSON file that tells
+    what it was trained on. A variant already trained with the same options on the same train and val scenes is not
+    trained again. With `config.keep == "best"`, the weights kept are those of the epoch with the best average precision
+    on the validation views, the earliest one on ties.
 
     Args:
         dataset: labelled train scenes, and val scenes if it has any.
@@ -84,11 +88,13 @@ def train(
     data: ViewpointDataModule | None = None
     models = []
     for variant in config.variants:
-        path = dataset.root / "weights" / f"mlp-{variant}.safetensors"
+        path = dataset.root / "weights" / weights_name(variant)
         options = config.of_variant(variant)
         about = _about(dataset, options, fingerprint, variant)
         model = None if force else _trained_before(path, variant, about)
-        if model is None:
+        if model is None and variant == TREES:
+            model = _train_trees(dataset, options, path, about, tracking, progress)
+        elif model is None:
             if data is None or data.config != options:
                 data = ViewpointDataModule(dataset, options, home_device(options), progress)
             data.setup()
@@ -104,7 +110,8 @@ def training_fingerprint(dataset: Dataset) -> str:
 
 def _about(dataset: Dataset, config: TrainConfig, fingerprint: str, variant: str) -> dict[str, Any]:
     """What decides which weights come out, as JSON values."""
-    options = {name: value for name, value in asdict(config).items() if name not in NOT_DECIDING}
+    deciding = OF_TREES if variant == TREES else [name for name in asdict(config) if name not in NOT_DECIDING]
+    options = {name: value for name, value in asdict(config).items() if name in deciding}
     about = {
         "dataset": dataset.name,
         "dataset_fingerprint": fingerprint,
@@ -160,6 +167,46 @@ def _train_variant(
         content = {"about": about, "weights_sha256": sha256(path), "run_id": run_id, "metrics": metrics}
         write_json(path.with_suffix(".json"), content)
     return TrainedModel(variant, path, run_id, metrics)
+
+
+def _train_trees(
+    dataset: Dataset, config: TrainConfig, path: Path, about: dict[str, Any], tracking: TrackingConfig, progress: bool
+) -> TrainedModel:
+    from wheretolook.learning.trees import fit_trees, load_pooled
+
+    train_scenes, val_scenes = dataset.split("train"), dataset.split("val")
+    if not train_scenes:
+        fix = "Make one, or train on another dataset."
+        raise TableError("the dataset has no train scene", path=dataset.root, fix=fix)
+    views = load_pooled(
+        dataset, [*train_scenes, *val_scenes], (config.max_error_m, config.max_error_deg), home_device(config), progress
+    )
+    if val_scenes:
+        held_out = views.scene >= len(train_scenes)
+    else:
+        held_out = hold_out_locations(views.scene, views.location, config.val_fraction, config.seed)
+    sides = {"train": views.only(~held_out), "val": views.only(held_out)}
+    for name, side in sides.items():
+        if side.labels.all() or not side.labels.any():
+            raise TableError(
+                f"the {name} labels are of one class", path=dataset.root, value=f"{len(side.labels)} viewpoints",
+                fix="Label more locations or scenes, or loosen max_error_m and max_error_deg.",
+            )  # fmt: skip
+    params = {
+        **{name: about[name] for name in ("variant", "dataset", "dataset_fingerprint")},
+        **about["config"]["trees"],
+        **{name: value for name, value in about["config"].items() if name != "trees"},
+        **{f"n_{name}": len(side.labels) for name, side in sides.items()},
+        **{f"positives_{name}": round(float(side.labels.mean()), 4) for name, side in sides.items()},
+    }
+    with start_run(tracking, "train trees", "train", params) as (client, run_id):
+        trees, metrics = fit_trees(sides["train"], sides["val"], dataset.camera, config.trees, config.seed)
+        trees.save(path, about)
+        log(client, run_id, metrics={f"kept_{name}": value for name, value in metrics.items()})
+        client.log_artifact(run_id, str(path))
+        content = {"about": about, "weights_sha256": sha256(path), "run_id": run_id, "metrics": metrics}
+        write_json(path.with_suffix(".json"), content)
+    return TrainedModel(TREES, path, run_id, metrics)
 
 
 def _log_artifacts(client: MlflowClient, run_id: str, weights: Path, history: pd.DataFrame, variant: str) -> None:

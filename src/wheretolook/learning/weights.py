@@ -19,6 +19,9 @@ from wheretolook.learning.network import InputStatistics, NetworkSpec, Viewpoint
 FORMAT_VERSION = 1
 """Version of the layout of the metadata."""
 
+MLP = "mlp"
+"""Kind of weights without a kind in their header."""
+
 METADATA_KEY = "wheretolook"
 """Key of the JSON text in the header of the file."""
 
@@ -53,7 +56,10 @@ def load_classifier(path: str | Path, device: str = "cpu") -> ViewpointNetwork:
     Raises:
         WeightsError: the file is missing, damaged, foreign, of another version, or does not fit its own description.
     """
-    tensors, header = _read(Path(path))
+    tensors, header = read_weights(Path(path))
+    if header.get("kind", MLP) != MLP:
+        fix = "Give weights of a network."
+        raise WeightsError("these weights are no network's", path=path, value=header["kind"], fix=fix)
     network = ViewpointNetwork(_spec(Path(path), header))
     try:
         network.layers.load_state_dict(tensors)
@@ -70,10 +76,24 @@ def read_training(path: str | Path) -> dict[str, Any]:
     Raises:
         WeightsError: the file is missing, damaged or foreign.
     """
-    return dict(_read(Path(path))[1].get("training", {}))
+    return dict(read_weights(Path(path))[1].get("training", {}))
 
 
-def _read(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+def weights_kind(path: str | Path) -> str:
+    """The method that a weights file serves: "mlp" or "trees".
+
+    Raises:
+        WeightsError: the file is missing, damaged or foreign.
+    """
+    return str(read_weights(Path(path))[1].get("kind", MLP))
+
+
+def read_weights(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Tensors of a weights file by name, and the description in its header.
+
+    Raises:
+        WeightsError: the file is missing, damaged, foreign or of another version.
+    """
     if not path.is_file():
         raise WeightsError("there are no weights", path=path, fix="Run the train stage first, or correct the path.")
     try:

@@ -13,9 +13,9 @@ from wheretolook.errors import WeightsError
 from wheretolook.features import CHANNELS, BinnedViews
 from wheretolook.geometry import Float, PinholeCamera
 from wheretolook.learning.network import ViewpointNetwork
-from wheretolook.learning.weights import load_classifier, read_training
+from wheretolook.learning.weights import load_classifier, read_training, weights_kind
 from wheretolook.localization_map import LocalizationMap
-from wheretolook.scoring.base import BLOCK, BinnedScorer
+from wheretolook.scoring.base import BLOCK, BinnedScorer, Scorer
 
 FIELD_OF_VIEW_TOLERANCE = 1e-3
 """Relative difference in width / focal length and height / focal length up to which fields of view are the same."""
@@ -41,12 +41,7 @@ class LearnedScorer(BinnedScorer):
         self.device = localization_map.device
         self.network = network.to(self.device).eval()
         trained, camera = network.spec.camera, localization_map.camera
-        if not _same_field_of_view(trained, camera):
-            raise WeightsError(
-                f"the network was trained for a camera of {_describe(trained)}",
-                value=_describe(camera),
-                fix="Use a pinhole camera with that field of view, or train with this one.",
-            )
+        check_field_of_view(trained, camera)
         scale = {"u": trained.width / camera.width, "v": trained.height / camera.height}
         self._scale = torch.tensor([scale.get(name, 1.0) for name in CHANNELS], device=self.device)[:, None, None]
 
@@ -77,13 +72,28 @@ class LearnedScorer(BinnedScorer):
         return scores
 
 
-def load_scorer(weights: str | Path, localization_map: LocalizationMap) -> LearnedScorer:
+def load_scorer(weights: str | Path, localization_map: LocalizationMap) -> Scorer:
     """The learned scorer of a weights file for a map: `load_scorer(weights, map).score(cam_from_world)`.
+
+    What method it is stands in the file.
 
     Raises:
         WeightsError: the file cannot be used, or was trained for another field of view than the map's camera.
     """
-    return LearnedScorer.load(weights, localization_map)
+    from wheretolook.scoring.trees import TreesScorer
+
+    scorer = TreesScorer if weights_kind(weights) == TreesScorer.name else LearnedScorer
+    return scorer.load(weights, localization_map)
+
+
+def check_field_of_view(trained: PinholeCamera, camera: Camera) -> None:
+    """Raise a WeightsError if a camera's field of view is not that of the camera of the training views."""
+    if not _same_field_of_view(trained, camera):
+        raise WeightsError(
+            f"the network was trained for a camera of {_describe(trained)}",
+            value=_describe(camera),
+            fix="Use a pinhole camera with that field of view, or train with this one.",
+        )
 
 
 def _same_field_of_view(trained: PinholeCamera, camera: Camera) -> bool:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from wheretolook.errors import ConfigError
+from wheretolook.errors import ConfigError, WeightsError
 from wheretolook.localization_map import LocalizationMap
 from wheretolook.scoring.base import Scorer
 from wheretolook.scoring.bins import BinsScorer
@@ -23,12 +23,16 @@ from wheretolook.scoring.random import RandomScorer
 from wheretolook.scoring.visible import VisibleScorer
 
 
-def _learned(localization_map: LocalizationMap, weights: str | Path | None) -> Scorer:
+def _learned(name: str, localization_map: LocalizationMap, weights: str | Path | None) -> Scorer:
     from wheretolook.scoring.learned import load_scorer  # PyTorch takes seconds to load
 
+    fix = "Give a file that the train stage wrote."
     if weights is None:
-        raise ConfigError("the method needs weights", value="mlp", fix="Give a file that the train stage wrote.")
-    return load_scorer(weights, localization_map)
+        raise ConfigError("the method needs weights", value=name, fix=fix)
+    scorer = load_scorer(weights, localization_map)
+    if scorer.name != name:
+        raise WeightsError(f"these weights are not of {name}", path=weights, value=scorer.name, fix=fix)
+    return scorer
 
 
 @dataclass(frozen=True)
@@ -61,7 +65,8 @@ SCORERS: dict[str, Callable[[LocalizationMap, ScorerOptions], Scorer]] = {
     **{name: _fisher(name) for name in _ALL_FISHER},
     "fisher-worst-trace": lambda localization_map, options: WorstTraceScorer(localization_map),
     "fisher-stationary-trace": lambda localization_map, options: StationaryTraceScorer(localization_map),
-    "mlp": lambda localization_map, options: _learned(localization_map, options.weights),
+    "mlp": lambda localization_map, options: _learned("mlp", localization_map, options.weights),
+    "trees": lambda localization_map, options: _learned("trees", localization_map, options.weights),
 }
 """How each method is built from a map and options."""
 
@@ -75,10 +80,11 @@ PROBES = ("fisher-worst-trace", "fisher-stationary-trace")
 def describe_methods() -> dict[str, str]:
     """What each method of `SCORERS` is, by its name: the first line of its class's docstring."""
     from wheretolook.scoring.learned import LearnedScorer
+    from wheretolook.scoring.trees import TreesScorer
 
     scorers: tuple[type[Scorer], ...] = (
         RandomScorer, ForwardScorer, VisibleScorer, BinsScorer, MaxVisibilityScorer, SwappedMaxVisibilityScorer,
-        WorstTraceScorer, StationaryTraceScorer, LearnedScorer,
+        WorstTraceScorer, StationaryTraceScorer, LearnedScorer, TreesScorer,
     )  # fmt: skip
     texts = {scorer.name: _first_line(scorer) for scorer in scorers}
     for name, (metric, approximation, about_origin) in _ALL_FISHER.items():

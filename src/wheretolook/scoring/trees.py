@@ -1,0 +1,60 @@
+"""The score of boosted trees, which know what landmarks are like."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from wheretolook.attributes import LandmarkDescriber, pool
+from wheretolook.errors import WeightsError
+from wheretolook.geometry import Float
+from wheretolook.learning.trees import BoostedTrees
+from wheretolook.localization_map import LocalizationMap
+from wheretolook.rendering.types import check_poses
+from wheretolook.scoring.base import BLOCK, Scorer
+from wheretolook.scoring.learned import check_field_of_view
+
+
+class TreesScorer(Scorer):
+    """Boosted trees on where the visible landmarks lie and how they were mapped: the probability that a view localizes.
+
+    Args:
+        localization_map: the map.
+        trees: trained for cameras of the same field of view.
+
+    Raises:
+        WeightsError: trained for another field of view than the map's camera.
+    """
+
+    name: ClassVar[str] = "trees"
+
+    def __init__(self, localization_map: LocalizationMap, trees: BoostedTrees) -> None:
+        super().__init__(localization_map)
+        check_field_of_view(trees.camera, localization_map.camera)
+        self.trees = trees.to(localization_map.device)
+        self._describer = LandmarkDescriber(localization_map)
+
+    @classmethod
+    def load(cls, weights: str | Path, localization_map: LocalizationMap) -> TreesScorer:
+        """Build a scorer from a weights file that the train stage wrote.
+
+        Raises:
+            WeightsError: the file cannot be used, or was trained for another field of view than the map's camera.
+        """
+        trees = BoostedTrees.load(weights)
+        try:
+            return cls(localization_map, trees)
+        except WeightsError as error:
+            raise WeightsError(error.problem, path=weights, value=error.value, fix=error.fix) from None
+
+    def score(self, cam_from_world: Float) -> Float:
+        """(B,) probabilities in [0, 1]."""
+        cam_from_world = check_poses(cam_from_world)
+        scores = np.empty(len(cam_from_world))
+        for begin in range(0, len(scores), BLOCK):
+            block = cam_from_world[begin : begin + BLOCK]
+            pooled = pool(self._describer.describe(block), block, self.localization_map.camera)
+            scores[begin : begin + BLOCK] = self.trees.logits(pooled).sigmoid().cpu().numpy()
+        return scores

@@ -16,7 +16,7 @@ from wheretolook.dataset import Dataset, write_text
 from wheretolook.errors import TableError, WeightsError
 from wheretolook.evaluation.config import THRESHOLDS, threshold_key, threshold_label
 from wheretolook.evaluation.report import markdown_table, score_markdown
-from wheretolook.evaluation.run import SCORES_CSV, VARIANTS_CSV
+from wheretolook.evaluation.results import SCORES_CSV, VARIANTS_CSV
 from wheretolook.evaluation.scores import ALL, read_scores
 from wheretolook.figures.style import method_style
 from wheretolook.labelling.report import POSITIVE, label_summary

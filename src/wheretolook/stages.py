@@ -278,7 +278,7 @@ def release(experiment: Experiment, say: Say = print, tick: Tick = lambda work: 
         StorageError: it is not smaller than 16 MB.
         ConfigError: another dataset lies where the copy belongs.
     """
-    from wheretolook.evaluation.run import SCORES_CSV, VARIANTS_CSV
+    from wheretolook.evaluation.results import SCORES_CSV, VARIANTS_CSV
     from wheretolook.evaluation.scores import LEARNED
     from wheretolook.release import copy_dataset, is_release, ship_weights, size_text, sizes, trained_weights
     from wheretolook.release_card import write_card

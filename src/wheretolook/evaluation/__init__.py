@@ -7,14 +7,15 @@ from typing import TYPE_CHECKING, Any
 from wheretolook.evaluation.config import EvaluateConfig
 
 if TYPE_CHECKING:
-    from wheretolook.evaluation.run import evaluate, latest_scores
+    from wheretolook.evaluation.results import latest_scores
+    from wheretolook.evaluation.run import evaluate
 
 __all__ = ["EvaluateConfig", "evaluate", "latest_scores"]
 
 
 def __getattr__(name: str) -> Any:
     if name in ("evaluate", "latest_scores"):  # loads scikit-learn and Matplotlib
-        from wheretolook.evaluation import run
+        from wheretolook.evaluation import results, run
 
-        return getattr(run, name)
+        return getattr(run if name == "evaluate" else results, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -12,12 +12,10 @@ from matplotlib.style import context
 from wheretolook.evaluation.config import threshold_label
 from wheretolook.evaluation.report import main_rows, methods_of, threshold_keys
 from wheretolook.evaluation.scores import ALL, Method
-from wheretolook.figures.style import GROUPS, INK, RC, method_group, method_style, new_figure
+from wheretolook.figures.style import INK, RC, method_style, new_figure, rows_by_group
 
 _LABELS = {"mesh": "mesh rays", "tsdf": "TSDF", "hidden-points": "hidden-point removal", "none": "none"}
 _MARKERS = ("o", "s", "^", "D")
-_GAP = 0.6
-"""Between groups of methods, in rows."""
 
 
 def occlusion_figure(scores: pd.DataFrame) -> Figure:
@@ -38,10 +36,7 @@ def occlusion_figure(scores: pd.DataFrame) -> Figure:
     models = list(pooled["occlusion"].unique())
     chosen = "best view" if n == 1 else f"best {n} views"
     methods = [method for method in methods_of(pooled) if method[0] != "random"]
-    methods.sort(key=lambda method: GROUPS.index(method_group(method[0])))
-    groups = [method_group(method[0]) for method in methods]
-    gaps = np.cumsum([0.0] + [_GAP * (one != other) for one, other in zip(groups[1:], groups, strict=False)])
-    y = {method: float(row + gap) for row, (method, gap) in enumerate(zip(methods, gaps, strict=False))}
+    y = rows_by_group(methods)
     with context(RC):
         figure = new_figure(8.0, 1.5 + 0.3 * (max(y.values(), default=0) + 1))
         left, right = figure.subplots(1, 2, sharey=True)

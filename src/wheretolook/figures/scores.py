@@ -16,10 +16,7 @@ from matplotlib.ticker import MaxNLocator
 from wheretolook.evaluation.config import threshold_label
 from wheretolook.evaluation.report import main_rows, methods_of, reference_of, threshold_keys
 from wheretolook.evaluation.scores import ALL, Method
-from wheretolook.figures.style import GROUPS, INK, RC, method_group, method_style, new_figure
-
-_GAP = 0.6
-"""Between groups of methods, in rows."""
+from wheretolook.figures.style import INK, RC, method_group, method_style, new_figure, rows_by_group
 
 _OTHER_MARKERS = ("o", "D", "s", "^")
 """Of the second and further N."""
@@ -154,15 +151,13 @@ def regret_figure(scores: pd.DataFrame) -> Figure:
 def _layout(pooled: pd.DataFrame, key: str) -> _Layout:
     """Rows by groups from top to bottom, in the table's order within each."""
     shown = pooled[pooled["method"] != "oracle"]
-    methods = sorted(methods_of(shown), key=lambda method: GROUPS.index(method_group(method[0])))
-    groups = [method_group(method[0]) for method in methods]
-    gaps = np.cumsum([0.0] + [_GAP * (one != other) for one, other in zip(groups[1:], groups, strict=False)])
+    y = rows_by_group(methods_of(shown))
+    methods = list(y)
     rows = {
         ((row["method"], row["inputs"]), row["top_n"]): {str(name): row[name] for name in row}
         for row in shown.to_dict("records")
     }
     top_n = [int(n) for n in shown["top_n"].unique()]
-    y = {method: float(row + gap) for row, (method, gap) in enumerate(zip(methods, gaps, strict=True))}
     everything = _Layout(rows, y, top_n, methods)
     chance = np.nan_to_num(everything.value(("random", ""), top_n[0], f"normalized_{key}"))
     near = [

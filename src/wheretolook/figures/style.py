@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -110,6 +111,19 @@ _GROUPS = {
 def method_group(method: str) -> str:
     """Which of `GROUPS` a method belongs to; one that is not listed is a rule."""
     return _GROUPS.get(method, "rules")
+
+
+def rows_by_group(methods: Iterable[tuple[str, str]], gap: float = 0.6) -> dict[tuple[str, str], float]:
+    """Where rows of methods are drawn, from the top down: in the order of `GROUPS`, then in the order given.
+
+    Args:
+        methods: names and inputs.
+        gap: between groups, in rows.
+    """
+    ordered = sorted(methods, key=lambda method: GROUPS.index(method_group(method[0])))
+    groups = [method_group(name) for name, _ in ordered]
+    new = [0.0] + [gap * (one != other) for one, other in zip(groups[1:], groups, strict=False)]
+    return {method: float(row + sum(new[: row + 1])) for row, method in enumerate(ordered)}
 
 
 def method_style(method: str, inputs: str = "") -> MethodStyle:

@@ -149,6 +149,52 @@ def _share(*tensors: Tensor) -> None:
         raise ConfigError(f"the views, {size:.1f} GB, do not fit into shared memory: {error}", fix=fix) from error
 
 
+def training_scenes(dataset: Dataset) -> list[SceneFolder]:
+    """The scenes that are read for training: train scenes, then val scenes.
+
+    Raises:
+        TableError: there is no train scene.
+    """
+    train = dataset.split("train")
+    if not train:
+        fix = "Make one, or train on another dataset."
+        raise TableError("the dataset has no train scene", path=dataset.root, fix=fix)
+    return [*train, *dataset.split("val")]
+
+
+def validation_views(
+    dataset: Dataset, scene: NDArray[np.int64], location: NDArray[np.int64], config: TrainConfig
+) -> NDArray[np.bool_]:
+    """Which views of `training_scenes` are for validation: those of val scenes, or else of held-out locations.
+
+    Args:
+        dataset: of the scenes.
+        scene: (B,) number of each view's scene.
+        location: (B,) location of each view within its scene.
+        config: share held out, seed.
+
+    Returns:
+        (B,).
+    """
+    if dataset.split("val"):
+        return scene >= len(dataset.split("train"))
+    return hold_out_locations(scene, location, config.val_fraction, config.seed)
+
+
+def check_classes(split: str, labels: NDArray[np.bool_], dataset: Dataset, config: TrainConfig) -> None:
+    """Raise a TableError if the labels (B,) of the views for "training" or "validation" are of one class."""
+    if labels.any() and not labels.all():
+        return
+    limits = f"{config.max_error_m:g} m and {config.max_error_deg:g} deg"
+    raise TableError(
+        f"the {split} labels are of one class: {labels.sum()} of {len(labels)} viewpoints localize within {limits}",
+        path=dataset.root,
+        fix="Label more locations or scenes, loosen max_error_m and max_error_deg, or map more of the scene."
+        if split == "training"
+        else "Label more locations, raise val_fraction, or add a val scene.",
+    )
+
+
 def hold_out_locations(
     scene: NDArray[np.int64], location: NDArray[np.int64], fraction: float, seed: int
 ) -> NDArray[np.bool_]:
@@ -305,17 +351,9 @@ class ViewpointDataModule(LightningDataModule):
         return self._loader(self.val_rows, 8 * self.config.batch_size)
 
     def _load(self) -> None:
-        train, val = self.dataset.split("train"), self.dataset.split("val")
-        if not train:
-            raise TableError(
-                "the dataset has no train scene", path=self.dataset.root, fix="Make one, or train on another dataset."
-            )
-        views = load_views(self.dataset, [*train, *val], self.config, self.device, self.progress)
-        if val:
-            held_out = views.scene >= len(train)
-        else:
-            held_out = hold_out_locations(views.scene, views.location, self.config.val_fraction, self.config.seed)
-        self.use(views, held_out)
+        scenes = training_scenes(self.dataset)
+        views = load_views(self.dataset, scenes, self.config, self.device, self.progress)
+        self.use(views, validation_views(self.dataset, views.scene, views.location, self.config))
 
     def use(self, views: LabelledViews, held_out: NDArray[np.bool_]) -> None:
         """Train on these views instead of those of the dataset.
@@ -330,7 +368,7 @@ class ViewpointDataModule(LightningDataModule):
         self.train_rows, self.val_rows = (torch.from_numpy(np.flatnonzero(side)) for side in (~held_out, held_out))
         labels = views.labels.cpu()
         for name, rows in (("training", self.train_rows), ("validation", self.val_rows)):
-            self._check_classes(name, labels[rows])
+            check_classes(name, labels[rows].numpy() > 0, self.dataset, self.config)
         if self.config.balance:
             self.train_rows = self.train_rows[balance_classes(labels[self.train_rows], self.config.seed)]
         self.class_weights = class_weights(labels[self.train_rows])
@@ -340,19 +378,6 @@ class ViewpointDataModule(LightningDataModule):
     def _loader(self, rows: Tensor, batch_size: int, shuffle_seed: int | None = None) -> BatchLoader:
         rank, world_size = (0, 1) if self.trainer is None else (self.trainer.global_rank, self.trainer.world_size)
         return BatchLoader(self.views, rows, batch_size, shuffle_seed, self.channels, rank, world_size)
-
-    def _check_classes(self, split: str, labels: Tensor) -> None:
-        positives = int(labels.sum())
-        if 0 < positives < len(labels):
-            return
-        limits = f"{self.config.max_error_m:g} m and {self.config.max_error_deg:g} deg"
-        raise TableError(
-            f"the {split} labels are of one class: {positives} of {len(labels)} viewpoints localize within {limits}",
-            path=self.dataset.root,
-            fix="Label more locations or scenes, loosen max_error_m and max_error_deg, or map more of the scene."
-            if split == "training"
-            else "Label more locations, raise val_fraction, or add a val scene.",
-        )
 
 
 def class_weights(labels: Tensor) -> tuple[float, float]:

@@ -14,11 +14,10 @@ from lightning.pytorch.utilities.seed import isolate_rng
 
 import wheretolook
 from wheretolook.dataset import Dataset, write_json
-from wheretolook.errors import TableError
 from wheretolook.features import INPUT_VARIANTS
 from wheretolook.learning.classifier import ViewpointClassifier
 from wheretolook.learning.config import TREES, TrainConfig, inputs_of, weights_name
-from wheretolook.learning.data import ViewpointDataModule, hold_out_locations
+from wheretolook.learning.data import ViewpointDataModule, check_classes, training_scenes, validation_views
 from wheretolook.learning.fit import EpochRecord, RunLog, fit, home_device
 from wheretolook.learning.network import NetworkSpec, ViewpointNetwork
 from wheretolook.learning.weights import save_classifier
@@ -174,24 +173,12 @@ def _train_trees(
 ) -> TrainedModel:
     from wheretolook.learning.trees import fit_trees, load_pooled
 
-    train_scenes, val_scenes = dataset.split("train"), dataset.split("val")
-    if not train_scenes:
-        fix = "Make one, or train on another dataset."
-        raise TableError("the dataset has no train scene", path=dataset.root, fix=fix)
-    views = load_pooled(
-        dataset, [*train_scenes, *val_scenes], (config.max_error_m, config.max_error_deg), home_device(config), progress
-    )
-    if val_scenes:
-        held_out = views.scene >= len(train_scenes)
-    else:
-        held_out = hold_out_locations(views.scene, views.location, config.val_fraction, config.seed)
+    limits = config.max_error_m, config.max_error_deg
+    views = load_pooled(dataset, training_scenes(dataset), limits, home_device(config), progress)
+    held_out = validation_views(dataset, views.scene, views.location, config)
     sides = {"train": views.only(~held_out), "val": views.only(held_out)}
-    for name, side in sides.items():
-        if side.labels.all() or not side.labels.any():
-            raise TableError(
-                f"the {name} labels are of one class", path=dataset.root, value=f"{len(side.labels)} viewpoints",
-                fix="Label more locations or scenes, or loosen max_error_m and max_error_deg.",
-            )  # fmt: skip
+    for name, side in (("training", sides["train"]), ("validation", sides["val"])):
+        check_classes(name, side.labels, dataset, config)
     params = {
         **{name: about[name] for name in ("variant", "dataset", "dataset_fingerprint")},
         **about["config"]["trees"],

@@ -23,7 +23,8 @@ class MaxVisibilityScorer(Scorer):
     """Landmarks in view within 3 m of depth, seen through walls, as a share of the map's.
 
     The benchmark looks for the best of 6 x 18 pitches and yaws by this count. Its code then gives pitch and yaw to a
-    function that takes yaw and pitch; see `SwappedMaxVisibilityScorer`.
+    function that takes yaw and pitch; see `SwappedMaxVisibilityScorer`. Here every candidate is ranked by its own
+    count, on the lattice or off it, while the swapped one knows a single axis.
     """
 
     name: ClassVar[str] = "max-visibility"

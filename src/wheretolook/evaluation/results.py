@@ -1,0 +1,210 @@
+"""What an evaluation leaves: files in the dataset's folder, and runs in the tracking store."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from wheretolook.dataset import Dataset, SceneFolder, write_text
+from wheretolook.evaluation.config import EvaluateConfig, threshold_key
+from wheretolook.evaluation.paper_tables import write_paper_tables
+from wheretolook.evaluation.ranking import TestViews
+from wheretolook.evaluation.report import main_rows, score_markdown
+from wheretolook.evaluation.scores import ALL, Choices, Method, read_scores
+from wheretolook.evaluation.scoring import Weights
+from wheretolook.evaluation.views import CandidateSet
+from wheretolook.fisher.soft_visibility import GaussianProcessVisibility, cone_half_angle
+from wheretolook.geometry import Float
+from wheretolook.table import fingerprint
+from wheretolook.tracking import TrackingConfig, artifact, log, newest_run, start_run
+from wheretolook.visibility.config import OcclusionConfig
+
+SCORES_CSV, SCORES_MD, SCORES_PNG, OCCLUSION_PNG = "scores.csv", "scores.md", "scores.png", "occlusion.png"
+CALIBRATION_CSV, CALIBRATION_PNG, REGRET_PNG = "calibration.csv", "calibration.png", "regret.png"
+"""Files of an evaluation, in `<dataset>/results/` and as artifacts of its run."""
+
+VARIANTS_CSV = "variants.csv"
+"""In a release's `results/`: scores of the networks for all inputs, as `scores.csv`, before one was chosen to ship."""
+
+LOCATIONS_PARQUET = "locations.parquet"
+"""Artifact of each nested run: what was chosen at each location."""
+
+
+@dataclass(frozen=True, eq=False)
+class ScoredSet:
+    """One candidate set with the scores by one occlusion model.
+
+    Attributes:
+        occlusion: name of the occlusion model.
+        candidates: the views.
+        scores: (B,) scores of these views, by method.
+        choices: what each method chooses.
+        table: the score table, with columns `occlusion` and `candidates`.
+    """
+
+    occlusion: str
+    candidates: CandidateSet
+    scores: Mapping[Method, Float]
+    choices: Choices
+    table: pd.DataFrame
+
+
+def results_folder(dataset: Dataset, config: EvaluateConfig) -> Path:
+    """Where an evaluation's files go: `<dataset>/results/`, or for scenes of another split than test a folder there."""
+    folder = dataset.root / "results"
+    return folder if config.split == "test" else folder / config.split
+
+
+def write_results(folder: Path, table: pd.DataFrame, calibration: pd.DataFrame, title: str) -> None:
+    """Write tables, report and figures; what belongs to an earlier evaluation goes.
+
+    Args:
+        folder: where; made when needed.
+        table: score tables of all occlusion models and candidate sets, one below the other.
+        calibration: reliability curves of learned methods, as `calibration_figure` wants them; empty without any.
+        title: of the report.
+    """
+    from wheretolook.figures.calibration import calibration_figure
+    from wheretolook.figures.occlusion import occlusion_figure
+    from wheretolook.figures.scores import regret_figure, score_figure
+    from wheretolook.figures.style import save_figure
+
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in ((SCORES_CSV, table.to_csv(index=False)), (SCORES_MD, score_markdown(table, title))):
+        write_text(folder / name, text)
+    variants = folder / VARIANTS_CSV
+    if variants.is_file():  # the paper's tables have a row for each of the network's inputs, which a release knows
+        known = {*zip(table["method"], table["inputs"], strict=True)}
+        others = main_rows(read_scores(variants))
+        methods = zip(others["method"], others["inputs"], strict=True)
+        others = others[[method not in known for method in methods]]
+        write_paper_tables(pd.concat([table, others], ignore_index=True), folder)
+    else:
+        write_paper_tables(table, folder)
+    save_figure(score_figure(table), folder / SCORES_PNG)
+    save_figure(regret_figure(table), folder / REGRET_PNG)
+    if table["occlusion"].nunique() > 1:
+        save_figure(occlusion_figure(table), folder / OCCLUSION_PNG)
+    else:
+        (folder / OCCLUSION_PNG).unlink(missing_ok=True)
+    if len(calibration):
+        write_text(folder / CALIBRATION_CSV, calibration.to_csv(index=False))
+        save_figure(calibration_figure(calibration), folder / CALIBRATION_PNG)
+    else:
+        for name in (CALIBRATION_CSV, CALIBRATION_PNG):
+            (folder / name).unlink(missing_ok=True)
+
+
+def log_evaluation(
+    dataset: Dataset,
+    scenes: Sequence[SceneFolder],
+    config: EvaluateConfig,
+    tracking: TrackingConfig,
+    weights: Weights,
+    views: TestViews,
+    scored: Sequence[ScoredSet],
+    occlusion: OcclusionConfig,
+    results: Path,
+) -> None:
+    """Log an evaluation: a run with the files of `results`, and in it one for each row over all scenes.
+
+    Args:
+        dataset: evaluated.
+        scenes: of the split.
+        config: of the evaluation.
+        tracking: where to log.
+        weights: of methods that have learnt.
+        views: all labelled views.
+        scored: of each occlusion model and candidate set.
+        occlusion: settings of occlusion models, logged if the configuration names any.
+        results: folder of the files.
+    """
+    params: dict[str, Any] = {
+        "dataset": dataset.name,
+        "dataset_fingerprint": Dataset(dataset.root, dataset.camera, tuple(scenes)).fingerprint(),
+        "scenes": " ".join(scene.name for scene in scenes),
+        **{name: value for name, value in asdict(config).items() if name not in ("weights", "methods")},
+        **(
+            {f"occlusion_{name}": value for name, value in asdict(occlusion).items() if name != "model"}
+            if config.occlusions
+            else {}
+        ),
+        "weights": " ".join(f"{path.stem}:{fingerprint(path)}" for path in weights),
+    }
+    if any(name.startswith("fisher") and "gp" in name for name in config.methods):
+        process = GaussianProcessVisibility.fitted(cone_half_angle(dataset.camera))
+        params |= {"gp_factors": process.n_factors, "gp_length": round(process.length, 4)}
+        params["gp_held_out_rmse"] = round(process.held_out_error(), 4)
+    positives = float(views.good[:, 0].mean())
+    metrics = {"n_locations": views.n_locations, "n_views": len(views.good), "positives": positives}
+    tags = {"dataset": dataset.name}
+    with (
+        TemporaryDirectory() as folder,
+        start_run(tracking, f"evaluate {dataset.name}", "evaluate", params, tags=tags) as (client, run),
+    ):
+        log(client, run, metrics=metrics)
+        for file in results.iterdir():
+            if file.is_file():
+                client.log_artifact(run, str(file))
+        for one in scored:
+            by_scene = one.table[one.table["scene"] != ALL]
+            for row in one.table[one.table["scene"] == ALL].to_dict("records"):
+                named = ("method", "inputs", "occlusion", "candidates", "top_n")
+                seen = (row["occlusion"], *([row["candidates"]] if row["candidates"] != ALL else []))
+                shown = (row["method"], row["inputs"], f"best {row['top_n']}", f"({', '.join(seen)})")
+                name = " ".join(part for part in shown if part)
+                child_params = {**params, **{key: row[key] for key in named}}
+                texts = (*named, "scene", "reference")
+                numbers = {str(key): float(value) for key, value in row.items() if key not in texts}
+                same = by_scene[["method", "inputs", "top_n"]] == [row[key] for key in ("method", "inputs", "top_n")]
+                for scene in by_scene[same.all(axis=1)].to_dict("records"):
+                    for key, value in scene.items():
+                        if str(key).startswith(("good_", "n_views", "normalized_", "regret_")):
+                            numbers[f"{key}/{scene['scene']}"] = float(value)
+                chosen = _location_table(one, (row["method"], row["inputs"]), row["top_n"], scenes, config)
+                chosen.to_parquet(Path(folder) / LOCATIONS_PARQUET, index=False)
+                with start_run(tracking, name, "evaluate", child_params, parent=run) as (_, child):
+                    log(client, child, metrics=numbers)
+                    client.log_artifact(child, str(Path(folder) / LOCATIONS_PARQUET))
+
+
+def _location_table(
+    scored: ScoredSet, method: Method, n: int, scenes: Sequence[SceneFolder], config: EvaluateConfig
+) -> pd.DataFrame:
+    """What a method chooses at each location, one row each.
+
+    Columns: scene, location_id, chosen (views), for each threshold good_* (how many of them are good) and any_*
+    (whether one is; for random choice both are expectations), and best_score, that of the view chosen first; NaN for
+    random choice and the oracle, which choose by no score.
+    """
+    views, top = scored.candidates.views, scored.choices[method, n]
+    columns: dict[str, Any] = {
+        "scene": [scenes[number].name for number in views.location_scene],
+        "location_id": scored.candidates.location_id,
+        "chosen": top.chosen.astype(np.int64),
+    }
+    for index, key in enumerate(map(threshold_key, config.thresholds)):
+        columns |= {f"good_{key}": top.good[:, index], f"any_{key}": top.any_good[:, index]}
+    best = np.full(views.n_locations, np.nan)
+    if method in scored.scores and method[0] != "random":
+        np.fmax.at(best, views.location, scored.scores[method])
+    return pd.DataFrame({**columns, "best_score": best})
+
+
+def latest_scores(tracking: TrackingConfig, dataset: str | None = None) -> pd.DataFrame | None:
+    """The score table of the newest evaluation in a store, or None if there is none.
+
+    Args:
+        tracking: the store.
+        dataset: name of the dataset evaluated; None for any.
+    """
+    run = newest_run(tracking, "evaluate", {"dataset": dataset} if dataset else None)
+    if run is None:
+        return None
+    return read_scores(artifact(tracking, run.info.run_id, SCORES_CSV))

@@ -1,0 +1,163 @@
+"""The scores of all methods for the views of an evaluation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+from tqdm.auto import tqdm
+
+from wheretolook.dataset import Dataset, SceneFolder
+from wheretolook.errors import TableError, WeightsError
+from wheretolook.evaluation.config import EvaluateConfig
+from wheretolook.evaluation.scores import WITH_WEIGHTS, Method, reference_method
+from wheretolook.geometry import Float
+from wheretolook.learning.config import VARIANTS, weights_name
+from wheretolook.learning.weights import read_training, weights_kind
+from wheretolook.localization_map import LocalizationMap
+from wheretolook.scene_occlusion import scene_occlusion
+from wheretolook.scoring import Scorer, make_scorer
+from wheretolook.table import fingerprint, poses
+from wheretolook.visibility.config import OcclusionConfig
+
+if TYPE_CHECKING:
+    from wheretolook.learning.training import TrainedModel
+
+BLOCK = 4096
+"""Views binned and scored at a time."""
+
+Weights = Mapping[Path, str]
+"""Files of weights, and the method that each serves."""
+
+
+def choose_weights(dataset: Dataset, config: EvaluateConfig, models: Sequence[TrainedModel | Path] | None) -> Weights:
+    """The weights to evaluate: those given, or those that the configuration names, or the dataset's own.
+
+    Raises:
+        WeightsError: there are none for a method that needs them, or the dataset's were trained on other data.
+    """
+    if not {*WITH_WEIGHTS} & {*config.methods}:
+        return {}
+    if models is not None:
+        weights = [model if isinstance(model, Path) else model.path for model in models]
+    else:
+        weights = list(config.weights) or _own_weights(dataset)
+    if not weights:
+        raise WeightsError(
+            "there are no weights to evaluate", path=dataset.root / "weights",
+            fix="Run the train stage first, name weights, or leave mlp out of the methods.",
+        )  # fmt: skip
+    kinds = {path: weights_kind(path) for path in weights}
+    for kind in WITH_WEIGHTS:
+        # who asks for all methods gets those that have been trained
+        if kind in config.methods and kind not in kinds.values() and config.methods != EvaluateConfig().methods:
+            raise WeightsError(
+                f"there are no weights of {kind} to evaluate", path=dataset.root / "weights",
+                fix=f"Run the train stage first, name weights, or leave {kind} out of the methods.",
+            )  # fmt: skip
+    return {path: kind for path, kind in kinds.items() if kind in config.methods}
+
+
+def _own_weights(dataset: Dataset) -> list[Path]:
+    """The weights in the dataset's folder, which must be trained on what the dataset now holds."""
+    from wheretolook.learning.training import training_fingerprint
+
+    named = (dataset.root / "weights" / weights_name(variant) for variant in VARIANTS)
+    weights = [path for path in named if path.is_file()]
+    now = training_fingerprint(dataset)
+    for path in weights:
+        if read_training(path).get("dataset_fingerprint") != now:
+            raise WeightsError(
+                "these weights were trained on other data than the dataset now holds", path=path,
+                fix="Run the train stage again, remove the file, or name weights in evaluate.weights.",
+            )  # fmt: skip
+    return weights
+
+
+def check_unseen(scenes: Sequence[SceneFolder], weights: Weights) -> None:
+    """Raise a WeightsError if weights would be tested on a scene they have learnt from."""
+    landmarks = {fingerprint(scene.landmarks): scene.name for scene in scenes if scene.landmarks.is_file()}
+    for path in weights:
+        for seen in read_training(path).get("landmarks", {}).values():
+            if seen in landmarks:
+                raise WeightsError(
+                    "these weights have learnt from a scene of the test split", path=path, value=landmarks[seen],
+                    fix="Train again without that scene, or evaluate on others.",
+                )  # fmt: skip
+
+
+def score_scenes(
+    dataset: Dataset,
+    scenes: Sequence[SceneFolder],
+    tables: Sequence[pd.DataFrame],
+    config: EvaluateConfig,
+    weights: Weights,
+    device: str,
+    progress: bool,
+    occlusion: OcclusionConfig | None,
+) -> tuple[dict[Method, Float], str]:
+    """Scores of every method. Views are binned once for all.
+
+    Args:
+        dataset: gives the camera.
+        scenes: of the dataset.
+        tables: their viewpoints, B in all.
+        config: methods, seed, heading, reference.
+        weights: of methods that have learnt.
+        device: "cpu" or a CUDA device.
+        progress: show a progress bar.
+        occlusion: model to see the landmarks by; None for the one that is stored with the sampled locations.
+
+    Returns:
+        (B,) scores by method and inputs, and the name of the occlusion model.
+
+    Raises:
+        TableError: a method gives scores that are not finite.
+        WeightsError: weights were trained for another field of view.
+        MapError, SceneError: a scene has no landmarks, or no mesh where one is needed.
+        ConfigError: the reference is none of the methods.
+    """
+    scores: dict[Method, list[Float]] = {}
+    used: set[str] = set()
+    text = f"score {scenes[0].split} views" + ("" if occlusion is None else f", {occlusion.model}")
+    with tqdm(total=sum(map(len, tables)), desc=text, unit="view", disable=not progress) as bar:
+        for scene, table in zip(scenes, tables, strict=True):
+            localization_map = scene.localization_map(dataset.camera, device)
+            # a release has no mesh, but what each location sees by it
+            if occlusion is not None and (scene.mesh.is_file() or occlusion.model != localization_map.occlusion.name):
+                model = scene_occlusion(scene, dataset.camera, occlusion, device, progress=progress)
+                localization_map = replace(localization_map, occlusion=model)
+            used.add(localization_map.occlusion.name)
+            scorers = _scorers(localization_map, config, weights)
+            reference_method(scorers, config.reference)  # an unknown one is told before the work
+            cam_from_world = poses(table)
+            for begin in range(0, len(table), BLOCK):
+                block = cam_from_world[begin : begin + BLOCK]
+                binned = localization_map.bin_views(block)
+                for method, scorer in scorers.items():
+                    values = scorer.score_binned(block, binned)
+                    if not np.isfinite(values).all():
+                        raise TableError(
+                            "a method gives scores that are not finite", path=scene.folder, value=" ".join(method),
+                            fix="Check the scene's landmarks and poses, and the weights; or leave the method out.",
+                        )  # fmt: skip
+                    scores.setdefault(method, []).append(values)
+                bar.update(len(block))
+    return {method: np.concatenate(parts) for method, parts in scores.items()}, " ".join(sorted(used))
+
+
+def _scorers(localization_map: LocalizationMap, config: EvaluateConfig, weights: Weights) -> dict[Method, Scorer]:
+    scorers: dict[Method, Scorer] = {}
+    for name in config.methods:
+        of_method = [path for path, kind in weights.items() if kind == name]
+        for path in of_method if name in WITH_WEIGHTS else [None]:
+            scorer = make_scorer(name, localization_map, config.seed, path, config.heading)
+            key = (scorer.name, scorer.inputs)
+            if key in scorers:  # two files of one variant: told apart by their names
+                key = (scorer.name, f"{scorer.inputs} {path}")
+            scorers[key] = scorer
+    return scorers

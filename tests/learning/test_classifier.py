@@ -10,8 +10,9 @@ from torch import nn
 from torchmetrics.classification import BinaryCalibrationError
 
 from wheretolook.features import CHANNELS
-from wheretolook.learning.classifier import CALIBRATION_BINS, add_noise, weight_penalty, weighted_bce
+from wheretolook.learning.classifier import CALIBRATION_BINS, weight_penalty, weighted_bce
 from wheretolook.learning.data import class_weights
+from wheretolook.learning.network import add_noise
 
 
 def test_loss_equals_a_hand_computation() -> None:

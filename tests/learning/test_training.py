@@ -105,9 +105,9 @@ def test_batches_hold_the_channels_asked_for(dataset: Dataset) -> None:
     data.channels = ("z", "u")
     batches = list(data.val_dataloader())
     means = data.views.means[data.val_rows]
-    torch.testing.assert_close(torch.cat([batch.means for batch in batches]), means[:, [4, 0]], rtol=0, atol=0)
+    torch.testing.assert_close(torch.cat([batch.inputs[0] for batch in batches]), means[:, [4, 0]], rtol=0, atol=0)
     filled, labels = data.views.filled[data.val_rows], data.views.labels[data.val_rows]
-    assert torch.equal(torch.cat([batch.filled for batch in batches]), filled)
+    assert torch.equal(torch.cat([batch.inputs[1] for batch in batches]), filled)
     assert torch.equal(torch.cat([batch.labels for batch in batches]), labels)
 
 
@@ -121,7 +121,7 @@ def test_processes_share_out_every_batch(dataset: Dataset, world_size: int) -> N
     shared_out = list(zip(*loaders, strict=True))
     assert len(shared_out) == len(whole) == 11
     for batch, shares in zip(whole, shared_out, strict=True):
-        assert torch.equal(torch.cat([share.means for share in shares]), batch.means)
+        assert torch.equal(torch.cat([share.inputs[0] for share in shares]), batch.inputs[0])
         assert {share.total for share in shares} == {batch.total} == {len(batch.labels)}
         sizes = [len(share.labels) for share in shares]
         assert max(sizes) - min(sizes) <= 1

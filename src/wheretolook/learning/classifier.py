@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from lightning.pytorch import LightningModule
@@ -11,10 +11,8 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 from torchmetrics.functional.classification import binary_auroc, binary_average_precision, binary_calibration_error
 from torchmetrics.utilities.distributed import gather_all_tensors
 
-from wheretolook.features import CHANNELS
 from wheretolook.learning.config import TrainConfig
 from wheretolook.learning.data import Batch
-from wheretolook.learning.network import ViewpointNetwork
 
 CALIBRATION_BINS = 15
 """Equal-width bins of the expected calibration error (Guo et al., ICML 2017)."""
@@ -42,36 +40,30 @@ def weight_penalty(module: nn.Module) -> Tensor:
     return weights.dot(weights)
 
 
-def add_noise(
-    means: Tensor, filled: Tensor, noise_px: float, noise_m: float, channels: tuple[str, ...] = CHANNELS
-) -> Tensor:
-    """Gaussian noise on filled bins, as the released code adds while training.
+@runtime_checkable
+class Augmented(Protocol):
+    """A network that changes its inputs while it learns."""
 
-    Args:
-        means: (B, C, bins, bins).
-        filled: (B, bins, bins) bool; empty bins stay zero.
-        noise_px: standard deviation on u and v.
-        noise_m: standard deviation on x, y and z.
-        channels: names of the C channels.
-    """
-    scale = means.new_tensor([noise_px if name in ("u", "v") else noise_m for name in channels])
-    return means + torch.randn_like(means) * scale[:, None, None] * filled[:, None]
+    def augment(self, config: TrainConfig, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """The inputs to learn from in place of a batch's."""
 
 
 class ViewpointClassifier(LightningModule):
-    """Learns whether a viewpoint localizes, from batches that hold the network's own channels.
+    """Learns whether a viewpoint localizes, from batches of the network's inputs.
+
+    A network with a method `augment(config, *inputs)` gets its inputs through that while it learns.
 
     Logged every epoch: `{train,val}_loss`, `{train,val}_bce`, `l2` (the weighted penalty), `train_average_precision`
     (with dropout on), `val_average_precision`, `val_roc_auc` and `val_calibration_error`. Balancing the classes shifts
     the probabilities towards one half, so the calibration error also shows how unbalanced the labels are.
 
     Args:
-        network: what to train.
+        network: what to train; takes a batch's inputs and gives logits (B,).
         config: optimizer and loss options.
         class_weights: weights of the negative and the positive class.
     """
 
-    def __init__(self, network: ViewpointNetwork, config: TrainConfig, class_weights: tuple[float, float]) -> None:
+    def __init__(self, network: nn.Module, config: TrainConfig, class_weights: tuple[float, float]) -> None:
         super().__init__()
         self.network, self.config, self.class_weights = network, config, class_weights
         # logits and labels of an epoch's batches: metrics of every step would take longer than the steps
@@ -79,9 +71,10 @@ class ViewpointClassifier(LightningModule):
         self._val_seen: list[Tensor] = []
         self._penalties: list[Tensor] = []
 
-    def forward(self, means: Tensor, filled: Tensor) -> Tensor:
-        """Logits (B,) of binned views."""
-        return self.network(means, filled)
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """Logits (B,) of views."""
+        logits: Tensor = self.network(*inputs)
+        return logits
 
     def on_fit_start(self) -> None:
         """Give every process its own dropout and noise."""
@@ -90,10 +83,10 @@ class ViewpointClassifier(LightningModule):
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Loss of one process's share of a batch. The mean over processes is the loss of the batch."""
-        means, filled, labels, total = batch
-        if self.config.noise_px > 0 or self.config.noise_m > 0:
-            means = add_noise(means, filled, self.config.noise_px, self.config.noise_m, self.network.spec.channels)
-        logits = self(means, filled)
+        inputs, labels, total = batch
+        if isinstance(self.network, Augmented):
+            inputs = self.network.augment(self.config, *inputs)
+        logits = self(*inputs)
         penalty = self.config.l2 * weight_penalty(self.network)
         self._train_seen.append(torch.stack([logits.detach(), labels]))
         self._penalties.append(penalty.detach() * total)
@@ -101,7 +94,7 @@ class ViewpointClassifier(LightningModule):
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         """Logits of one process's share of a batch."""
-        self._val_seen.append(torch.stack([self(batch.means, batch.filled), batch.labels]))
+        self._val_seen.append(torch.stack([self(*batch.inputs), batch.labels]))
 
     def on_validation_epoch_end(self) -> None:
         """Log the metrics of all validation views."""

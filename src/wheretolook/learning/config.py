@@ -17,7 +17,10 @@ TREES = "trees"
 NETWORKS = (*INPUT_VARIANTS, RELEASED)
 """Networks that can be trained."""
 
-VARIANTS = (*NETWORKS, TREES)
+OWN_OPTIONS = {TREES: "trees"}
+"""Variants that are not the paper's network, and the field of `TrainConfig` with the options of each."""
+
+VARIANTS = (*NETWORKS, *OWN_OPTIONS)
 """All that can be trained."""
 
 RELEASED_OPTIONS: dict[str, Any] = {
@@ -66,6 +69,32 @@ class TreesConfig:
             raise ConfigError(
                 "trees need a positive learning_rate and no negative l2", value=(self.learning_rate, self.l2)
             )
+
+
+@dataclass(frozen=True)
+class FittingConfig:
+    """Options of every network but the paper's: Adam, its rate falling to zero by a cosine, all views as they are.
+
+    The weights kept are those of the epoch with the best validation average precision; the probabilities are then
+    calibrated on the validation views (Platt scaling).
+
+    Args:
+        epochs: passes over the training viewpoints.
+        batch_size: viewpoints a step.
+        learning_rate: Adam's initial rate.
+        l2: factor of the sum of squared weights.
+    """
+
+    epochs: int = 20
+    batch_size: int = 512
+    learning_rate: float = 2e-3
+    l2: float = 1e-5
+
+    def __post_init__(self) -> None:
+        if self.epochs < 1 or self.batch_size < 1:
+            raise ConfigError("epochs and batch_size must be at least 1", value=(self.epochs, self.batch_size))
+        if not self.learning_rate > 0 or not self.l2 >= 0:
+            raise ConfigError("learning_rate must be positive and l2 not negative", value=(self.learning_rate, self.l2))
 
 
 @dataclass(frozen=True)
@@ -165,12 +194,20 @@ class TrainConfig:
 
     def of_variant(self, variant: str) -> TrainConfig:
         """The options that a variant is trained with."""
-        return replace(self, **RELEASED_OPTIONS) if variant == RELEASED else self
+        if variant == RELEASED:
+            return replace(self, **RELEASED_OPTIONS)
+        own = getattr(self, OWN_OPTIONS[variant]) if variant in OWN_OPTIONS else None
+        if isinstance(own, FittingConfig):
+            return replace(
+                self, epochs=own.epochs, batch_size=own.batch_size, learning_rate=own.learning_rate, l2=own.l2,
+                schedule="cosine", keep="best", patience=None, balance=False,
+            )  # fmt: skip
+        return self
 
 
 def weights_name(variant: str) -> str:
     """File in a dataset's `weights` folder of what a variant has learnt."""
-    return "trees.safetensors" if variant == TREES else f"mlp-{variant}.safetensors"
+    return f"{variant}.safetensors" if variant in OWN_OPTIONS else f"mlp-{variant}.safetensors"
 
 
 def inputs_of(variant: str) -> str:

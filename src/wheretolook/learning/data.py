@@ -33,14 +33,13 @@ class Batch(NamedTuple):
     """One process's share of a batch.
 
     Attributes:
-        means: (B, C, bins, bins) float32.
-        filled: (B, bins, bins) bool.
+        inputs: what the network takes, tensors with B rows; of binned views means (B, C, bins, bins) float32 and
+            filled (B, bins, bins) bool.
         labels: (B,) float32.
         total: views in the whole batch, over all processes.
     """
 
-    means: Tensor
-    filled: Tensor
+    inputs: tuple[Tensor, ...]
     labels: Tensor
     total: int
 
@@ -286,12 +285,8 @@ class BatchLoader:
         rows = rows.to(means.device)
         for batch, wanted in zip(rows.split(self.batch_size), of_rows.split(self.batch_size), strict=True):
             share, planes_of_share = (part.tensor_split(self.world_size)[self.rank] for part in (batch, wanted))
-            yield Batch(
-                planes.index_select(0, planes_of_share.flatten()).view(len(share), *shape),
-                filled.index_select(0, share),
-                labels.index_select(0, share),
-                len(batch),
-            )
+            binned = planes.index_select(0, planes_of_share.flatten()).view(len(share), *shape)
+            yield Batch((binned, filled.index_select(0, share)), labels.index_select(0, share), len(batch))
 
 
 class ViewpointDataModule(LightningDataModule):

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 import torch
-from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch import Callback, LightningDataModule, LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint, EarlyStopping
 from lightning.pytorch.strategies import DDPStrategy
 from torch.multiprocessing.spawn import ProcessException
@@ -25,7 +25,6 @@ from tqdm.auto import tqdm
 from wheretolook.errors import ConfigError, WorkerError
 from wheretolook.learning.classifier import ViewpointClassifier
 from wheretolook.learning.config import TrainConfig
-from wheretolook.learning.data import ViewpointDataModule
 from wheretolook.tracking import TrackingConfig, client
 
 if TYPE_CHECKING:
@@ -60,7 +59,7 @@ def home_device(config: TrainConfig) -> str:
     return "cuda:0" if gpus else "cpu"
 
 
-def fit(classifier: ViewpointClassifier, data: ViewpointDataModule, record: EpochRecord) -> None:
+def fit(classifier: ViewpointClassifier, data: LightningDataModule, record: EpochRecord) -> None:
     """Train a classifier; afterwards `record` has the history and the weights to keep.
 
     With `config.devices > 1`, every device has its own process, started here and ended here: a script that calls this
@@ -68,7 +67,7 @@ def fit(classifier: ViewpointClassifier, data: ViewpointDataModule, record: Epoc
 
     Args:
         classifier: what to train.
-        data: the views, set up.
+        data: batches of its network's inputs.
         record: gathers the results.
     """
     config = classifier.config

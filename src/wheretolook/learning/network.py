@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from wheretolook.errors import ConfigError
 from wheretolook.features import CHANNELS, INPUT_VARIANTS, Layout
 from wheretolook.geometry import PinholeCamera
+from wheretolook.learning.config import TrainConfig
 
 STATISTICS_BLOCK = 256
 """Views worked through at a time when statistics are taken: few enough for a processor's cache."""
@@ -150,6 +151,22 @@ def move_to_front(values: Tensor, filled: Tensor) -> Tensor:
     return moved.view_as(values)
 
 
+def add_noise(
+    means: Tensor, filled: Tensor, noise_px: float, noise_m: float, channels: tuple[str, ...] = CHANNELS
+) -> Tensor:
+    """Gaussian noise on filled bins, as the released code adds while training.
+
+    Args:
+        means: (B, C, bins, bins).
+        filled: (B, bins, bins) bool; empty bins stay zero.
+        noise_px: standard deviation on u and v.
+        noise_m: standard deviation on x, y and z.
+        channels: names of the C channels.
+    """
+    scale = means.new_tensor([noise_px if name in ("u", "v") else noise_m for name in channels])
+    return means + torch.randn_like(means) * scale[:, None, None] * filled[:, None]
+
+
 class ViewpointNetwork(nn.Module):
     """The paper's classifier (its architecture table): linear layers with ReLU and dropout between, one logit out.
 
@@ -176,3 +193,9 @@ class ViewpointNetwork(nn.Module):
             filled: (B, bins, bins) bool.
         """
         return self.layers(self.input(means, filled)).squeeze(-1)
+
+    def augment(self, config: TrainConfig, means: Tensor, filled: Tensor) -> tuple[Tensor, Tensor]:
+        """The views with the noise that the options ask for, if any."""
+        if config.noise_px > 0 or config.noise_m > 0:
+            means = add_noise(means, filled, config.noise_px, config.noise_m, self.spec.channels)
+        return means, filled

@@ -14,11 +14,13 @@ from lightning.pytorch.utilities.seed import isolate_rng
 
 import wheretolook
 from wheretolook.dataset import Dataset, write_json
+from wheretolook.errors import ConfigError
 from wheretolook.features import INPUT_VARIANTS
 from wheretolook.learning.classifier import ViewpointClassifier
-from wheretolook.learning.config import TREES, TrainConfig, inputs_of, weights_name
-from wheretolook.learning.data import ViewpointDataModule, check_classes, training_scenes, validation_views
+from wheretolook.learning.config import OWN_OPTIONS, TREES, TrainConfig, inputs_of, weights_name
+from wheretolook.learning.data import ViewpointDataModule
 from wheretolook.learning.fit import EpochRecord, RunLog, fit, home_device
+from wheretolook.learning.learner import Learner, Task
 from wheretolook.learning.network import NetworkSpec, ViewpointNetwork
 from wheretolook.learning.weights import save_classifier
 from wheretolook.table import fingerprint as file_fingerprint
@@ -28,11 +30,11 @@ from wheretolook.tracking import TrackingConfig, log, start_run
 if TYPE_CHECKING:
     from mlflow import MlflowClient
 
-NOT_DECIDING = ("variants", "accelerator", "devices", "trees")
-"""Options that do not decide what a network learns: only where, and with which random numbers."""
+NOT_DECIDING = ("variants", "accelerator", "devices", *dict.fromkeys(OWN_OPTIONS.values()))
+"""Options that do not decide what the paper's network learns: where, with which random numbers, and others' own."""
 
-OF_TREES = ("trees", "max_error_m", "max_error_deg", "val_fraction", "seed")
-"""Options that decide what boosted trees learn."""
+OF_ALL = ("max_error_m", "max_error_deg", "val_fraction", "seed")
+"""Options that decide what any learner learns, beside its own."""
 
 
 @dataclass(frozen=True)
@@ -61,12 +63,12 @@ def train(
     progress: bool = True,
     force: bool = False,
 ) -> list[TrainedModel]:
-    """Train the paper's classifier for each input variant, and boosted trees if they are among the variants.
+    """Train the paper's classifier for each input variant, and what else is among the variants.
 
-    Writes `<dataset>/weights/mlp-<variant>.safetensors` or `trees.safetensors` and, beside it, a JSON file that tells
-    what it was trained on. A variant already trained with the same options on the same train and val scenes is not
-    trained again. With `config.keep == "best"`, the weights kept are those of the epoch with the best average precision
-    on the validation views, the earliest one on ties.
+    Writes `<dataset>/weights/mlp-<variant>.safetensors`, `trees.safetensors` and so on and, beside it, a JSON
+    file that tells what it was trained on. A variant already trained with the same options on the same train and val
+    scenes is not trained again. With `config.keep == "best"`, the weights kept are those of the epoch with the best
+    average precision on the validation views, the earliest one on ties.
 
     Args:
         dataset: labelled train scenes, and val scenes if it has any.
@@ -91,8 +93,8 @@ def train(
         options = config.of_variant(variant)
         about = _about(dataset, options, fingerprint, variant)
         model = None if force else _trained_before(path, variant, about)
-        if model is None and variant == TREES:
-            model = _train_trees(dataset, options, path, about, tracking, progress)
+        if model is None and variant in OWN_OPTIONS:
+            model = _learn(dataset, options, variant, path, about, tracking, progress)
         elif model is None:
             if data is None or data.config != options:
                 data = ViewpointDataModule(dataset, options, home_device(options), progress)
@@ -102,6 +104,15 @@ def train(
     return models
 
 
+def learner_of(variant: str) -> Learner:
+    """How a variant of `OWN_OPTIONS` learns."""
+    if variant == TREES:
+        from wheretolook.learning.trees import learn_trees
+
+        return learn_trees
+    raise ConfigError("no such variant", value=variant)
+
+
 def training_fingerprint(dataset: Dataset) -> str:
     """16 hexadecimal digits that change with anything a network learns from: the train and val scenes."""
     return Dataset(dataset.root, dataset.camera, (*dataset.split("train"), *dataset.split("val"))).fingerprint()
@@ -109,7 +120,8 @@ def training_fingerprint(dataset: Dataset) -> str:
 
 def _about(dataset: Dataset, config: TrainConfig, fingerprint: str, variant: str) -> dict[str, Any]:
     """What decides which weights come out, as JSON values."""
-    deciding = OF_TREES if variant == TREES else [name for name in asdict(config) if name not in NOT_DECIDING]
+    own = OWN_OPTIONS.get(variant)
+    deciding = (*OF_ALL, own) if own else [name for name in asdict(config) if name not in NOT_DECIDING]
     options = {name: value for name, value in asdict(config).items() if name in deciding}
     about = {
         "dataset": dataset.name,
@@ -155,12 +167,13 @@ def _train_variant(
             inputs_of(variant), data.dataset.camera, data.statistics.select(channels), config.bins, config.layout,
             config.hidden, config.dropout, config.input_dropout,
         )  # fmt: skip
-        classifier = ViewpointClassifier(ViewpointNetwork(spec), config, data.class_weights)
+        network = ViewpointNetwork(spec)
+        classifier = ViewpointClassifier(network, config, data.class_weights)
         record = EpochRecord(f"train {variant}", config, progress, RunLog(tracking, run_id))
         data.channels = channels
         fit(classifier, data, record)
         metrics = record.restore(classifier)
-        save_classifier(classifier.network, path, about)
+        save_classifier(network, path, about)
         log(client, run_id, metrics={f"kept_{name}": value for name, value in metrics.items()})
         _log_artifacts(client, run_id, path, record.history, variant)
         content = {"about": about, "weights_sha256": sha256(path), "run_id": run_id, "metrics": metrics}
@@ -168,39 +181,38 @@ def _train_variant(
     return TrainedModel(variant, path, run_id, metrics)
 
 
-def _train_trees(
-    dataset: Dataset, config: TrainConfig, path: Path, about: dict[str, Any], tracking: TrackingConfig, progress: bool
-) -> TrainedModel:
-    from wheretolook.learning.trees import fit_trees, load_pooled
-
-    limits = config.max_error_m, config.max_error_deg
-    views = load_pooled(dataset, training_scenes(dataset), limits, home_device(config), progress)
-    held_out = validation_views(dataset, views.scene, views.location, config)
-    sides = {"train": views.only(~held_out), "val": views.only(held_out)}
-    for name, side in (("training", sides["train"]), ("validation", sides["val"])):
-        check_classes(name, side.labels, dataset, config)
+def _learn(
+    dataset: Dataset, config: TrainConfig, variant: str, path: Path, about: dict[str, Any], tracking: TrackingConfig,
+    progress: bool,
+) -> TrainedModel:  # fmt: skip
+    own = OWN_OPTIONS[variant]
     params = {
         **{name: about[name] for name in ("variant", "dataset", "dataset_fingerprint")},
-        **about["config"]["trees"],
-        **{name: value for name, value in about["config"].items() if name != "trees"},
-        **{f"n_{name}": len(side.labels) for name, side in sides.items()},
-        **{f"positives_{name}": round(float(side.labels.mean()), 4) for name, side in sides.items()},
+        **about["config"][own],
+        **{name: value for name, value in about["config"].items() if name != own},
     }
-    with start_run(tracking, "train trees", "train", params) as (client, run_id):
-        trees, metrics = fit_trees(sides["train"], sides["val"], dataset.camera, config.trees, config.seed)
-        trees.save(path, about)
-        log(client, run_id, metrics={f"kept_{name}": value for name, value in metrics.items()})
-        client.log_artifact(run_id, str(path))
-        content = {"about": about, "weights_sha256": sha256(path), "run_id": run_id, "metrics": metrics}
+    with start_run(tracking, f"train {variant}", "train", params) as (client, run_id), isolate_rng():
+        seed_everything(config.seed, verbose=False)
+        task = Task(dataset, config, f"train {variant}", progress, RunLog(tracking, run_id))
+        learnt = learner_of(variant)(task)
+        learnt.model.save(path, about)
+        kept = {f"kept_{name}": value for name, value in learnt.metrics.items()}
+        log(client, run_id, params=learnt.counts, metrics=kept)
+        _log_artifacts(client, run_id, path, learnt.history, variant)
+        content = {"about": about, "weights_sha256": sha256(path), "run_id": run_id, "metrics": learnt.metrics}
         write_json(path.with_suffix(".json"), content)
-    return TrainedModel(TREES, path, run_id, metrics)
+    return TrainedModel(variant, path, run_id, learnt.metrics)
 
 
-def _log_artifacts(client: MlflowClient, run_id: str, weights: Path, history: pd.DataFrame, variant: str) -> None:
+def _log_artifacts(
+    client: MlflowClient, run_id: str, weights: Path, history: pd.DataFrame | None, variant: str
+) -> None:
     from wheretolook.figures.style import save_figure
     from wheretolook.figures.training import training_figure
 
     client.log_artifact(run_id, str(weights))
+    if history is None:
+        return
     with TemporaryDirectory() as folder:
         history.to_csv(Path(folder) / "history.csv", index=False)
         save_figure(training_figure({variant: history}), Path(folder) / "curves.png")

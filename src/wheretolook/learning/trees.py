@@ -21,6 +21,10 @@ from wheretolook.dataset import Dataset, SceneFolder
 from wheretolook.errors import ConfigError, TableError, WeightsError
 from wheretolook.geometry import PinholeCamera
 from wheretolook.learning.config import TREES, TreesConfig
+from wheretolook.learning.data import check_classes, training_scenes, validation_views
+from wheretolook.learning.fit import home_device
+from wheretolook.learning.learner import Learnt, Task, class_counts
+from wheretolook.learning.platt import fit_platt
 from wheretolook.learning.weights import FORMAT_VERSION, METADATA_KEY, read_weights
 from wheretolook.table import UNLABELLED, is_good, poses
 
@@ -216,6 +220,23 @@ def load_pooled(
     return PooledViews(np.concatenate(values), np.concatenate(labels), scene_numbers, np.concatenate(location))
 
 
+def learn_trees(task: Task) -> Learnt:
+    """Boosted trees from a dataset's train scenes; see `fit_trees`.
+
+    Raises:
+        TableError: no train scene, no labels, or labels of one class only.
+    """
+    dataset, config = task.dataset, task.config
+    limits = config.max_error_m, config.max_error_deg
+    views = load_pooled(dataset, training_scenes(dataset), limits, home_device(config), task.progress)
+    held_out = validation_views(dataset, views.scene, views.location, config)
+    train, val = views.only(~held_out), views.only(held_out)
+    for name, side in (("training", train), ("validation", val)):
+        check_classes(name, side.labels, dataset, config)
+    trees, metrics = fit_trees(train, val, dataset.camera, config.trees, config.seed)
+    return Learnt(trees, metrics, class_counts(train=train.labels, val=val.labels))
+
+
 def fit_trees(
     train: PooledViews, val: PooledViews, camera: PinholeCamera, config: TreesConfig, seed: int = 0
 ) -> tuple[BoostedTrees, dict[str, float]]:
@@ -232,7 +253,6 @@ def fit_trees(
         The trees, and their metrics on the validation views.
     """
     from sklearn.ensemble import HistGradientBoostingClassifier
-    from sklearn.linear_model import LogisticRegression
     from sklearn.metrics import average_precision_score, log_loss, roc_auc_score
 
     model = HistGradientBoostingClassifier(
@@ -249,10 +269,8 @@ def fit_trees(
     kept = max(precision, key=lambda number: precision[number])
     trees = BoostedTrees.of_sklearn(model, camera, kept)
     raw = trees.raw_logits(torch.from_numpy(val.values)).numpy()
-    line = LogisticRegression(C=1e6).fit(raw[:, None], val.labels)
-    scale, offset = float(line.coef_[0, 0]), float(line.intercept_[0])
-    if scale > 0:  # else the order would be turned round: trees that know nothing stay as they are
-        trees = replace(trees, scale=scale, offset=offset)
+    scale, offset = fit_platt(raw, val.labels)
+    trees = replace(trees, scale=scale, offset=offset)
     logits = trees.logits(torch.from_numpy(val.values))
     probabilities = logits.sigmoid().numpy()
     return trees, {

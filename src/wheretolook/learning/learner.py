@@ -1,0 +1,99 @@
+"""What every way of learning beside the paper's network has in common: data in, a model and its metrics out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import pandas as pd
+import torch
+from lightning.pytorch import LightningDataModule
+from numpy.typing import NDArray
+from torch import nn
+
+from wheretolook.dataset import Dataset
+from wheretolook.learning.classifier import ViewpointClassifier
+from wheretolook.learning.config import TrainConfig
+from wheretolook.learning.fit import EpochRecord, RunLog, fit
+
+
+class Model(Protocol):
+    """Something learnt that lies in a weights file."""
+
+    def save(self, path: Path, training: dict[str, Any] | None = None) -> None:
+        """Write one safetensors file, atomically, with JSON values about the training in its header."""
+
+
+@dataclass(frozen=True, eq=False)
+class Learnt:
+    """What a learner has learnt.
+
+    Attributes:
+        model: to be saved.
+        metrics: of what is kept, on the validation views; "val_average_precision" among them.
+        counts: of what it has learnt from, such as n_train; logged as parameters.
+        history: metrics of each epoch, None where there are no epochs.
+    """
+
+    model: Model
+    metrics: dict[str, float]
+    counts: dict[str, Any] = field(default_factory=dict)
+    history: pd.DataFrame | None = None
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a learner is asked to do.
+
+    Attributes:
+        dataset: labelled train scenes, and val scenes if it has any.
+        config: options, those of the variant in place.
+        title: of its progress bar.
+        progress: whether to show it.
+        run_log: takes the metrics of epochs.
+    """
+
+    dataset: Dataset
+    config: TrainConfig
+    title: str
+    progress: bool
+    run_log: RunLog
+
+
+Learner = Callable[[Task], Learnt]
+
+
+def fit_network(
+    network: nn.Module, data: LightningDataModule, task: Task, class_weights: tuple[float, float] = (1.0, 1.0)
+) -> tuple[dict[str, float], pd.DataFrame]:
+    """Train a network by the options of a task; it then holds the weights to keep.
+
+    Returns:
+        Metrics of the epoch kept, and of all epochs.
+    """
+    classifier = ViewpointClassifier(network, task.config, class_weights)
+    record = EpochRecord(task.title, task.config, task.progress, task.run_log)
+    fit(classifier, data, record)
+    metrics = record.restore(classifier)
+    network.eval()
+    return metrics, record.history
+
+
+def predict(network: nn.Module, data: LightningDataModule) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Logits and labels (B,) of the validation views, by a network where it is."""
+    network.eval()
+    device = next(network.parameters()).device
+    logits, labels = [], []
+    with torch.inference_mode():
+        for batch in data.val_dataloader():
+            logits.append(network(*(one.to(device) for one in batch.inputs)).float().cpu())
+            labels.append(batch.labels.cpu())
+    return torch.cat(logits).numpy(), torch.cat(labels).numpy()
+
+
+def class_counts(**sides: NDArray[Any]) -> dict[str, Any]:
+    """Number of views of each side, and share of positives, by the names in which runs have them."""
+    counts: dict[str, Any] = {f"n_{name}": len(labels) for name, labels in sides.items()}
+    return counts | {f"positives_{name}": round(float(labels.mean()), 4) for name, labels in sides.items()}

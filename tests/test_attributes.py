@@ -65,6 +65,7 @@ def test_each_landmark_by_hand(localization_map: LocalizationMap) -> None:
             "direction_spread": m.mapping_direction_spread[rows],
             "ambiguity": m.ambiguity[rows],
             "mapped_distance": np.log(m.mapping_distance_m[rows]),
+            "distance_spread": m.mapping_distance_spread[rows],
         }
         assert tuple(expected) == ATTRIBUTES == POSE_ATTRIBUTES + MAP_ATTRIBUTES
         found = described.values[described.starts[view] : described.starts[view + 1]].cpu()

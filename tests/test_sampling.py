@@ -24,7 +24,8 @@ def landmarks_at(points: np.ndarray) -> Landmarks:
     return Landmarks(
         ids=np.arange(n), points=points, track_length=np.full(n, 3, np.int32), reprojection_error_px=zeros,
         triangulation_angle_deg=zeros, mapping_direction=np.tile(np.float32([1, 0, 0]), (n, 1)),
-        mapping_direction_spread=zeros, mapping_distance_m=zeros, descriptors=None, ambiguity=zeros,
+        mapping_direction_spread=zeros, mapping_distance_m=zeros, mapping_distance_spread=zeros,
+        descriptors=None, ambiguity=zeros,
     )  # fmt: skip
 
 

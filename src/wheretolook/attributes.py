@@ -15,19 +15,12 @@ from torch import Tensor
 from wheretolook.camera_models import Camera, ColmapCamera
 from wheretolook.geometry import Float, split_poses
 from wheretolook.localization_map import LocalizationMap
-from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.mapping.landmarks import MAP_ATTRIBUTES
 from wheretolook.visibility import VisibleSets
 
 POSE_ATTRIBUTES = ("across", "down", "distance", "mapped_angle", "distance_ratio")
 """Of a landmark in a view: x/z and y/z in the camera; the distance in metres, its logarithm; the cosine between the ray
 from the camera and the mean direction it was mapped from; the logarithm of the distance over the mean mapping one."""
-
-MAP_ATTRIBUTES = (
-    "track_length", "reprojection_error", "triangulation_angle", "direction_spread", "ambiguity", "mapped_distance",
-)  # fmt: skip
-"""Of a landmark in its map: the logarithm of the number of observations; the mean error in pixels; the logarithm of the
-largest angle between two rays, in degrees; 1 - |mean mapping direction|; the cosine between its descriptor and the
-nearest other one, NaN where that is not known; the logarithm of the mean mapping distance, in metres."""
 
 ATTRIBUTES = POSE_ATTRIBUTES + MAP_ATTRIBUTES
 
@@ -60,21 +53,6 @@ class ViewLandmarks:
         return torch.arange(len(self), device=self.starts.device).repeat_interleave(self.counts)
 
 
-def map_attributes(landmarks: Landmarks) -> Float:
-    """`MAP_ATTRIBUTES` of landmarks; (N, 6) float32."""
-    return np.stack(
-        [
-            np.log(np.maximum(landmarks.track_length, 1)),
-            landmarks.reprojection_error_px,
-            np.log(np.maximum(landmarks.triangulation_angle_deg, 0.01)),
-            landmarks.mapping_direction_spread,
-            landmarks.ambiguity,
-            np.log(np.maximum(landmarks.mapping_distance_m, 1e-3)),
-        ],
-        axis=1,
-    ).astype(np.float32)
-
-
 class LandmarkDescriber:
     """Describes the landmarks that views of a map see.
 
@@ -87,7 +65,7 @@ class LandmarkDescriber:
         landmarks, device = localization_map.landmarks, localization_map.device
         self._points = torch.from_numpy(landmarks.points).to(device)
         self._directions = torch.from_numpy(landmarks.mapping_direction).to(device)
-        self._attributes = torch.from_numpy(map_attributes(landmarks)).to(device)
+        self._attributes = torch.from_numpy(landmarks.attributes()).to(device)
 
     def describe(self, cam_from_world: Float, visible: VisibleSets | None = None) -> ViewLandmarks:
         """What views see.

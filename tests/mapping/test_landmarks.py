@@ -191,7 +191,9 @@ def test_long_and_short_tracks_against_a_plain_loop(tmp_path):
         mean = unit.mean(0)
         assert landmarks.track_length[p] == len(track)
         assert landmarks.triangulation_angle_deg[p] == pytest.approx(angle, rel=1e-4)
-        assert landmarks.mapping_distance_m[p] == pytest.approx(np.linalg.norm(rays, axis=1).mean(), rel=1e-5)
+        distances = np.linalg.norm(rays, axis=1)
+        assert landmarks.mapping_distance_m[p] == pytest.approx(distances.mean(), rel=1e-5)
+        assert landmarks.mapping_distance_spread[p] == pytest.approx(distances.std() / distances.mean(), abs=1e-6)
         assert landmarks.mapping_direction_spread[p] == pytest.approx(1 - np.linalg.norm(mean), abs=1e-6)
         np.testing.assert_allclose(landmarks.mapping_direction[p], mean / np.linalg.norm(mean), atol=1e-6)
 
@@ -327,6 +329,17 @@ def test_databases_that_do_not_match(tmp_path, model_dir):
         pass
     with pytest.raises(MapError, match="lacks an image"):
         load_colmap_landmarks(model_dir, tmp_path / "no_images.db")
+
+
+def test_landmarks_of_an_earlier_version_do_not_know_the_spread_of_distances(tmp_path, model_dir):
+    landmarks = load_colmap_landmarks(model_dir)
+    landmarks.save(tmp_path / "landmarks.npz")
+    with np.load(tmp_path / "landmarks.npz") as stored:
+        before = {name: stored[name] for name in stored.files if name != "mapping_distance_spread"}
+    np.savez(tmp_path / "before.npz", **before)
+    found = Landmarks.load(tmp_path / "before.npz")
+    assert np.isnan(found.mapping_distance_spread).all() and len(found.mapping_distance_spread) == len(landmarks)
+    np.testing.assert_array_equal(found.mapping_distance_m, landmarks.mapping_distance_m)
 
 
 def test_damaged_landmark_files(tmp_path, model_dir):

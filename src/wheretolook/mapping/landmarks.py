@@ -15,6 +15,15 @@ from wheretolook.errors import MapError
 from wheretolook.mapping.colmap_model import ModelArrays, model_arrays, read_descriptors, read_model
 from wheretolook.mapping.extraction import quantize_descriptors, unit_descriptors
 
+MAP_ATTRIBUTES = (
+    "track_length", "reprojection_error", "triangulation_angle", "direction_spread", "ambiguity", "mapped_distance",
+    "distance_spread",
+)  # fmt: skip
+"""What a scorer is told of a landmark in its map: the logarithm of the number of observations; the mean error in
+pixels; the logarithm of the largest angle between two rays, in degrees; 1 - |mean mapping direction|; the cosine
+between its descriptor and the nearest other one; the logarithm of the mean mapping distance, in metres; the standard
+deviation of the mapping distances over their mean. NaN where one is not known."""
+
 _BLOCK = 4096  # landmarks whose tracks are gathered at a time
 
 
@@ -31,6 +40,8 @@ class Landmarks:
         mapping_direction: (N, 3) float32, unit mean direction from the mapping cameras to the landmark, world.
         mapping_direction_spread: (N,) float32, 1 - |mean of the unit directions|: 0 when all look from one side.
         mapping_distance_m: (N,) float32, mean distance of the mapping cameras.
+        mapping_distance_spread: (N,) float32, standard deviation of these distances over their mean; NaN where a file
+            of an earlier version does not say.
         descriptors: (N, 128) uint8, mean over the track of the unit descriptors, as COLMAP stores descriptors (512
             times the unit vector); None where the model came without a database.
         ambiguity: (N,) float32, cosine between the landmark's descriptor and the nearest one of another landmark; NaN
@@ -45,11 +56,27 @@ class Landmarks:
     mapping_direction: NDArray[np.float32]
     mapping_direction_spread: NDArray[np.float32]
     mapping_distance_m: NDArray[np.float32]
+    mapping_distance_spread: NDArray[np.float32]
     descriptors: NDArray[np.uint8] | None
     ambiguity: NDArray[np.float32]
 
     def __len__(self) -> int:
         return len(self.ids)
+
+    def attributes(self) -> NDArray[np.float32]:
+        """`MAP_ATTRIBUTES` of each landmark, (N, len(MAP_ATTRIBUTES)) float32."""
+        return np.stack(
+            [
+                np.log(np.maximum(self.track_length, 1)),
+                self.reprojection_error_px,
+                np.log(np.maximum(self.triangulation_angle_deg, 0.01)),
+                self.mapping_direction_spread,
+                self.ambiguity,
+                np.log(np.maximum(self.mapping_distance_m, 1e-3)),
+                self.mapping_distance_spread,
+            ],
+            axis=1,
+        ).astype(np.float32)
 
     def save(self, path: str | Path, compact: bool = False) -> None:
         """Write an NPZ file, atomically. The same landmarks give the same bytes.
@@ -57,7 +84,7 @@ class Landmarks:
         Args:
             path: file to write.
             compact: leave out the descriptors, keep points in single and attributes in half precision, and compress:
-                about 26 bytes a landmark. Such landmarks serve visibility, features and scorers, but no localization.
+                about 28 bytes a landmark. Such landmarks serve visibility, features and scorers, but no localization.
         """
         path = Path(path)
         partial = path.with_name(path.name + ".partial")
@@ -85,6 +112,8 @@ class Landmarks:
         except Exception as error:  # a damaged zip raises many kinds of errors
             raise MapError(f"not a readable NPZ file: {error}", path=path, fix=fix) from error
         names = {f.name for f in fields(cls)}
+        if set(values) and "mapping_distance_spread" not in values and "mapping_distance_m" in values:
+            values["mapping_distance_spread"] = np.full(len(values["mapping_distance_m"]), np.nan, dtype=np.float32)
         if set(values) | {"descriptors"} != names:
             raise MapError("not a file of landmarks", path=path, value=sorted(values), fix=fix)
         if len({len(v) for v in values.values()}) != 1 or values["points"].shape[1:] != (3,):
@@ -220,11 +249,14 @@ def _viewing_geometry(model: ModelArrays) -> dict[str, NDArray[np.float32]]:
         for block in np.array_split(members, -(-len(members) * int(n) ** 2 // 4_000_000)):
             track = rays[start[block][:, None] + np.arange(n)]
             angle[block] = np.degrees(np.arccos(np.clip((track @ track.swapaxes(1, 2)).min((1, 2)), -1, 1)))
+    mean_distance = np.add.reduceat(distance, start[:-1]) / lengths
+    variance = np.add.reduceat((distance - np.repeat(mean_distance, lengths)) ** 2, start[:-1]) / lengths
     return {
         "triangulation_angle_deg": angle.astype(np.float32),
         "mapping_direction": (mean / np.maximum(length, 1e-12)[:, None]).astype(np.float32),
         "mapping_direction_spread": np.clip(1 - length, 0, 1).astype(np.float32),
-        "mapping_distance_m": (np.add.reduceat(distance, start[:-1]) / lengths).astype(np.float32),
+        "mapping_distance_m": mean_distance.astype(np.float32),
+        "mapping_distance_spread": (np.sqrt(variance) / np.maximum(mean_distance, 1e-12)).astype(np.float32),
     }
 
 

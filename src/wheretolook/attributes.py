@@ -6,6 +6,7 @@ from where they were mapped, how well, and how unlike others. All of it is known
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,9 @@ from wheretolook.geometry import Float, split_poses
 from wheretolook.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import MAP_ATTRIBUTES
 from wheretolook.visibility import VisibleSets
+
+BLOCK_ENTRIES = 1 << 18
+"""Landmarks in view that a network over them looks at together: some hundred megabytes."""
 
 POSE_ATTRIBUTES = ("across", "down", "distance", "mapped_angle", "distance_ratio")
 """Of a landmark in a view: x/z and y/z in the camera; the distance in metres, its logarithm; the cosine between the ray
@@ -102,6 +106,23 @@ class LandmarkDescriber:
         )
         return ViewLandmarks(starts, rows, torch.cat([of_pose, of_map], dim=1))
 
+    def in_blocks(self, cam_from_world: Float) -> Iterator[tuple[slice, ViewLandmarks]]:
+        """What views (B, 3, 4) see, so many at a time that a network over the landmarks has room to work.
+
+        Yields:
+            Which of the views, and their landmarks.
+        """
+        visible = self.localization_map.visible_landmarks(cam_from_world)
+        begin = 0
+        while begin < len(visible):
+            # as many views as have at most so many landmarks, but one at least
+            end = int(np.searchsorted(visible.starts, visible.starts[begin] + BLOCK_ENTRIES, side="right")) - 1
+            end = min(max(end, begin + 1), len(visible))
+            rows, entries = slice(begin, end), slice(int(visible.starts[begin]), int(visible.starts[end]))
+            part = VisibleSets(visible.starts[begin : end + 1] - visible.starts[begin], visible.indices[entries])
+            yield rows, self.describe(cam_from_world[rows], part)
+            begin = end
+
 
 FILLED = 30
 """Bins along each side of the image, of which the filled ones are counted, as in the paper."""
@@ -153,6 +174,12 @@ def _sums(values: Tensor, views: Tensor, n: int) -> Tensor:
 
 def _occupied(landmarks: ViewLandmarks, views: Tensor, camera: Camera, bins: int) -> Tensor:
     """Landmarks in each bin of the image, (B, bins^2) float32."""
+    cells = views * bins**2 + image_cells(landmarks, camera, bins)
+    return torch.bincount(cells, minlength=len(landmarks) * bins**2).view(len(landmarks), bins**2).float()
+
+
+def image_cells(landmarks: ViewLandmarks, camera: Camera, bins: int) -> Tensor:
+    """Which of bins x bins cells of the image, row by row, each landmark falls into, (E,) int64."""
     rays = landmarks.values[:, :2]
     if isinstance(camera, ColmapCamera):
         along = torch.cat([rays, torch.ones_like(rays[:, :1])], dim=1)
@@ -161,8 +188,7 @@ def _occupied(landmarks: ViewLandmarks, views: Tensor, camera: Camera, bins: int
         pixels = rays * camera.focal_px + torch.tensor([camera.cx, camera.cy]).to(rays)
     column = (pixels[:, 0] * (bins / camera.width)).long().clamp(0, bins - 1)
     row = (pixels[:, 1] * (bins / camera.height)).long().clamp(0, bins - 1)
-    cells = (views * bins + row) * bins + column
-    return torch.bincount(cells, minlength=len(landmarks) * bins**2).view(len(landmarks), bins**2).float()
+    return row * bins + column
 
 
 def _quantiles(values: Tensor, landmarks: ViewLandmarks, views: Tensor) -> list[Tensor]:

@@ -68,9 +68,9 @@ class SceneFolder:
         """Which landmark each sampled location has a free line of sight to."""
         return self.folder / "occlusion.npz"
 
-    def read_table(self) -> pd.DataFrame:
-        """The scene's viewpoints. Raises TableError if there are none or the file is damaged."""
-        return read_table(self.table)
+    def read_table(self, matches: bool = False) -> pd.DataFrame:
+        """The scene's viewpoints, on request with their matches; see `wheretolook.table.read_table`."""
+        return read_table(self.table, matches)
 
     def localization_map(self, camera: PinholeCamera, device: str = "cpu") -> LocalizationMap:
         """The scene's map with the occlusion stored for its sampled locations; the mesh is not needed."""

@@ -17,7 +17,7 @@ from wheretolook.evaluation.calibration import calibration_rows, fit_temperature
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.report import score_markdown
 from wheretolook.evaluation.results import ScoredSet, log_evaluation, results_folder, write_results
-from wheretolook.evaluation.scores import WITH_WEIGHTS, Method, choose, score_table
+from wheretolook.evaluation.scores import PROBABILITIES, Method, choose, score_table
 from wheretolook.evaluation.scoring import Weights, check_unseen, choose_weights, score_scenes
 from wheretolook.evaluation.views import candidate_sets, views_of
 from wheretolook.geometry import Float
@@ -137,7 +137,7 @@ def _calibration(
     """
     parts = []
     for (name, inputs), values in scores.items():
-        if name in WITH_WEIGHTS:
+        if name in PROBABILITIES:
             temperature = temperatures.get((name, inputs), float("nan"))
             about = {"method": name, "inputs": inputs, "temperature": temperature, "n_val": n_val}
             curves = calibration_rows(values, good, temperature)

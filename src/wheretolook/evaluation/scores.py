@@ -39,8 +39,8 @@ ORACLE: Method = ("oracle", "")
 LEARNED = "mlp"
 """The paper's network: `LearnedScorer.name`, without loading PyTorch."""
 
-WITH_WEIGHTS = (LEARNED, "trees")
-"""Methods that have learnt from labels; their scores are probabilities."""
+PROBABILITIES = (LEARNED, "trees", "set")
+"""Methods whose scores are probabilities, learnt from labels."""
 
 _PAIRED = ("difference", "difference_low", "difference_high", "p")
 _CALIBRATION = ("ece", "ece_scaled", "temperature")
@@ -84,7 +84,7 @@ def reference_method(methods: Iterable[Method], name: str) -> Method | None:
     if name and name not in named:
         known = f"There are {', '.join(named)}."
         raise ConfigError("the reference is none of the methods evaluated", value=name, fix=known)
-    learned = [method for method in named.values() if method[0] in WITH_WEIGHTS]
+    learned = [method for method in named.values() if method[0] in PROBABILITIES]
     first = (LEARNED, "2d+3d") if (LEARNED, "2d+3d") in learned else next(iter(learned), None)
     return named[name] if name else first
 
@@ -236,7 +236,7 @@ def _calibration_metrics(
     method: Method, good: NDArray[np.bool_], scores: Float, temperature: float | None
 ) -> dict[str, float]:
     metrics = dict.fromkeys(_CALIBRATION, float("nan"))
-    if method[0] in WITH_WEIGHTS:
+    if method[0] in PROBABILITIES:
         metrics["ece"] = expected_calibration_error(scores, good)
         if temperature is not None and np.isfinite(temperature):
             scaled = scale_probability(scores, temperature)

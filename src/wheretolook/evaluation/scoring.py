@@ -14,13 +14,14 @@ from tqdm.auto import tqdm
 from wheretolook.dataset import Dataset, SceneFolder
 from wheretolook.errors import TableError, WeightsError
 from wheretolook.evaluation.config import EvaluateConfig
-from wheretolook.evaluation.scores import WITH_WEIGHTS, Method, reference_method
+from wheretolook.evaluation.scores import Method, reference_method
 from wheretolook.geometry import Float
-from wheretolook.learning.config import VARIANTS, weights_name
+from wheretolook.learning.config import MATCHABILITY, VARIANTS, weights_name
 from wheretolook.learning.weights import read_training, weights_kind
 from wheretolook.localization_map import LocalizationMap
 from wheretolook.scene_occlusion import scene_occlusion
 from wheretolook.scoring import Scorer, make_scorer
+from wheretolook.scoring.registry import WEIGHTS_OF
 from wheretolook.table import fingerprint, poses
 from wheretolook.visibility.config import OcclusionConfig
 
@@ -31,7 +32,7 @@ BLOCK = 4096
 """Views binned and scored at a time."""
 
 Weights = Mapping[Path, str]
-"""Files of weights, and the method that each serves."""
+"""Files of weights, and the kind of each (`wheretolook.learning.weights.weights_kind`)."""
 
 
 def choose_weights(dataset: Dataset, config: EvaluateConfig, models: Sequence[TrainedModel | Path] | None) -> Weights:
@@ -40,7 +41,7 @@ def choose_weights(dataset: Dataset, config: EvaluateConfig, models: Sequence[Tr
     Raises:
         WeightsError: there are none for a method that needs them, or the dataset's were trained on other data.
     """
-    if not {*WITH_WEIGHTS} & {*config.methods}:
+    if not {*WEIGHTS_OF} & {*config.methods}:
         return {}
     if models is not None:
         weights = [model if isinstance(model, Path) else model.path for model in models]
@@ -52,14 +53,15 @@ def choose_weights(dataset: Dataset, config: EvaluateConfig, models: Sequence[Tr
             fix="Run the train stage first, name weights, or leave mlp out of the methods.",
         )  # fmt: skip
     kinds = {path: weights_kind(path) for path in weights}
-    for kind in WITH_WEIGHTS:
+    wanted = {name: WEIGHTS_OF[name] for name in config.methods if name in WEIGHTS_OF}
+    for name, kind in wanted.items():
         # who asks for all methods gets those that have been trained
-        if kind in config.methods and kind not in kinds.values() and config.methods != EvaluateConfig().methods:
+        if kind not in kinds.values() and config.methods != EvaluateConfig().methods:
             raise WeightsError(
                 f"there are no weights of {kind} to evaluate", path=dataset.root / "weights",
-                fix=f"Run the train stage first, name weights, or leave {kind} out of the methods.",
+                fix=f"Run the train stage first, name weights, or leave {name} out of the methods.",
             )  # fmt: skip
-    return {path: kind for path, kind in kinds.items() if kind in config.methods}
+    return {path: kind for path, kind in kinds.items() if kind in wanted.values()}
 
 
 def _own_weights(dataset: Dataset) -> list[Path]:
@@ -70,7 +72,8 @@ def _own_weights(dataset: Dataset) -> list[Path]:
     weights = [path for path in named if path.is_file()]
     now = training_fingerprint(dataset)
     for path in weights:
-        if read_training(path).get("dataset_fingerprint") != now:
+        # compact tables hold no matches: what has learnt from these has learnt from the dataset they were copied from
+        if weights_kind(path) != MATCHABILITY and read_training(path).get("dataset_fingerprint") != now:
             raise WeightsError(
                 "these weights were trained on other data than the dataset now holds", path=path,
                 fix="Run the train stage again, remove the file, or name weights in evaluate.weights.",
@@ -153,8 +156,8 @@ def score_scenes(
 def _scorers(localization_map: LocalizationMap, config: EvaluateConfig, weights: Weights) -> dict[Method, Scorer]:
     scorers: dict[Method, Scorer] = {}
     for name in config.methods:
-        of_method = [path for path, kind in weights.items() if kind == name]
-        for path in of_method if name in WITH_WEIGHTS else [None]:
+        of_method = [path for path, kind in weights.items() if kind == WEIGHTS_OF.get(name)]
+        for path in of_method if name in WEIGHTS_OF else [None]:
             scorer = make_scorer(name, localization_map, config.seed, path, config.heading)
             key = (scorer.name, scorer.inputs)
             if key in scorers:  # two files of one variant: told apart by their names

@@ -90,6 +90,13 @@ _STYLES = {
     ("mlp", "2d"): MethodStyle("MLP, 2d", "#56B4E9", "v", (0, (5, 1))),
     ("mlp", "2d+z"): MethodStyle("MLP, 2d + z", "#0072B2", "^", (0, (3, 1, 1, 1))),
     ("mlp", "2d+3d"): MethodStyle("MLP, 2d + 3d", "#D55E00", "o", "-"),
+    ("expected", "inliers"): MethodStyle("expected inliers", "#44AA99", "s", (0, (3, 1))),
+    ("expected", "bins"): MethodStyle("expected bins", "#117733", "D", (0, (3, 1))),
+    **{
+        ("expected", metric): MethodStyle(f"Fisher, {name}, expected", "#332288", marker, (0, (3, 1)))
+        for metric, (name, marker) in _FISHER_METRICS.items()
+    },
+    ("set", ""): MethodStyle("set of landmarks", "#CC3311", "o", "-"),
     ("trees", ""): MethodStyle("boosted trees, landmark attributes", "#882255", "*", "-"),
     ("mlp", "released"): MethodStyle("MLP, trained as the released code", "#F0A070", "p", (0, (2, 2))),
 }
@@ -102,6 +109,8 @@ GROUPS = ("learned", "rules", "Fisher", "probes")
 _GROUPS = {
     "mlp": "learned",
     "trees": "learned",
+    "set": "learned",
+    "expected": "learned",
     "fisher": "Fisher",
     "fisher-worst-trace": "probes",
     "fisher-stationary-trace": "probes",

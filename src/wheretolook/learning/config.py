@@ -14,10 +14,16 @@ RELEASED = "released"
 TREES = "trees"
 """The variant that is no network: boosted trees on pooled statistics of what landmarks are like."""
 
+MATCHABILITY = "matchability"
+"""The variant that tells which landmarks will be found, for methods that weight them by it."""
+
+SET = "set"
+"""The variant that scores a view by the set of landmarks it sees."""
+
 NETWORKS = (*INPUT_VARIANTS, RELEASED)
 """Networks that can be trained."""
 
-OWN_OPTIONS = {TREES: "trees"}
+OWN_OPTIONS = {TREES: "trees", MATCHABILITY: "matchability", SET: "set"}
 """Variants that are not the paper's network, and the field of `TrainConfig` with the options of each."""
 
 VARIANTS = (*NETWORKS, *OWN_OPTIONS)
@@ -97,14 +103,82 @@ class FittingConfig:
             raise ConfigError("learning_rate must be positive and l2 not negative", value=(self.learning_rate, self.l2))
 
 
+def _check_hidden(names: tuple[str, ...]) -> None:
+    from wheretolook.attributes import ATTRIBUTES  # PyTorch takes seconds to load
+
+    if unknown := [name for name in names if name not in ATTRIBUTES]:
+        known = f"There are {', '.join(ATTRIBUTES)}."
+        raise ConfigError("hidden names an attribute that there is not", value=unknown[0], fix=known)
+
+
+@dataclass(frozen=True)
+class MatchabilityConfig(FittingConfig):
+    """Options of the probability that a landmark in view is found.
+
+    Args:
+        landmarks: landmarks of a view to learn from, at most, chosen at random.
+        width: units of each of two hidden layers.
+        hidden: attributes (`wheretolook.attributes.ATTRIBUTES`) not to look at, to see what each is worth.
+    """
+
+    epochs: int = 6
+    batch_size: int = 256
+    landmarks: int = 64
+    width: int = 48
+    hidden: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.landmarks < 1 or self.width < 1:
+            raise ConfigError("landmarks and width must be at least 1", value=(self.landmarks, self.width))
+        if self.hidden:
+            _check_hidden(self.hidden)
+
+
+@dataclass(frozen=True)
+class SetConfig(FittingConfig):
+    """Options of the network over the set of landmarks in view.
+
+    Args:
+        landmarks: landmarks of a view that a training step looks at, at most, chosen at random.
+        width: units of the layers that look at single landmarks.
+        pooled: numbers that attention pools beside what the landmarks are expected to tell of the pose.
+        head: units of the layers that decide.
+        dropout: share of the deciding layers' units dropped.
+        from_matchability: start from `weights/matchability.safetensors` where the dataset has it.
+        hidden: attributes (`wheretolook.attributes.ATTRIBUTES`) not to look at, to see what each is worth.
+    """
+
+    epochs: int = 12
+    landmarks: int = 192
+    width: int = 48
+    pooled: int = 0
+    head: int = 48
+    dropout: float = 0.1
+    from_matchability: bool = True
+    hidden: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if min(self.landmarks, self.width, self.head) < 1 or self.pooled < 0 or not 0 <= self.dropout < 1:
+            raise ConfigError(
+                "a set network needs landmarks, width and head >= 1, pooled >= 0 and a dropout below 1",
+                value=(self.landmarks, self.width, self.head, self.pooled, self.dropout),
+            )
+        if self.hidden:
+            _check_hidden(self.hidden)
+
+
 @dataclass(frozen=True)
 class TrainConfig:
     """Options of training. The defaults are the paper's where it says something (Sec. 3.3 and 4).
 
     Args:
         variants: what to train: networks by their inputs, "2d", "2d+z" and "2d+3d"; "released", which has the inputs
-            "2d+3d" and learns with the options of the paper's released code instead of those here; and "trees",
-            boosted trees that know what landmarks are like, with the options in `trees` and none of the network's.
+            "2d+3d" and learns with the options of the paper's released code instead of those here; and learners
+            that know what landmarks are like, with options of their own: "trees", boosted trees on statistics of the
+            landmarks in view; "set", a network over them one by one; "matchability", which tells which of them will be
+            found (needs labels with `--label.store_matches true`).
         epochs: passes over the training viewpoints (paper: 300).
         batch_size: viewpoints a step, shared out over the devices (the paper gives none; 128 is the released code's).
         learning_rate: Adam's initial learning rate (paper: 1e-3; released code: 1e-4).
@@ -134,6 +208,8 @@ class TrainConfig:
         devices: GPUs, or processes on the CPU, to train with. One step of many is one step of one: each takes its share
             of the same batch. Dropout and noise draw other numbers, though.
         trees: options of "trees".
+        matchability: options of "matchability".
+        set: options of "set".
     """
 
     variants: tuple[str, ...] = tuple(INPUT_VARIANTS)
@@ -159,6 +235,8 @@ class TrainConfig:
     accelerator: Literal["auto", "cpu", "gpu"] = "auto"
     devices: int = 1
     trees: TreesConfig = field(default_factory=TreesConfig)
+    matchability: MatchabilityConfig = field(default_factory=MatchabilityConfig)
+    set: SetConfig = field(default_factory=SetConfig)
 
     def __post_init__(self) -> None:
         unknown = [name for name in self.variants if name not in VARIANTS]

@@ -17,7 +17,7 @@ from wheretolook.dataset import Dataset, write_json
 from wheretolook.errors import ConfigError
 from wheretolook.features import INPUT_VARIANTS
 from wheretolook.learning.classifier import ViewpointClassifier
-from wheretolook.learning.config import OWN_OPTIONS, TREES, TrainConfig, inputs_of, weights_name
+from wheretolook.learning.config import MATCHABILITY, OWN_OPTIONS, SET, TREES, TrainConfig, inputs_of, weights_name
 from wheretolook.learning.data import ViewpointDataModule
 from wheretolook.learning.fit import EpochRecord, RunLog, fit, home_device
 from wheretolook.learning.learner import Learner, Task
@@ -110,6 +110,14 @@ def learner_of(variant: str) -> Learner:
         from wheretolook.learning.trees import learn_trees
 
         return learn_trees
+    if variant == MATCHABILITY:
+        from wheretolook.learning.matchability import learn_matchability
+
+        return learn_matchability
+    if variant == SET:
+        from wheretolook.learning.set import learn_set
+
+        return learn_set
     raise ConfigError("no such variant", value=variant)
 
 
@@ -123,7 +131,7 @@ def _about(dataset: Dataset, config: TrainConfig, fingerprint: str, variant: str
     own = OWN_OPTIONS.get(variant)
     deciding = (*OF_ALL, own) if own else [name for name in asdict(config) if name not in NOT_DECIDING]
     options = {name: value for name, value in asdict(config).items() if name in deciding}
-    about = {
+    about: dict[str, Any] = {
         "dataset": dataset.name,
         "dataset_fingerprint": fingerprint,
         "landmarks": {
@@ -134,6 +142,9 @@ def _about(dataset: Dataset, config: TrainConfig, fingerprint: str, variant: str
         "camera": asdict(dataset.camera),
         "config": options,
     }
+    if variant == SET and config.set.from_matchability:
+        start = dataset.root / "weights" / weights_name(MATCHABILITY)
+        about["matchability_sha256"] = sha256(start) if start.is_file() else None
     return dict(json.loads(json.dumps(about)))
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -12,7 +10,6 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors.numpy import save
 from torch import Tensor
 from tqdm.auto import tqdm
 
@@ -25,7 +22,7 @@ from wheretolook.learning.data import check_classes, training_scenes, validation
 from wheretolook.learning.fit import home_device
 from wheretolook.learning.learner import Learnt, Task, class_counts
 from wheretolook.learning.platt import fit_platt
-from wheretolook.learning.weights import FORMAT_VERSION, METADATA_KEY, read_weights
+from wheretolook.learning.weights import check_kind, read_weights, write_weights
 from wheretolook.table import UNLABELLED, is_good, poses
 
 BLOCK = 4096
@@ -106,18 +103,14 @@ class BoostedTrees:
             path: file to write; its folder is made when needed.
             training: what else to keep about the training (JSON values).
         """
-        path.parent.mkdir(parents=True, exist_ok=True)
         header = {
-            "format_version": FORMAT_VERSION, "kind": TREES, "features": list(POOLED), "camera": asdict(self.camera),
+            "kind": TREES, "features": list(POOLED), "camera": asdict(self.camera),
             **{name: getattr(self, name) for name in _NUMBERS}, "training": training or {},
         }  # fmt: skip
-        arrays = {name: np.ascontiguousarray(getattr(self, name).cpu().numpy()) for name in _ARRAYS}
-        arrays |= {name: arrays[name].astype(np.int32) for name in ("roots", "left", "right")}
-        arrays["feature"] = arrays["feature"].astype(np.uint8)
-        arrays["missing_left"] = arrays["missing_left"].astype(np.uint8)
-        partial = path.with_name(path.name + ".partial")
-        partial.write_bytes(save(arrays, metadata={METADATA_KEY: json.dumps(header)}))
-        os.replace(partial, path)
+        narrow = {"roots": torch.int32, "left": torch.int32, "right": torch.int32, "feature": torch.uint8}
+        narrow["missing_left"] = torch.uint8
+        arrays = {name: getattr(self, name) for name in _ARRAYS}
+        write_weights(path, {name: one.to(narrow.get(name, one.dtype)) for name, one in arrays.items()}, header)
 
     @classmethod
     def load(cls, path: str | Path) -> BoostedTrees:
@@ -127,9 +120,8 @@ class BoostedTrees:
             WeightsError: the file is missing, damaged, foreign, of another kind, or its trees are none.
         """
         tensors, header = read_weights(Path(path))
+        check_kind(path, header, TREES)
         fix = "Train again, or give weights of trees."
-        if header.get("kind") != TREES:
-            raise WeightsError("these weights are no boosted trees", path=path, value=header.get("kind"), fix=fix)
         if header.get("features") != list(POOLED):
             raise WeightsError("these trees ask for other statistics of a view", path=path, fix=fix)
         try:

@@ -11,6 +11,7 @@ from typing import Any
 
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
+from torch import Tensor
 
 from wheretolook.errors import ConfigError, WeightsError
 from wheretolook.geometry import PinholeCamera
@@ -36,14 +37,35 @@ def save_classifier(network: ViewpointNetwork, path: str | Path, training: Mappi
         path: file to write; its folder is made when needed.
         training: what else to keep about the training (JSON values), such as the dataset's fingerprint.
     """
+    header = {**asdict(network.spec), "training": dict(training or {})}
+    write_weights(path, network.layers.state_dict(), header)
+
+
+def write_weights(path: str | Path, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> None:
+    """Write tensors and a description (JSON values) as one safetensors file, atomically. The same give the same bytes.
+
+    Args:
+        path: file to write; its folder is made when needed.
+        tensors: by name, on any device.
+        header: the description; "kind" names the method that the weights serve.
+    """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    header = {"format_version": FORMAT_VERSION, **asdict(network.spec), "training": dict(training or {})}
+    text = json.dumps({"format_version": FORMAT_VERSION, **header})
     partial = path.with_name(path.name + ".partial")
-    tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in network.layers.state_dict().items()}
     # not by `save_file`, which makes a file that other users cannot read
-    partial.write_bytes(save(tensors, metadata={METADATA_KEY: json.dumps(header)}))
+    content = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    partial.write_bytes(save(content, metadata={METADATA_KEY: text}))
     os.replace(partial, path)
+
+
+def check_kind(path: str | Path, header: Mapping[str, Any], kind: str) -> None:
+    """Raise a WeightsError unless the description of weights says that they serve this method."""
+    if header.get("kind", MLP) != kind:
+        raise WeightsError(
+            f"these weights are not of {kind}", path=path, value=header.get("kind", MLP),
+            fix=f"Give weights of {kind}, or train them.",
+        )  # fmt: skip
 
 
 def load_classifier(path: str | Path, device: str = "cpu") -> ViewpointNetwork:
@@ -57,9 +79,7 @@ def load_classifier(path: str | Path, device: str = "cpu") -> ViewpointNetwork:
         WeightsError: the file is missing, damaged, foreign, of another version, or does not fit its own description.
     """
     tensors, header = read_weights(Path(path))
-    if header.get("kind", MLP) != MLP:
-        fix = "Give weights of a network."
-        raise WeightsError("these weights are no network's", path=path, value=header["kind"], fix=fix)
+    check_kind(path, header, MLP)
     network = ViewpointNetwork(_spec(Path(path), header))
     try:
         network.layers.load_state_dict(tensors)
@@ -80,7 +100,7 @@ def read_training(path: str | Path) -> dict[str, Any]:
 
 
 def weights_kind(path: str | Path) -> str:
-    """The method that a weights file serves: "mlp" or "trees".
+    """The method that a weights file serves, such as "mlp" or "trees".
 
     Raises:
         WeightsError: the file is missing, damaged or foreign.

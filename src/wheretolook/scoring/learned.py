@@ -80,10 +80,15 @@ def load_scorer(weights: str | Path, localization_map: LocalizationMap) -> Score
     Raises:
         WeightsError: the file cannot be used, or was trained for another field of view than the map's camera.
     """
+    from wheretolook.scoring.set import SetScorer
     from wheretolook.scoring.trees import TreesScorer
 
-    scorer = TreesScorer if weights_kind(weights) == TreesScorer.name else LearnedScorer
-    return scorer.load(weights, localization_map)
+    scorers = {scorer.name: scorer for scorer in (LearnedScorer, TreesScorer, SetScorer)}
+    kind = weights_kind(weights)
+    if kind not in scorers:
+        known = f"Give weights of {', '.join(scorers)}."
+        raise WeightsError("these weights are not of one scorer", path=weights, value=kind, fix=known)
+    return scorers[kind].load(weights, localization_map)
 
 
 def check_field_of_view(trained: PinholeCamera, camera: Camera) -> None:

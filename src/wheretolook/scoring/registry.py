@@ -26,13 +26,17 @@ from wheretolook.scoring.visible import VisibleScorer
 def _learned(name: str, localization_map: LocalizationMap, weights: str | Path | None) -> Scorer:
     from wheretolook.scoring.learned import load_scorer  # PyTorch takes seconds to load
 
-    fix = "Give a file that the train stage wrote."
-    if weights is None:
-        raise ConfigError("the method needs weights", value=name, fix=fix)
-    scorer = load_scorer(weights, localization_map)
+    scorer = load_scorer(_given(name, weights), localization_map)
     if scorer.name != name:
+        fix = f"Give weights of {name}, or train them."
         raise WeightsError(f"these weights are not of {name}", path=weights, value=scorer.name, fix=fix)
     return scorer
+
+
+def _given(name: str, weights: str | Path | None) -> str | Path:
+    if weights is None:
+        raise ConfigError("the method needs weights", value=name, fix="Give a file that the train stage wrote.")
+    return weights
 
 
 @dataclass(frozen=True)
@@ -53,6 +57,21 @@ def _forward(localization_map: LocalizationMap, options: ScorerOptions) -> Score
     return ForwardScorer(localization_map, heading, options.seed)
 
 
+def _expected(name: str) -> Callable[[LocalizationMap, ScorerOptions], Scorer]:
+    def build(localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
+        from wheretolook.scoring.expected import ExpectedScorer  # PyTorch takes seconds to load
+
+        return ExpectedScorer(localization_map, _given(name, options.weights), EXPECTED_METHODS[name])
+
+    return build
+
+
+EXPECTED_METHODS = {
+    "expected-inliers": "inliers", "expected-bins": "bins", "fisher-mineig-expected": "mineig",
+    "fisher-logdet-expected": "logdet", "fisher-trace-expected": "trace",
+}  # fmt: skip
+"""What each method that weights landmarks by their chance of being found makes of them."""
+
 _ALL_FISHER = {**FISHER_METHODS, **ORIGIN_METHODS}
 
 SCORERS: dict[str, Callable[[LocalizationMap, ScorerOptions], Scorer]] = {
@@ -66,9 +85,14 @@ SCORERS: dict[str, Callable[[LocalizationMap, ScorerOptions], Scorer]] = {
     "fisher-worst-trace": lambda localization_map, options: WorstTraceScorer(localization_map),
     "fisher-stationary-trace": lambda localization_map, options: StationaryTraceScorer(localization_map),
     "mlp": lambda localization_map, options: _learned("mlp", localization_map, options.weights),
+    **{name: _expected(name) for name in EXPECTED_METHODS},
     "trees": lambda localization_map, options: _learned("trees", localization_map, options.weights),
+    "set": lambda localization_map, options: _learned("set", localization_map, options.weights),
 }
 """How each method is built from a map and options."""
+
+WEIGHTS_OF = {"mlp": "mlp", **dict.fromkeys(EXPECTED_METHODS, "matchability"), "trees": "trees", "set": "set"}
+"""Methods that have learnt, and the kind of weights (`wheretolook.learning.weights.weights_kind`) that each needs."""
 
 OPTIONAL = tuple(ORIGIN_METHODS)
 """Methods that an evaluation has only if it names them: no rows of the paper."""
@@ -80,16 +104,25 @@ PROBES = ("fisher-worst-trace", "fisher-stationary-trace")
 def describe_methods() -> dict[str, str]:
     """What each method of `SCORERS` is, by its name: the first line of its class's docstring."""
     from wheretolook.scoring.learned import LearnedScorer
+    from wheretolook.scoring.set import SetScorer
     from wheretolook.scoring.trees import TreesScorer
 
     scorers: tuple[type[Scorer], ...] = (
         RandomScorer, ForwardScorer, VisibleScorer, BinsScorer, MaxVisibilityScorer, SwappedMaxVisibilityScorer,
-        WorstTraceScorer, StationaryTraceScorer, LearnedScorer, TreesScorer,
+        WorstTraceScorer, StationaryTraceScorer, LearnedScorer, TreesScorer, SetScorer,
     )  # fmt: skip
     texts = {scorer.name: _first_line(scorer) for scorer in scorers}
     for name, (metric, approximation, about_origin) in _ALL_FISHER.items():
         about = ", turned about the world's origin (only if named)" if about_origin else ""
         texts[name] = f"{_first_line(FisherScorer).removesuffix('.')}: {metric}, {approximation}{about}."
+    texts |= {
+        "expected-inliers": "Landmarks in view, each counted by its learned chance of being found.",
+        "expected-bins": "Bins of the image, each counted by the chance that a landmark in it is found.",
+        **{
+            name: f"Expected Fisher information of the pose, landmarks weighted by their chance of being found: {kind}."
+            for name, kind in EXPECTED_METHODS.items() if name.startswith("fisher")
+        },
+    }  # fmt: skip
     return {name: texts[name] for name in SCORERS}
 
 

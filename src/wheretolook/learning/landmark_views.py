@@ -1,0 +1,234 @@
+"""Labelled viewpoints as the landmarks they see, one by one: what the learners without bins read."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from math import ceil
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from tqdm.auto import tqdm
+
+from wheretolook.attributes import LandmarkDescriber, ViewLandmarks
+from wheretolook.dataset import Dataset, SceneFolder
+from wheretolook.errors import TableError
+from wheretolook.learning.config import TrainConfig
+from wheretolook.learning.data import Batch
+from wheretolook.table import LOCALIZED, UNLABELLED, is_good, poses
+
+BLOCK = 2048
+"""Views described at a time: some million landmarks."""
+
+
+@dataclass(frozen=True)
+class AttributeStatistics:
+    """Mean and standard deviation of what is known of each landmark, over those in view while training.
+
+    Attributes:
+        mean: (len(ATTRIBUTES),), 0 for what is not known of any.
+        std: (len(ATTRIBUTES),), 1 where it would be 0.
+    """
+
+    mean: tuple[float, ...]
+    std: tuple[float, ...]
+
+    @classmethod
+    def of(cls, values: Tensor) -> AttributeStatistics:
+        """Statistics over landmarks (E, len(ATTRIBUTES)), some numbers NaN."""
+        means, stds = [], []
+        for column in values.unbind(1):
+            known = column[~column.isnan()].double()
+            mean = float(known.mean()) if len(known) else 0.0
+            std = float((known - mean).square().mean().sqrt()) if len(known) else 0.0
+            means.append(mean)
+            stds.append(std if std > 1e-6 else 1.0)
+        return cls(tuple(means), tuple(stds))
+
+
+@dataclass(frozen=True, eq=False)
+class LandmarkViews:
+    """Labelled viewpoints of some scenes, by the landmarks they see.
+
+    A view's landmarks are in random order, and at most `most` of them are kept: any first few are a random sample.
+
+    Attributes:
+        starts: (B + 1,) int64; view b has entries `starts[b]` to `starts[b + 1]`.
+        values: (E, len(ATTRIBUTES)) float16.
+        visible: (B,) int64, landmarks that each view sees.
+        axis_height: (B,) float32, z of the optical axis in the world.
+        labels: (B,) float32, 1 where the viewpoint localizes.
+        scene: (B,) int64, number of each view's scene in the order given.
+        location: (B,) int64, location_id of each view, unique only within its scene.
+        found: (E,) bool, whether the localizer found the landmark; None where that was not asked for.
+    """
+
+    starts: Tensor
+    values: Tensor
+    visible: Tensor
+    axis_height: Tensor
+    labels: Tensor
+    scene: NDArray[np.int64]
+    location: NDArray[np.int64]
+    found: Tensor | None = None
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    def to(self, device: torch.device | str) -> LandmarkViews:
+        """The same views with their tensors on a device."""
+        moved: dict[str, Any] = {
+            name: value.to(device) for name, value in vars(self).items() if isinstance(value, Tensor)
+        }
+        return replace(self, **moved)
+
+    @property
+    def n_bytes(self) -> int:
+        """Memory the tensors take."""
+        return sum(value.nbytes for value in vars(self).values() if isinstance(value, Tensor))
+
+
+def load_landmark_views(
+    dataset: Dataset,
+    scenes: Sequence[SceneFolder],
+    config: TrainConfig,
+    most: int,
+    device: str = "cpu",
+    progress: bool = True,
+    matches: bool = False,
+) -> LandmarkViews:
+    """Describe what the labelled viewpoints of some scenes see.
+
+    Args:
+        dataset: gives the camera.
+        scenes: of the dataset.
+        config: limits of a positive label, seed of the choice of landmarks.
+        most: landmarks kept of a view.
+        device: where to describe, "cpu" or a CUDA device.
+        progress: show a progress bar.
+        matches: also tell which landmarks the localizer found: the inliers of a view that was localized, and all that
+            were matched in one that was not. Landmarks that the view does not see by the map's occlusion do not count.
+
+    Returns:
+        On the CPU.
+
+    Raises:
+        TableError: a scene has no table or no labelled viewpoint, its occlusion does not fit, or the matches are asked
+            for but not stored.
+        MapError: a scene has no landmarks.
+    """
+    tables = [(scene, scene.read_table(matches=matches)) for scene in scenes]
+    blocks: list[LandmarkViews] = []
+    generator = torch.Generator().manual_seed(config.seed)
+    total = sum(len(table) for _, table in tables)
+    with tqdm(total=total, desc="describe views", unit="view", disable=not progress) as bar:
+        for number, (scene, whole) in enumerate(tables):
+            table = whole[whole["status"] != UNLABELLED]
+            if table.empty:
+                raise TableError("no viewpoint has a label", path=scene.table, fix="Run the label stage.")
+            describer = LandmarkDescriber(scene.localization_map(dataset.camera, device))
+            cam_from_world, good = poses(table), is_good(table, config.max_error_m, config.max_error_deg)
+            for begin in range(0, len(table), BLOCK):
+                rows = slice(begin, begin + BLOCK)
+                described = describer.describe(cam_from_world[rows])
+                found = _found(described, table.iloc[rows]) if matches else None
+                starts, kept = _some_of_each(described, most, generator)
+                blocks.append(
+                    LandmarkViews(
+                        starts.cpu(),
+                        described.values[kept].to("cpu", torch.float16),
+                        described.counts.cpu(),
+                        torch.from_numpy(cam_from_world[rows, 2, 2].astype(np.float32)),
+                        torch.from_numpy(good[rows].astype(np.float32)),
+                        np.full(len(described), number),
+                        table["location_id"].to_numpy(np.int64)[rows],
+                        None if found is None else found[kept.cpu()],
+                    )
+                )
+                bar.update(len(described))
+    return _joined(blocks)
+
+
+def _found(described: ViewLandmarks, table: pd.DataFrame) -> Tensor:
+    """(E,) bool, on the CPU: whether each entry's landmark was found in its view."""
+    rows, starts = described.rows.cpu().numpy(), described.starts.cpu().numpy()
+    found = np.zeros(len(rows), dtype=bool)
+    localized = (table["status"] == LOCALIZED).to_numpy()
+    for view, (inliers, matched) in enumerate(zip(table["inlier_rows"], table["matched_rows"], strict=True)):
+        part = slice(starts[view], starts[view + 1])
+        found[part] = np.isin(rows[part], inliers if localized[view] else matched)
+    return torch.from_numpy(found)
+
+
+def _some_of_each(described: ViewLandmarks, most: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """At most so many landmarks of each view, at random: their starts (B + 1,) and entries, in random order."""
+    views = described.views
+    key = views.double() + torch.rand(len(views), generator=generator, dtype=torch.float64).to(views.device) * 0.999
+    order = key.argsort()
+    place = torch.arange(len(views), device=views.device) - described.starts[views]  # views stay where they are
+    kept = order[place < most]
+    starts = torch.zeros_like(described.starts)
+    starts[1:] = described.counts.clamp(max=most).cumsum(0)
+    return starts, kept
+
+
+def _joined(blocks: Sequence[LandmarkViews]) -> LandmarkViews:
+    lengths = torch.cat([block.starts.diff() for block in blocks])
+    starts = torch.zeros(len(lengths) + 1, dtype=torch.int64)
+    starts[1:] = lengths.cumsum(0)
+    found = [block.found for block in blocks if block.found is not None]
+    return LandmarkViews(
+        starts,
+        torch.cat([block.values for block in blocks]),
+        torch.cat([block.visible for block in blocks]),
+        torch.cat([block.axis_height for block in blocks]),
+        torch.cat([block.labels for block in blocks]),
+        np.concatenate([block.scene for block in blocks]),
+        np.concatenate([block.location for block in blocks]),
+        torch.cat(found) if found else None,
+    )
+
+
+class LandmarkLoader:
+    """Batches of views for `wheretolook.learning.set_network.SetNetwork`: a window of each view's landmarks.
+
+    Args:
+        views: the views.
+        rows: rows of `views` to go through, (n,).
+        batch_size: views a batch.
+        width: landmarks a view at most.
+        shuffle_seed: seed of order and windows; None goes through the views in order, from their first landmark.
+    """
+
+    def __init__(
+        self, views: LandmarkViews, rows: Tensor, batch_size: int, width: int, shuffle_seed: int | None = None
+    ) -> None:
+        self.views, self.rows, self.batch_size, self.width = views, rows.to(views.labels.device), batch_size, width
+        self.shuffle_seed, self._pass = shuffle_seed, 0
+
+    def __len__(self) -> int:
+        return ceil(len(self.rows) / self.batch_size)
+
+    def __iter__(self) -> Iterator[Batch]:
+        rows, device = self.rows, self.rows.device
+        generator = torch.Generator(device)
+        if self.shuffle_seed is not None:
+            generator.manual_seed(1_000_003 * self.shuffle_seed + self._pass)
+            self._pass += 1  # another order every time
+            rows = rows[torch.randperm(len(rows), generator=generator, device=device)]
+        for part in rows.split(self.batch_size):
+            starts, lengths = self.views.starts[part], self.views.starts[part + 1] - self.views.starts[part]
+            taken = lengths.clamp(max=self.width)
+            first = torch.zeros(len(part), device=device)
+            if self.shuffle_seed is not None:  # landmarks lie in random order, so any window is a random sample
+                first = torch.rand(len(part), generator=generator, device=device) * lengths
+            place = (first.long()[:, None] + torch.arange(int(taken.max()), device=device)) % lengths.clamp(min=1)[
+                :, None
+            ]
+            entries = (starts[:, None] + place).clamp(max=len(self.views.values) - 1)
+            inputs = (self.views.values[entries].float(), taken, self.views.visible[part], self.views.axis_height[part])
+            yield Batch(inputs, self.views.labels[part], len(part))

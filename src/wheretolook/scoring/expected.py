@@ -1,0 +1,116 @@
+"""What a view can be expected to find: landmarks weighted by the probability that the localizer finds them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import ClassVar
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from wheretolook.attributes import LandmarkDescriber, ViewLandmarks, image_cells
+from wheretolook.errors import ConfigError, WeightsError
+from wheretolook.fisher.metrics import METRICS, metric_of
+from wheretolook.geometry import Float
+from wheretolook.learning.matchability import Matchability
+from wheretolook.learning.set_network import expected_parts
+from wheretolook.localization_map import LocalizationMap
+from wheretolook.rendering.types import check_poses
+from wheretolook.scoring.base import Scorer
+from wheretolook.scoring.learned import check_field_of_view
+
+BINS = 30
+"""Bins along each side of the image, of which those expected to hold a found landmark are counted."""
+
+INLIERS, FILLED = "inliers", "bins"
+
+
+class Expectation:
+    """What the views of a map can be expected to find, shared by all scorers that are made of it.
+
+    Args:
+        localization_map: landmarks, camera and occlusion.
+        matchability: trained for cameras of the same field of view.
+    """
+
+    _of_maps: ClassVar[WeakKeyDictionary[LocalizationMap, dict[str, Expectation]]] = WeakKeyDictionary()
+
+    def __init__(self, localization_map: LocalizationMap, matchability: Matchability) -> None:
+        check_field_of_view(matchability.camera, localization_map.camera)
+        self.matchability, self.camera = matchability, localization_map.camera
+        self._describer = LandmarkDescriber(localization_map)
+        self._poses: Float = np.empty((0, 3, 4))
+        self._sums: Float = np.empty((0, 17))
+
+    @classmethod
+    def of_map(cls, localization_map: LocalizationMap, weights: str | Path) -> Expectation:
+        """The one of a map and a weights file.
+
+        Raises:
+            WeightsError: the file cannot be used, or was trained for another field of view than the map's camera.
+        """
+        known = cls._of_maps.setdefault(localization_map, {})
+        if str(weights) not in known:
+            try:
+                known[str(weights)] = cls(localization_map, Matchability.load(weights, localization_map.device))
+            except WeightsError as error:
+                raise WeightsError(error.problem, path=weights, value=error.value, fix=error.fix) from None
+        return known[str(weights)]
+
+    def sums(self, cam_from_world: Float) -> Float:
+        """Of poses (B, 3, 4), (B, 17): landmarks expected to be found; their information on the pose, 15 numbers (see
+        `wheretolook.fisher.information`, in the camera's axes); bins expected to hold one that is found.
+        """
+        cam_from_world = check_poses(cam_from_world)
+        if not np.array_equal(cam_from_world, self._poses):  # several methods ask for the same block of views
+            sums = np.empty((len(cam_from_world), 17))
+            for rows, described in self._describer.in_blocks(cam_from_world):
+                log_odds = self.matchability.log_odds(described.values)
+                parts = expected_parts(described.values, log_odds)[:, :16].double()
+                sums[rows, :16] = torch.segment_reduce(parts, "sum", lengths=described.counts, initial=0.0).cpu()
+                sums[rows, 16] = self._filled(described, log_odds).cpu()
+            self._poses, self._sums = cam_from_world.copy(), sums
+        return self._sums
+
+    def _filled(self, described: ViewLandmarks, log_odds: Tensor) -> Tensor:
+        """Bins expected to hold at least one landmark that is found, each found or not on its own, (B,)."""
+        cells = described.views * BINS**2 + image_cells(described, self.camera, BINS)
+        missed = torch.zeros(len(described) * BINS**2, dtype=torch.float64, device=cells.device)
+        missed.index_add_(0, cells, torch.nn.functional.logsigmoid(-log_odds).double())
+        return (1 - missed.exp()).view(len(described), -1).sum(1)
+
+
+class ExpectedScorer(Scorer):
+    """What a view can be expected to find, each landmark in view weighted by its learned chance of being found.
+
+    Args:
+        localization_map: the map.
+        weights: of a matchability model.
+        kind: "inliers", the landmarks expected to be found; "bins", the bins of the image expected to hold one;
+            "mineig", "logdet" or "trace" of the expected Fisher information of the pose.
+
+    Raises:
+        WeightsError: the weights cannot be used, or were trained for another field of view than the map's camera.
+        ConfigError: no such kind.
+    """
+
+    name: ClassVar[str] = "expected"
+
+    def __init__(self, localization_map: LocalizationMap, weights: str | Path, kind: str) -> None:
+        super().__init__(localization_map)
+        if kind not in (INLIERS, FILLED, *METRICS):
+            known = f"There are {', '.join((INLIERS, FILLED, *METRICS))}."
+            raise ConfigError("unknown expectation", value=kind, fix=known)
+        self.inputs = kind
+        self._expectation = Expectation.of_map(localization_map, weights)
+
+    def score(self, cam_from_world: Float) -> Float:
+        """(B,), not bounded by 1."""
+        sums = self._expectation.sums(cam_from_world)
+        if self.inputs == INLIERS:
+            return sums[:, 0].copy()
+        if self.inputs == FILLED:
+            return sums[:, 16].copy()
+        return metric_of(sums[:, 1:16], self.inputs)

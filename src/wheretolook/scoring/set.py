@@ -1,0 +1,61 @@
+"""The score of a network over the set of landmarks in view."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import torch
+
+from wheretolook.attributes import LandmarkDescriber
+from wheretolook.errors import WeightsError
+from wheretolook.geometry import Float
+from wheretolook.learning.set import SetModel
+from wheretolook.localization_map import LocalizationMap
+from wheretolook.rendering.types import check_poses
+from wheretolook.scoring.base import Scorer
+from wheretolook.scoring.learned import check_field_of_view
+
+
+class SetScorer(Scorer):
+    """Network over the set of landmarks in view: each by its chance of being found, all by what they tell of the pose.
+
+    Args:
+        localization_map: the map.
+        model: trained for cameras of the same field of view.
+
+    Raises:
+        WeightsError: trained for another field of view than the map's camera.
+    """
+
+    name: ClassVar[str] = "set"
+
+    def __init__(self, localization_map: LocalizationMap, model: SetModel) -> None:
+        super().__init__(localization_map)
+        check_field_of_view(model.camera, localization_map.camera)
+        self.model = model
+        model.network.to(localization_map.device)
+        self._describer = LandmarkDescriber(localization_map)
+
+    @classmethod
+    def load(cls, weights: str | Path, localization_map: LocalizationMap) -> SetScorer:
+        """Build a scorer from a weights file that the train stage wrote.
+
+        Raises:
+            WeightsError: the file cannot be used, or was trained for another field of view than the map's camera.
+        """
+        model = SetModel.load(weights, localization_map.device)
+        try:
+            return cls(localization_map, model)
+        except WeightsError as error:
+            raise WeightsError(error.problem, path=weights, value=error.value, fix=error.fix) from None
+
+    def score(self, cam_from_world: Float) -> Float:
+        """(B,) probabilities in [0, 1]."""
+        cam_from_world = check_poses(cam_from_world)
+        scores = np.empty(len(cam_from_world))
+        for rows, described in self._describer.in_blocks(cam_from_world):
+            height = torch.from_numpy(cam_from_world[rows, 2, 2]).to(described.values)
+            scores[rows] = self.model.log_odds(described, height).sigmoid().cpu().numpy()
+        return scores

@@ -77,17 +77,21 @@ MOST_OF_WINDOW = 2
 """Landmarks kept of a view, over those that a training step looks at."""
 
 
-def learn_set(task: Task) -> Learnt:
+def learn_set(task: Task, data: SetData | None = None) -> Learnt:
     """A set network from a dataset's labels.
 
     Whether landmarks are found it learns on the way, from the labels alone. If the dataset's `weights` folder has a
     matchability model of the same width, it starts from that.
 
+    Args:
+        task: what to do.
+        data: the dataset's views, if they have been described already.
+
     Raises:
         TableError: no train scene, no labels, or labels of one class only.
         WeightsError: the matchability model is damaged.
     """
-    data, options = SetData(task), task.config.set
+    data, options = data or SetData(task), task.config.set
     path = task.dataset.root / "weights" / weights_name(MATCHABILITY)
     start = Matchability.load(path).network if options.from_matchability and path.is_file() else None
     statistics = data.statistics if start is None else start.statistics

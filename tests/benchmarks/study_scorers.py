@@ -1,0 +1,147 @@
+"""Which learner to ship: seeds, ablations and learning curves, all judged on the validation scenes alone.
+
+    python tests/benchmarks/study_scorers.py seeds --data data --dataset release --out study
+    python tests/benchmarks/study_scorers.py attributes ...   the set network without each attribute of a landmark
+    python tests/benchmarks/study_scorers.py options ...      the set network with other options
+    python tests/benchmarks/study_scorers.py curves ...       with fewer training scenes and viewpoints
+
+The protocol, fixed before the test scenes were looked at: options are chosen by the mean validation average precision
+over seeds; of all learners the one with the best mean ships, with the weights of its best seed; test scenes and scenes
+of others are scored once, with every seed's weights. Appends one row a training to `<out>/<part>.csv`; rows that are
+there are not made again. Weights lie in `<out>/<variant>-<seed>/weights`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+
+from wheretolook.attributes import ATTRIBUTES
+from wheretolook.dataset import Dataset
+from wheretolook.learning.config import MATCHABILITY, SET, TrainConfig, weights_name
+from wheretolook.learning.fit import RunLog
+from wheretolook.learning.learner import Task
+from wheretolook.learning.set import SetData, learn_set
+from wheretolook.learning.training import train
+from wheretolook.tracking import TrackingConfig, start_run
+
+VARIANTS = ("2d+z", "2d+3d+landmark", "conv", "trees", "set", "sphere")
+
+OF_NETWORKS = {"balance": True, "batch_size": 4096, "noise_px": 1.0, "noise_m": 0.02, "epochs": 100}
+"""Options of the paper's network: those of configs/release.yaml, with a third of its epochs."""
+
+
+class Table:
+    """Rows in a CSV file, appended one by one.
+
+    Args:
+        path: of the file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        path.parent.mkdir(parents=True, exist_ok=True)
+
+    def has(self, **key: Any) -> bool:
+        """Whether there is a row with these values."""
+        if not self.path.is_file():
+            return False
+        table = pd.read_csv(self.path, keep_default_na=False)
+        return bool(np.logical_and.reduce([table[name].astype(str) == str(value) for name, value in key.items()]).any())
+
+    def add(self, row: dict[str, Any]) -> None:
+        """Append a row and print it."""
+        pd.DataFrame([row]).to_csv(self.path, mode="a", index=False, header=not self.path.is_file())
+        print(" ".join(f"{name} {value}" for name, value in row.items()), flush=True)
+
+
+def seeds(dataset: Dataset, args: argparse.Namespace, tracking: TrackingConfig) -> None:
+    """Every learner, several times."""
+    table = Table(args.out / "seeds.csv")
+    for seed in args.seeds:
+        for variant in args.variants:
+            if table.has(variant=variant, seed=seed):
+                continue
+            own = Dataset(args.out / f"{variant}-{seed}", dataset.camera, dataset.scenes)
+            start = dataset.root / "weights" / weights_name(MATCHABILITY)
+            if start.is_file():
+                (own.root / "weights").mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(start, own.root / "weights" / start.name)
+            config = TrainConfig(variants=(variant,), seed=seed, **OF_NETWORKS)
+            (model,) = train(own, config, tracking, progress=args.progress)
+            table.add({"variant": variant, "seed": seed, **metrics_of(model.metrics)})
+
+
+def metrics_of(metrics: dict[str, float]) -> dict[str, float]:
+    """The metrics that a study notes."""
+    return {name: round(metrics[f"val_{name}"], 5) for name in ("average_precision", "roc_auc", "bce")}
+
+
+def of_set_network(dataset: Dataset, args: argparse.Namespace, tracking: TrackingConfig) -> None:
+    """The set network under other conditions, all on views that are described once."""
+    table = Table(args.out / f"{args.part}.csv")
+    log = RunLog(tracking, "")
+    task = Task(dataset, TrainConfig(variants=(SET,)).of_variant(SET), SET, args.progress, log)
+    data = SetData(task)
+    whole = data.train_rows
+    conditions: list[tuple[str, dict[str, Any], torch.Tensor]] = []
+    if args.part == "attributes":
+        groups = {"none": (), **{name: (name,) for name in ATTRIBUTES[3:]}, "all": ATTRIBUTES[3:]}
+        conditions = [(name, {"hidden": hidden}, whole) for name, hidden in groups.items()]
+    if args.part == "options":
+        choices: list[dict[str, Any]] = [
+            {}, {"pooled": 8}, {"width": 96}, {"width": 24}, {"head": 96}, {"dropout": 0.3}, {"l2": 1e-4},
+            {"learning_rate": 1e-3}, {"epochs": 24}, {"from_matchability": False}, {"landmarks": 96},
+        ]  # fmt: skip
+        conditions = [(" ".join(f"{k}={v}" for k, v in one.items()) or "default", one, whole) for one in choices]
+    if args.part == "curves":
+        rows, rng = whole.numpy(), np.random.default_rng(0)
+        scene = data.views.scene[rows]
+        order = rng.permutation(np.unique(scene))
+        some = {f"{n} scenes": rows[np.isin(scene, order[:n])] for n in (1, 2, 3, 5, 7, 9) if n <= len(order)}
+        for share in (0.01, 0.03, 0.1, 0.3):
+            some[f"{share:g} of the views"] = np.sort(rng.choice(rows, int(share * len(rows)), replace=False))
+        conditions = [(name, {}, torch.from_numpy(chosen)) for name, chosen in some.items()]
+    for seed in args.seeds:
+        for name, options, rows in conditions:
+            if table.has(condition=name, seed=seed):
+                continue
+            data.train_rows = rows
+            settings = replace(TrainConfig(variants=(SET,), seed=seed).set, **options)
+            # as many steps, whatever there is to learn from
+            epochs = min(200, round(settings.epochs * len(whole) / len(rows)))
+            config = TrainConfig(variants=(SET,), seed=seed, set=replace(settings, epochs=epochs)).of_variant(SET)
+            data.config = config
+            torch.manual_seed(seed)
+            about = {"condition": name, "seed": seed}
+            with start_run(tracking, f"study {args.part} {name}", "train", about) as (_, run):
+                learnt = learn_set(replace(task, config=config, run_log=RunLog(tracking, run)), data)
+            table.add({"condition": name, "seed": seed, "views": len(rows), **metrics_of(learnt.metrics)})
+
+
+def main() -> None:
+    """Do one part of the study."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("part", choices=("seeds", "attributes", "options", "curves"))
+    parser.add_argument("--data", type=Path, default=Path("data"))
+    parser.add_argument("--dataset", default="release")
+    parser.add_argument("--out", type=Path, default=Path("study"))
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
+    parser.add_argument("--variants", nargs="+", default=list(VARIANTS))
+    parser.add_argument("--progress", action="store_true")
+    args = parser.parse_args()
+    whole = Dataset.load(args.data / args.dataset)
+    dataset = Dataset(whole.root, whole.camera, (*whole.split("train"), *whole.split("val")))
+    part = seeds if args.part == "seeds" else of_set_network
+    part(dataset, args, TrackingConfig(folder=str(args.out / "mlruns"), experiment="study"))
+
+
+if __name__ == "__main__":
+    main()

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from wheretolook.errors import ConfigError
-from wheretolook.features import INPUT_VARIANTS, Layout
+from wheretolook.features import CHANNELS, INPUT_VARIANTS, PAPER_VARIANTS, Layout
 
 RELEASED = "released"
 """The variant that trains as the paper's released code does, on the inputs of "2d+3d"."""
@@ -14,13 +14,16 @@ RELEASED = "released"
 TREES = "trees"
 """The variant that is no network: boosted trees on pooled statistics of what landmarks are like."""
 
-NETWORKS = (*INPUT_VARIANTS, RELEASED)
-"""Networks that can be trained."""
+CONV = "conv"
+"""The variant that is a convolutional network over the bins, which also knows what landmarks are like."""
 
-OWN_OPTIONS = {TREES: "trees"}
+NETWORKS = (*PAPER_VARIANTS, RELEASED)
+"""The paper's networks, of which a release ships one."""
+
+OWN_OPTIONS = {TREES: "trees", CONV: "conv"}
 """Variants that are not the paper's network, and the field of `TrainConfig` with the options of each."""
 
-VARIANTS = (*NETWORKS, *OWN_OPTIONS)
+VARIANTS = (*INPUT_VARIANTS, RELEASED, *OWN_OPTIONS)
 """All that can be trained."""
 
 RELEASED_OPTIONS: dict[str, Any] = {
@@ -98,13 +101,42 @@ class FittingConfig:
 
 
 @dataclass(frozen=True)
+class ConvConfig(FittingConfig):
+    """Options of the convolutional network over the bins.
+
+    Args:
+        epochs, batch_size, learning_rate, l2: see `FittingConfig`.
+        widths: channels after each convolution; every one but the first halves the sides of the grid.
+        dropout: share of pooled values dropped in training.
+        bins: bins along each side of the image.
+    """
+
+    widths: tuple[int, ...] = (32, 64, 128, 128)
+    dropout: float = 0.2
+    bins: int = 30
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.widths or min(self.widths) < 1:
+            raise ConfigError(
+                "convolutions must be at least one channel wide, and there must be one", value=self.widths
+            )
+        if not 0 <= self.dropout < 1 or self.bins < 1:
+            raise ConfigError(
+                "a convolutional network needs bins >= 1 and a dropout from 0 to less than 1",
+                value=(self.bins, self.dropout),
+            )
+
+
+@dataclass(frozen=True)
 class TrainConfig:
     """Options of training. The defaults are the paper's where it says something (Sec. 3.3 and 4).
 
     Args:
-        variants: what to train: networks by their inputs, "2d", "2d+z" and "2d+3d"; "released", which has the inputs
-            "2d+3d" and learns with the options of the paper's released code instead of those here; and "trees",
-            boosted trees that know what landmarks are like, with the options in `trees` and none of the network's.
+        variants: what to train: networks by their inputs, "2d", "2d+z" and "2d+3d", and "2d+3d+landmark", which is
+            also told what landmarks are like; "released", which has the inputs "2d+3d" and learns with the options of
+            the paper's released code instead of those here; and, with options of their own and none of the network's,
+            "trees", boosted trees that know what landmarks are like, and "conv", a convolutional network that does.
         epochs: passes over the training viewpoints (paper: 300).
         batch_size: viewpoints a step, shared out over the devices (the paper gives none; 128 is the released code's).
         learning_rate: Adam's initial learning rate (paper: 1e-3; released code: 1e-4).
@@ -134,9 +166,10 @@ class TrainConfig:
         devices: GPUs, or processes on the CPU, to train with. One step of many is one step of one: each takes its share
             of the same batch. Dropout and noise draw other numbers, though.
         trees: options of "trees".
+        conv: options of "conv".
     """
 
-    variants: tuple[str, ...] = tuple(INPUT_VARIANTS)
+    variants: tuple[str, ...] = tuple(PAPER_VARIANTS)
     epochs: int = 300
     batch_size: int = 128
     learning_rate: float = 1e-3
@@ -159,6 +192,7 @@ class TrainConfig:
     accelerator: Literal["auto", "cpu", "gpu"] = "auto"
     devices: int = 1
     trees: TreesConfig = field(default_factory=TreesConfig)
+    conv: ConvConfig = field(default_factory=ConvConfig)
 
     def __post_init__(self) -> None:
         unknown = [name for name in self.variants if name not in VARIANTS]
@@ -213,3 +247,8 @@ def weights_name(variant: str) -> str:
 def inputs_of(variant: str) -> str:
     """The key in `wheretolook.features.INPUT_VARIANTS` of what a variant looks at."""
     return "2d+3d" if variant == RELEASED else variant
+
+
+def needs_landmark_channels(variant: str) -> bool:
+    """Whether a variant of the paper's network looks at more than `wheretolook.features.CHANNELS`."""
+    return not {*INPUT_VARIANTS[inputs_of(variant)]} <= {*CHANNELS}

@@ -17,7 +17,15 @@ from wheretolook.dataset import Dataset, write_json
 from wheretolook.errors import ConfigError
 from wheretolook.features import INPUT_VARIANTS
 from wheretolook.learning.classifier import ViewpointClassifier
-from wheretolook.learning.config import OWN_OPTIONS, TREES, TrainConfig, inputs_of, weights_name
+from wheretolook.learning.config import (
+    CONV,
+    OWN_OPTIONS,
+    TREES,
+    TrainConfig,
+    inputs_of,
+    needs_landmark_channels,
+    weights_name,
+)
 from wheretolook.learning.data import ViewpointDataModule
 from wheretolook.learning.fit import EpochRecord, RunLog, fit, home_device
 from wheretolook.learning.learner import Learner, Task
@@ -97,7 +105,10 @@ def train(
             model = _learn(dataset, options, variant, path, about, tracking, progress)
         elif model is None:
             if data is None or data.config != options:
-                data = ViewpointDataModule(dataset, options, home_device(options), progress)
+                networks = [one for one in config.variants if one not in OWN_OPTIONS]
+                sharing = [one for one in networks if config.of_variant(one) == options]
+                wide = any(map(needs_landmark_channels, sharing))
+                data = ViewpointDataModule(dataset, options, home_device(options), progress, wide)
             data.setup()
             model = _train_variant(data, variant, path, about, tracking, progress)
         models.append(model)
@@ -110,6 +121,10 @@ def learner_of(variant: str) -> Learner:
         from wheretolook.learning.trees import learn_trees
 
         return learn_trees
+    if variant == CONV:
+        from wheretolook.learning.conv import learn_conv
+
+        return learn_conv
     raise ConfigError("no such variant", value=variant)
 
 

@@ -2,15 +2,30 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from conftest import RandomViews
+from synthetic_dataset import make_landmarks
+from wheretolook.attributes import ATTRIBUTES, LandmarkDescriber
 from wheretolook.camera_models import ColmapCamera
 from wheretolook.errors import ConfigError
-from wheretolook.features import CHANNELS, INPUT_VARIANTS, arrange, bin_views, bin_views_plain
+from wheretolook.features import (
+    ALL_CHANNELS,
+    CHANNELS,
+    INPUT_VARIANTS,
+    LANDMARK_CHANNELS,
+    PAPER_VARIANTS,
+    arrange,
+    bin_views,
+    bin_views_plain,
+)
 from wheretolook.geometry import PinholeCamera, transform
-from wheretolook.visibility import VisibleSets
+from wheretolook.localization_map import LocalizationMap
+from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.visibility import VisibleSets, visible_landmarks
 
 LOOKING_ALONG_Z = np.eye(3, 4)[None]
 
@@ -61,6 +76,52 @@ def test_a_distorted_camera_bins_what_it_projects(random_views: RandomViews) -> 
         np.testing.assert_array_equal(binned.counts[view], expected)
 
 
+def landmarks_of(views: RandomViews) -> Landmarks:
+    return replace(make_landmarks(np.random.default_rng(0), len(views.points)), points=views.points)
+
+
+def test_kernel_bins_what_landmarks_are_like_as_its_plain_twin(random_views: RandomViews, device: str) -> None:
+    v, landmarks = random_views, landmarks_of(random_views)
+    arguments = v.camera, v.cam_from_world, v.points, v.visible, v.location_rows
+    kernel = bin_views(*arguments, bins=12, device=device, landmarks=landmarks)
+    plain = bin_views_plain(*arguments, bins=12, landmarks=landmarks)
+    assert kernel.channels == plain.channels == ALL_CHANNELS
+    np.testing.assert_array_equal(kernel.counts, plain.counts)
+    np.testing.assert_allclose(kernel.means, plain.means, rtol=1e-5, atol=2e-5)
+    without = bin_views(*arguments, bins=12, device=device)
+    assert without.channels == CHANNELS
+    np.testing.assert_array_equal(kernel.means[:, : len(CHANNELS)], without.means)  # who does not ask pays nothing
+    assert plain.means[:, len(CHANNELS) :].std((0, 2, 3)).min() > 0.01
+
+
+@pytest.mark.parametrize("distorted", [False, True])
+def test_channels_of_landmarks_are_means_of_their_attributes(random_views: RandomViews, distorted: bool) -> None:
+    v, landmarks = random_views, landmarks_of(random_views)
+    camera = ColmapCamera("RADIAL", 320, 240, (150.0, 165.0, 118.0, -0.15, 0.02)) if distorted else v.camera
+    arguments = v.cam_from_world, v.points, v.visible, v.location_rows
+    binned = bin_views(camera, *arguments, bins=1, landmarks=landmarks)
+    seen = visible_landmarks(camera, *arguments)
+    described = LandmarkDescriber(LocalizationMap(landmarks, camera)).describe(v.cam_from_world, seen)
+    of_bins = [ATTRIBUTES.index(name) for name in LANDMARK_CHANNELS]
+    for view in range(len(v.cam_from_world)):
+        values = described.values[described.views == view].numpy()[:, of_bins]
+        expected = values.mean(0) if len(values) else np.zeros(len(LANDMARK_CHANNELS))
+        np.testing.assert_allclose(binned.means[view, len(CHANNELS) :, 0, 0], expected, rtol=1e-4, atol=1e-5)
+
+
+def test_a_mean_with_an_unknown_value_is_unknown_and_nothing_else_is(random_views: RandomViews, device: str) -> None:
+    v, landmarks = random_views, landmarks_of(random_views)
+    known = np.random.default_rng(1).random(len(landmarks)) < 0.9
+    landmarks = replace(landmarks, ambiguity=np.where(known, landmarks.ambiguity, np.nan).astype(np.float32))
+    arguments = v.camera, v.cam_from_world, v.points, v.visible, v.location_rows
+    kernel = bin_views(*arguments, bins=12, device=device, landmarks=landmarks)
+    plain = bin_views_plain(*arguments, bins=12, landmarks=landmarks)
+    np.testing.assert_array_equal(np.isnan(kernel.means), np.isnan(plain.means))
+    unknown = np.isnan(kernel.means).sum((0, 2, 3))
+    assert 0 < unknown[ALL_CHANNELS.index("ambiguity")] < (kernel.counts > 0).sum()
+    assert unknown.sum() == unknown[ALL_CHANNELS.index("ambiguity")]
+
+
 def test_blocks_do_not_change_the_bins(random_views: RandomViews) -> None:
     v = random_views
     arguments = v.camera, v.cam_from_world, v.points, v.visible, v.location_rows
@@ -72,8 +133,9 @@ def test_blocks_do_not_change_the_bins(random_views: RandomViews) -> None:
 def test_input_sizes_are_those_of_the_variants(random_views: RandomViews) -> None:
     v = random_views
     binned = bin_views(v.camera, v.cam_from_world, v.points, v.visible, v.location_rows)
-    sizes = {name: binned.select(channels).means[0].size for name, channels in INPUT_VARIANTS.items()}
+    sizes = {name: binned.select(channels).means[0].size for name, channels in PAPER_VARIANTS.items()}
     assert sizes == {"2d": 1800, "2d+z": 2700, "2d+3d": 4500}
+    assert len(INPUT_VARIANTS["2d+3d+landmark"]) * 900 == 12600
     np.testing.assert_array_equal(binned.select(("z",)).means[:, 0], binned.means[:, CHANNELS.index("z")])
     with pytest.raises(ConfigError, match="unknown input channel"):
         binned.select(("u", "colour"))

@@ -16,7 +16,7 @@ from torch import Tensor
 from wheretolook.camera_models import Camera, ColmapCamera
 from wheretolook.geometry import Float, split_poses
 from wheretolook.localization_map import LocalizationMap
-from wheretolook.mapping.landmarks import MAP_ATTRIBUTES
+from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 from wheretolook.visibility import VisibleSets
 
 BLOCK_ENTRIES = 1 << 18

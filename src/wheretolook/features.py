@@ -8,7 +8,7 @@ the filled ones to the front, so that an input has no fixed place in the image. 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import warp as wp
@@ -18,6 +18,7 @@ from wheretolook.camera_models import Camera, ColmapCamera
 from wheretolook.errors import ConfigError
 from wheretolook.features_kernel import bin_kernel
 from wheretolook.geometry import Float, split_poses
+from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 from wheretolook.visibility.frustum import (
     MIN_DEPTH_M,
     VisibleSets,
@@ -29,15 +30,27 @@ from wheretolook.visibility.frustum import (
 )
 from wheretolook.warp_setup import start_warp
 
+if TYPE_CHECKING:
+    from wheretolook.mapping.landmarks import Landmarks
+
 CHANNELS = ("u", "v", "x", "y", "z")
 """Channels of every landmark: pixel (u, v) and position (x, y, z) in the camera frame in metres."""
 
-INPUT_VARIANTS: dict[str, tuple[str, ...]] = {
+LANDMARK_CHANNELS = ("mapped_angle", "distance_ratio", *MAP_ATTRIBUTES)
+"""Channels of what landmarks are like, on request only: two of `wheretolook.attributes.POSE_ATTRIBUTES`, and what the
+map knows. A bin's mean is NaN where one of its landmarks' values is not known."""
+
+ALL_CHANNELS = CHANNELS + LANDMARK_CHANNELS
+
+PAPER_VARIANTS: dict[str, tuple[str, ...]] = {
     "2d": ("u", "v"),
     "2d+z": ("u", "v", "z"),
     "2d+3d": ("u", "v", "x", "y", "z"),
 }
 """The paper's inputs by name: 1,800, 2,700 and 4,500 values at 30 x 30 bins (its "4220" is a stale number)."""
+
+INPUT_VARIANTS: dict[str, tuple[str, ...]] = {**PAPER_VARIANTS, "2d+3d+landmark": ALL_CHANNELS}
+"""All inputs of the paper's network by name: the paper's own, and with what landmarks are like."""
 
 Layout = Literal["in_place", "compact"]
 
@@ -47,8 +60,8 @@ class BinnedViews:
     """Landmarks of a batch of views, binned.
 
     Attributes:
-        means: (B, C, bins, bins) float32, mean of each channel over a bin's landmarks, zero where there are none. Rows
-            go down the image, columns right.
+        means: (B, C, bins, bins) float32, mean of each channel over a bin's landmarks, zero where there are none, NaN
+            where a landmark's value is not known. Rows go down the image, columns right.
         counts: (B, bins, bins) int32, landmarks in each bin.
         channels: names of the C channels.
     """
@@ -112,8 +125,9 @@ def bin_views(
     bins: int = 30,
     device: str = "cpu",
     block_bytes: int = 1 << 30,
+    landmarks: Landmarks | None = None,
 ) -> BinnedViews:
-    """Bin the visible landmarks of every view, with all of `CHANNELS`.
+    """Bin the visible landmarks of every view, with all of `CHANNELS` or, on request, of `ALL_CHANNELS`.
 
     Args:
         camera: pinhole, or any COLMAP model (which is projected by COLMAP on the CPU).
@@ -124,15 +138,23 @@ def bin_views(
         bins: bins along each side of the image.
         device: "cpu" or a CUDA device; one thread a view, so that sums do not depend on the order of threads.
         block_bytes: views are worked through in blocks of about this many bytes.
+        landmarks: whose the points are; with them the bins also have `LANDMARK_CHANNELS`, for about three times the
+            memory.
     """
     if isinstance(camera, ColmapCamera):
-        return bin_views_plain(camera, cam_from_world, points, visible, location_rows, bins)
+        return bin_views_plain(camera, cam_from_world, points, visible, location_rows, bins, landmarks)
     device = start_warp(device)
-    n_views, n_channels = len(cam_from_world), len(CHANNELS)
+    channels = CHANNELS if landmarks is None else ALL_CHANNELS
+    n_views, n_channels = len(cam_from_world), len(channels)
     means = np.empty((n_views, n_channels, bins, bins), dtype=np.float32)
     counts = np.empty((n_views, bins, bins), dtype=np.int32)
     block = max(1, block_bytes // (bins * bins * (n_channels + 1) * 4))
     points_on_device: Any = wp.array(np.asarray(points, dtype=np.float64), dtype=wp.vec3d, device=device)
+    directions: Any = wp.empty(0, dtype=wp.vec3, device=device)
+    attributes: Any = wp.empty((0, len(MAP_ATTRIBUTES)), dtype=wp.float32, device=device)
+    if landmarks is not None:
+        directions = wp.array(landmarks.mapping_direction, dtype=wp.vec3, device=device)
+        attributes = wp.array(landmarks.attributes(), dtype=wp.float32, device=device)
     starts: Any = wp.array(visible.starts, dtype=wp.int32, device=device)
     indices: Any = wp.array(visible.indices, dtype=wp.int32, device=device)
     for begin in range(0, n_views, block):
@@ -149,7 +171,7 @@ def bin_views(
                 wp.array(rotations.astype(np.float32), dtype=wp.mat33, device=device),
                 wp.array(centers, dtype=wp.vec3d, device=device),
                 wp.array(np.asarray(location_rows[rows], dtype=np.int32), dtype=wp.int32, device=device),
-                points_on_device, starts, indices,
+                points_on_device, directions, attributes, starts, indices,
                 wp.float64(camera.focal_px), wp.float64(camera.cx), wp.float64(camera.cy),
                 wp.float64(bins / camera.width), wp.float64(bins / camera.height), wp.float64(MIN_DEPTH_M), bins,
             ],
@@ -158,7 +180,7 @@ def bin_views(
         )  # fmt: skip
         means[rows] = block_means.numpy().reshape(-1, n_channels, bins, bins)
         counts[rows] = block_counts.numpy().reshape(-1, bins, bins)
-    return BinnedViews(means, counts, CHANNELS)
+    return BinnedViews(means, counts, channels)
 
 
 def bin_views_plain(
@@ -168,22 +190,34 @@ def bin_views_plain(
     visible: VisibleSets,
     location_rows: NDArray[np.integer[Any]],
     bins: int = 30,
+    landmarks: Landmarks | None = None,
 ) -> BinnedViews:
     """What `bin_views` computes, in NumPy."""
+    channels = CHANNELS if landmarks is None else ALL_CHANNELS
+    attributes = None if landmarks is None else landmarks.attributes()
     n_views, n_cells = len(cam_from_world), bins * bins
-    means = np.zeros((n_views, len(CHANNELS), n_cells), dtype=np.float32)
+    means = np.zeros((n_views, len(channels), n_cells), dtype=np.float32)
     counts = np.zeros((n_views, n_cells), dtype=np.int32)
     rows = zip(*split_poses(cam_from_world), location_rows, strict=True)
     for view, (rotation, center, location) in enumerate(rows):
-        offsets = offsets_from(center, points[visible[int(location)]])
-        offsets = offsets[in_view(camera, rotation[None], offsets)[0]]
+        in_sight = visible[int(location)]
+        offsets = offsets_from(center, points[in_sight])
+        inside = in_view(camera, rotation[None], offsets)[0]
+        offsets, in_sight = offsets[inside], in_sight[inside]
         seen = rotate(rotation.astype(np.float32), offsets)
         pixels = pixels_of(camera, seen)
         scale = np.array([bins / camera.width, bins / camera.height])
         column, row = np.clip((pixels * scale).astype(int), 0, bins - 1).T
         cell = row * bins + column
         counts[view] = np.bincount(cell, minlength=n_cells)
-        for channel, values in enumerate([*pixels.T, *seen.T]):
+        columns = [*pixels.T, *seen.T]
+        if landmarks is not None and attributes is not None:
+            distance = np.linalg.norm(offsets.astype(np.float64), axis=1)
+            along = (offsets.astype(np.float64) * landmarks.mapping_direction[in_sight]).sum(1)
+            of_map = attributes[in_sight]
+            ratio = np.log(distance) - of_map[:, MAP_ATTRIBUTES.index("mapped_distance")]
+            columns += [along / distance, ratio, *of_map.T]
+        for channel, values in enumerate(columns):
             total = np.bincount(cell, weights=values, minlength=n_cells)
             means[view, channel] = total / np.maximum(counts[view], 1)
-    return BinnedViews(means.reshape(n_views, -1, bins, bins), counts.reshape(n_views, bins, bins), CHANNELS)
+    return BinnedViews(means.reshape(n_views, -1, bins, bins), counts.reshape(n_views, bins, bins), channels)

@@ -7,9 +7,12 @@ from __future__ import annotations
 
 import warp as wp
 
+from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 from wheretolook.visibility.frustum_kernel import dot, in_view, offset_from, pixel_of
 
 wp.set_module_options({"fuse_fp": False})  # for `pixel_of`
+
+MAPPED_DISTANCE = wp.constant(MAP_ATTRIBUTES.index("mapped_distance"))
 
 
 @wp.kernel
@@ -19,6 +22,8 @@ def bin_kernel(
     centers: wp.array[wp.vec3d],
     location_rows: wp.array[wp.int32],
     points: wp.array[wp.vec3d],
+    directions: wp.array[wp.vec3],
+    attributes: wp.array2d[wp.float32],  # of no landmark where they are not asked for
     starts: wp.array[wp.int32],
     indices: wp.array[wp.int32],
     focal: wp.float64,
@@ -36,7 +41,8 @@ def bin_kernel(
     center = centers[view]
     location = location_rows[view]
     for entry in range(starts[location], starts[location + 1]):
-        offset = offset_from(center, points[indices[entry]])
+        landmark = indices[entry]
+        offset = offset_from(center, points[landmark])
         if in_view(sides, view, offset, min_depth):
             pixel = pixel_of(rotation, offset, focal, cx, cy)
             column = wp.clamp(wp.int32(pixel[0] * columns_per_pixel), 0, bins - 1)
@@ -48,8 +54,17 @@ def bin_kernel(
             means[view, 2, cell] = means[view, 2, cell] + wp.float32(dot(rotation[0], offset))
             means[view, 3, cell] = means[view, 3, cell] + wp.float32(dot(rotation[1], offset))
             means[view, 4, cell] = means[view, 4, cell] + wp.float32(dot(rotation[2], offset))
+            if attributes.shape[0] > 0:
+                distance = wp.sqrt(dot(offset, offset))
+                angle = wp.float32(dot(offset, directions[landmark]) / distance)
+                ratio = wp.float32(wp.log(distance) - wp.float64(attributes[landmark, MAPPED_DISTANCE]))
+                means[view, 5, cell] = means[view, 5, cell] + angle
+                means[view, 6, cell] = means[view, 6, cell] + ratio
+                for column_of_map in range(attributes.shape[1]):
+                    value = attributes[landmark, column_of_map]
+                    means[view, 7 + column_of_map, cell] = means[view, 7 + column_of_map, cell] + value
     for cell in range(bins * bins):
         if counts[view, cell] > 1:
             scale = 1.0 / wp.float32(counts[view, cell])
-            for channel in range(5):
+            for channel in range(means.shape[1]):
                 means[view, channel, cell] = means[view, channel, cell] * scale

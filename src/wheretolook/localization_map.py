@@ -74,8 +74,13 @@ class LocalizationMap:
             occlusion = MeshOcclusion(MeshRaycaster(loaded, device), two_sided=two_sided)
         return cls(landmarks, camera, occlusion, device)
 
-    def bin_views(self, cam_from_world: Float, bins: int = 30) -> BinnedViews:
-        """Bin the landmarks that views (B, 3, 4) see. Views that share a location share its occlusion test.
+    def bin_views(self, cam_from_world: Float, bins: int = 30, landmark_channels: bool = False) -> BinnedViews:
+        """Bin the landmarks that views see. Views that share a location share its occlusion test.
+
+        Args:
+            cam_from_world: (B, 3, 4).
+            bins: bins along each side of the image.
+            landmark_channels: whether the bins also tell what landmarks are like (`ALL_CHANNELS`, not `CHANNELS`).
 
         Raises:
             ValueError: the poses have another shape, or entries that are not finite.
@@ -83,8 +88,9 @@ class LocalizationMap:
         cam_from_world = check_poses(cam_from_world)
         unoccluded, rows = self._unoccluded(cam_from_world)
         return bin_views(
-            self.camera, cam_from_world, self.landmarks.points, unoccluded, rows, bins=bins, device=self.device
-        )
+            self.camera, cam_from_world, self.landmarks.points, unoccluded, rows, bins=bins, device=self.device,
+            landmarks=self.landmarks if landmark_channels else None,
+        )  # fmt: skip
 
     def visible_landmarks(self, cam_from_world: Float) -> VisibleSets:
         """The landmarks that each of the views (B, 3, 4) sees. Views that share a location share its occlusion test.

@@ -27,7 +27,7 @@ import torch
 from lightning.pytorch import LightningModule, Trainer, seed_everything
 
 from wheretolook.dataset import Dataset
-from wheretolook.features import CHANNELS, INPUT_VARIANTS
+from wheretolook.features import CHANNELS, PAPER_VARIANTS
 from wheretolook.geometry import PinholeCamera
 from wheretolook.learning.classifier import ViewpointClassifier, weight_penalty, weighted_bce
 from wheretolook.learning.config import TrainConfig
@@ -101,7 +101,7 @@ class TimedRecord(EpochRecord):
 def make_network(data: ViewpointDataModule, variant: str) -> ViewpointNetwork:
     config = data.config
     seed_everything(config.seed, verbose=False)
-    statistics_of_variant = data.statistics.select(INPUT_VARIANTS[variant])
+    statistics_of_variant = data.statistics.select(PAPER_VARIANTS[variant])
     return ViewpointNetwork(
         NetworkSpec(variant, CAMERA, statistics_of_variant, config.bins, config.layout, config.hidden, config.dropout)
     )
@@ -141,7 +141,7 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         data = ViewpointDataModule(Dataset(folder, CAMERA, ()), config, device, progress=False)
         data.use(views, np.arange(len(views)) >= args.views)
-        data.channels = INPUT_VARIANTS[args.variant]
+        data.channels = PAPER_VARIANTS[args.variant]
         split = now(device)
         tracking = TrackingConfig(folder, "benchmark")
         with start_run(tracking, "benchmark", "train") as (_, run_id):
@@ -203,7 +203,7 @@ def main() -> None:
     )
     parser.add_argument("--devices", type=int, default=1, help="GPUs or processes; no bare loop if more than 1")
     parser.add_argument(
-        "--variant", choices=list(INPUT_VARIANTS), default="2d", help="input of the network (default: 2d)"
+        "--variant", choices=list(PAPER_VARIANTS), default="2d", help="input of the network (default: 2d)"
     )
     parser.add_argument("--hidden", type=int, nargs="*", default=[300, 300], help="hidden widths (default: 300 300)")
     parser.add_argument("--bare-epochs", type=int, help="epochs of the bare loop (default: as many)")

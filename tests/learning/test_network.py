@@ -11,9 +11,16 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from wheretolook.errors import WeightsError
-from wheretolook.features import CHANNELS, INPUT_VARIANTS, arrange
+from wheretolook.features import ALL_CHANNELS, CHANNELS, INPUT_VARIANTS, LANDMARK_CHANNELS, arrange
 from wheretolook.geometry import PinholeCamera
-from wheretolook.learning.network import BinnedInput, InputStatistics, NetworkSpec, ViewpointNetwork, move_to_front
+from wheretolook.learning.network import (
+    BinnedInput,
+    InputStatistics,
+    NetworkSpec,
+    ViewpointNetwork,
+    add_noise,
+    move_to_front,
+)
 from wheretolook.learning.weights import METADATA_KEY, load_classifier, read_training, save_classifier
 
 BINS = 6
@@ -25,15 +32,15 @@ def views() -> tuple[torch.Tensor, torch.Tensor]:
     generator = torch.Generator().manual_seed(0)
     filled = torch.rand((50, BINS, BINS), generator=generator) < 0.4
     filled[0] = False
-    scale = torch.tensor([100.0, 70.0, 1.0, 2.0, 5.0])[:, None, None]
-    values = torch.randn((50, len(CHANNELS), BINS, BINS), generator=generator)
+    scale = torch.tensor([100.0, 70.0, 1.0, 2.0, 5.0] + [0.3] * len(LANDMARK_CHANNELS))[:, None, None]
+    values = torch.randn((50, len(ALL_CHANNELS), BINS, BINS), generator=generator)
     return (values + 3) * scale * filled[:, None], filled
 
 
 def make_network(
     views: tuple[torch.Tensor, torch.Tensor], variant: str = "2d+z", **options: object
 ) -> ViewpointNetwork:
-    statistics = InputStatistics.of(*views, torch.arange(50)).select(INPUT_VARIANTS[variant])
+    statistics = InputStatistics.of(*views, torch.arange(50), ALL_CHANNELS).select(INPUT_VARIANTS[variant])
     torch.manual_seed(1)
     spec = NetworkSpec(variant, PinholeCamera(64, 48, 32.0), statistics, bins=BINS, hidden=(8, 8), **options)  # type: ignore[arg-type]
     return ViewpointNetwork(spec).eval()
@@ -42,8 +49,8 @@ def make_network(
 def test_statistics_are_over_filled_bins_of_the_given_views(views: tuple[torch.Tensor, torch.Tensor]) -> None:
     means, filled = views
     rows = torch.arange(10, 40)
-    statistics = InputStatistics.of(means, filled, rows)
-    for index, name in enumerate(CHANNELS):
+    statistics = InputStatistics.of(means, filled, rows, ALL_CHANNELS)
+    for index, name in enumerate(ALL_CHANNELS):
         values = means[rows, index][filled[rows]].double()
         assert statistics.mean[statistics.channels.index(name)] == pytest.approx(values.mean().item(), rel=1e-6)
         assert statistics.std[index] == pytest.approx(values.std(correction=0).item(), rel=1e-5)
@@ -59,7 +66,7 @@ def test_standardized_inputs_have_mean_0_and_deviation_1_where_filled_and_are_0_
     views: tuple[torch.Tensor, torch.Tensor], variant: str
 ) -> None:
     means, filled = views
-    statistics = InputStatistics.of(means, filled, torch.arange(50)).select(INPUT_VARIANTS[variant])
+    statistics = InputStatistics.of(means, filled, torch.arange(50), ALL_CHANNELS).select(INPUT_VARIANTS[variant])
     layer = BinnedInput(NetworkSpec(variant, PinholeCamera(), statistics, bins=BINS))
     values = layer(means, filled).reshape(50, -1, BINS, BINS)
     assert values.shape[1] == len(INPUT_VARIANTS[variant])
@@ -67,6 +74,36 @@ def test_standardized_inputs_have_mean_0_and_deviation_1_where_filled_and_are_0_
         assert torch.all(channel[~filled] == 0)
         assert channel[filled].mean().item() == pytest.approx(0, abs=1e-5)
         assert channel[filled].std(correction=0).item() == pytest.approx(1, abs=1e-4)
+
+
+def test_what_is_not_known_of_landmarks_is_the_mean_of_what_is(views: tuple[torch.Tensor, torch.Tensor]) -> None:
+    means, filled = views
+    ambiguity, spread = (ALL_CHANNELS.index(name) for name in ("ambiguity", "distance_spread"))
+    known = means.clone()
+    means[:20, ambiguity] = torch.where(filled[:20], torch.nan, 0.0)  # a map without descriptors
+    means[:, spread] = torch.where(filled, torch.nan, 0.0)  # known of no map
+    statistics = InputStatistics.of(means, filled, torch.arange(50), ALL_CHANNELS)
+    rest = InputStatistics.of(means[20:], filled[20:], torch.arange(30), ALL_CHANNELS)
+    assert statistics.mean[ambiguity] == pytest.approx(rest.mean[ambiguity], rel=1e-9)
+    assert statistics.std[ambiguity] == pytest.approx(rest.std[ambiguity], rel=1e-6)
+
+    variant = "2d+3d+landmark"
+    layer = BinnedInput(NetworkSpec(variant, PinholeCamera(), statistics, bins=BINS))
+    values = layer(means, filled).reshape(known.shape)
+    assert values.isfinite().all()
+    assert torch.all(values[:20, ambiguity] == 0) and values[20:, ambiguity].std() > 0.1
+    assert torch.all(values[:, spread] == 0)
+    # what was never known while it learnt says nothing to a network when it is
+    assert torch.all(layer(known, filled).reshape(known.shape)[:, spread] == 0)
+    means[3, 0, 2, 2] = torch.nan  # where a landmark lies is always known: such an error is not hidden
+    assert layer(means, torch.ones_like(filled)).isnan().any()
+
+
+def test_noise_leaves_what_landmarks_are_like(views: tuple[torch.Tensor, torch.Tensor]) -> None:
+    means, filled = views
+    noisy = add_noise(means, filled, noise_px=2.0, noise_m=0.1, channels=ALL_CHANNELS)
+    changed = (noisy != means).sum((0, 2, 3)) > 0
+    assert changed.tolist() == [name in CHANNELS for name in ALL_CHANNELS]
 
 
 def test_compact_layout_is_the_one_of_features(views: tuple[torch.Tensor, torch.Tensor]) -> None:

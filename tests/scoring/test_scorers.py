@@ -11,9 +11,10 @@ import torch
 from synthetic_dataset import CAMERA, make_landmarks
 from wheretolook.attributes import LandmarkDescriber, pool
 from wheretolook.errors import ConfigError, WeightsError
-from wheretolook.features import CHANNELS, INPUT_VARIANTS, BinnedViews
+from wheretolook.features import ALL_CHANNELS, CHANNELS, INPUT_VARIANTS, BinnedViews
 from wheretolook.geometry import Float, PinholeCamera, poses_looking_along
 from wheretolook.learning.config import TreesConfig
+from wheretolook.learning.conv import ConvNetwork, ConvSpec
 from wheretolook.learning.network import InputStatistics, NetworkSpec, ViewpointNetwork
 from wheretolook.learning.trees import BoostedTrees, PooledViews, fit_trees
 from wheretolook.learning.weights import save_classifier
@@ -53,6 +54,13 @@ def some_trees(localization_map: LocalizationMap) -> BoostedTrees:
     return fit_trees(views, views, CAMERA, TreesConfig(max_trees=10, max_leaves=15, min_leaf=3))[0]
 
 
+def some_convolutions() -> ConvNetwork:
+    """An untrained network whose scores differ from view to view."""
+    torch.manual_seed(0)
+    mean, std = (80.0, 60.0, 0.0, 0.0, 2.0, *[0.5] * 9), (40.0, 30.0, *[1.0] * 12)
+    return ConvNetwork(ConvSpec(CAMERA, InputStatistics(ALL_CHANNELS, mean, std), 30, (8, 8), 0.0))
+
+
 @pytest.mark.parametrize("name", SCORERS)
 def test_scorers_keep_their_contract(
     name: str, localization_map: LocalizationMap, views: Float, weights: Path, monkeypatch: pytest.MonkeyPatch
@@ -60,6 +68,9 @@ def test_scorers_keep_their_contract(
     if name == "trees":
         weights = weights.with_name("trees.safetensors")
         some_trees(localization_map).save(weights)
+    if name == "conv":
+        weights = weights.with_name("conv.safetensors")
+        some_convolutions().save(weights)
     scorer = make_scorer(name, localization_map, seed=3, weights=weights)
     assert isinstance(scorer, Scorer)
     assert name in (scorer.name, f"{scorer.name}-{scorer.inputs.replace(' ', '-')}")

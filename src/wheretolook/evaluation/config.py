@@ -28,8 +28,8 @@ class EvaluateConfig:
 
     Args:
         methods: methods to compare, keys of `wheretolook.scoring.SCORERS`; if not named, all but
-            `wheretolook.scoring.registry.OPTIONAL`. "mlp" and "trees" stand
-            for every weights file of their kind.
+            `wheretolook.scoring.registry.OPTIONAL`. Methods that have
+            learnt, such as "mlp" and "trees", stand for every weights file of their kind.
         weights: weights to evaluate; empty for all in the dataset's `weights` folder.
         split: whose scenes to evaluate on: "test", "val" or "train".
         top_n: how many of a location's best-scored viewpoints count; every value gives a row of the table.

@@ -39,7 +39,7 @@ ORACLE: Method = ("oracle", "")
 LEARNED = "mlp"
 """The paper's network: `LearnedScorer.name`, without loading PyTorch."""
 
-PROBABILITIES = (LEARNED, "trees", "set")
+PROBABILITIES = (LEARNED, "trees", "conv", "set", "sphere")
 """Methods whose scores are probabilities, learnt from labels."""
 
 _PAIRED = ("difference", "difference_low", "difference_high", "p")

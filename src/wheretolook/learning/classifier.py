@@ -35,8 +35,9 @@ def weighted_bce(
 
 
 def weight_penalty(module: nn.Module) -> Tensor:
-    """Sum of the squares of all weight matrices, a scalar. Biases are left out (the paper's sum is over W_l)."""
-    weights = torch.cat([layer.weight.flatten() for layer in module.modules() if isinstance(layer, nn.Linear)])
+    """Sum of the squares of all weights, a scalar. Biases are left out (the paper's sum is over W_l)."""
+    layers = [layer for layer in module.modules() if isinstance(layer, (nn.Linear, nn.Conv2d))]
+    weights = torch.cat([layer.weight.flatten() for layer in layers])
     return weights.dot(weights)
 
 

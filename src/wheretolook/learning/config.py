@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from wheretolook.errors import ConfigError
-from wheretolook.features import INPUT_VARIANTS, Layout
+from wheretolook.features import CHANNELS, INPUT_VARIANTS, PAPER_VARIANTS, Layout
 
 RELEASED = "released"
 """The variant that trains as the paper's released code does, on the inputs of "2d+3d"."""
@@ -20,13 +20,16 @@ MATCHABILITY = "matchability"
 SET = "set"
 """The variant that scores a view by the set of landmarks it sees."""
 
-NETWORKS = (*INPUT_VARIANTS, RELEASED)
-"""Networks that can be trained."""
+CONV = "conv"
+"""The variant that is a convolutional network over the bins, which also knows what landmarks are like."""
 
-OWN_OPTIONS = {TREES: "trees", MATCHABILITY: "matchability", SET: "set"}
+NETWORKS = (*PAPER_VARIANTS, RELEASED)
+"""The paper's networks, of which a release ships one."""
+
+OWN_OPTIONS = {name: name for name in (TREES, MATCHABILITY, CONV, SET)}
 """Variants that are not the paper's network, and the field of `TrainConfig` with the options of each."""
 
-VARIANTS = (*NETWORKS, *OWN_OPTIONS)
+VARIANTS = (*INPUT_VARIANTS, RELEASED, *OWN_OPTIONS)
 """All that can be trained."""
 
 RELEASED_OPTIONS: dict[str, Any] = {
@@ -170,15 +173,44 @@ class SetConfig(FittingConfig):
 
 
 @dataclass(frozen=True)
+class ConvConfig(FittingConfig):
+    """Options of the convolutional network over the bins.
+
+    Args:
+        epochs, batch_size, learning_rate, l2: see `FittingConfig`.
+        widths: channels after each convolution; every one but the first halves the sides of the grid.
+        dropout: share of pooled values dropped in training.
+        bins: bins along each side of the image.
+    """
+
+    widths: tuple[int, ...] = (32, 64, 128, 128)
+    dropout: float = 0.2
+    bins: int = 30
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.widths or min(self.widths) < 1:
+            raise ConfigError(
+                "convolutions must be at least one channel wide, and there must be one", value=self.widths
+            )
+        if not 0 <= self.dropout < 1 or self.bins < 1:
+            raise ConfigError(
+                "a convolutional network needs bins >= 1 and a dropout from 0 to less than 1",
+                value=(self.bins, self.dropout),
+            )
+
+
+@dataclass(frozen=True)
 class TrainConfig:
     """Options of training. The defaults are the paper's where it says something (Sec. 3.3 and 4).
 
     Args:
-        variants: what to train: networks by their inputs, "2d", "2d+z" and "2d+3d"; "released", which has the inputs
-            "2d+3d" and learns with the options of the paper's released code instead of those here; and learners
-            that know what landmarks are like, with options of their own: "trees", boosted trees on statistics of the
-            landmarks in view; "set", a network over them one by one; "matchability", which tells which of them will be
-            found (needs labels with `--label.store_matches true`).
+        variants: what to train: networks by their inputs, "2d", "2d+z" and "2d+3d", and "2d+3d+landmark", which is
+            also told what landmarks are like; "released", which has the inputs "2d+3d" and learns with the options of
+            the paper's released code instead of those here; and learners that know what landmarks are like, with
+            options of their own and none of the network's: "trees", boosted trees on statistics of the landmarks in
+            view; "conv", a convolutional network over the bins; "set", a network over landmarks one by one; and
+            "matchability", which tells which of them will be found (needs labels with `--label.store_matches true`).
         epochs: passes over the training viewpoints (paper: 300).
         batch_size: viewpoints a step, shared out over the devices (the paper gives none; 128 is the released code's).
         learning_rate: Adam's initial learning rate (paper: 1e-3; released code: 1e-4).
@@ -210,9 +242,10 @@ class TrainConfig:
         trees: options of "trees".
         matchability: options of "matchability".
         set: options of "set".
+        conv: options of "conv".
     """
 
-    variants: tuple[str, ...] = tuple(INPUT_VARIANTS)
+    variants: tuple[str, ...] = tuple(PAPER_VARIANTS)
     epochs: int = 300
     batch_size: int = 128
     learning_rate: float = 1e-3
@@ -237,6 +270,7 @@ class TrainConfig:
     trees: TreesConfig = field(default_factory=TreesConfig)
     matchability: MatchabilityConfig = field(default_factory=MatchabilityConfig)
     set: SetConfig = field(default_factory=SetConfig)
+    conv: ConvConfig = field(default_factory=ConvConfig)
 
     def __post_init__(self) -> None:
         unknown = [name for name in self.variants if name not in VARIANTS]
@@ -291,3 +325,8 @@ def weights_name(variant: str) -> str:
 def inputs_of(variant: str) -> str:
     """The key in `wheretolook.features.INPUT_VARIANTS` of what a variant looks at."""
     return "2d+3d" if variant == RELEASED else variant
+
+
+def needs_landmark_channels(variant: str) -> bool:
+    """Whether a variant of the paper's network looks at more than `wheretolook.features.CHANNELS`."""
+    return not {*INPUT_VARIANTS[inputs_of(variant)]} <= {*CHANNELS}

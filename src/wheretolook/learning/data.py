@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import ceil
 from typing import NamedTuple
 
@@ -17,7 +17,7 @@ from tqdm.auto import tqdm
 
 from wheretolook.dataset import Dataset, SceneFolder
 from wheretolook.errors import ConfigError, TableError
-from wheretolook.features import CHANNELS
+from wheretolook.features import ALL_CHANNELS, CHANNELS
 from wheretolook.learning.config import TrainConfig
 from wheretolook.learning.network import InputStatistics
 from wheretolook.table import UNLABELLED, is_good, poses
@@ -46,16 +46,18 @@ class Batch(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class LabelledViews:
-    """Labelled viewpoints of some scenes, binned, with all of `CHANNELS`.
+    """Labelled viewpoints of some scenes, binned.
 
-    A view takes about 19 kB at 30 x 30 bins: 0.6 GB for 30,000 views, 6.4 GB for 340,000.
+    With `CHANNELS` a view takes about 19 kB at 30 x 30 bins: 0.6 GB for 30,000 views, 6.4 GB for 340,000; with
+    `ALL_CHANNELS` 51 kB.
 
     Attributes:
-        means: (B, len(CHANNELS), bins, bins) float32, empty bins zero.
+        means: (B, C, bins, bins) float32, empty bins zero; see `BinnedViews`.
         filled: (B, bins, bins) bool.
         labels: (B,) float32, 1 where the viewpoint localizes.
         scene: (B,) int64, number of each view's scene in the order given.
         location: (B,) int64, location_id of each view, unique only within its scene.
+        channels: names of the C channels.
     """
 
     means: Tensor
@@ -63,15 +65,15 @@ class LabelledViews:
     labels: Tensor
     scene: NDArray[np.int64]
     location: NDArray[np.int64]
+    channels: tuple[str, ...] = CHANNELS
 
     def __len__(self) -> int:
         return len(self.labels)
 
     def to(self, device: torch.device | str) -> LabelledViews:
         """The same views with their tensors on a device."""
-        return LabelledViews(
-            self.means.to(device), self.filled.to(device), self.labels.to(device), self.scene, self.location
-        )
+        means, filled, labels = (tensor.to(device) for tensor in (self.means, self.filled, self.labels))
+        return replace(self, means=means, filled=filled, labels=labels)
 
     @property
     def n_bytes(self) -> int:
@@ -85,7 +87,12 @@ def has_room(device: torch.device | str, n_bytes: int) -> bool:
 
 
 def load_views(
-    dataset: Dataset, scenes: Sequence[SceneFolder], config: TrainConfig, device: str = "cpu", progress: bool = True
+    dataset: Dataset,
+    scenes: Sequence[SceneFolder],
+    config: TrainConfig,
+    device: str = "cpu",
+    progress: bool = True,
+    landmark_channels: bool = False,
 ) -> LabelledViews:
     """Read the labelled viewpoints of some scenes and bin their landmarks.
 
@@ -96,6 +103,7 @@ def load_views(
         device: where the binning runs, "cpu" or a CUDA device. The views come back on this device if one device trains
             and it has room for them, else on the CPU; for several, in memory that processes can share.
         progress: show a progress bar.
+        landmark_channels: whether the bins also tell what landmarks are like (`ALL_CHANNELS`, not `CHANNELS`).
 
     Raises:
         TableError: a scene has no table or no labelled viewpoint, or its occlusion does not fit.
@@ -110,9 +118,10 @@ def load_views(
             raise TableError("no viewpoint has a label", path=scene.table, fix="Run the label stage.")
         tables.append(table)
     total, bins = sum(map(len, tables)), config.bins
-    n_bytes = total * bins**2 * (len(CHANNELS) * torch.float32.itemsize + torch.bool.itemsize)
+    channels = ALL_CHANNELS if landmark_channels else CHANNELS
+    n_bytes = total * bins**2 * (len(channels) * torch.float32.itemsize + torch.bool.itemsize)
     home = device if config.devices == 1 and has_room(device, n_bytes) else "cpu"
-    means = torch.empty((total, len(CHANNELS), bins, bins), device=home)
+    means = torch.empty((total, len(channels), bins, bins), device=home)
     filled = torch.empty((total, bins, bins), dtype=torch.bool, device=home)
     if config.devices > 1:
         _share(means, filled)
@@ -121,7 +130,8 @@ def load_views(
         for scene, table in zip(scenes, tables, strict=True):
             localization_map = scene.localization_map(dataset.camera, device)
             for begin in range(0, len(table), BLOCK):
-                binned = localization_map.bin_views(poses(table.iloc[begin : begin + BLOCK]), bins=bins)
+                block = poses(table.iloc[begin : begin + BLOCK])
+                binned = localization_map.bin_views(block, bins, landmark_channels)
                 rows = slice(start, start + len(binned))
                 means[rows] = torch.from_numpy(binned.means)
                 filled[rows] = torch.from_numpy(binned.counts > 0)
@@ -134,6 +144,7 @@ def load_views(
         torch.from_numpy(np.concatenate(good).astype(np.float32)).to(home),
         np.repeat(np.arange(len(tables)), [len(table) for table in tables]),
         np.concatenate([table["location_id"].to_numpy(np.int64) for table in tables]),
+        channels,
     )
 
 
@@ -265,7 +276,7 @@ class BatchLoader:
     ) -> None:
         self.views, self.rows, self.batch_size, self.shuffle_seed = views, rows, batch_size, shuffle_seed
         self.rank, self.world_size = rank, world_size
-        self._channels = torch.tensor([CHANNELS.index(name) for name in channels])
+        self._channels = torch.tensor([views.channels.index(name) for name in channels])
         self._passes = 0
 
     def __len__(self) -> int:
@@ -301,9 +312,10 @@ class ViewpointDataModule(LightningDataModule):
         config: batch size, bins, label limits, share held out, balance, devices, seed.
         device: where the binning runs, and where the views are kept if one device trains and it has room for them.
         progress: show progress bars.
+        landmark_channels: whether the views also tell what landmarks are like, for about three times the memory.
 
     Attributes:
-        channels: channels that batches hold; all of `CHANNELS` unless set otherwise.
+        channels: channels that batches hold; all that the views have unless set otherwise.
 
     Attributes (after `setup`):
         views: the views of train and val scenes.
@@ -319,10 +331,18 @@ class ViewpointDataModule(LightningDataModule):
     statistics: InputStatistics
     class_weights: tuple[float, float]
 
-    def __init__(self, dataset: Dataset, config: TrainConfig, device: str = "cpu", progress: bool = True) -> None:
+    def __init__(
+        self,
+        dataset: Dataset,
+        config: TrainConfig,
+        device: str = "cpu",
+        progress: bool = True,
+        landmark_channels: bool = False,
+    ) -> None:
         super().__init__()
         self.dataset, self.config, self.device, self.progress = dataset, config, device, progress
-        self.channels: tuple[str, ...] = CHANNELS
+        self.landmark_channels = landmark_channels
+        self.channels: tuple[str, ...] = ALL_CHANNELS if landmark_channels else CHANNELS
 
     def setup(self, stage: str | None = None) -> None:
         """Read, bin and split the views, once; in a process that trains, bring them to its device.
@@ -347,7 +367,7 @@ class ViewpointDataModule(LightningDataModule):
 
     def _load(self) -> None:
         scenes = training_scenes(self.dataset)
-        views = load_views(self.dataset, scenes, self.config, self.device, self.progress)
+        views = load_views(self.dataset, scenes, self.config, self.device, self.progress, self.landmark_channels)
         self.use(views, validation_views(self.dataset, views.scene, views.location, self.config))
 
     def use(self, views: LabelledViews, held_out: NDArray[np.bool_]) -> None:
@@ -367,7 +387,7 @@ class ViewpointDataModule(LightningDataModule):
         if self.config.balance:
             self.train_rows = self.train_rows[balance_classes(labels[self.train_rows], self.config.seed)]
         self.class_weights = class_weights(labels[self.train_rows])
-        self.statistics = InputStatistics.of(views.means, views.filled, self.train_rows)
+        self.statistics = InputStatistics.of(views.means, views.filled, self.train_rows, views.channels)
         self.views = views
 
     def _loader(self, rows: Tensor, batch_size: int, shuffle_seed: int | None = None) -> BatchLoader:

@@ -99,6 +99,7 @@ def fit(classifier: ViewpointClassifier, data: LightningDataModule, record: Epoc
                 fix="There may be too little memory: lower train.devices.",
             ) from error  # fmt: skip
         record.collect()
+    data.trainer = None  # who asks for batches from now on gets whole ones, not one process's share
 
 
 class RunLog:

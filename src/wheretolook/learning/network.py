@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from wheretolook.errors import ConfigError
-from wheretolook.features import CHANNELS, INPUT_VARIANTS, Layout
+from wheretolook.features import ALL_CHANNELS, CHANNELS, INPUT_VARIANTS, Layout
 from wheretolook.geometry import PinholeCamera
 from wheretolook.learning.config import TrainConfig
 
@@ -21,9 +21,10 @@ class InputStatistics:
     """Mean and standard deviation of each kind of input over the filled bins of the training views.
 
     Attributes:
-        channels: names of the channels, as in `wheretolook.features.CHANNELS`.
-        mean: mean of each channel, in its unit (pixels or metres).
-        std: standard deviation of each channel, in its unit; 1 where it would be 0.
+        channels: names of the channels, as in `wheretolook.features.ALL_CHANNELS`.
+        mean: mean of each channel, in its unit (such as pixels or metres), over the values that are known.
+        std: standard deviation of each channel, in its unit; 1 where it would be 0. Infinite where no value is known,
+            so that a network does not look at a channel that it has never seen.
     """
 
     channels: tuple[str, ...]
@@ -35,24 +36,28 @@ class InputStatistics:
         """Statistics over the filled bins of some views.
 
         Args:
-            means: (B, C, bins, bins) binned views, empty bins zero.
+            means: (B, C, bins, bins) binned views, empty bins zero, NaN where a value is not known.
             filled: (B, bins, bins) bool.
             rows: views to use, (n,) int64.
             channels: names of the C channels.
         """
         rows = rows.to(means.device)
-        count = torch.zeros((), dtype=torch.float64, device=means.device)
         total = torch.zeros(len(channels), dtype=torch.float64, device=means.device)
+        n_filled, unknown = torch.zeros_like(total), torch.zeros_like(total)
         for block in rows.split(STATISTICS_BLOCK):  # empty bins are zero: they add nothing to the sum
-            count += filled[block].sum()
-            total += means[block].sum((0, 2, 3), dtype=torch.float64)
-        mean = total / count.clamp(min=1)
+            values = means[block]
+            n_filled += filled[block].sum()
+            unknown += values.isnan().sum((0, 2, 3))
+            total += values.nan_to_num_().sum((0, 2, 3), dtype=torch.float64)
+        count = (n_filled - unknown).clamp(min=1)
+        mean = total / count
         squares = torch.zeros_like(total)
         for block in rows.split(STATISTICS_BLOCK):  # a second pass: no cancellation between large numbers
             centred = (means[block] - mean.float()[:, None, None]) * filled[block][:, None]
-            squares += centred.square_().sum((0, 2, 3), dtype=torch.float64)
-        std = (squares / count.clamp(min=1)).sqrt()
+            squares += centred.nan_to_num_().square_().sum((0, 2, 3), dtype=torch.float64)
+        std = (squares / count).sqrt()
         std = torch.where(std > 0, std, 1.0)
+        std = torch.where((n_filled > 0) & (unknown == n_filled), torch.inf, std)
         return cls(channels, tuple(mean.tolist()), tuple(std.tolist()))
 
     def select(self, channels: tuple[str, ...]) -> InputStatistics:
@@ -103,11 +108,29 @@ class NetworkSpec:
         return len(self.channels) * self.bins**2
 
 
+def standardize(means: Tensor, filled: Tensor, mean: Tensor, std: Tensor) -> Tensor:
+    """Standardize each channel by its kind (paper, Sec. 3.3 "Data").
+
+    Empty bins are exactly zero afterwards, that is, the mean of their kind; so are landmark channels where a value is
+    not known.
+
+    Args:
+        means: (B, C, bins, bins).
+        filled: (B, bins, bins) bool.
+        mean, std: (C, 1, 1).
+
+    Returns:
+        (B, C, bins, bins).
+    """
+    values = (means - mean) / std * filled[:, None]
+    if values.shape[1] > len(CHANNELS):  # where landmarks lie is always known: a NaN there is an error to be seen
+        of_landmarks = values[:, len(CHANNELS) :]
+        of_landmarks.masked_fill_(of_landmarks.isnan(), 0.0)
+    return values
+
+
 class BinnedInput(nn.Module):
     """Turns binned views into a network's standardized, flat input.
-
-    Each channel is standardized by its kind (paper, Sec. 3.3 "Data"); empty bins are exactly zero afterwards, that is,
-    the mean of their kind.
 
     Args:
         spec: variant, statistics, bins and layout.
@@ -121,7 +144,9 @@ class BinnedInput(nn.Module):
         super().__init__()
         self.layout, self.input_size = spec.layout, spec.input_size
         # these follow from the specification, which is stored beside the weights: persistent=False
-        self.register_buffer("index", torch.tensor([CHANNELS.index(name) for name in spec.channels]), persistent=False)
+        self.register_buffer(
+            "index", torch.tensor([ALL_CHANNELS.index(name) for name in spec.channels]), persistent=False
+        )
         self.register_buffer("mean", torch.tensor(spec.statistics.mean)[:, None, None], persistent=False)
         self.register_buffer("std", torch.tensor(spec.statistics.std)[:, None, None], persistent=False)
 
@@ -129,7 +154,7 @@ class BinnedInput(nn.Module):
         """Means and filled, as `ViewpointNetwork.forward` takes them, to (B, input_size) float32."""
         if means.shape[1] != len(self.index):
             means = means.index_select(1, self.index)
-        values = (means - self.mean) / self.std * filled[:, None]
+        values = standardize(means, filled, self.mean, self.std)
         if self.layout == "compact":
             values = move_to_front(values, filled)
         return values.reshape(-1, self.input_size)
@@ -160,10 +185,11 @@ def add_noise(
         means: (B, C, bins, bins).
         filled: (B, bins, bins) bool; empty bins stay zero.
         noise_px: standard deviation on u and v.
-        noise_m: standard deviation on x, y and z.
+        noise_m: standard deviation on x, y and z. What landmarks are like stays as it is.
         channels: names of the C channels.
     """
-    scale = means.new_tensor([noise_px if name in ("u", "v") else noise_m for name in channels])
+    of_kind = {"u": noise_px, "v": noise_px, "x": noise_m, "y": noise_m, "z": noise_m}
+    scale = means.new_tensor([of_kind.get(name, 0.0) for name in channels])
     return means + torch.randn_like(means) * scale[:, None, None] * filled[:, None]
 
 
@@ -189,7 +215,7 @@ class ViewpointNetwork(nn.Module):
         """Logits (B,) of binned views.
 
         Args:
-            means: (B, C, bins, bins) float32, with all of `CHANNELS` or with the variant's own alone.
+            means: (B, C, bins, bins) float32, with all of `CHANNELS` or `ALL_CHANNELS`, or the variant's own alone.
             filled: (B, bins, bins) bool.
         """
         return self.layers(self.input(means, filled)).squeeze(-1)

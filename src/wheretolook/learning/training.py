@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass
+from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -17,7 +18,15 @@ from wheretolook.dataset import Dataset, write_json
 from wheretolook.errors import ConfigError
 from wheretolook.features import INPUT_VARIANTS
 from wheretolook.learning.classifier import ViewpointClassifier
-from wheretolook.learning.config import MATCHABILITY, OWN_OPTIONS, SET, TREES, TrainConfig, inputs_of, weights_name
+from wheretolook.learning.config import (
+    MATCHABILITY,
+    OWN_OPTIONS,
+    SET,
+    TrainConfig,
+    inputs_of,
+    needs_landmark_channels,
+    weights_name,
+)
 from wheretolook.learning.data import ViewpointDataModule
 from wheretolook.learning.fit import EpochRecord, RunLog, fit, home_device
 from wheretolook.learning.learner import Learner, Task
@@ -97,7 +106,10 @@ def train(
             model = _learn(dataset, options, variant, path, about, tracking, progress)
         elif model is None:
             if data is None or data.config != options:
-                data = ViewpointDataModule(dataset, options, home_device(options), progress)
+                networks = [one for one in config.variants if one not in OWN_OPTIONS]
+                sharing = [one for one in networks if config.of_variant(one) == options]
+                wide = any(map(needs_landmark_channels, sharing))
+                data = ViewpointDataModule(dataset, options, home_device(options), progress, wide)
             data.setup()
             model = _train_variant(data, variant, path, about, tracking, progress)
         models.append(model)
@@ -106,18 +118,8 @@ def train(
 
 def learner_of(variant: str) -> Learner:
     """How a variant of `OWN_OPTIONS` learns."""
-    if variant == TREES:
-        from wheretolook.learning.trees import learn_trees
-
-        return learn_trees
-    if variant == MATCHABILITY:
-        from wheretolook.learning.matchability import learn_matchability
-
-        return learn_matchability
-    if variant == SET:
-        from wheretolook.learning.set import learn_set
-
-        return learn_set
+    if variant in OWN_OPTIONS:  # each in a module of its own, as some take long to load
+        return getattr(import_module(f"wheretolook.learning.{variant}"), f"learn_{variant}")  # type: ignore[no-any-return]
     raise ConfigError("no such variant", value=variant)
 
 

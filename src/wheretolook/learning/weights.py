@@ -140,14 +140,17 @@ def read_weights(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     return tensors, header
 
 
+def stored_statistics(stored: Mapping[str, Any]) -> InputStatistics:
+    """Input statistics from a header."""
+    return InputStatistics(tuple(stored["channels"]), tuple(stored["mean"]), tuple(stored["std"]))
+
+
 def _spec(path: Path, header: dict[str, Any]) -> NetworkSpec:
     try:
-        stored = header["statistics"]
-        statistics = InputStatistics(tuple(stored["channels"]), tuple(stored["mean"]), tuple(stored["std"]))
         return NetworkSpec(
             variant=header["variant"],
             camera=PinholeCamera(**header["camera"]),
-            statistics=statistics,
+            statistics=stored_statistics(header["statistics"]),
             bins=int(header["bins"]),
             layout=header["layout"],
             hidden=tuple(header["hidden"]),

@@ -12,17 +12,9 @@ import torch
 from numpy.typing import DTypeLike, NDArray
 
 from wheretolook.errors import MapError
+from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 from wheretolook.mapping.colmap_model import ModelArrays, model_arrays, read_descriptors, read_model
 from wheretolook.mapping.extraction import quantize_descriptors, unit_descriptors
-
-MAP_ATTRIBUTES = (
-    "track_length", "reprojection_error", "triangulation_angle", "direction_spread", "ambiguity", "mapped_distance",
-    "distance_spread",
-)  # fmt: skip
-"""What a scorer is told of a landmark in its map: the logarithm of the number of observations; the mean error in
-pixels; the logarithm of the largest angle between two rays, in degrees; 1 - |mean mapping direction|; the cosine
-between its descriptor and the nearest other one; the logarithm of the mean mapping distance, in metres; the standard
-deviation of the mapping distances over their mean. NaN where one is not known."""
 
 _BLOCK = 4096  # landmarks whose tracks are gathered at a time
 
@@ -65,18 +57,16 @@ class Landmarks:
 
     def attributes(self) -> NDArray[np.float32]:
         """`MAP_ATTRIBUTES` of each landmark, (N, len(MAP_ATTRIBUTES)) float32."""
-        return np.stack(
-            [
-                np.log(np.maximum(self.track_length, 1)),
-                self.reprojection_error_px,
-                np.log(np.maximum(self.triangulation_angle_deg, 0.01)),
-                self.mapping_direction_spread,
-                self.ambiguity,
-                np.log(np.maximum(self.mapping_distance_m, 1e-3)),
-                self.mapping_distance_spread,
-            ],
-            axis=1,
-        ).astype(np.float32)
+        values = {
+            "track_length": np.log(np.maximum(self.track_length, 1)),
+            "reprojection_error": self.reprojection_error_px,
+            "triangulation_angle": np.log(np.maximum(self.triangulation_angle_deg, 0.01)),
+            "direction_spread": self.mapping_direction_spread,
+            "ambiguity": self.ambiguity,
+            "mapped_distance": np.log(np.maximum(self.mapping_distance_m, 1e-3)),
+            "distance_spread": self.mapping_distance_spread,
+        }
+        return np.stack([values[name] for name in MAP_ATTRIBUTES], axis=1).astype(np.float32)
 
     def save(self, path: str | Path, compact: bool = False) -> None:
         """Write an NPZ file, atomically. The same landmarks give the same bytes.

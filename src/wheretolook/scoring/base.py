@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from wheretolook.features import BinnedViews
+from wheretolook.features import ALL_CHANNELS, CHANNELS, BinnedViews
 from wheretolook.geometry import Float
 from wheretolook.localization_map import LocalizationMap
 
@@ -48,7 +48,7 @@ class Scorer(ABC):
 
         Args:
             cam_from_world: (B, 3, 4).
-            binned: the same views, as `localization_map.bin_views` bins them, with all channels.
+            binned: the same views, as `localization_map.bin_views` bins them, with all of `CHANNELS`.
 
         Returns:
             (B,) float64, the same as `score` gives.
@@ -62,26 +62,29 @@ class BinnedScorer(Scorer):
     Args:
         localization_map: the map.
         bins: bins along each side of the image.
+        landmark_channels: whether it asks what the landmarks are like (`ALL_CHANNELS`, not `CHANNELS`).
     """
 
-    def __init__(self, localization_map: LocalizationMap, bins: int = 30) -> None:
+    def __init__(self, localization_map: LocalizationMap, bins: int = 30, landmark_channels: bool = False) -> None:
         super().__init__(localization_map)
-        self.bins = bins
+        self.bins, self.landmark_channels = bins, landmark_channels
 
     def score(self, cam_from_world: Float) -> Float:
         """Score poses (B, 3, 4). Returns (B,) float64."""
         scores = np.empty(len(cam_from_world))
         for begin in range(0, len(scores), BLOCK):
             poses = cam_from_world[begin : begin + BLOCK]
-            scores[begin : begin + BLOCK] = self.score_bins(self.localization_map.bin_views(poses, bins=self.bins))
+            binned = self.localization_map.bin_views(poses, self.bins, self.landmark_channels)
+            scores[begin : begin + BLOCK] = self.score_bins(binned)
         return scores
 
     def score_binned(self, cam_from_world: Float, binned: BinnedViews) -> Float:
-        """Score binned views; views with another number of bins are binned again."""
-        if binned.counts.shape[-1] != self.bins:
+        """Score binned views; views with another number of bins, or without channels it needs, are binned again."""
+        wanted = ALL_CHANNELS if self.landmark_channels else CHANNELS
+        if binned.counts.shape[-1] != self.bins or not {*wanted} <= {*binned.channels}:
             return self.score(cam_from_world)
         return self.score_bins(binned)
 
     @abstractmethod
     def score_bins(self, binned: BinnedViews) -> Float:
-        """Score binned views with all channels. Returns (B,) float64, finite."""
+        """Score binned views with all channels that it asks for. Returns (B,) float64, finite."""

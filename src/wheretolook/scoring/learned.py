@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import ClassVar
 
@@ -10,7 +11,7 @@ import torch
 
 from wheretolook.camera_models import Camera, ColmapCamera
 from wheretolook.errors import WeightsError
-from wheretolook.features import CHANNELS, BinnedViews
+from wheretolook.features import ALL_CHANNELS, CHANNELS, BinnedViews
 from wheretolook.geometry import Float, PinholeCamera
 from wheretolook.learning.network import ViewpointNetwork
 from wheretolook.learning.weights import load_classifier, read_training, weights_kind
@@ -36,14 +37,14 @@ class LearnedScorer(BinnedScorer):
     name: ClassVar[str] = "mlp"
 
     def __init__(self, localization_map: LocalizationMap, network: ViewpointNetwork, inputs: str | None = None) -> None:
-        super().__init__(localization_map, network.spec.bins)
+        super().__init__(localization_map, network.spec.bins, not {*network.spec.channels} <= {*CHANNELS})
         self.inputs = network.spec.variant if inputs is None else inputs
         self.device = localization_map.device
         self.network = network.to(self.device).eval()
         trained, camera = network.spec.camera, localization_map.camera
         check_field_of_view(trained, camera)
-        scale = {"u": trained.width / camera.width, "v": trained.height / camera.height}
-        self._scale = torch.tensor([scale.get(name, 1.0) for name in CHANNELS], device=self.device)[:, None, None]
+        self._channels = ALL_CHANNELS if self.landmark_channels else CHANNELS
+        self._scale = torch.tensor(channel_scales(trained, camera, self._channels), device=self.device)[:, None, None]
 
     @classmethod
     def load(cls, weights: str | Path, localization_map: LocalizationMap) -> LearnedScorer:
@@ -60,7 +61,7 @@ class LearnedScorer(BinnedScorer):
 
     def score_bins(self, binned: BinnedViews) -> Float:
         """(B,) probabilities in [0, 1]."""
-        binned = binned.select(CHANNELS) if binned.channels != CHANNELS else binned
+        binned = binned.select(self._channels) if binned.channels != self._channels else binned
         scores = np.empty(len(binned))
         with torch.inference_mode():
             for begin in range(0, len(scores), BLOCK):
@@ -80,15 +81,24 @@ def load_scorer(weights: str | Path, localization_map: LocalizationMap) -> Score
     Raises:
         WeightsError: the file cannot be used, or was trained for another field of view than the map's camera.
     """
+    from wheretolook.scoring.conv import ConvScorer
     from wheretolook.scoring.set import SetScorer
     from wheretolook.scoring.trees import TreesScorer
 
-    scorers = {scorer.name: scorer for scorer in (LearnedScorer, TreesScorer, SetScorer)}
+    loaders: dict[str, Callable[[str | Path, LocalizationMap], Scorer]] = {
+        scorer.name: scorer.load for scorer in (LearnedScorer, TreesScorer, ConvScorer, SetScorer)
+    }
     kind = weights_kind(weights)
-    if kind not in scorers:
-        known = f"Give weights of {', '.join(scorers)}."
+    if kind not in loaders:
+        known = f"Give weights of {', '.join(loaders)}."
         raise WeightsError("these weights are not of one scorer", path=weights, value=kind, fix=known)
-    return scorers[kind].load(weights, localization_map)
+    return loaders[kind](weights, localization_map)
+
+
+def channel_scales(trained: PinholeCamera, camera: Camera, channels: tuple[str, ...]) -> list[float]:
+    """What channels of a camera's views are multiplied by to be as those of the camera of the training views."""
+    scale = {"u": trained.width / camera.width, "v": trained.height / camera.height}
+    return [scale.get(name, 1.0) for name in channels]
 
 
 def check_field_of_view(trained: PinholeCamera, camera: Camera) -> None:

@@ -23,14 +23,17 @@ from wheretolook.scoring.random import RandomScorer
 from wheretolook.scoring.visible import VisibleScorer
 
 
-def _learned(name: str, localization_map: LocalizationMap, weights: str | Path | None) -> Scorer:
-    from wheretolook.scoring.learned import load_scorer  # PyTorch takes seconds to load
+def _with_weights(name: str) -> Callable[[LocalizationMap, ScorerOptions], Scorer]:
+    def build(localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
+        from wheretolook.scoring.learned import load_scorer  # PyTorch takes seconds to load
 
-    scorer = load_scorer(_given(name, weights), localization_map)
-    if scorer.name != name:
-        fix = f"Give weights of {name}, or train them."
-        raise WeightsError(f"these weights are not of {name}", path=weights, value=scorer.name, fix=fix)
-    return scorer
+        scorer = load_scorer(_given(name, options.weights), localization_map)
+        if scorer.name != name:
+            fix = f"Give weights of {name}, or train them."
+            raise WeightsError(f"these weights are not of {name}", path=options.weights, value=scorer.name, fix=fix)
+        return scorer
+
+    return build
 
 
 def _given(name: str, weights: str | Path | None) -> str | Path:
@@ -84,14 +87,16 @@ SCORERS: dict[str, Callable[[LocalizationMap, ScorerOptions], Scorer]] = {
     **{name: _fisher(name) for name in _ALL_FISHER},
     "fisher-worst-trace": lambda localization_map, options: WorstTraceScorer(localization_map),
     "fisher-stationary-trace": lambda localization_map, options: StationaryTraceScorer(localization_map),
-    "mlp": lambda localization_map, options: _learned("mlp", localization_map, options.weights),
+    "mlp": _with_weights("mlp"),
     **{name: _expected(name) for name in EXPECTED_METHODS},
-    "trees": lambda localization_map, options: _learned("trees", localization_map, options.weights),
-    "set": lambda localization_map, options: _learned("set", localization_map, options.weights),
+    **{name: _with_weights(name) for name in ("trees", "conv", "set")},
 }
 """How each method is built from a map and options."""
 
-WEIGHTS_OF = {"mlp": "mlp", **dict.fromkeys(EXPECTED_METHODS, "matchability"), "trees": "trees", "set": "set"}
+WEIGHTS_OF = {
+    **dict.fromkeys(EXPECTED_METHODS, "matchability"),
+    **{name: name for name in ("mlp", "trees", "conv", "set")},
+}
 """Methods that have learnt, and the kind of weights (`wheretolook.learning.weights.weights_kind`) that each needs."""
 
 OPTIONAL = tuple(ORIGIN_METHODS)
@@ -103,13 +108,14 @@ PROBES = ("fisher-worst-trace", "fisher-stationary-trace")
 
 def describe_methods() -> dict[str, str]:
     """What each method of `SCORERS` is, by its name: the first line of its class's docstring."""
+    from wheretolook.scoring.conv import ConvScorer
     from wheretolook.scoring.learned import LearnedScorer
     from wheretolook.scoring.set import SetScorer
     from wheretolook.scoring.trees import TreesScorer
 
     scorers: tuple[type[Scorer], ...] = (
         RandomScorer, ForwardScorer, VisibleScorer, BinsScorer, MaxVisibilityScorer, SwappedMaxVisibilityScorer,
-        WorstTraceScorer, StationaryTraceScorer, LearnedScorer, TreesScorer, SetScorer,
+        WorstTraceScorer, StationaryTraceScorer, LearnedScorer, TreesScorer, ConvScorer, SetScorer,
     )  # fmt: skip
     texts = {scorer.name: _first_line(scorer) for scorer in scorers}
     for name, (metric, approximation, about_origin) in _ALL_FISHER.items():

@@ -28,7 +28,7 @@ class EvaluateConfig:
 
     Args:
         methods: methods to compare, keys of `wheretolook.scoring.SCORERS`; if not named, all but
-            `wheretolook.scoring.registry.OPTIONAL`. "mlp" and "trees" stand
+            `wheretolook.scoring.registry.OPTIONAL`. "mlp", "trees" and "sphere" stand
             for every weights file of their kind.
         weights: weights to evaluate; empty for all in the dataset's `weights` folder.
         split: whose scenes to evaluate on: "test", "val" or "train".

@@ -39,7 +39,7 @@ ORACLE: Method = ("oracle", "")
 LEARNED = "mlp"
 """The paper's network: `LearnedScorer.name`, without loading PyTorch."""
 
-WITH_WEIGHTS = (LEARNED, "trees")
+WITH_WEIGHTS = (LEARNED, "trees", "sphere")
 """Methods that have learnt from labels; their scores are probabilities."""
 
 _PAIRED = ("difference", "difference_low", "difference_high", "p")

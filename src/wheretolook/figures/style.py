@@ -91,6 +91,7 @@ _STYLES = {
     ("mlp", "2d+z"): MethodStyle("MLP, 2d + z", "#0072B2", "^", (0, (3, 1, 1, 1))),
     ("mlp", "2d+3d"): MethodStyle("MLP, 2d + 3d", "#D55E00", "o", "-"),
     ("trees", ""): MethodStyle("boosted trees, landmark attributes", "#882255", "*", "-"),
+    ("sphere", ""): MethodStyle("whole sphere (manner of ActLoc)", "#332288", "H", (0, (3, 1))),
     ("mlp", "released"): MethodStyle("MLP, trained as the released code", "#F0A070", "p", (0, (2, 2))),
 }
 
@@ -102,6 +103,7 @@ GROUPS = ("learned", "rules", "Fisher", "probes")
 _GROUPS = {
     "mlp": "learned",
     "trees": "learned",
+    "sphere": "learned",
     "fisher": "Fisher",
     "fisher-worst-trace": "probes",
     "fisher-stationary-trace": "probes",

@@ -14,10 +14,13 @@ RELEASED = "released"
 TREES = "trees"
 """The variant that is no network: boosted trees on pooled statistics of what landmarks are like."""
 
+SPHERE = "sphere"
+"""The variant that scores all directions at a location at once, in the manner of ActLoc."""
+
 NETWORKS = (*INPUT_VARIANTS, RELEASED)
 """Networks that can be trained."""
 
-OWN_OPTIONS = {TREES: "trees"}
+OWN_OPTIONS = {TREES: "trees", SPHERE: "sphere"}
 """Variants that are not the paper's network, and the field of `TrainConfig` with the options of each."""
 
 VARIANTS = (*NETWORKS, *OWN_OPTIONS)
@@ -98,13 +101,48 @@ class FittingConfig:
 
 
 @dataclass(frozen=True)
+class SphereConfig(FittingConfig):
+    """Options of "sphere"; a batch holds whole locations with about `batch_size` viewpoints in all.
+
+    Args:
+        points: landmarks of a location at most, spread evenly over those in free sight.
+        cameras: mapping cameras at most, spread evenly over all.
+        width: of tokens and queries; a multiple of `heads`.
+        heads: of attention.
+        layers: blocks of attention among the tokens.
+        dropout: share of values dropped in the blocks of attention.
+    """
+
+    epochs: int = 30
+    batch_size: int = 1024
+    learning_rate: float = 5e-4
+    points: int = 512
+    cameras: int = 128
+    width: int = 96
+    heads: int = 4
+    layers: int = 2
+    dropout: float = 0.1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("points", "cameras", "width", "heads", "layers"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"sphere needs {name} of at least 1", value=getattr(self, name))
+        if self.width % self.heads:
+            raise ConfigError("sphere needs a width that is a multiple of heads", value=(self.width, self.heads))
+        if not 0 <= self.dropout < 1:
+            raise ConfigError("dropout must be at least 0 and less than 1", value=self.dropout)
+
+
+@dataclass(frozen=True)
 class TrainConfig:
     """Options of training. The defaults are the paper's where it says something (Sec. 3.3 and 4).
 
     Args:
         variants: what to train: networks by their inputs, "2d", "2d+z" and "2d+3d"; "released", which has the inputs
             "2d+3d" and learns with the options of the paper's released code instead of those here; and "trees",
-            boosted trees that know what landmarks are like, with the options in `trees` and none of the network's.
+            boosted trees that know what landmarks are like, with the options in `trees` and none of the network's;
+            "sphere", a network that scores all directions at a location at once, with those in `sphere`.
         epochs: passes over the training viewpoints (paper: 300).
         batch_size: viewpoints a step, shared out over the devices (the paper gives none; 128 is the released code's).
         learning_rate: Adam's initial learning rate (paper: 1e-3; released code: 1e-4).
@@ -134,6 +172,7 @@ class TrainConfig:
         devices: GPUs, or processes on the CPU, to train with. One step of many is one step of one: each takes its share
             of the same batch. Dropout and noise draw other numbers, though.
         trees: options of "trees".
+        sphere: options of "sphere".
     """
 
     variants: tuple[str, ...] = tuple(INPUT_VARIANTS)
@@ -159,6 +198,7 @@ class TrainConfig:
     accelerator: Literal["auto", "cpu", "gpu"] = "auto"
     devices: int = 1
     trees: TreesConfig = field(default_factory=TreesConfig)
+    sphere: SphereConfig = field(default_factory=SphereConfig)
 
     def __post_init__(self) -> None:
         unknown = [name for name in self.variants if name not in VARIANTS]

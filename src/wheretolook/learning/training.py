@@ -17,7 +17,7 @@ from wheretolook.dataset import Dataset, write_json
 from wheretolook.errors import ConfigError
 from wheretolook.features import INPUT_VARIANTS
 from wheretolook.learning.classifier import ViewpointClassifier
-from wheretolook.learning.config import OWN_OPTIONS, TREES, TrainConfig, inputs_of, weights_name
+from wheretolook.learning.config import OWN_OPTIONS, SPHERE, TREES, TrainConfig, inputs_of, weights_name
 from wheretolook.learning.data import ViewpointDataModule
 from wheretolook.learning.fit import EpochRecord, RunLog, fit, home_device
 from wheretolook.learning.learner import Learner, Task
@@ -110,6 +110,10 @@ def learner_of(variant: str) -> Learner:
         from wheretolook.learning.trees import learn_trees
 
         return learn_trees
+    if variant == SPHERE:
+        from wheretolook.learning.sphere import learn_sphere
+
+        return learn_sphere
     raise ConfigError("no such variant", value=variant)
 
 

@@ -80,7 +80,7 @@ def read_training(path: str | Path) -> dict[str, Any]:
 
 
 def weights_kind(path: str | Path) -> str:
-    """The method that a weights file serves: "mlp" or "trees".
+    """The method that a weights file serves, such as "mlp" or "trees".
 
     Raises:
         WeightsError: the file is missing, damaged or foreign.

@@ -79,10 +79,15 @@ def load_scorer(weights: str | Path, localization_map: LocalizationMap) -> Score
 
     Raises:
         WeightsError: the file cannot be used, or was trained for another field of view than the map's camera.
+        MapError: the map lacks what the method needs.
     """
+    from wheretolook.scoring.sphere import SphereScorer
     from wheretolook.scoring.trees import TreesScorer
 
-    scorer = TreesScorer if weights_kind(weights) == TreesScorer.name else LearnedScorer
+    kind = weights_kind(weights)
+    if kind == SphereScorer.name:
+        return SphereScorer.load(weights, localization_map)
+    scorer = TreesScorer if kind == TreesScorer.name else LearnedScorer
     return scorer.load(weights, localization_map)
 
 

@@ -67,6 +67,7 @@ SCORERS: dict[str, Callable[[LocalizationMap, ScorerOptions], Scorer]] = {
     "fisher-stationary-trace": lambda localization_map, options: StationaryTraceScorer(localization_map),
     "mlp": lambda localization_map, options: _learned("mlp", localization_map, options.weights),
     "trees": lambda localization_map, options: _learned("trees", localization_map, options.weights),
+    "sphere": lambda localization_map, options: _learned("sphere", localization_map, options.weights),
 }
 """How each method is built from a map and options."""
 
@@ -80,11 +81,12 @@ PROBES = ("fisher-worst-trace", "fisher-stationary-trace")
 def describe_methods() -> dict[str, str]:
     """What each method of `SCORERS` is, by its name: the first line of its class's docstring."""
     from wheretolook.scoring.learned import LearnedScorer
+    from wheretolook.scoring.sphere import SphereScorer
     from wheretolook.scoring.trees import TreesScorer
 
     scorers: tuple[type[Scorer], ...] = (
         RandomScorer, ForwardScorer, VisibleScorer, BinsScorer, MaxVisibilityScorer, SwappedMaxVisibilityScorer,
-        WorstTraceScorer, StationaryTraceScorer, LearnedScorer, TreesScorer,
+        WorstTraceScorer, StationaryTraceScorer, LearnedScorer, TreesScorer, SphereScorer,
     )  # fmt: skip
     texts = {scorer.name: _first_line(scorer) for scorer in scorers}
     for name, (metric, approximation, about_origin) in _ALL_FISHER.items():

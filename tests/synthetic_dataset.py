@@ -9,8 +9,9 @@ import pandas as pd
 
 from wheretolook.dataset import Dataset, SceneFolder, Split
 from wheretolook.features import bin_views_plain
-from wheretolook.geometry import PinholeCamera, poses_looking_along
+from wheretolook.geometry import Float, PinholeCamera, poses_looking_along
 from wheretolook.grid import fibonacci_sphere
+from wheretolook.mapping.cameras import save_mapping_poses
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.table import LOCALIZED, NO_POSE, TOO_FEW_MATCHES, pose_columns, write_table
 from wheretolook.visibility import StoredOcclusion, VisibleSets
@@ -37,6 +38,12 @@ def make_landmarks(rng: np.random.Generator, n: int) -> Landmarks:
     return Landmarks(ids=np.arange(n, dtype=np.int64), points=points, descriptors=None, **values)
 
 
+def make_mapping_poses(seed: int, n: int = 12) -> Float:
+    """Poses of mapping cameras that look around in the box."""
+    rng = np.random.default_rng([seed, 1])
+    return poses_looking_along(rng.uniform((-2, -2, 1), (2, 2, 2), (n, 3)), rng.normal(size=(n, 3)) * (1, 1, 0.2))
+
+
 def make_scene(
     folder: Path, split: Split, seed: int, n_locations: int = 24, n_directions: int = 20, n_landmarks: int = 500
 ) -> SceneFolder:
@@ -46,6 +53,7 @@ def make_scene(
     scene.map.mkdir(parents=True)
     landmarks = make_landmarks(rng, n_landmarks)
     landmarks.save(scene.landmarks)
+    save_mapping_poses(make_mapping_poses(seed), scene.mapping_cameras)
     locations = rng.uniform((-2, -2, 0.5), (2, 2, 2), (n_locations, 3))
     mask = rng.random((n_locations, n_landmarks)) < 0.8
     StoredOcclusion.from_mask(locations, mask).save(scene.occlusion)

@@ -9,11 +9,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import pandas as pd
 
 from wheretolook.errors import TableError
-from wheretolook.geometry import PinholeCamera
+from wheretolook.geometry import Float, PinholeCamera
 from wheretolook.localization_map import LocalizationMap
+from wheretolook.mapping.cameras import CAMERAS_FILE, colmap_poses, holds_model, load_mapping_poses
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.table import fingerprint, read_table
 from wheretolook.visibility import StoredOcclusion
@@ -45,13 +47,18 @@ class SceneFolder:
 
     @property
     def map(self) -> Path:
-        """Folder of the COLMAP model, with `landmarks.npz` beside it."""
+        """Folder of the COLMAP model, with `landmarks.npz` and `cameras.npz` beside it."""
         return self.folder / "map"
 
     @property
     def landmarks(self) -> Path:
         """Landmarks with their attributes."""
         return self.map / "landmarks.npz"
+
+    @property
+    def mapping_cameras(self) -> Path:
+        """Poses of the mapping images."""
+        return self.map / CAMERAS_FILE
 
     @property
     def table(self) -> Path:
@@ -72,9 +79,22 @@ class SceneFolder:
         """The scene's viewpoints, on request with their matches; see `wheretolook.table.read_table`."""
         return read_table(self.table, matches)
 
+    def mapping_poses(self) -> Float | None:
+        """Poses cam_from_world (M, 3, 4) float32 of the mapping images; None if neither their file nor a model is left.
+
+        Maps made before there was such a file have a COLMAP model, which tells the same.
+
+        Raises:
+            MapError: the file or the model is damaged.
+        """
+        if self.mapping_cameras.is_file():
+            return load_mapping_poses(self.mapping_cameras)
+        return colmap_poses(self.map).astype(np.float32) if holds_model(self.map) else None
+
     def localization_map(self, camera: PinholeCamera, device: str = "cpu") -> LocalizationMap:
         """The scene's map with the occlusion stored for its sampled locations; the mesh is not needed."""
-        return LocalizationMap(Landmarks.load(self.landmarks), camera, StoredOcclusion.load(self.occlusion), device)
+        landmarks, occlusion = Landmarks.load(self.landmarks), StoredOcclusion.load(self.occlusion)
+        return LocalizationMap(landmarks, camera, occlusion, device, self.mapping_poses())
 
 
 @dataclass(frozen=True)

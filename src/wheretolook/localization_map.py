@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from wheretolook.camera_models import Camera
 from wheretolook.features import BinnedViews, bin_views
 from wheretolook.geometry import Float, PinholeCamera, camera_centers
+from wheretolook.mapping.cameras import colmap_poses
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
 from wheretolook.rendering.types import check_poses
 from wheretolook.visibility import NoOcclusion, OcclusionModel, VisibleSets, visible_landmarks
@@ -28,12 +29,14 @@ class LocalizationMap:
         camera: the camera that will look: a pinhole, or any COLMAP model.
         occlusion: which landmarks have a free line of sight from a location.
         device: where kernels run, "cpu" or a CUDA device.
+        mapping_poses: cam_from_world (M, 3, 4) of the images the map was made from, where they are known.
     """
 
     landmarks: Landmarks
     camera: Camera = PinholeCamera()
     occlusion: OcclusionModel = NoOcclusion()
     device: str = "cpu"
+    mapping_poses: Float | None = None
 
     @classmethod
     def from_colmap(
@@ -72,7 +75,7 @@ class LocalizationMap:
             loaded = load_mesh(Path(mesh))
             two_sided = FreeSpace(loaded, device=device).two_sided
             occlusion = MeshOcclusion(MeshRaycaster(loaded, device), two_sided=two_sided)
-        return cls(landmarks, camera, occlusion, device)
+        return cls(landmarks, camera, occlusion, device, colmap_poses(model).astype(np.float32))
 
     def bin_views(self, cam_from_world: Float, bins: int = 30, landmark_channels: bool = False) -> BinnedViews:
         """Bin the landmarks that views see. Views that share a location share its occlusion test.
@@ -104,6 +107,12 @@ class LocalizationMap:
 
     def _unoccluded(self, cam_from_world: Float) -> tuple[VisibleSets, NDArray[np.int64]]:
         """Landmarks with a free line of sight from each location of poses, and each pose's row among these."""
-        centers = np.round(camera_centers(cam_from_world), SAME_LOCATION_DECIMALS)
-        locations, rows = np.unique(centers, axis=0, return_inverse=True)
-        return VisibleSets.from_mask(self.occlusion.unoccluded(locations, self.landmarks.points)), rows.reshape(-1)
+        locations, rows = shared_locations(cam_from_world)
+        return VisibleSets.from_mask(self.occlusion.unoccluded(locations, self.landmarks.points)), rows
+
+
+def shared_locations(cam_from_world: Float) -> tuple[Float, NDArray[np.int64]]:
+    """Locations (L, 3) m that poses (B, 3, 4) look from, and each pose's row among these, (B,)."""
+    centers = np.round(camera_centers(cam_from_world), SAME_LOCATION_DECIMALS)
+    locations, rows = np.unique(centers, axis=0, return_inverse=True)
+    return locations, rows.reshape(-1)

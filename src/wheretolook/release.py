@@ -18,6 +18,7 @@ import wheretolook
 from wheretolook.dataset import Dataset, SceneFolder, write_json
 from wheretolook.errors import ConfigError, StorageError, TableError, WeightsError
 from wheretolook.learning.config import NETWORKS, RELEASED
+from wheretolook.mapping.cameras import CAMERAS_FILE, save_mapping_poses
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.table import sha256, write_table
 from wheretolook.visibility import StoredOcclusion
@@ -49,7 +50,8 @@ def copy_dataset(dataset: Dataset, experiment: Experiment) -> Dataset:
     """Write a compact copy of a labelled dataset to `<data>/release/`. The same dataset gives the same bytes.
 
     Tables are written compact (`wheretolook.table.COMPACT_SCHEMA`), without matches, landmarks without descriptors and
-    in half precision, and what labels were made with without the list of shards. Weights and results that lie there
+    in half precision, the mapping images' poses if they are known, and what labels were made with without the list of
+    shards. Weights and results that lie there
     stay; the card and the scores of networks that do not ship go if the data changed.
 
     Args:
@@ -72,6 +74,10 @@ def copy_dataset(dataset: Dataset, experiment: Experiment) -> Dataset:
         write_table(scene.read_table(), copy.table, compact=True)
         Landmarks.load(scene.landmarks).save(copy.landmarks, compact=True)
         StoredOcclusion.load(scene.occlusion).save(copy.occlusion)
+        if (mapping_poses := scene.mapping_poses()) is None:
+            copy.mapping_cameras.unlink(missing_ok=True)
+        else:
+            save_mapping_poses(mapping_poses, copy.mapping_cameras)
         copy.label_manifest.unlink(missing_ok=True)
         if scene.label_manifest.is_file():
             write_json(copy.label_manifest, _manifest(scene.label_manifest))
@@ -149,7 +155,10 @@ def sizes(root: Path, weights: bool = True) -> dict[str, int]:
     Raises:
         StorageError: it is not smaller than `MAX_BYTES`.
     """
-    kinds = {"viewpoints.parquet": "tables", "landmarks.npz": "landmarks", "occlusion.npz": "occlusion"}
+    kinds = {
+        "viewpoints.parquet": "tables", "landmarks.npz": "landmarks", CAMERAS_FILE: "cameras",
+        "occlusion.npz": "occlusion",
+    }  # fmt: skip
     parts = dict.fromkeys((*kinds.values(), "weights", "text"), 0)
     for path in root.rglob("*"):
         shelved = path.suffix == ".safetensors" and (path.parent.name == SHELF or not weights)

@@ -52,6 +52,8 @@ too_few_matches, no_pose), `error_m`, `error_deg`, `n_inliers`. World in metres,
 forward. `map/landmarks.npz` holds the landmarks (`wheretolook.mapping.landmarks.Landmarks`), `occlusion.npz` which of \
 them each location has a free line of sight to (`wheretolook.visibility.StoredOcclusion`)."""
 
+_CAMERAS = "`map/cameras.npz` holds the poses cam_from_world of the images that the map was made from."
+
 
 def write_card(release: Dataset) -> Path:
     """Write `<release>/README.md` from what lies in the release's folder. The same files give the same bytes.
@@ -124,6 +126,7 @@ def release_card(release: Dataset) -> str:
         f"```yaml\n{_changed_settings(about['settings'])}```",
         *_label_text(release),
         _TABLES,
+        *([_CAMERAS] if all(scene.mapping_cameras.is_file() for scene in release.scenes) else []),
         "## Training",
         _training_text(weights, training, record, shares),
         _variant_table(weights, training),
@@ -285,7 +288,7 @@ def _size_text(release: Dataset) -> str:
     n_landmarks = sum(len(Landmarks.load(scene.landmarks)) for scene in release.scenes)
     n_locations = sum(len(StoredOcclusion.load(scene.occlusion).locations) for scene in release.scenes)
     return (
-        f"{size_text({name: size for name, size in parts.items() if name != 'text'})}; "
+        f"{size_text({name: size for name, size in parts.items() if size and name != 'text'})}; "
         f"{parts['tables'] / n_views:.1f} bytes a viewpoint, {parts['landmarks'] / n_landmarks:.1f} a landmark, "
         f"{parts['occlusion'] / n_locations:.0f} a location"
     )

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import overload
 
-import numpy as np
-
 from wheretolook.dataset import SceneFolder
-from wheretolook.errors import MapError, SceneError
+from wheretolook.errors import SceneError
 from wheretolook.geometry import Float, PinholeCamera
+from wheretolook.mapping.cameras import colmap_poses
 from wheretolook.rendering import MeshRaycaster, WarpRenderer
 from wheretolook.scenes.loading import load_mesh
 from wheretolook.scenes.mesh import TexturedMesh
@@ -52,27 +51,10 @@ def scene_occlusion(
                              fix="Run the scenes stage, or use hidden-points or none.")  # fmt: skip
         mesh = load_mesh(scene.mesh)
     if config.model == "tsdf":
-        images = RenderedDepth(WarpRenderer(mesh, device), camera, map_poses(scene))
+        images = RenderedDepth(WarpRenderer(mesh, device), camera, colmap_poses(scene.map))
         tsdf = TsdfConfig(voxel_size_m=config.voxel_m, max_depth_m=config.max_depth_m)
         return TsdfOcclusion(TsdfVolume.from_images(images, tsdf, progress), config.margin_m, device)
     return MeshOcclusion(MeshRaycaster(mesh, device), config.margin_m, two_sided)
-
-
-def map_poses(scene: SceneFolder) -> Float:
-    """Poses cam_from_world (B, 3, 4) of the images of a scene's map, in the order of their ids.
-
-    Raises:
-        MapError: there is no COLMAP model, or it holds no image.
-    """
-    import pycolmap
-
-    try:
-        images = pycolmap.Reconstruction(scene.map).images
-    except Exception as error:
-        raise MapError(f"cannot read the map's images: {error}", path=scene.map, fix="Run the map stage.") from error
-    if not images:
-        raise MapError("the map has no images", path=scene.map, value=0, fix="Run the map stage again.")
-    return np.stack([images[number].cam_from_world().matrix() for number in sorted(images)])
 
 
 class RenderedDepth(Sequence[DepthImage]):

@@ -21,6 +21,7 @@ from wheretolook.mapping import (
     plan_walk,
     triangulation,
 )
+from wheretolook.mapping.cameras import load_mapping_poses
 from wheretolook.mapping.processes import Processes
 from wheretolook.rendering import WarpRenderer
 from wheretolook.scenes.mesh import TexturedMesh
@@ -72,6 +73,15 @@ def test_model_reopens_with_the_poses_of_the_walk(built, room, room_free_space):
         image = model.images[index + 1]
         assert image.name == f"{index:05d}.png" and image.has_pose
         np.testing.assert_allclose(image.cam_from_world().matrix(), pose, atol=1e-9)
+
+
+def test_stored_poses_are_those_of_the_model(built):
+    folder, _ = built
+    images = pycolmap.Reconstruction(str(folder)).images
+    expected = np.stack([images[number].cam_from_world().matrix() for number in sorted(images)])
+    stored = load_mapping_poses(folder / "cameras.npz")
+    assert stored.shape == (CONFIG.n_images, 3, 4) and stored.dtype == np.float32
+    np.testing.assert_array_equal(stored, expected.astype(np.float32))
 
 
 def test_landmarks_project_to_their_keypoints(built):
@@ -135,7 +145,7 @@ def test_same_seed_same_bytes_whatever_the_workers(built, room, room_free_space,
     build_map(room, renderer, room_free_space, CAMERA, CONFIG, SEED, again, workers=2, progress=False)
     names = sorted(p.relative_to(folder) for p in folder.rglob("*") if p.is_file())
     assert names == sorted(p.relative_to(again) for p in again.rglob("*") if p.is_file())
-    assert Path("points3D.bin") in names and Path("landmarks.npz") in names
+    assert Path("points3D.bin") in names and {Path("landmarks.npz"), Path("cameras.npz")} < {*names}
     for name in names:
         if name.name not in ("report.json", "database.db"):
             assert (folder / name).read_bytes() == (again / name).read_bytes(), name
@@ -174,7 +184,7 @@ def test_earlier_map_is_replaced_and_extras_are_optional(room, room_free_space, 
     build_map(room, renderer, room_free_space, CAMERA, config, 1, folder, workers=1, progress=False)
     assert (folder / "landmarks.npz").read_bytes() != first
     model_files = {"cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin"}
-    assert {p.name for p in folder.iterdir()} == model_files | {"landmarks.npz", "report.json"}
+    assert {p.name for p in folder.iterdir()} == model_files | {"landmarks.npz", "cameras.npz", "report.json"}
     assert [p.name for p in tmp_path.iterdir()] == ["map"]
 
 

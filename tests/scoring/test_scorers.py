@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 import torch
 
-from synthetic_dataset import CAMERA, make_landmarks
+from synthetic_dataset import CAMERA, make_landmarks, make_mapping_poses
 from wheretolook.attributes import LandmarkDescriber, pool
 from wheretolook.errors import ConfigError, WeightsError
 from wheretolook.features import ALL_CHANNELS, CHANNELS, INPUT_VARIANTS, BinnedViews
 from wheretolook.geometry import Float, PinholeCamera, poses_looking_along
-from wheretolook.learning.config import TreesConfig
+from wheretolook.learning.config import SphereConfig, TreesConfig
 from wheretolook.learning.conv import ConvNetwork, ConvSpec
 from wheretolook.learning.network import InputStatistics, NetworkSpec, ViewpointNetwork
+from wheretolook.learning.sphere import SphereModel, SphereNetwork
 from wheretolook.learning.trees import BoostedTrees, PooledViews, fit_trees
 from wheretolook.learning.weights import save_classifier
 from wheretolook.localization_map import LocalizationMap
@@ -24,7 +25,8 @@ from wheretolook.scoring import SCORERS, BinsScorer, Scorer, VisibleScorer, load
 
 @pytest.fixture
 def localization_map() -> LocalizationMap:
-    return LocalizationMap(make_landmarks(np.random.default_rng(0), 200), CAMERA)
+    landmarks = make_landmarks(np.random.default_rng(0), 200)
+    return LocalizationMap(landmarks, CAMERA, mapping_poses=make_mapping_poses(0))
 
 
 @pytest.fixture
@@ -71,6 +73,9 @@ def test_scorers_keep_their_contract(
     if name == "conv":
         weights = weights.with_name("conv.safetensors")
         some_convolutions().save(weights)
+    if name == "sphere":
+        weights = weights.with_name("sphere.safetensors")
+        SphereModel(SphereNetwork(SphereConfig()), SphereConfig(), CAMERA).save(weights)
     scorer = make_scorer(name, localization_map, seed=3, weights=weights)
     assert isinstance(scorer, Scorer)
     assert name in (scorer.name, f"{scorer.name}-{scorer.inputs.replace(' ', '-')}")

@@ -99,7 +99,8 @@ _STYLES = {
     ("set", ""): MethodStyle("set of landmarks", "#CC3311", "o", "-"),
     ("trees", ""): MethodStyle("boosted trees, landmark attributes", "#882255", "*", "-"),
     ("mlp", "2d+3d+landmark"): MethodStyle("MLP, 2d + 3d + landmark", "#8C3A00", "H", (0, (6, 1, 1, 1))),
-    ("conv", ""): MethodStyle("convolutional, landmark attributes", "#332288", "8", (0, (3, 1))),
+    ("conv", ""): MethodStyle("convolutional, landmark attributes", "#AA4499", "8", (0, (3, 1))),
+    ("sphere", ""): MethodStyle("whole sphere (manner of ActLoc)", "#6699CC", "H", (0, (3, 1))),
     ("mlp", "released"): MethodStyle("MLP, trained as the released code", "#F0A070", "p", (0, (2, 2))),
 }
 
@@ -114,6 +115,7 @@ _GROUPS = {
     "set": "learned",
     "expected": "learned",
     "conv": "learned",
+    "sphere": "learned",
     "fisher": "Fisher",
     "fisher-worst-trace": "probes",
     "fisher-stationary-trace": "probes",

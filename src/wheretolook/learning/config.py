@@ -23,13 +23,17 @@ SET = "set"
 CONV = "conv"
 """The variant that is a convolutional network over the bins, which also knows what landmarks are like."""
 
+SPHERE = "sphere"
+"""The variant that scores all directions at a location at once, in the manner of ActLoc."""
+
 NETWORKS = (*PAPER_VARIANTS, RELEASED)
 """The paper's networks, of which a release ships one."""
 
-OWN_OPTIONS = {name: name for name in (TREES, MATCHABILITY, CONV, SET)}
-"""Variants that are not the paper's network, and the field of `TrainConfig` with the options of each."""
+LEARNERS = (TREES, MATCHABILITY, CONV, SET, SPHERE)
+"""Variants that are not the paper's network. Each has its options in the field of its name in `TrainConfig`, and learns
+by a function in the module of its name in `wheretolook.learning`."""
 
-VARIANTS = (*INPUT_VARIANTS, RELEASED, *OWN_OPTIONS)
+VARIANTS = (*INPUT_VARIANTS, RELEASED, *LEARNERS)
 """All that can be trained."""
 
 RELEASED_OPTIONS: dict[str, Any] = {
@@ -201,6 +205,40 @@ class ConvConfig(FittingConfig):
 
 
 @dataclass(frozen=True)
+class SphereConfig(FittingConfig):
+    """Options of "sphere"; a batch holds whole locations with about `batch_size` viewpoints in all.
+
+    Args:
+        points: landmarks of a location at most, spread evenly over those in free sight.
+        cameras: mapping cameras at most, spread evenly over all.
+        width: of tokens and queries; a multiple of `heads`.
+        heads: of attention.
+        layers: blocks of attention among the tokens.
+        dropout: share of values dropped in the blocks of attention.
+    """
+
+    epochs: int = 30
+    batch_size: int = 1024
+    learning_rate: float = 5e-4
+    points: int = 512
+    cameras: int = 128
+    width: int = 96
+    heads: int = 4
+    layers: int = 2
+    dropout: float = 0.1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("points", "cameras", "width", "heads", "layers"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"sphere needs {name} of at least 1", value=getattr(self, name))
+        if self.width % self.heads:
+            raise ConfigError("sphere needs a width that is a multiple of heads", value=(self.width, self.heads))
+        if not 0 <= self.dropout < 1:
+            raise ConfigError("dropout must be at least 0 and less than 1", value=self.dropout)
+
+
+@dataclass(frozen=True)
 class TrainConfig:
     """Options of training. The defaults are the paper's where it says something (Sec. 3.3 and 4).
 
@@ -209,8 +247,166 @@ class TrainConfig:
             also told what landmarks are like; "released", which has the inputs "2d+3d" and learns with the options of
             the paper's released code instead of those here; and learners that know what landmarks are like, with
             options of their own and none of the network's: "trees", boosted trees on statistics of the landmarks in
-            view; "conv", a convolutional network over the bins; "set", a network over landmarks one by one; and
-            "matchability", which tells which of them will be found (needs labels with `--label.store_matches true`).
+            view; "conv", a convolutional network over the bins; "set", a network over landmarks one by one;
+            "sphere", one that scores all directions at a location at once; and "matchability", which tells which
+            landmarks will be found (needs labels with `--label.store_matches true`).
+        epochs: passes over the training viewpoints.
+        batch_size: viewpoints a step.
+        learning_rate: Adam's initial rate.
+        l2: factor of the sum of squared weights.
+    """
+
+    epochs: int = 20
+    batch_size: int = 512
+    learning_rate: float = 2e-3
+    l2: float = 1e-5
+
+    def __post_init__(self) -> None:
+        if self.epochs < 1 or self.batch_size < 1:
+            raise ConfigError("epochs and batch_size must be at least 1", value=(self.epochs, self.batch_size))
+        if not self.learning_rate > 0 or not self.l2 >= 0:
+            raise ConfigError("learning_rate must be positive and l2 not negative", value=(self.learning_rate, self.l2))
+
+
+def _check_hidden(names: tuple[str, ...]) -> None:
+    from wheretolook.attributes import ATTRIBUTES  # PyTorch takes seconds to load
+
+    if unknown := [name for name in names if name not in ATTRIBUTES]:
+        known = f"There are {', '.join(ATTRIBUTES)}."
+        raise ConfigError("hidden names an attribute that there is not", value=unknown[0], fix=known)
+
+
+@dataclass(frozen=True)
+class MatchabilityConfig(FittingConfig):
+    """Options of the probability that a landmark in view is found.
+
+    Args:
+        landmarks: landmarks of a view to learn from, at most, chosen at random.
+        width: units of each of two hidden layers.
+        hidden: attributes (`wheretolook.attributes.ATTRIBUTES`) not to look at, to see what each is worth.
+    """
+
+    epochs: int = 6
+    batch_size: int = 256
+    landmarks: int = 64
+    width: int = 48
+    hidden: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.landmarks < 1 or self.width < 1:
+            raise ConfigError("landmarks and width must be at least 1", value=(self.landmarks, self.width))
+        if self.hidden:
+            _check_hidden(self.hidden)
+
+
+@dataclass(frozen=True)
+class SetConfig(FittingConfig):
+    """Options of the network over the set of landmarks in view.
+
+    Args:
+        landmarks: landmarks of a view that a training step looks at, at most, chosen at random.
+        width: units of the layers that look at single landmarks.
+        pooled: numbers that attention pools beside what the landmarks are expected to tell of the pose.
+        head: units of the layers that decide.
+        dropout: share of the deciding layers' units dropped.
+        from_matchability: start from `weights/matchability.safetensors` where the dataset has it.
+        hidden: attributes (`wheretolook.attributes.ATTRIBUTES`) not to look at, to see what each is worth.
+    """
+
+    epochs: int = 12
+    landmarks: int = 192
+    width: int = 48
+    pooled: int = 0
+    head: int = 48
+    dropout: float = 0.1
+    from_matchability: bool = True
+    hidden: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if min(self.landmarks, self.width, self.head) < 1 or self.pooled < 0 or not 0 <= self.dropout < 1:
+            raise ConfigError(
+                "a set network needs landmarks, width and head >= 1, pooled >= 0 and a dropout below 1",
+                value=(self.landmarks, self.width, self.head, self.pooled, self.dropout),
+            )
+        if self.hidden:
+            _check_hidden(self.hidden)
+
+
+@dataclass(frozen=True)
+class ConvConfig(FittingConfig):
+    """Options of the convolutional network over the bins.
+
+    Args:
+        epochs, batch_size, learning_rate, l2: see `FittingConfig`.
+        widths: channels after each convolution; every one but the first halves the sides of the grid.
+        dropout: share of pooled values dropped in training.
+        bins: bins along each side of the image.
+    """
+
+    widths: tuple[int, ...] = (32, 64, 128, 128)
+    dropout: float = 0.2
+    bins: int = 30
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.widths or min(self.widths) < 1:
+            raise ConfigError(
+                "convolutions must be at least one channel wide, and there must be one", value=self.widths
+            )
+        if not 0 <= self.dropout < 1 or self.bins < 1:
+            raise ConfigError(
+                "a convolutional network needs bins >= 1 and a dropout from 0 to less than 1",
+                value=(self.bins, self.dropout),
+            )
+
+
+@dataclass(frozen=True)
+class SphereConfig(FittingConfig):
+    """Options of "sphere"; a batch holds whole locations with about `batch_size` viewpoints in all.
+
+    Args:
+        points: landmarks of a location at most, spread evenly over those in free sight.
+        cameras: mapping cameras at most, spread evenly over all.
+        width: of tokens and queries; a multiple of `heads`.
+        heads: of attention.
+        layers: blocks of attention among the tokens.
+        dropout: share of values dropped in the blocks of attention.
+    """
+
+    epochs: int = 30
+    batch_size: int = 1024
+    learning_rate: float = 5e-4
+    points: int = 512
+    cameras: int = 128
+    width: int = 96
+    heads: int = 4
+    layers: int = 2
+    dropout: float = 0.1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("points", "cameras", "width", "heads", "layers"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"sphere needs {name} of at least 1", value=getattr(self, name))
+        if self.width % self.heads:
+            raise ConfigError("sphere needs a width that is a multiple of heads", value=(self.width, self.heads))
+        if not 0 <= self.dropout < 1:
+            raise ConfigError("dropout must be at least 0 and less than 1", value=self.dropout)
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Options of training. The defaults are the paper's where it says something (Sec. 3.3 and 4).
+
+    Args:
+        variants: what to train: networks by their inputs, "2d", "2d+z" and "2d+3d", and "2d+3d+landmark", which is
+            also told what landmarks are like; "released", which has the inputs "2d+3d" and learns with the options of
+            the paper's released code instead of those here; and learners that know what landmarks are like, with
+            options of their own and none of the network's: "trees", boosted trees on statistics of the landmarks in
+            view; "conv", a convolutional network over the bins; "set", a network over landmarks one by one;
+            "sphere", one that scores all directions at a location at once; and "matchability", which tells which of them will be found (needs labels with `--label.store_matches true`).
         epochs: passes over the training viewpoints (paper: 300).
         batch_size: viewpoints a step, shared out over the devices (the paper gives none; 128 is the released code's).
         learning_rate: Adam's initial learning rate (paper: 1e-3; released code: 1e-4).
@@ -243,6 +439,7 @@ class TrainConfig:
         matchability: options of "matchability".
         set: options of "set".
         conv: options of "conv".
+        sphere: options of "sphere".
     """
 
     variants: tuple[str, ...] = tuple(PAPER_VARIANTS)
@@ -271,6 +468,7 @@ class TrainConfig:
     matchability: MatchabilityConfig = field(default_factory=MatchabilityConfig)
     set: SetConfig = field(default_factory=SetConfig)
     conv: ConvConfig = field(default_factory=ConvConfig)
+    sphere: SphereConfig = field(default_factory=SphereConfig)
 
     def __post_init__(self) -> None:
         unknown = [name for name in self.variants if name not in VARIANTS]
@@ -308,7 +506,7 @@ class TrainConfig:
         """The options that a variant is trained with."""
         if variant == RELEASED:
             return replace(self, **RELEASED_OPTIONS)
-        own = getattr(self, OWN_OPTIONS[variant]) if variant in OWN_OPTIONS else None
+        own = getattr(self, variant) if variant in LEARNERS else None
         if isinstance(own, FittingConfig):
             return replace(
                 self, epochs=own.epochs, batch_size=own.batch_size, learning_rate=own.learning_rate, l2=own.l2,
@@ -319,7 +517,7 @@ class TrainConfig:
 
 def weights_name(variant: str) -> str:
     """File in a dataset's `weights` folder of what a variant has learnt."""
-    return f"{variant}.safetensors" if variant in OWN_OPTIONS else f"mlp-{variant}.safetensors"
+    return f"{variant}.safetensors" if variant in LEARNERS else f"mlp-{variant}.safetensors"
 
 
 def inputs_of(variant: str) -> str:

@@ -15,12 +15,11 @@ from lightning.pytorch.utilities.seed import isolate_rng
 
 import wheretolook
 from wheretolook.dataset import Dataset, write_json
-from wheretolook.errors import ConfigError
 from wheretolook.features import INPUT_VARIANTS
 from wheretolook.learning.classifier import ViewpointClassifier
 from wheretolook.learning.config import (
+    LEARNERS,
     MATCHABILITY,
-    OWN_OPTIONS,
     SET,
     TrainConfig,
     inputs_of,
@@ -39,7 +38,7 @@ from wheretolook.tracking import TrackingConfig, log, start_run
 if TYPE_CHECKING:
     from mlflow import MlflowClient
 
-NOT_DECIDING = ("variants", "accelerator", "devices", *dict.fromkeys(OWN_OPTIONS.values()))
+NOT_DECIDING = ("variants", "accelerator", "devices", *LEARNERS)
 """Options that do not decide what the paper's network learns: where, with which random numbers, and others' own."""
 
 OF_ALL = ("max_error_m", "max_error_deg", "val_fraction", "seed")
@@ -102,11 +101,11 @@ def train(
         options = config.of_variant(variant)
         about = _about(dataset, options, fingerprint, variant)
         model = None if force else _trained_before(path, variant, about)
-        if model is None and variant in OWN_OPTIONS:
+        if model is None and variant in LEARNERS:
             model = _learn(dataset, options, variant, path, about, tracking, progress)
         elif model is None:
             if data is None or data.config != options:
-                networks = [one for one in config.variants if one not in OWN_OPTIONS]
+                networks = [one for one in config.variants if one not in LEARNERS]
                 sharing = [one for one in networks if config.of_variant(one) == options]
                 wide = any(map(needs_landmark_channels, sharing))
                 data = ViewpointDataModule(dataset, options, home_device(options), progress, wide)
@@ -117,10 +116,10 @@ def train(
 
 
 def learner_of(variant: str) -> Learner:
-    """How a variant of `OWN_OPTIONS` learns."""
-    if variant in OWN_OPTIONS:  # each in a module of its own, as some take long to load
-        return getattr(import_module(f"wheretolook.learning.{variant}"), f"learn_{variant}")  # type: ignore[no-any-return]
-    raise ConfigError("no such variant", value=variant)
+    """How a variant of `LEARNERS` learns."""
+    module = import_module(f"wheretolook.learning.{variant}")  # some take long to load
+    learner: Learner = getattr(module, f"learn_{variant}")
+    return learner
 
 
 def training_fingerprint(dataset: Dataset) -> str:
@@ -130,8 +129,8 @@ def training_fingerprint(dataset: Dataset) -> str:
 
 def _about(dataset: Dataset, config: TrainConfig, fingerprint: str, variant: str) -> dict[str, Any]:
     """What decides which weights come out, as JSON values."""
-    own = OWN_OPTIONS.get(variant)
-    deciding = (*OF_ALL, own) if own else [name for name in asdict(config) if name not in NOT_DECIDING]
+    of_network = [name for name in asdict(config) if name not in NOT_DECIDING]
+    deciding = (*OF_ALL, variant) if variant in LEARNERS else of_network
     options = {name: value for name, value in asdict(config).items() if name in deciding}
     about: dict[str, Any] = {
         "dataset": dataset.name,
@@ -198,11 +197,10 @@ def _learn(
     dataset: Dataset, config: TrainConfig, variant: str, path: Path, about: dict[str, Any], tracking: TrackingConfig,
     progress: bool,
 ) -> TrainedModel:  # fmt: skip
-    own = OWN_OPTIONS[variant]
     params = {
         **{name: about[name] for name in ("variant", "dataset", "dataset_fingerprint")},
-        **about["config"][own],
-        **{name: value for name, value in about["config"].items() if name != own},
+        **about["config"][variant],
+        **{name: value for name, value in about["config"].items() if name != variant},
     }
     with start_run(tracking, f"train {variant}", "train", params) as (client, run_id), isolate_rng():
         seed_everything(config.seed, verbose=False)

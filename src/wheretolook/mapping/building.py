@@ -18,6 +18,7 @@ from tqdm.auto import tqdm
 
 from wheretolook.errors import MapError
 from wheretolook.geometry import PinholeCamera, poses_looking_along
+from wheretolook.mapping.cameras import CAMERAS_FILE, colmap_poses, save_mapping_poses
 from wheretolook.mapping.config import MapConfig
 from wheretolook.mapping.extraction import KeypointExtractor, Keypoints
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
@@ -90,7 +91,8 @@ def build_map(
 ) -> MapReport:
     """Map a scene: walk, render, extract, match, triangulate with known poses, filter.
 
-    The result is a COLMAP model (binary) that any COLMAP tool opens, with `landmarks.npz` and `report.json` beside it.
+    The result is a COLMAP model (binary) that any COLMAP tool opens, with `landmarks.npz`, `cameras.npz`
+    and `report.json` beside it.
     The model holds the filtered points only, so that every reader sees the same map. The folder appears when all is
     done; an interrupted or failed build leaves nothing and does not touch an earlier map.
 
@@ -162,6 +164,7 @@ def build_map(
         with clock("landmarks"):
             landmarks = load_colmap_landmarks(partial, database, config.max_reprojection_error_px)
             landmarks.save(partial / LANDMARKS_FILE)
+            save_mapping_poses(colmap_poses(partial), partial / CAMERAS_FILE)
         with clock("accuracy"):
             distance_cm = _surface_distance_cm(landmarks, mesh, raycaster)
         if not config.keep_database:

@@ -80,13 +80,15 @@ def load_scorer(weights: str | Path, localization_map: LocalizationMap) -> Score
 
     Raises:
         WeightsError: the file cannot be used, or was trained for another field of view than the map's camera.
+        MapError: the map lacks what the method needs.
     """
     from wheretolook.scoring.conv import ConvScorer
     from wheretolook.scoring.set import SetScorer
+    from wheretolook.scoring.sphere import SphereScorer
     from wheretolook.scoring.trees import TreesScorer
 
     loaders: dict[str, Callable[[str | Path, LocalizationMap], Scorer]] = {
-        scorer.name: scorer.load for scorer in (LearnedScorer, TreesScorer, ConvScorer, SetScorer)
+        scorer.name: scorer.load for scorer in (LearnedScorer, TreesScorer, ConvScorer, SetScorer, SphereScorer)
     }
     kind = weights_kind(weights)
     if kind not in loaders:

@@ -89,13 +89,13 @@ SCORERS: dict[str, Callable[[LocalizationMap, ScorerOptions], Scorer]] = {
     "fisher-stationary-trace": lambda localization_map, options: StationaryTraceScorer(localization_map),
     "mlp": _with_weights("mlp"),
     **{name: _expected(name) for name in EXPECTED_METHODS},
-    **{name: _with_weights(name) for name in ("trees", "conv", "set")},
+    **{name: _with_weights(name) for name in ("trees", "conv", "set", "sphere")},
 }
 """How each method is built from a map and options."""
 
 WEIGHTS_OF = {
     **dict.fromkeys(EXPECTED_METHODS, "matchability"),
-    **{name: name for name in ("mlp", "trees", "conv", "set")},
+    **{name: name for name in ("mlp", "trees", "conv", "set", "sphere")},
 }
 """Methods that have learnt, and the kind of weights (`wheretolook.learning.weights.weights_kind`) that each needs."""
 
@@ -111,11 +111,13 @@ def describe_methods() -> dict[str, str]:
     from wheretolook.scoring.conv import ConvScorer
     from wheretolook.scoring.learned import LearnedScorer
     from wheretolook.scoring.set import SetScorer
+    from wheretolook.scoring.sphere import SphereScorer
     from wheretolook.scoring.trees import TreesScorer
 
     scorers: tuple[type[Scorer], ...] = (
         RandomScorer, ForwardScorer, VisibleScorer, BinsScorer, MaxVisibilityScorer, SwappedMaxVisibilityScorer,
         WorstTraceScorer, StationaryTraceScorer, LearnedScorer, TreesScorer, ConvScorer, SetScorer,
+        SphereScorer,
     )  # fmt: skip
     texts = {scorer.name: _first_line(scorer) for scorer in scorers}
     for name, (metric, approximation, about_origin) in _ALL_FISHER.items():

@@ -1,0 +1,61 @@
+"""Where a map's images were taken from and where they looked: small enough to travel without the COLMAP model."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from wheretolook.errors import MapError
+from wheretolook.geometry import Float
+from wheretolook.mapping.colmap_model import MODEL_FILES, read_model
+
+CAMERAS_FILE = "cameras.npz"
+"""Lies beside the landmarks."""
+
+
+def colmap_poses(model_dir: str | Path) -> Float:
+    """Poses cam_from_world (M, 3, 4) float64 of the images of a COLMAP model that have one, in the order of their ids.
+
+    Raises:
+        MapError: the folder or a file is missing or corrupt, or no image has a pose.
+    """
+    images = read_model(model_dir).images
+    posed = [images[number] for number in sorted(images) if images[number].has_pose]
+    if not posed:
+        raise MapError("the map has no images", path=model_dir, value=0, fix="Run the map stage again.")
+    return np.stack([image.cam_from_world().matrix() for image in posed])
+
+
+def holds_model(folder: Path) -> bool:
+    """Whether a folder holds a COLMAP model, binary or text."""
+    return any(all((folder / (name + suffix)).is_file() for name in MODEL_FILES) for suffix in (".bin", ".txt"))
+
+
+def save_mapping_poses(cam_from_world: Float, path: str | Path) -> None:
+    """Write poses (M, 3, 4) in single precision as an NPZ file, atomically. The same poses give the same bytes."""
+    path = Path(path)
+    partial = path.with_name(path.name + ".partial")
+    with partial.open("wb") as file:
+        np.savez(file, cam_from_world=np.asarray(cam_from_world, dtype=np.float32))
+    os.replace(partial, path)
+
+
+def load_mapping_poses(path: str | Path) -> Float:
+    """Read what `save_mapping_poses` wrote, (M, 3, 4) float32.
+
+    Raises:
+        MapError: the file is missing, damaged, or does not hold poses.
+    """
+    path, fix = Path(path), "Run the map stage again, or remove it to read the COLMAP model beside it instead."
+    if not path.is_file():
+        raise MapError("there is no file of the mapping images' poses", path=path, fix="Run the map stage again.")
+    try:
+        with np.load(path) as stored:
+            poses = stored["cam_from_world"]
+    except Exception as error:  # a damaged zip raises many kinds of errors
+        raise MapError(f"cannot read the mapping images' poses: {error}", path=path, fix=fix) from error
+    if poses.ndim != 3 or poses.shape[1:] != (3, 4) or not len(poses) or not np.isfinite(poses).all():
+        raise MapError("these are no poses of mapping images", path=path, value=poses.shape, fix=fix)
+    return np.asarray(poses, dtype=np.float32)

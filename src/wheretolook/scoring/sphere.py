@@ -1,0 +1,68 @@
+"""The score of a network that sees a location's landmarks and mapping cameras all around."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import torch
+
+from wheretolook.errors import WeightsError
+from wheretolook.geometry import Float
+from wheretolook.learning.sphere import SphereModel, on_lattice
+from wheretolook.learning.sphere_views import LocationDescriber
+from wheretolook.localization_map import LocalizationMap, shared_locations
+from wheretolook.rendering.types import check_poses
+from wheretolook.scoring.base import Scorer
+from wheretolook.scoring.learned import check_field_of_view
+
+
+class SphereScorer(Scorer):
+    """In the manner of ActLoc: one pass over a location's landmarks and the mapping cameras scores 6 x 18 directions.
+
+    A pose's score is the probability that it localizes, interpolated between those directions; roll does not count.
+
+    Args:
+        localization_map: the map, with its mapping cameras.
+        model: trained for cameras of the same field of view.
+
+    Raises:
+        WeightsError: trained for another field of view than the map's camera.
+        MapError: the map has no mapping cameras.
+    """
+
+    name: ClassVar[str] = "sphere"
+
+    def __init__(self, localization_map: LocalizationMap, model: SphereModel) -> None:
+        super().__init__(localization_map)
+        check_field_of_view(model.camera, localization_map.camera)
+        self._describer = LocationDescriber(localization_map, model.config)
+        self.model = model.to(localization_map.device)
+
+    @classmethod
+    def load(cls, weights: str | Path, localization_map: LocalizationMap) -> SphereScorer:
+        """Build a scorer from a weights file that the train stage wrote.
+
+        Raises:
+            WeightsError: the file cannot be used, or was trained for another field of view than the map's camera.
+            MapError: the map has no mapping cameras.
+        """
+        model = SphereModel.load(weights)
+        try:
+            return cls(localization_map, model)
+        except WeightsError as error:
+            raise WeightsError(error.problem, path=weights, value=error.value, fix=error.fix) from None
+
+    def score(self, cam_from_world: Float) -> Float:
+        """(B,) probabilities in [0, 1]."""
+        cam_from_world = check_poses(cam_from_world)
+        if not len(cam_from_world):
+            return np.empty(0)
+        locations, rows = shared_locations(cam_from_world)
+        device = self.localization_map.device
+        described = self._describer.describe(locations)
+        lattices = torch.stack([self.model.lattice_logits(tokens.to(device)) for tokens in described])
+        axes = torch.from_numpy(np.ascontiguousarray(cam_from_world[:, 2, :3], dtype=np.float64)).to(device)
+        logits = on_lattice(lattices, torch.from_numpy(rows).to(device), axes)
+        return np.asarray(logits.sigmoid().cpu().numpy())

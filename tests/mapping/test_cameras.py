@@ -1,0 +1,66 @@
+"""Poses of mapping images: stored, read back, and read from the COLMAP model where there is no file of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mapping.test_landmarks import CENTERS, hand_written_model
+from synthetic_dataset import CAMERA, make_mapping_poses, make_scene
+from wheretolook.dataset import Dataset, SceneFolder
+from wheretolook.errors import MapError
+from wheretolook.geometry import camera_centers
+from wheretolook.localization_map import LocalizationMap
+from wheretolook.mapping.cameras import load_mapping_poses, save_mapping_poses
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> SceneFolder:
+    """A scene without a COLMAP model, as of a release."""
+    return make_scene(tmp_path / "scene", "train", seed=0, n_locations=3, n_directions=4, n_landmarks=20)
+
+
+def test_poses_come_back_from_disk_and_give_the_same_bytes(tmp_path: Path) -> None:
+    poses, path = make_mapping_poses(3), tmp_path / "cameras.npz"
+    save_mapping_poses(poses, path)
+    np.testing.assert_array_equal(load_mapping_poses(path), poses.astype(np.float32))
+    content = path.read_bytes()
+    save_mapping_poses(load_mapping_poses(path), path)
+    assert path.read_bytes() == content and [file.name for file in tmp_path.iterdir()] == ["cameras.npz"]
+
+
+def test_a_model_tells_the_poses_where_there_is_no_file(scene: SceneFolder) -> None:
+    stored = scene.localization_map(CAMERA).mapping_poses
+    np.testing.assert_array_equal(stored, load_mapping_poses(scene.mapping_cameras))
+    scene.mapping_cameras.unlink()
+    assert scene.localization_map(CAMERA).mapping_poses is None
+    hand_written_model()[0].write_binary(str(scene.map))
+    found = scene.localization_map(CAMERA).mapping_poses
+    assert found is not None and found.dtype == np.float32
+    np.testing.assert_allclose(camera_centers(found), CENTERS, atol=1e-6)
+    np.testing.assert_allclose(found[:, 2, :3], np.tile([0.0, 1.0, 0.0], (3, 1)), atol=1e-6)
+    of_model = LocalizationMap.from_colmap(scene.map, CAMERA, max_reprojection_error_px=5.0).mapping_poses
+    np.testing.assert_array_equal(of_model, found)
+
+
+def test_the_file_leaves_a_datasets_fingerprint_alone(scene: SceneFolder) -> None:
+    dataset = Dataset(scene.folder.parent, CAMERA, (scene,))
+    before = dataset.fingerprint()
+    scene.mapping_cameras.unlink()
+    assert dataset.fingerprint() == before  # weights trained before there was such a file stay valid
+
+
+def test_damage_is_named(scene: SceneFolder) -> None:
+    path = scene.mapping_cameras
+    path.write_bytes(path.read_bytes()[:-40])
+    with pytest.raises(MapError, match=r"cameras\.npz.*cannot read"):
+        scene.localization_map(CAMERA)
+    for wrong in (np.zeros((2, 4, 4)), np.zeros((0, 3, 4)), np.full((2, 3, 4), np.nan)):
+        save_mapping_poses(wrong, path)
+        with pytest.raises(MapError, match=r"cameras\.npz.*no poses"):
+            load_mapping_poses(path)
+    path.unlink()
+    with pytest.raises(MapError, match=r"cameras\.npz.*there is no file.*map stage"):
+        load_mapping_poses(path)

@@ -73,17 +73,16 @@ class SphereNetwork(nn.Module):
     def __init__(self, config: SphereConfig) -> None:
         super().__init__()
         width = config.width
-
-        def options() -> dict[str, Any]:
-            return {"nhead": config.heads, "dim_feedforward": 2 * width, "dropout": config.dropout,
-                    "activation": "gelu", "batch_first": True, "norm_first": True}  # fmt: skip
-
+        options: dict[str, Any] = {
+            "nhead": config.heads, "dim_feedforward": 2 * width, "dropout": config.dropout, "activation": "gelu",
+            "batch_first": True, "norm_first": True,
+        }  # fmt: skip
         self.token = nn.Sequential(nn.Linear(len(FEATURES), width), nn.GELU(), nn.Linear(width, width))
-        self.among_tokens = nn.ModuleList(nn.TransformerEncoderLayer(width, **options()) for _ in range(config.layers))
+        self.among_tokens = nn.ModuleList(nn.TransformerEncoderLayer(width, **options) for _ in range(config.layers))
         self.memory_norm = nn.LayerNorm(width)
         self.query = nn.Parameter(0.02 * torch.randn(PITCHES * YAWS, width))
         self.direction = nn.Sequential(nn.Linear(3, width), nn.GELU(), nn.Linear(width, width))
-        self.to_tokens = nn.TransformerDecoderLayer(width, **options())
+        self.to_tokens = nn.TransformerDecoderLayer(width, **options)
         self.logit = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, 1))
         lattice = torch.from_numpy(axes_of_angles(yaw_pitch_angles())).float()
         self.register_buffer("lattice", lattice, persistent=False)

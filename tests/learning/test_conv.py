@@ -196,7 +196,7 @@ def test_a_network_comes_back_from_disk(network: ConvNetwork, tmp_path: Path) ->
     assert path.read_bytes() == content
     assert [file.name for file in path.parent.iterdir()] == ["conv.safetensors"]
     assert weights_kind(path) == "conv" and read_training(path) == {"variant": "conv"}
-    with pytest.raises(WeightsError, match=r"conv\.safetensors.*no network's"):
+    with pytest.raises(WeightsError, match=r"conv\.safetensors.*not of mlp"):
         load_classifier(path)
 
 

@@ -293,7 +293,7 @@ def test_weights_survive_the_disk(model: SphereModel, localization_map: Localiza
     assert weights_kind(path) == "sphere" and read_training(path) == {"variant": "sphere"}
     scorer = load_scorer(path, localization_map)
     assert isinstance(scorer, SphereScorer) and (scorer.name, scorer.inputs) == ("sphere", "")
-    with pytest.raises(WeightsError, match=r"sphere\.safetensors.*no network's"):
+    with pytest.raises(WeightsError, match=r"sphere\.safetensors.*not of mlp"):
         load_classifier(path)
     with pytest.raises(WeightsError, match="not of trees"):
         make_scorer("trees", localization_map, weights=path)

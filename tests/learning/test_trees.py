@@ -78,7 +78,7 @@ def test_trees_come_back_from_disk(trees: BoostedTrees, tmp_path: Path) -> None:
     BoostedTrees.load(path).save(path, {"variant": "trees"})
     assert path.read_bytes() == content
     assert weights_kind(path) == "trees" and read_training(path) == {"variant": "trees"}
-    with pytest.raises(WeightsError, match=r"trees.safetensors.*no network's"):
+    with pytest.raises(WeightsError, match=r"trees.safetensors.*not of mlp"):
         load_classifier(path)
 
 
@@ -93,7 +93,7 @@ def test_damaged_trees_are_named(trees: BoostedTrees, tmp_path: Path) -> None:
         ({"value": arrays["value"][:-1]}, {}, "lead out of"),
         ({"feature": np.full_like(arrays["feature"], 200)}, {}, "lead out of"),
         ({}, {"features": ["height"]}, "other statistics"),
-        ({}, {"kind": "mlp"}, "no boosted trees"),
+        ({}, {"kind": "mlp"}, "not of trees"),
         ({}, {"camera": {"width": 3}}, "damaged description"),
     ):
         save_file({**arrays, **wrong}, path, metadata={METADATA_KEY: json.dumps({**header, **changed})})

@@ -157,6 +157,8 @@ class SetConfig(FittingConfig):
     """
 
     epochs: int = 12
+    batch_size: int = 1024
+    learning_rate: float = 3e-3
     landmarks: int = 192
     width: int = 48
     pooled: int = 0

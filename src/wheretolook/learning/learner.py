@@ -82,13 +82,12 @@ def fit_network(
 
 
 def predict(network: nn.Module, data: LightningDataModule) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Logits and labels (B,) of the validation views, by a network where it is."""
+    """Logits and labels (B,) of the validation views, by a network that is brought to where they are."""
     network.eval()
-    device = next(network.parameters()).device
     logits, labels = [], []
     with torch.inference_mode():
         for batch in data.val_dataloader():
-            logits.append(network(*(one.to(device) for one in batch.inputs)).float().cpu())
+            logits.append(network.to(batch.inputs[0].device)(*batch.inputs).float().cpu())
             labels.append(batch.labels.cpu())
     return torch.cat(logits).numpy(), torch.cat(labels).numpy()
 

@@ -69,6 +69,14 @@ def test_as_many_trees_are_kept_as_order_the_other_views_best() -> None:
     )
 
 
+def test_a_statistic_that_is_never_known_is_not_asked_for() -> None:
+    train_views, val = some_views(400, 0), some_views(200, 1)
+    train_views.values[:, 11] = np.nan
+    trees, _ = fit_trees(train_views, val, CAMERA, FEW)
+    assert 11 not in trees.feature[trees.left != torch.arange(len(trees.left))]
+    assert torch.isfinite(trees.logits(torch.from_numpy(val.values))).all()
+
+
 def test_trees_come_back_from_disk(trees: BoostedTrees, tmp_path: Path) -> None:
     path = tmp_path / "weights" / "trees.safetensors"
     trees.save(path, {"variant": "trees"})

@@ -247,10 +247,12 @@ def fit_trees(
     from sklearn.ensemble import HistGradientBoostingClassifier
     from sklearn.metrics import average_precision_score, log_loss, roc_auc_score
 
+    values = train.values.astype(np.float64)
+    values[:, np.isnan(values).all(0)] = 0  # scikit-learn takes no column of which nothing is known
     model = HistGradientBoostingClassifier(
         max_iter=config.max_trees, learning_rate=config.learning_rate, max_leaf_nodes=config.max_leaves,
         min_samples_leaf=config.min_leaf, l2_regularization=config.l2, early_stopping=False, random_state=seed,
-    ).fit(train.values.astype(np.float64), train.labels)  # fmt: skip
+    ).fit(values, train.labels)  # fmt: skip
     every = max(1, config.max_trees // 40)
     stages = model.staged_decision_function(val.values.astype(np.float64))
     precision = {

@@ -98,7 +98,7 @@ def of_set_network(dataset: Dataset, args: argparse.Namespace, tracking: Trackin
     if args.part == "options":
         choices: list[dict[str, Any]] = [
             {}, {"pooled": 8}, {"width": 96}, {"width": 24}, {"head": 96}, {"dropout": 0.3}, {"l2": 1e-4},
-            {"learning_rate": 1e-3}, {"epochs": 24}, {"from_matchability": False}, {"landmarks": 96},
+            {"learning_rate": 1e-3}, {"epochs": 16}, {"from_matchability": False}, {"landmarks": 96},
         ]  # fmt: skip
         conditions = [(" ".join(f"{k}={v}" for k, v in one.items()) or "default", one, whole) for one in choices]
     if args.part == "curves":

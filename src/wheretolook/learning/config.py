@@ -156,7 +156,7 @@ class SetConfig(FittingConfig):
         hidden: attributes (`wheretolook.attributes.ATTRIBUTES`) not to look at, to see what each is worth.
     """
 
-    epochs: int = 12
+    epochs: int = 8
     batch_size: int = 1024
     learning_rate: float = 3e-3
     landmarks: int = 192

@@ -213,7 +213,9 @@ def expected_statistics(sums: Tensor, visible: Tensor) -> Tensor:
     # in double precision: the covariance is an inverse
     information = information_matrices(sums[:, 1:16].double()) + PRIOR * torch.eye(6, device=sums.device).double()
     factor = torch.linalg.cholesky(information)
-    variances = torch.cholesky_inverse(factor).diagonal(dim1=-2, dim2=-1)
+    unit = torch.eye(6, dtype=factor.dtype, device=factor.device).expand_as(factor)
+    # not by `cholesky_inverse`, which takes the matrices of a batch one by one on a GPU
+    variances = torch.linalg.solve_triangular(factor, unit, upper=False).square().sum(-2)
     log_det = 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
     across, down = moments[:, 0], moments[:, 1]
     spread = (moments[:, 2] - across**2) * (moments[:, 4] - down**2) - (moments[:, 3] - across * down) ** 2

@@ -217,7 +217,7 @@ def test_damaged_networks_are_named(network: ConvNetwork, tmp_path: Path) -> Non
             ConvNetwork.load(path)
         assert str(path) in str(error.value)
     save_file(tensors, path, metadata={METADATA_KEY: json.dumps({**header, "kind": "oracle"})})
-    with pytest.raises(WeightsError, match="unknown kind"):
+    with pytest.raises(WeightsError, match="not of one scorer"):
         load_scorer(path, LocalizationMap(make_landmarks(np.random.default_rng(0), 10), CAMERA))
 
 

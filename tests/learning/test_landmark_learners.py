@@ -35,7 +35,6 @@ from wheretolook.learning.training import train
 from wheretolook.learning.weights import METADATA_KEY, weights_kind
 from wheretolook.localization_map import LocalizationMap
 from wheretolook.scoring import load_scorer, make_scorer
-from wheretolook.scoring.expected import ExpectedScorer
 from wheretolook.scoring.set import SetScorer
 from wheretolook.table import LOCALIZED, poses, read_table, write_table
 from wheretolook.tracking import TrackingConfig
@@ -281,26 +280,30 @@ def test_expected_scores_by_hand(dataset: Dataset, trained: dict[str, Path]) -> 
     p = Matchability.load(trained["matchability"]).log_odds(described.values).sigmoid().double().numpy()
     starts = described.starts.numpy()
     scores = {
-        kind: ExpectedScorer(localization_map, trained["matchability"], kind).score(views)
-        for kind in ("inliers", "bins", "trace", "logdet", "mineig")
+        name: make_scorer(name, localization_map, weights=trained["matchability"]).score(views)
+        for name in ("expected-inliers", "expected-bins", "fisher-trace-expected", "fisher-mineig-expected")
     }
     fx = CAMERA.focal_px
     for view in range(40):
         part = slice(starts[view], starts[view + 1])
-        assert scores["inliers"][view] == pytest.approx(p[part].sum(), rel=1e-5)
+        assert scores["expected-inliers"][view] == pytest.approx(
+            p[part].sum() / len(localization_map.landmarks), rel=1e-5
+        )
         uv = described.values[part, :2].double().numpy() * fx + [CAMERA.cx, CAMERA.cy]
         cells = (uv * 30 / [CAMERA.width, CAMERA.height]).astype(int).clip(0, 29)
         none = {}
         for cell, one in zip(map(tuple, cells), p[part], strict=True):
             none[cell] = none.get(cell, 1.0) * (1 - one)
-        assert scores["bins"][view] == pytest.approx(sum(1 - one for one in none.values()), rel=1e-4, abs=1e-9)
+        assert scores["expected-bins"][view] == pytest.approx(
+            sum(1 - one for one in none.values()) / 900, rel=1e-4, abs=1e-9
+        )
         points = localization_map.landmarks.points[described.rows.numpy()[part]]
         offsets = points + views[view][:, :3].T @ views[view][:, 3]
         numbers = (p[part, None] * information.bearing_numbers(offsets)).sum(0)
         matrix = information.information_matrices(numbers)
         values = np.linalg.eigvalsh(matrix)
-        assert scores["trace"][view] == pytest.approx(values.sum(), rel=1e-4, abs=1e-6)
-        assert scores["mineig"][view] == pytest.approx(abs(values).min(), rel=1e-3, abs=1e-5)
+        assert scores["fisher-trace-expected"][view] == pytest.approx(values.sum(), rel=1e-4, abs=1e-6)
+        assert scores["fisher-mineig-expected"][view] == pytest.approx(abs(values).min(), rel=1e-3, abs=1e-5)
 
 
 def test_certain_landmarks_give_the_exact_information(dataset: Dataset, tmp_path: Path) -> None:
@@ -313,7 +316,8 @@ def test_certain_landmarks_give_the_exact_information(dataset: Dataset, tmp_path
     localization_map = dataset.split("test")[0].localization_map(CAMERA)
     views = poses(dataset.split("test")[0].read_table())[:60]
     for metric in ("trace", "logdet"):
-        expected = ExpectedScorer(localization_map, tmp_path / "certain.safetensors", metric).score(views)
+        certain = make_scorer(f"fisher-{metric}-expected", localization_map, weights=tmp_path / "certain.safetensors")
+        expected = certain.score(views)
         exact = make_scorer(f"fisher-{metric}-exact", localization_map).score(views)
         np.testing.assert_allclose(expected, exact, rtol=1e-3, atol=1e-4)
 
@@ -340,7 +344,9 @@ def test_all_are_evaluated(dataset: Dataset, trained: dict[str, Path], tracking:
     config = EvaluateConfig(methods=names, top_n=(1,), resamples=50)
     table = evaluate(dataset, config, tracking, progress=False)
     rows = table[table["scene"] == "all"].set_index(["method", "inputs"])
-    assert {("set", ""), ("expected", "inliers"), ("expected", "bins"), ("expected", "logdet")} <= set(rows.index)
+    assert {("set", ""), ("expected", "inliers"), ("expected", "bins"), ("fisher", "logdet expected")} <= set(
+        rows.index
+    )
     assert rows.loc[("set", ""), "roc_auc"] > 0.8 and np.isfinite(rows.loc[("set", ""), "ece"])
     assert rows.loc[("set", ""), "reference"] == "set"
 

@@ -9,18 +9,23 @@ import pytest
 import torch
 
 from synthetic_dataset import CAMERA, make_landmarks, make_mapping_poses
-from wheretolook.attributes import LandmarkDescriber, pool
+from wheretolook.attributes import ATTRIBUTES, LandmarkDescriber, pool
 from wheretolook.errors import ConfigError, WeightsError
 from wheretolook.features import ALL_CHANNELS, CHANNELS, INPUT_VARIANTS, BinnedViews
 from wheretolook.geometry import Float, PinholeCamera, poses_looking_along
 from wheretolook.learning.config import SphereConfig, TreesConfig
 from wheretolook.learning.conv import ConvNetwork, ConvSpec
+from wheretolook.learning.landmark_views import AttributeStatistics
+from wheretolook.learning.matchability import Matchability
 from wheretolook.learning.network import InputStatistics, NetworkSpec, ViewpointNetwork
+from wheretolook.learning.set import SetModel
+from wheretolook.learning.set_network import MatchabilityNetwork, SetNetwork
 from wheretolook.learning.sphere import SphereModel, SphereNetwork
 from wheretolook.learning.trees import BoostedTrees, PooledViews, fit_trees
 from wheretolook.learning.weights import save_classifier
 from wheretolook.localization_map import LocalizationMap
 from wheretolook.scoring import SCORERS, BinsScorer, Scorer, VisibleScorer, load_scorer, make_scorer
+from wheretolook.scoring.registry import EXPECTED_METHODS
 
 
 @pytest.fixture
@@ -44,6 +49,9 @@ def weights(tmp_path: Path) -> Path:
     path = tmp_path / "mlp.safetensors"
     save_classifier(ViewpointNetwork(NetworkSpec("2d+3d", CAMERA, statistics, hidden=(16,))), path)
     return path
+
+
+NO_STATISTICS = AttributeStatistics((0.0,) * len(ATTRIBUTES), (1.0,) * len(ATTRIBUTES))
 
 
 def some_trees(localization_map: LocalizationMap) -> BoostedTrees:
@@ -76,6 +84,12 @@ def test_scorers_keep_their_contract(
     if name == "sphere":
         weights = weights.with_name("sphere.safetensors")
         SphereModel(SphereNetwork(SphereConfig()), SphereConfig(), CAMERA).save(weights)
+    if name == "set":
+        weights = weights.with_name("set.safetensors")
+        SetModel(SetNetwork(NO_STATISTICS, pooled=2), CAMERA).save(weights)
+    if name in EXPECTED_METHODS:
+        weights = weights.with_name("matchability.safetensors")
+        Matchability(MatchabilityNetwork(NO_STATISTICS), CAMERA).save(weights)
     scorer = make_scorer(name, localization_map, seed=3, weights=weights)
     assert isinstance(scorer, Scorer)
     assert name in (scorer.name, f"{scorer.name}-{scorer.inputs.replace(' ', '-')}")

@@ -122,7 +122,7 @@ def _fit_temperatures(
     if not labelled:
         return {}, 0
     scenes, tables = zip(*labelled, strict=True)
-    learned = replace(config, methods=tuple(dict.fromkeys(weights.values())), reference="")
+    learned = replace(config, methods=tuple(name for name in config.methods if name in PROBABILITIES), reference="")
     scores, _ = score_scenes(dataset, scenes, tables, learned, weights, device, progress, occlusion)
     good = np.concatenate([is_good(table, *config.thresholds[0]) for table in tables])
     return {method: fit_temperature(values, good) for method, values in scores.items()}, len(good)

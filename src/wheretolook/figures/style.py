@@ -93,7 +93,7 @@ _STYLES = {
     ("expected", "inliers"): MethodStyle("expected inliers", "#44AA99", "s", (0, (3, 1))),
     ("expected", "bins"): MethodStyle("expected bins", "#117733", "D", (0, (3, 1))),
     **{
-        ("expected", metric): MethodStyle(f"Fisher, {name}, expected", "#332288", marker, (0, (3, 1)))
+        ("fisher", f"{metric} expected"): MethodStyle(f"Fisher, {name}, expected", "#332288", marker, (0, (3, 1)))
         for metric, (name, marker) in _FISHER_METRICS.items()
     },
     ("set", ""): MethodStyle("set of landmarks", "#CC3311", "o", "-"),

@@ -83,13 +83,13 @@ class Expectation:
 
 
 class ExpectedScorer(Scorer):
-    """What a view can be expected to find, each landmark in view weighted by its learned chance of being found.
+    """Landmarks in view, each by its learned chance of being found; or the bins of the image expected to hold one.
 
     Args:
         localization_map: the map.
         weights: of a matchability model.
-        kind: "inliers", the landmarks expected to be found; "bins", the bins of the image expected to hold one;
-            "mineig", "logdet" or "trace" of the expected Fisher information of the pose.
+        kind: "inliers", the share of the map's landmarks expected to be found; "bins", the share of the image's bins
+            expected to hold one that is.
 
     Raises:
         WeightsError: the weights cannot be used, or were trained for another field of view than the map's camera.
@@ -100,17 +100,42 @@ class ExpectedScorer(Scorer):
 
     def __init__(self, localization_map: LocalizationMap, weights: str | Path, kind: str) -> None:
         super().__init__(localization_map)
-        if kind not in (INLIERS, FILLED, *METRICS):
-            known = f"There are {', '.join((INLIERS, FILLED, *METRICS))}."
-            raise ConfigError("unknown expectation", value=kind, fix=known)
+        if kind not in (INLIERS, FILLED):
+            raise ConfigError("unknown expectation", value=kind, fix=f"There are {INLIERS} and {FILLED}.")
         self.inputs = kind
         self._expectation = Expectation.of_map(localization_map, weights)
 
     def score(self, cam_from_world: Float) -> Float:
-        """(B,), not bounded by 1."""
+        """(B,) in [0, 1]."""
         sums = self._expectation.sums(cam_from_world)
-        if self.inputs == INLIERS:
-            return sums[:, 0].copy()
         if self.inputs == FILLED:
-            return sums[:, 16].copy()
-        return metric_of(sums[:, 1:16], self.inputs)
+            return sums[:, 16] / BINS**2
+        return sums[:, 0] / max(1, len(self.localization_map.landmarks))
+
+
+class ExpectedFisherScorer(Scorer):
+    """Expected Fisher information of the pose, each landmark in view weighted by its learned chance of being found.
+
+    Args:
+        localization_map: the map.
+        weights: of a matchability model.
+        metric: "mineig", "logdet" or "trace".
+
+    Raises:
+        WeightsError: the weights cannot be used, or were trained for another field of view than the map's camera.
+        ConfigError: no such metric.
+    """
+
+    name: ClassVar[str] = "fisher"
+
+    def __init__(self, localization_map: LocalizationMap, weights: str | Path, metric: str) -> None:
+        super().__init__(localization_map)
+        if metric not in METRICS:
+            raise ConfigError("unknown metric of information", value=metric, fix=f"There are {', '.join(METRICS)}.")
+        self.metric, self.inputs = metric, f"{metric} expected"
+        self._expectation = Expectation.of_map(localization_map, weights)
+
+    def score(self, cam_from_world: Float) -> Float:
+        """(B,), not bounded by 1."""
+        numbers = self._expectation.sums(cam_from_world)[:, 1:16]
+        return metric_of(numbers, self.metric, device=self.localization_map.device)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from wheretolook.errors import ConfigError, WeightsError
+from wheretolook.fisher.metrics import METRICS
 from wheretolook.localization_map import LocalizationMap
 from wheretolook.scoring.base import Scorer
 from wheretolook.scoring.bins import BinsScorer
@@ -62,18 +63,21 @@ def _forward(localization_map: LocalizationMap, options: ScorerOptions) -> Score
 
 def _expected(name: str) -> Callable[[LocalizationMap, ScorerOptions], Scorer]:
     def build(localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
-        from wheretolook.scoring.expected import ExpectedScorer  # PyTorch takes seconds to load
+        from wheretolook.scoring.expected import ExpectedFisherScorer, ExpectedScorer  # PyTorch takes seconds to load
 
-        return ExpectedScorer(localization_map, _given(name, options.weights), EXPECTED_METHODS[name])
+        weights = _given(name, options.weights)
+        if name in EXPECTED_FISHER_METHODS:
+            return ExpectedFisherScorer(localization_map, weights, EXPECTED_FISHER_METHODS[name])
+        return ExpectedScorer(localization_map, weights, name.removeprefix("expected-"))
 
     return build
 
 
-EXPECTED_METHODS = {
-    "expected-inliers": "inliers", "expected-bins": "bins", "fisher-mineig-expected": "mineig",
-    "fisher-logdet-expected": "logdet", "fisher-trace-expected": "trace",
-}  # fmt: skip
-"""What each method that weights landmarks by their chance of being found makes of them."""
+EXPECTED_FISHER_METHODS = {f"fisher-{metric}-expected": metric for metric in METRICS}
+"""Metric of the information that is weighted by the landmarks' chance of being found, by the names of the methods."""
+
+EXPECTED_METHODS = ("expected-inliers", "expected-bins", *EXPECTED_FISHER_METHODS)
+"""Methods that weight landmarks by their chance of being found."""
 
 _ALL_FISHER = {**FISHER_METHODS, **ORIGIN_METHODS}
 
@@ -109,6 +113,7 @@ PROBES = ("fisher-worst-trace", "fisher-stationary-trace")
 def describe_methods() -> dict[str, str]:
     """What each method of `SCORERS` is, by its name: the first line of its class's docstring."""
     from wheretolook.scoring.conv import ConvScorer
+    from wheretolook.scoring.expected import ExpectedFisherScorer
     from wheretolook.scoring.learned import LearnedScorer
     from wheretolook.scoring.set import SetScorer
     from wheretolook.scoring.sphere import SphereScorer
@@ -123,14 +128,10 @@ def describe_methods() -> dict[str, str]:
     for name, (metric, approximation, about_origin) in _ALL_FISHER.items():
         about = ", turned about the world's origin (only if named)" if about_origin else ""
         texts[name] = f"{_first_line(FisherScorer).removesuffix('.')}: {metric}, {approximation}{about}."
-    texts |= {
-        "expected-inliers": "Landmarks in view, each counted by its learned chance of being found.",
-        "expected-bins": "Bins of the image, each counted by the chance that a landmark in it is found.",
-        **{
-            name: f"Expected Fisher information of the pose, landmarks weighted by their chance of being found: {kind}."
-            for name, kind in EXPECTED_METHODS.items() if name.startswith("fisher")
-        },
-    }  # fmt: skip
+    texts["expected-inliers"] = "Landmarks in view, each by its learned chance of being found."
+    texts["expected-bins"] = "Bins of the image, each by the learned chance that a landmark in it is found."
+    for name, metric in EXPECTED_FISHER_METHODS.items():
+        texts[name] = f"{_first_line(ExpectedFisherScorer).removesuffix('.')}: {metric}."
     return {name: texts[name] for name in SCORERS}
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from synthetic_dataset import CAMERA, make_landmarks
 from wheretolook.attributes import (
@@ -137,3 +138,32 @@ def test_inputs_are_known_before_localization() -> None:
     assert not [
         name for name in names for word in ("status", "inlier", "matched_rows", "localiz", "label") if word in name
     ]
+
+
+@pytest.mark.parametrize("most", [None, 1, 20, 10_000])
+def test_blocks_of_views_hold_all_or_evenly_spread_landmarks(
+    localization_map: LocalizationMap, most: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    views = some_views()
+    describer = LandmarkDescriber(localization_map)
+    whole = describer.describe(views)
+    monkeypatch.setattr("wheretolook.attributes.BLOCK_ENTRIES", {"cpu": 100, "cuda": 100})
+    at = 0
+    for rows, part, visible in describer.in_blocks(views, most):
+        assert rows.start == at and (len(part) == 1 or part.counts.sum() <= 100)
+        for view in range(len(part)):
+            all_rows = whole.rows[whole.starts[at] : whole.starts[at + 1]]
+            found = slice(int(part.starts[view]), int(part.starts[view + 1]))
+            assert visible[view] == len(all_rows)
+            if most is None or len(all_rows) <= most:
+                expected = torch.arange(len(all_rows))
+            else:
+                expected = torch.arange(most) * len(all_rows) // most
+            assert torch.equal(part.rows[found].cpu(), all_rows.cpu()[expected])
+            assert torch.equal(part.values[found], whole.values[whole.starts[at] : whole.starts[at + 1]][expected])
+            at += 1
+    assert at == len(views)
+
+
+def test_no_views_are_no_blocks(localization_map: LocalizationMap) -> None:
+    assert list(LandmarkDescriber(localization_map).in_blocks(some_views()[:0], 5)) == []

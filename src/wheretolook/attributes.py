@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from wheretolook.camera_models import Camera, ColmapCamera
@@ -19,8 +20,8 @@ from wheretolook.localization_map import LocalizationMap
 from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 from wheretolook.visibility import VisibleSets
 
-BLOCK_ENTRIES = 1 << 18
-"""Landmarks in view that a network over them looks at together: some hundred megabytes."""
+BLOCK_ENTRIES = {"cpu": 1 << 15, "cuda": 1 << 22}
+"""Landmarks in view that a network over them looks at together: what stays in the cache, or a gigabyte of a GPU's."""
 
 POSE_ATTRIBUTES = ("across", "down", "distance", "mapped_angle", "distance_ratio")
 """Of a landmark in a view: x/z and y/z in the camera; the distance in metres, its logarithm; the cosine between the ray
@@ -82,11 +83,15 @@ class LandmarkDescriber:
             On the map's device.
         """
         if visible is None:
-            visible = self.localization_map.visible_landmarks(cam_from_world)
+            starts, indices = self.localization_map.visible_on_device(cam_from_world)
+        else:
+            starts, indices = visible.starts.astype(np.int64), torch.from_numpy(visible.indices)
+        return self._describe(cam_from_world, torch.from_numpy(starts), indices)
+
+    def _describe(self, cam_from_world: Float, starts: Tensor, indices: Tensor) -> ViewLandmarks:
         device = self._points.device
-        starts = torch.from_numpy(visible.starts).to(device, torch.int64)
-        rows = torch.from_numpy(visible.indices).to(device, torch.int64)
-        views = torch.arange(len(visible), device=device).repeat_interleave(starts.diff())
+        starts, rows = starts.to(device), indices.to(device, torch.int64)
+        views = torch.arange(len(starts) - 1, device=device).repeat_interleave(starts.diff())
         rotations, centers = split_poses(np.asarray(cam_from_world, dtype=np.float64))
         offsets = (self._points[rows] - torch.from_numpy(centers).to(device)[views]).float()
         distance = offsets.norm(dim=1)
@@ -106,22 +111,45 @@ class LandmarkDescriber:
         )
         return ViewLandmarks(starts, rows, torch.cat([of_pose, of_map], dim=1))
 
-    def in_blocks(self, cam_from_world: Float) -> Iterator[tuple[slice, ViewLandmarks]]:
+    def in_blocks(
+        self, cam_from_world: Float, most: int | None = None
+    ) -> Iterator[tuple[slice, ViewLandmarks, Tensor]]:
         """What views (B, 3, 4) see, so many at a time that a network over the landmarks has room to work.
 
+        Args:
+            cam_from_world: (B, 3, 4).
+            most: describe at most so many landmarks of a view, evenly spread over those it sees in the map's order.
+
         Yields:
-            Which of the views, and their landmarks.
+            Which of the views, their landmarks, and how many each of them sees in all.
         """
-        visible = self.localization_map.visible_landmarks(cam_from_world)
-        begin = 0
+        starts, indices = self.localization_map.visible_on_device(cam_from_world)
+        visible = np.diff(starts)
+        if most is not None and len(visible) and visible.max() > most:
+            starts, indices = _thinned(torch.from_numpy(starts), indices, most)
+        begin, room = 0, BLOCK_ENTRIES[self._points.device.type]
         while begin < len(visible):
             # as many views as have at most so many landmarks, but one at least
-            end = int(np.searchsorted(visible.starts, visible.starts[begin] + BLOCK_ENTRIES, side="right")) - 1
+            end = int(np.searchsorted(starts, starts[begin] + room, side="right")) - 1
             end = min(max(end, begin + 1), len(visible))
-            rows, entries = slice(begin, end), slice(int(visible.starts[begin]), int(visible.starts[end]))
-            part = VisibleSets(visible.starts[begin : end + 1] - visible.starts[begin], visible.indices[entries])
-            yield rows, self.describe(cam_from_world[rows], part)
+            rows = slice(begin, end)
+            part = torch.from_numpy(starts[begin : end + 1] - starts[begin])
+            described = self._describe(cam_from_world[rows], part, indices[int(starts[begin]) : int(starts[end])])
+            yield rows, described, torch.from_numpy(visible[rows]).to(self._points.device)
             begin = end
+
+
+def _thinned(starts: Tensor, indices: Tensor, most: int) -> tuple[NDArray[np.int64], Tensor]:
+    """At most so many entries of each set, evenly spread over it."""
+    lengths = starts.diff()
+    kept = lengths.clamp(max=most)
+    ends = kept.cumsum(0)
+    new = torch.cat([torch.zeros(1, dtype=torch.int64), ends])
+    # entry k of a set comes from k * length / kept, rounded down
+    sets = torch.arange(len(kept), device=indices.device).repeat_interleave(kept.to(indices.device))
+    there = torch.stack([starts[:-1], lengths, kept, new[:-1]]).to(indices.device)[:, sets]
+    place = torch.arange(len(sets), device=indices.device) - there[3]
+    return new.numpy(), indices[there[0] + place * there[1] // there[2]]
 
 
 FILLED = 30

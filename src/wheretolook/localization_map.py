@@ -4,17 +4,22 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.camera_models import Camera
+from wheretolook.camera_models import Camera, ColmapCamera
 from wheretolook.features import BinnedViews, bin_views
 from wheretolook.geometry import Float, PinholeCamera, camera_centers
 from wheretolook.mapping.cameras import colmap_poses
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
 from wheretolook.rendering.types import check_poses
 from wheretolook.visibility import NoOcclusion, OcclusionModel, VisibleSets, visible_landmarks
+from wheretolook.visibility.frustum import visible_on_device
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 SAME_LOCATION_DECIMALS = 6
 """Camera centres that agree to this many decimals of a metre share one visibility test."""
@@ -104,6 +109,29 @@ class LocalizationMap:
         cam_from_world = check_poses(cam_from_world)
         unoccluded, rows = self._unoccluded(cam_from_world)
         return visible_landmarks(self.camera, cam_from_world, self.landmarks.points, unoccluded, rows, self.device)
+
+    def visible_on_device(self, cam_from_world: Float) -> tuple[NDArray[np.int64], Tensor]:
+        """What `visible_landmarks` gives, its indices left on the map's device.
+
+        Returns:
+            starts: (B + 1,) int64; view b sees the landmarks `indices[starts[b]:starts[b + 1]]`.
+            indices: int32, on the map's device.
+
+        Raises:
+            ValueError: the poses have another shape, or entries that are not finite.
+        """
+        import torch  # takes seconds to load
+        import warp as wp
+
+        cam_from_world = check_poses(cam_from_world)
+        unoccluded, rows = self._unoccluded(cam_from_world)
+        if isinstance(self.camera, ColmapCamera):
+            visible = visible_landmarks(self.camera, cam_from_world, self.landmarks.points, unoccluded, rows)
+            return visible.starts.astype(np.int64), torch.from_numpy(visible.indices).to(self.device)
+        starts, indices = visible_on_device(
+            self.camera, cam_from_world, self.landmarks.points, unoccluded, rows, self.device
+        )
+        return starts.astype(np.int64), wp.to_torch(indices)
 
     def _unoccluded(self, cam_from_world: Float) -> tuple[VisibleSets, NDArray[np.int64]]:
         """Landmarks with a free line of sight from each location of poses, and each pose's row among these."""

@@ -103,7 +103,7 @@ def test_more_landmarks_leave_less_error_to_expect() -> None:
 def test_views_without_landmarks_are_scored() -> None:
     network = SetNetwork(NO_STATISTICS, pooled=3).eval()
     empty = ViewLandmarks(torch.tensor([0, 0, 0]), torch.zeros(0, dtype=torch.int64), torch.zeros(0, len(ATTRIBUTES)))
-    logits = network.score(empty, torch.zeros(2))
+    logits = network.score(empty, empty.counts, torch.zeros(2))
     assert logits.shape == (2,) and torch.isfinite(logits).all()
 
 
@@ -118,7 +118,7 @@ def test_a_sample_of_all_landmarks_scores_as_all_of_them(pooled: int) -> None:
     for view in range(3):
         padded[view, : counts[view]] = values[starts[view] : starts[view + 1]]
     height = torch.tensor([0.1, -0.2, 0.3])
-    whole = network.score(ViewLandmarks(starts, torch.zeros(48, dtype=torch.int64), values), height)
+    whole = network.score(ViewLandmarks(starts, torch.zeros(48, dtype=torch.int64), values), counts, height)
     torch.testing.assert_close(network(padded, counts, counts, height), whole, rtol=1e-4, atol=1e-5)
 
 

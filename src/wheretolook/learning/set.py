@@ -26,10 +26,10 @@ class SetModel(LandmarkModel):
     kind: ClassVar[str] = SET
     network_class: ClassVar[type[nn.Module]] = SetNetwork
 
-    def log_odds(self, landmarks: ViewLandmarks, axis_height: Tensor) -> Tensor:
-        """Calibrated log-odds (B,) float64 of views, and their axes' height (B,), on the network's device."""
+    def log_odds(self, landmarks: ViewLandmarks, visible: Tensor, axis_height: Tensor) -> Tensor:
+        """Calibrated log-odds (B,) float64 of views by `SetNetwork.score`, all on the network's device."""
         with torch.inference_mode():
-            logits: Tensor = self.network.score(landmarks, axis_height)
+            logits: Tensor = self.network.score(landmarks, visible, axis_height)
             return self.scale * logits.double() + self.offset
 
 

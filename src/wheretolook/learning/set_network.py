@@ -155,10 +155,10 @@ class SetNetwork(nn.Module):
         sums = (self.parts(values) * there[..., None]).sum(1)
         return self.logits(sums * (visible / taken.clamp(min=1))[:, None], visible, axis_height)
 
-    def score(self, landmarks: ViewLandmarks, axis_height: Tensor) -> Tensor:
-        """Logits (B,) from all landmarks of each view; its height of the axis (B,)."""
+    def score(self, landmarks: ViewLandmarks, visible: Tensor, axis_height: Tensor) -> Tensor:
+        """Logits (B,) from landmarks of each view, of those it sees in all (B,), and its height of the axis (B,)."""
         sums = torch.segment_reduce(self.parts(landmarks.values), "sum", lengths=landmarks.counts, initial=0.0)
-        return self.logits(sums, landmarks.counts, axis_height)
+        return self.logits(sums * (visible / landmarks.counts.clamp(min=1))[:, None], visible, axis_height)
 
     def parts(self, values: Tensor) -> Tensor:
         """What each landmark (..., len(ATTRIBUTES)) adds to its view's sums, (..., D)."""

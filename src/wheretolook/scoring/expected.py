@@ -66,7 +66,7 @@ class Expectation:
         cam_from_world = check_poses(cam_from_world)
         if not np.array_equal(cam_from_world, self._poses):  # several methods ask for the same block of views
             sums = np.empty((len(cam_from_world), 17))
-            for rows, described in self._describer.in_blocks(cam_from_world):
+            for rows, described, _ in self._describer.in_blocks(cam_from_world):
                 log_odds = self.matchability.log_odds(described.values)
                 parts = expected_parts(described.values, log_odds)[:, :16].double()
                 sums[rows, :16] = torch.segment_reduce(parts, "sum", lengths=described.counts, initial=0.0).cpu()

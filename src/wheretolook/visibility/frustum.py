@@ -159,6 +159,19 @@ def visible_landmarks(
     """
     if isinstance(camera, ColmapCamera):
         return visible_landmarks_plain(camera, cam_from_world, points, unoccluded, location_rows)
+    starts, indices = visible_on_device(camera, cam_from_world, points, unoccluded, location_rows, device)
+    return VisibleSets(starts, indices.numpy())
+
+
+def visible_on_device(
+    camera: PinholeCamera,
+    cam_from_world: Float,
+    points: Float,
+    unoccluded: VisibleSets,
+    location_rows: NDArray[np.integer[Any]],
+    device: str = "cpu",
+) -> tuple[NDArray[np.int32], Any]:
+    """What `visible_landmarks` gives for a pinhole: the starts (B + 1,), and the indices as a Warp array of int32."""
     device = start_warp(device)
     rotations, centers = split_poses(cam_from_world)
     inputs: list[Any] = [
@@ -171,13 +184,19 @@ def visible_landmarks(
         wp.float64(MIN_DEPTH_M),
     ]
     lengths: Any = wp.empty(len(centers), dtype=wp.int32, device=device)
+    if len(centers) == 1:  # no need to count before there is room
+        starts_there: Any = wp.zeros(1, dtype=wp.int32, device=device)
+        indices: Any = wp.empty(len(unoccluded[int(location_rows[0])]), dtype=wp.int32, device=device)
+        wp.launch(collect_kernel, 1, [*inputs, True, starts_there], [lengths, indices], device=device)
+        starts = _starts(lengths.numpy())
+        return starts, indices[: int(starts[-1])]
     nothing: Any = wp.empty(0, dtype=wp.int32, device=device)
     wp.launch(collect_kernel, len(centers), [*inputs, False, nothing], [lengths, nothing], device=device)
     starts = _starts(lengths.numpy())
-    indices: Any = wp.empty(int(starts[-1]), dtype=wp.int32, device=device)
-    starts_there: Any = wp.array(starts, dtype=wp.int32, device=device)
+    indices = wp.empty(int(starts[-1]), dtype=wp.int32, device=device)
+    starts_there = wp.array(starts, dtype=wp.int32, device=device)
     wp.launch(collect_kernel, len(centers), [*inputs, True, starts_there], [lengths, indices], device=device)
-    return VisibleSets(starts, indices.numpy())
+    return starts, indices
 
 
 def visible_landmarks_plain(

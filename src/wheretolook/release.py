@@ -10,14 +10,14 @@ import json
 import os
 import shutil
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import wheretolook
 from wheretolook.dataset import Dataset, SceneFolder, write_json
 from wheretolook.errors import ConfigError, StorageError, TableError, WeightsError
-from wheretolook.learning.config import NETWORKS, RELEASED
+from wheretolook.learning.config import MATCHABILITY, NETWORKS, RELEASED, VARIANTS, weights_name
 from wheretolook.mapping.cameras import CAMERAS_FILE, save_mapping_poses
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.table import sha256, write_table
@@ -100,49 +100,81 @@ def copy_dataset(dataset: Dataset, experiment: Experiment) -> Dataset:
     return release
 
 
+@dataclass(frozen=True)
+class Choice:
+    """What of the weights in a release's folder ships.
+
+    Attributes:
+        network: the paper's network with the inputs of the best validation average precision.
+        best: the weights with the best one of all, which a user gets who names none; may be the network.
+        shelved: the rest.
+        precision: validation average precision of all by their file's name without its ending.
+    """
+
+    network: Path
+    best: Path
+    shelved: tuple[Path, ...]
+    precision: dict[str, float]
+
+
 def trained_weights(release: Dataset) -> list[Path]:
-    """Weights in a release's folder, one for each input variant trained."""
-    named = (release.root / "weights" / f"mlp-{variant}.safetensors" for variant in NETWORKS)
+    """Weights in a release's folder, one for each variant trained but matchability, which is no scorer by itself."""
+    named = (release.root / "weights" / weights_name(variant) for variant in VARIANTS if variant != MATCHABILITY)
     return [path for path in named if path.is_file()]
 
 
-def ship_weights(release: Dataset) -> tuple[Path, dict[str, float]]:
-    """Choose the variant with the best validation average precision, and store its weights in half precision.
-
-    Weights of other variants are put on the shelf, `weights/others/`, where no evaluation finds them. Done again,
-    nothing changes.
-
-    Returns:
-        The weights that ship, and the validation average precision of every variant.
+def choose_weights_to_ship(release: Dataset) -> Choice:
+    """Choose by the best validation average precision.
 
     Raises:
-        WeightsError: there are no weights, or they or their record do not fit the release.
+        WeightsError: there are no weights of the paper's network, or weights or their record do not fit the release.
     """
     from wheretolook.learning.training import training_fingerprint
-    from wheretolook.learning.weights import load_classifier, read_training, save_classifier
+    from wheretolook.learning.weights import read_record, read_training
 
     folder, now = release.root / "weights", training_fingerprint(release)
     fix = f"Run `wheretolook train --config configs/{release.name}.yaml`."
-    records: dict[Path, dict[str, Any]] = {}
+    precision: dict[Path, float] = {}
     for path in trained_weights(release):
-        records[path], training = _record(path), read_training(path)
-        if records[path]["about"] != training or training.get("dataset_fingerprint") != now:
+        record, training = read_record(path), read_training(path)
+        if record["about"] != training or training.get("dataset_fingerprint") != now:
             raise WeightsError("these weights were not trained on this release", path=path, fix=fix)
-    if not records:
+        precision[path] = float(record["metrics"]["val_average_precision"])
+    if not precision:
         raise WeightsError("there are no weights to ship", path=folder, fix=fix)
-    precision = {path: float(record["metrics"]["val_average_precision"]) for path, record in records.items()}
-    shippable = [path for path in precision if path.stem != f"mlp-{RELEASED}"]  # which is there to compare with
-    if not shippable:
-        raise WeightsError("there are no weights to ship but the released code's", path=folder, fix=fix)
-    best = max(shippable, key=lambda path: precision[path])
-    for path in records:
-        if path != best:
-            (folder / SHELF).mkdir(exist_ok=True)
-            for file in (path, path.with_suffix(".json")):
-                os.replace(file, folder / SHELF / file.name)
-    save_classifier(load_classifier(best).half(), best, read_training(best))
-    write_json(best.with_suffix(".json"), {**records[best], "weights_sha256": sha256(best)})
-    return best, {path.stem.removeprefix("mlp-"): value for path, value in precision.items()}
+    networks = [folder / weights_name(variant) for variant in NETWORKS if variant != RELEASED]  # to compare with
+    networks = [path for path in networks if path in precision]
+    if not networks:
+        raise WeightsError("there are no weights to ship of the paper's network", path=folder, fix=fix)
+    network = max(networks, key=lambda path: precision[path])
+    best = max(
+        (path for path in precision if path == network or path not in [folder / weights_name(v) for v in NETWORKS]),
+        key=lambda path: precision[path],
+    )
+    shelved = tuple(path for path in precision if path not in (network, best))
+    return Choice(network, best, shelved, {path.stem: value for path, value in precision.items()})
+
+
+def ship_weights(release: Dataset) -> Choice:
+    """Choose what ships; store the weights of the paper's network in half precision, put the rest on the shelf.
+
+    The shelf is `weights/others/`, where no evaluation finds them. A matchability model stays where it is: methods that
+    weight landmarks need it. Done again, nothing changes.
+
+    Raises:
+        WeightsError: as `choose_weights_to_ship`.
+    """
+    from wheretolook.learning.weights import load_classifier, read_record, read_training, save_classifier
+
+    choice, folder = choose_weights_to_ship(release), release.root / "weights"
+    for path in choice.shelved:
+        (folder / SHELF).mkdir(exist_ok=True)
+        for file in (path, path.with_suffix(".json")):
+            os.replace(file, folder / SHELF / file.name)
+    record = read_record(choice.network)
+    save_classifier(load_classifier(choice.network).half(), choice.network, read_training(choice.network))
+    write_json(choice.network.with_suffix(".json"), {**record, "weights_sha256": sha256(choice.network)})
+    return choice
 
 
 def sizes(root: Path, weights: bool = True) -> dict[str, int]:
@@ -229,16 +261,3 @@ def _settings(experiment: Experiment) -> dict[str, Any]:
         "label": {"localizer": asdict(experiment.label.localizer)},
     }
     return dict(json.loads(json.dumps(settings, default=str)))
-
-
-def _record(weights: Path) -> dict[str, Any]:
-    """What the train stage wrote beside weights."""
-    path = weights.with_suffix(".json")
-    try:
-        record = dict(json.loads(path.read_text()))
-        float(record["metrics"]["val_average_precision"]), record["about"]
-        return record
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        raise WeightsError(
-            f"the record of training is missing or damaged: {error}", path=path, fix="Train again."
-        ) from error

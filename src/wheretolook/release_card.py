@@ -20,6 +20,7 @@ from wheretolook.evaluation.results import SCORES_CSV, VARIANTS_CSV
 from wheretolook.evaluation.scores import ALL, read_scores
 from wheretolook.figures.style import method_style
 from wheretolook.labelling.report import POSITIVE, label_summary
+from wheretolook.learning.config import LEARNERS, NETWORKS, weights_name
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.release import CARD, SHELF, read_about, size_text, sizes
 from wheretolook.table import sha256
@@ -39,7 +40,7 @@ from wheretolook.table import poses
 
 dataset = Dataset.load(Path("{root}"))
 scene = dataset.split("test")[0]
-scorer = load_scorer("{root}/weights/{weights}", scene.localization_map(dataset.camera))
+scorer = load_scorer("{root}/weights", scene.localization_map(dataset.camera))
 scores = scorer.score(poses(scene.read_table()))  # one for each viewpoint, in [0, 1]
 ```"""
 
@@ -62,7 +63,7 @@ def write_card(release: Dataset) -> Path:
         The card's path.
 
     Raises:
-        WeightsError: not exactly one file of weights ships.
+        WeightsError: not exactly one of the paper's networks ships, or a record of training is missing.
         TableError: there are no scores, or no labels.
         ConfigError: the description of the release is missing or damaged.
         StorageError: the release is too large.
@@ -75,10 +76,11 @@ def write_card(release: Dataset) -> Path:
 def release_card(release: Dataset) -> str:
     """The card. Raises as `write_card`."""
     from wheretolook.learning.training import training_fingerprint
-    from wheretolook.learning.weights import read_training
+    from wheretolook.learning.weights import best_weights, read_record, read_training
 
-    about, weights = read_about(release), _weights(release)
-    training, record = read_training(weights), _json(weights.with_suffix(".json"))
+    about, weights = read_about(release), _network(release)
+    best = best_weights(weights.parent)
+    training, record = read_training(weights), read_record(weights)
     tables = {scene.name: scene.read_table() for scene in release.scenes}
     shares = label_summary(tables, {scene.name: scene.split for scene in release.scenes}).shares
     everything = shares.iloc[-1]
@@ -87,29 +89,32 @@ def release_card(release: Dataset) -> str:
     results = release.root / "results"
     if not (results / SCORES_CSV).is_file():
         raise TableError("there are no scores", path=results / SCORES_CSV, fix="Run the evaluate stage.")
-    variant = method_style("mlp", training["variant"]).label
+    variant = _label(training["variant"])
+    shipped = f"{variant}, half precision"
+    if best != weights:
+        shipped = f"{_label(read_training(best)['variant'])}; and of the paper's best network, {shipped}"
 
     lines = [f"# {source}: tables, landmarks and weights"]
     lines += [
         f"{everything['n_views']:,} labelled viewpoints at {everything['n_locations']:,} locations of "
-        f"{len(release.scenes)} scenes, the landmarks they were localized against, and the weights of the best network "
-        f"trained on them ({variant}, half precision). Enough to train and to evaluate; meshes, COLMAP models "
+        f"{len(release.scenes)} scenes, the landmarks they were localized against, and the weights of the best scorer "
+        f"trained on them ({shipped}). Enough to train and to evaluate; meshes, COLMAP models "
         "and descriptors are left out, so nothing here can be labelled anew without making the scenes again.",
         f"```sh\nwheretolook evaluate --config {config}   # the scores below, in minutes on two cores, no GPU\n```",
-        _HOW_TO_USE.format(root=root, weights=weights.name),
+        _HOW_TO_USE.format(root=root),
         "## Scores",
-        f"On the test scenes, of which the network has learnt nothing. The weights are {weights.name}.",
+        f"On the test scenes, of which nothing was learnt. The weights are {_names(release)}.",
         _demoted(score_markdown(read_scores(results / SCORES_CSV), f"Localization score on {source}")),
     ]
     if (results / VARIANTS_CSV).is_file():
         lines += [
-            "## Scores of the networks for all inputs",
-            "Before one was chosen by its validation metrics (see Training), in full precision.",
+            "## Scores of all that was trained",
+            "Before what ships was chosen by its validation metrics (see Training), in full precision.",
             _demoted(score_markdown(read_scores(results / VARIANTS_CSV), f"Localization score on {source}")),
         ]
     if (results / GENERALIZATION_CSV).is_file():
         others = read_scores(results / GENERALIZATION_CSV)
-        others = others[others["weights_sha256"] == sha256(weights)].drop(columns="weights_sha256")
+        others = others[others["weights_sha256"] == sha256(best)].drop(columns="weights_sha256")
         if len(others):
             lines += ["## Scores on other datasets", "Scenes neither trained nor validated on."]
         if len(others) and (results / GENERALIZATION_MD).is_file():
@@ -130,6 +135,7 @@ def release_card(release: Dataset) -> str:
         "## Training",
         _training_text(weights, training, record, shares),
         _variant_table(weights, training),
+        *_learner_text(weights.parent),
         "Validation metrics are those of the epoch kept, before the weights were rounded to half precision; the scores "
         "above are of the weights as they ship.",
         "## To make it again",
@@ -149,7 +155,7 @@ def release_card(release: Dataset) -> str:
                 ["dataset", release.fingerprint()],
                 ["its train and val scenes", training_fingerprint(release)],
                 [f"{source}, from which it was made", about["source_fingerprint"]],
-                [f"weights/{weights.name}, SHA-256", sha256(weights)],
+                *([f"weights/{path.name}, SHA-256", sha256(path)] for path in _weights(release)),
             ],
         ),
         f"Version {about['code_version']} of the code. Sizes without text: {_size_text(release)}.",
@@ -157,14 +163,31 @@ def release_card(release: Dataset) -> str:
     return "\n\n".join(part.strip("\n") for part in lines) + "\n"
 
 
-def _weights(release: Dataset) -> Path:
-    found = sorted((release.root / "weights").glob("*.safetensors"))
+def _weights(release: Dataset) -> list[Path]:
+    """All weights that ship."""
+    return sorted((release.root / "weights").glob("*.safetensors"))
+
+
+def _names(release: Dataset) -> str:
+    names = [path.name for path in _weights(release)]
+    return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
+
+
+def _network(release: Dataset) -> Path:
+    """The weights of the paper's network."""
+    named = [release.root / "weights" / weights_name(variant) for variant in NETWORKS]
+    found = [path for path in _weights(release) if path in named]
     if len(found) != 1:
         raise WeightsError(
-            "a release ships the weights of one network", path=release.root / "weights",
+            "a release ships the weights of one of the paper's networks", path=release.root / "weights",
             value=[path.name for path in found], fix=f"Run `wheretolook release --config configs/{release.name}.yaml`.",
         )  # fmt: skip
     return found[0]
+
+
+def _label(variant: str) -> str:
+    """Name of a variant for people."""
+    return method_style(variant).label if variant in LEARNERS else method_style("mlp", variant).label
 
 
 def _demoted(markdown: str) -> str:
@@ -245,8 +268,8 @@ def _training_text(weights: Path, training: Mapping[str, Any], record: Mapping[s
         else f"{100 * config['val_fraction']:g} % of each scene's locations held out for validation"
     )
     return (
-        f"From the {n_views['train']:,} viewpoints of the train scenes, {validated}. The network that ships, "
-        f"{weights.name}, had the best validation average precision of those trained. Kept is epoch "
+        f"From the {n_views['train']:,} viewpoints of the train scenes, {validated}. Of the "
+        f"paper's networks {weights.name}, which ships, had the best validation average precision. Kept is epoch "
         f"{record['metrics']['epoch'] + 1:.0f} of at most {config['epochs']}. "
         f"Options: {_pairs({name: value for name, value in config.items() if name != 'epochs'})}."
     )
@@ -263,7 +286,7 @@ def _variant_table(weights: Path, training: Mapping[str, Any]) -> str:
     names = [name for name in records[0]["metrics"] if name.startswith("val_")]
     lines = [
         [
-            method_style("mlp", record["about"]["variant"]).label,
+            _label(record["about"]["variant"]),
             "yes" if number == 0 else "no",
             f"{record['metrics']['epoch'] + 1:.0f}",
             *[f"{record['metrics'].get(name, float('nan')):.4f}" for name in names],
@@ -272,6 +295,44 @@ def _variant_table(weights: Path, training: Mapping[str, Any]) -> str:
     ]
     header = ["network", "ships", "epoch", *[name.removeprefix("val_").replace("_", " ") for name in names]]
     return markdown_table(header, lines)
+
+
+def _learner_text(folder: Path) -> list[str]:
+    """Options and validation metrics of what was trained beside the paper's network, if anything was."""
+    from wheretolook.learning.weights import read_record
+
+    places = {True: folder, False: folder / SHELF}
+    records = [
+        (ships, read_record(place / weights_name(variant)))
+        for variant in LEARNERS
+        for ships, place in places.items()
+        if (place / weights_name(variant)).with_suffix(".json").is_file()
+    ]
+    if not records:
+        return []
+    lines = [
+        [
+            _label(record["about"]["variant"]),
+            "yes" if ships else "no",
+            *[f"{record['metrics'].get(f'val_{name}', float('nan')):.4f}" for name in _LEARNER_METRICS],
+        ]
+        for ships, record in records
+    ]
+    header = ["beside it", "ships", *[name.replace("_", " ") for name in _LEARNER_METRICS]]
+    options = [
+        f"{_label(variant)}: {_pairs(record['about']['config'][variant])}."
+        for ships, record in records
+        if ships and (variant := record["about"]["variant"]) in record["about"]["config"]
+    ]
+    return [
+        "Learnt from the same viewpoints, with what is known of each landmark (matchability: whether the localizer "
+        "finds a landmark, from the stored matches; its metrics are of landmarks, not of viewpoints):",
+        markdown_table(header, lines),
+        "Options of those that ship. " + " ".join(options),
+    ]
+
+
+_LEARNER_METRICS = ("average_precision", "roc_auc", "bce")
 
 
 def _licence(scenes: Mapping[str, Any]) -> str:

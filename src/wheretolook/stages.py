@@ -279,8 +279,16 @@ def release(experiment: Experiment, say: Say = print, tick: Tick = lambda work: 
         ConfigError: another dataset lies where the copy belongs.
     """
     from wheretolook.evaluation.results import SCORES_CSV, VARIANTS_CSV
-    from wheretolook.evaluation.scores import LEARNED
-    from wheretolook.release import copy_dataset, is_release, ship_weights, size_text, sizes, trained_weights
+    from wheretolook.learning.weights import weights_kind
+    from wheretolook.release import (
+        choose_weights_to_ship,
+        copy_dataset,
+        is_release,
+        ship_weights,
+        size_text,
+        sizes,
+        trained_weights,
+    )
     from wheretolook.release_card import write_card
 
     dataset = _dataset(experiment, "label")
@@ -296,12 +304,14 @@ def release(experiment: Experiment, say: Say = print, tick: Tick = lambda work: 
     # on the CPU, as those who have no GPU will do it
     on_cpu = replace(experiment, device="cpu", evaluate=replace(experiment.evaluate, weights=()))
     results = dataset.root / "results"
-    if len(trained_weights(dataset)) > 1:  # all that were trained, before only the best is left
-        evaluate(replace(on_cpu, evaluate=replace(on_cpu.evaluate, methods=(LEARNED,), reference="")), say)
+    if choose_weights_to_ship(dataset).shelved:  # all that were trained, before only the best are left
+        methods = tuple(dict.fromkeys(weights_kind(path) for path in trained_weights(dataset)))
+        evaluate(replace(on_cpu, evaluate=replace(on_cpu.evaluate, methods=methods, reference="")), say)
         shutil.copyfile(results / SCORES_CSV, results / VARIANTS_CSV)
-    weights, precisions = ship_weights(dataset)
-    compared = ", ".join(f"{variant} {value:.4f}" for variant, value in precisions.items())
-    say(f"validation average precision: {compared}; ships in half precision: {weights}")
+    choice = ship_weights(dataset)
+    compared = ", ".join(f"{name} {value:.4f}" for name, value in choice.precision.items())
+    say(f"validation average precision: {compared}")
+    say(f"the paper's network that ships, in half precision: {choice.network}; the best of all: {choice.best}")
     sizes(dataset.root)  # too large? then before the evaluation
     evaluate(on_cpu, say, tick)
     say(f"the card -> {write_card(dataset)}")

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from wheretolook.errors import ConfigError, WeightsError
 from wheretolook.geometry import PinholeCamera
+from wheretolook.learning.config import MATCHABILITY
 from wheretolook.learning.network import InputStatistics, NetworkSpec, ViewpointNetwork
 
 FORMAT_VERSION = 1
@@ -97,6 +98,35 @@ def read_training(path: str | Path) -> dict[str, Any]:
         WeightsError: the file is missing, damaged or foreign.
     """
     return dict(read_weights(Path(path))[1].get("training", {}))
+
+
+def read_record(path: str | Path) -> dict[str, Any]:
+    """What the train stage wrote beside weights: "about", "weights_sha256", "run_id" and "metrics".
+
+    Raises:
+        WeightsError: it is missing or damaged.
+    """
+    beside = Path(path).with_suffix(".json")
+    try:
+        record = dict(json.loads(beside.read_text()))
+        float(record["metrics"]["val_average_precision"]), record["about"]
+        return record
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise WeightsError(
+            f"the record of training is missing or damaged: {error}", path=beside, fix="Train again."
+        ) from error
+
+
+def best_weights(folder: str | Path) -> Path:
+    """The weights of a folder with the best validation average precision; of matchability none, which scores no views.
+
+    Raises:
+        WeightsError: there are none, or a record of training is missing or damaged.
+    """
+    scorers = [path for path in sorted(Path(folder).glob("*.safetensors")) if path.stem != MATCHABILITY]
+    if not scorers:
+        raise WeightsError("there are no weights of a scorer", path=folder, fix="Run the train stage first.")
+    return max(scorers, key=lambda path: float(read_record(path)["metrics"]["val_average_precision"]))
 
 
 def weights_kind(path: str | Path) -> str:

@@ -14,7 +14,7 @@ from wheretolook.errors import WeightsError
 from wheretolook.features import ALL_CHANNELS, CHANNELS, BinnedViews
 from wheretolook.geometry import Float, PinholeCamera
 from wheretolook.learning.network import ViewpointNetwork
-from wheretolook.learning.weights import load_classifier, read_training, weights_kind
+from wheretolook.learning.weights import best_weights, load_classifier, read_training, weights_kind
 from wheretolook.localization_map import LocalizationMap
 from wheretolook.scoring.base import BLOCK, BinnedScorer, Scorer
 
@@ -74,9 +74,12 @@ class LearnedScorer(BinnedScorer):
 
 
 def load_scorer(weights: str | Path, localization_map: LocalizationMap) -> Scorer:
-    """The learned scorer of a weights file for a map: `load_scorer(weights, map).score(cam_from_world)`.
+    """The learned scorer of weights for a map: `load_scorer(weights, map).score(cam_from_world)`.
 
-    What method it is stands in the file.
+    Args:
+        weights: a file that the train stage wrote, in which stands what method it is; or a folder of such files, of
+            which the one with the best validation average precision is taken.
+        localization_map: what to score views of.
 
     Raises:
         WeightsError: the file cannot be used, or was trained for another field of view than the map's camera.
@@ -90,6 +93,7 @@ def load_scorer(weights: str | Path, localization_map: LocalizationMap) -> Score
     loaders: dict[str, Callable[[str | Path, LocalizationMap], Scorer]] = {
         scorer.name: scorer.load for scorer in (LearnedScorer, TreesScorer, ConvScorer, SetScorer, SphereScorer)
     }
+    weights = best_weights(weights) if Path(weights).is_dir() else weights
     kind = weights_kind(weights)
     if kind not in loaders:
         known = f"Give weights of {', '.join(loaders)}."

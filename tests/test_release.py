@@ -21,12 +21,13 @@ from wheretolook.dataset import Dataset, write_json
 from wheretolook.errors import ConfigError, StorageError, TableError, WeightsError
 from wheretolook.evaluation import EvaluateConfig, evaluate
 from wheretolook.evaluation.report import score_markdown
-from wheretolook.learning.config import TrainConfig
+from wheretolook.learning.config import SetConfig, TrainConfig, TreesConfig
 from wheretolook.learning.data import load_views
 from wheretolook.learning.training import train
 from wheretolook.learning.weights import load_classifier
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.release_card import release_card
+from wheretolook.scoring import load_scorer
 from wheretolook.table import write_table
 from wheretolook.tracking import TrackingConfig
 from wheretolook.visibility import StoredOcclusion
@@ -169,6 +170,34 @@ def test_the_best_on_validation_ships(finished: Path) -> None:
         progress=False,
     )
     assert models[0].reused
+
+
+def test_what_is_best_of_all_ships_beside_the_network(folder: Path, tmp_path: Path) -> None:
+    root = folder / "data" / "release"
+    release, tracking = Dataset.load(root), TrackingConfig(str(folder / "mlruns"))
+    few = replace(TRAIN, set=SetConfig(epochs=4, batch_size=32), trees=TreesConfig(max_trees=3, min_leaf=5))
+    train(release, replace(few, variants=("set", "trees")), tracking, progress=False)
+    records = {name: root / "weights" / f"{name}.json" for name in ("set", "trees")}
+    for name, precision in (("set", 0.9999), ("trees", 0.5)):  # whatever they have learnt from so little
+        record = json.loads(records[name].read_text())
+        record["metrics"]["val_average_precision"] = precision
+        records[name].write_text(json.dumps(record))
+    stages.release(experiment_of(folder, "release"), say=quiet)
+    (network,) = (path for path in (root / "weights").glob("mlp-*.safetensors"))
+    assert sorted(path.name for path in (root / "weights").glob("*.safetensors")) == [network.name, "set.safetensors"]
+    assert (root / "weights" / releases.SHELF / "trees.safetensors").is_file()
+    scores, variants = (pd.read_csv(root / "results" / f"{name}.csv") for name in ("scores", "variants"))
+    assert {"mlp", "set"} <= {*scores["method"]} and "trees" not in {*scores["method"]}
+    assert {"mlp", "set", "trees"} <= {*variants["method"]}
+    card = (root / "README.md").read_text()
+    assert card == release_card(release)
+    for said in (f"{network.name} and set.safetensors", "set of landmarks; and of the paper's best network", "0.9999"):
+        assert said in card, said
+    scorer = load_scorer(root / "weights", release.scenes[0].localization_map(release.camera))
+    assert scorer.name == "set"
+    before = contents(root)
+    stages.release(experiment_of(folder, "release"), say=quiet)
+    assert contents(root) == before
 
 
 def test_done_again_it_gives_the_same_bytes(folder: Path) -> None:

@@ -25,6 +25,7 @@ import torch
 
 from wheretolook.attributes import ATTRIBUTES
 from wheretolook.dataset import Dataset
+from wheretolook.learning import set as set_learner
 from wheretolook.learning.config import MATCHABILITY, SET, TrainConfig, weights_name
 from wheretolook.learning.fit import RunLog
 from wheretolook.learning.learner import Task
@@ -65,6 +66,15 @@ class Table:
 def seeds(dataset: Dataset, args: argparse.Namespace, tracking: TrackingConfig) -> None:
     """Every learner, several times."""
     table = Table(args.out / "seeds.csv")
+    described: dict[str, SetData] = {}
+
+    def described_once(task: Task) -> SetData:
+        if not described:
+            described["all"] = SetData(task)
+        described["all"].config = task.config
+        return described["all"]
+
+    set_learner.SetData = described_once  # type: ignore[assignment,misc]
     for seed in args.seeds:
         for variant in args.variants:
             if table.has(variant=variant, seed=seed):

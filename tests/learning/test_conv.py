@@ -205,7 +205,7 @@ def test_damaged_networks_are_named(network: ConvNetwork, tmp_path: Path) -> Non
     network.save(path)
     tensors, header = load_file(path), json.loads(_header(path))
     for wrong, changed, message in (
-        ({}, {"kind": "trees"}, "no convolutional network's"),
+        ({}, {"kind": "trees"}, "not of conv"),
         ({}, {"widths": [8, 15]}, "do not fit"),
         ({}, {"widths": []}, "damaged description"),
         ({}, {"camera": {"breadth": 3}}, "damaged description"),

@@ -309,7 +309,7 @@ def test_unusable_weights_are_named(model: SphereModel, tmp_path: Path) -> None:
     with safe_open(path, framework="pt") as file:
         header = json.loads(file.metadata()[METADATA_KEY])
     for change, message in (
-        ({"kind": "mlp"}, "no sphere's"),
+        ({"kind": "mlp"}, "not of sphere"),
         ({"features": ["height"]}, "other tokens"),
         ({"options": {**header["options"], "width": 64}}, "do not fit"),
         ({"options": {**header["options"], "width": 33}}, "damaged description.*multiple of heads"),

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import json
-import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import save
 from torch import Tensor, nn
 from torch.nn.functional import relu
 
@@ -23,7 +20,7 @@ from wheretolook.learning.fit import home_device
 from wheretolook.learning.learner import Learnt, Task, class_counts, fit_network, predict
 from wheretolook.learning.network import InputStatistics, standardize
 from wheretolook.learning.platt import fit_platt
-from wheretolook.learning.weights import FORMAT_VERSION, METADATA_KEY, read_weights, stored_statistics
+from wheretolook.learning.weights import check_kind, read_weights, stored_statistics, write_weights
 
 
 @dataclass(frozen=True)
@@ -105,15 +102,11 @@ class ConvNetwork(nn.Module):
             path: file to write; its folder is made when needed.
             training: what else to keep about the training (JSON values).
         """
-        path.parent.mkdir(parents=True, exist_ok=True)
         header = {
-            "format_version": FORMAT_VERSION, "kind": CONV, **asdict(self.spec), "scale": self.scale,
-            "offset": self.offset, "training": dict(training or {}),
+            "kind": CONV, **asdict(self.spec), "scale": self.scale, "offset": self.offset,
+            "training": dict(training or {}),
         }  # fmt: skip
-        tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in self.state_dict().items()}
-        partial = path.with_name(path.name + ".partial")
-        partial.write_bytes(save(tensors, metadata={METADATA_KEY: json.dumps(header)}))
-        os.replace(partial, path)
+        write_weights(path, self.state_dict(), header)
 
     @classmethod
     def load(cls, path: str | Path, device: str = "cpu") -> ConvNetwork:
@@ -127,10 +120,8 @@ class ConvNetwork(nn.Module):
             WeightsError: the file is missing, damaged, foreign, of another kind, or does not fit its own description.
         """
         tensors, header = read_weights(Path(path))
+        check_kind(path, header, CONV)
         fix = "Train again, or give weights of a convolutional network."
-        if header.get("kind") != CONV:
-            kind = header.get("kind")
-            raise WeightsError("these weights are no convolutional network's", path=path, value=kind, fix=fix)
         try:
             network = cls(
                 ConvSpec(

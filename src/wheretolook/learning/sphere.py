@@ -6,14 +6,11 @@ between them, at the direction it looks in; roll does not count.
 
 from __future__ import annotations
 
-import json
-import os
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import save
 from torch import Tensor, nn
 
 from wheretolook.errors import ConfigError, WeightsError
@@ -25,7 +22,7 @@ from wheretolook.learning.fit import home_device
 from wheretolook.learning.learner import Learnt, Task, class_counts, fit_network, predict
 from wheretolook.learning.platt import fit_platt
 from wheretolook.learning.sphere_views import FEATURES, TOWARDS, TURNING, SphereDataModule, load_sphere_views
-from wheretolook.learning.weights import FORMAT_VERSION, METADATA_KEY, read_weights
+from wheretolook.learning.weights import check_kind, read_weights, write_weights
 
 PITCHES, YAWS = 6, 18
 """Rows and columns of the lattice, `wheretolook.grid.yaw_pitch_angles`."""
@@ -161,16 +158,12 @@ class SphereModel:
             path: file to write; its folder is made when needed.
             training: what else to keep about the training (JSON values).
         """
-        path.parent.mkdir(parents=True, exist_ok=True)
         header = {
-            "format_version": FORMAT_VERSION, "kind": SPHERE, "features": list(FEATURES),
+            "kind": SPHERE, "features": list(FEATURES),
             "camera": asdict(self.camera), "options": asdict(self.config), "scale": self.scale, "offset": self.offset,
             "training": training or {},
         }  # fmt: skip
-        tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in self.network.state_dict().items()}
-        partial = path.with_name(path.name + ".partial")
-        partial.write_bytes(save(tensors, metadata={METADATA_KEY: json.dumps(header)}))
-        os.replace(partial, path)
+        write_weights(path, self.network.state_dict(), header)
 
     @classmethod
     def load(cls, path: str | Path) -> SphereModel:
@@ -180,9 +173,8 @@ class SphereModel:
             WeightsError: the file is missing, damaged, foreign, of another kind, or does not fit its own description.
         """
         tensors, header = read_weights(Path(path))
+        check_kind(path, header, SPHERE)
         fix = "Train again, or give weights of sphere."
-        if header.get("kind") != SPHERE:
-            raise WeightsError("these weights are no sphere's", path=path, value=header.get("kind"), fix=fix)
         if header.get("features") != list(FEATURES):
             raise WeightsError("these weights ask for other tokens", path=path, fix=fix)
         try:

@@ -8,13 +8,12 @@ from typing import ClassVar
 import numpy as np
 import torch
 
-from wheretolook.errors import WeightsError
 from wheretolook.features import ALL_CHANNELS, BinnedViews
 from wheretolook.geometry import Float
 from wheretolook.learning.conv import ConvNetwork
 from wheretolook.localization_map import LocalizationMap
 from wheretolook.scoring.base import BinnedScorer
-from wheretolook.scoring.learned import channel_scales, check_field_of_view
+from wheretolook.scoring.learned import channel_scales, check_field_of_view, naming
 
 BLOCK = 512
 """Views at a time: the first convolution of one takes 115 kB."""
@@ -49,10 +48,8 @@ class ConvScorer(BinnedScorer):
             WeightsError: the file cannot be used, or was trained for another field of view than the map's camera.
         """
         network = ConvNetwork.load(weights)
-        try:
+        with naming(weights):
             return cls(localization_map, network)
-        except WeightsError as error:
-            raise WeightsError(error.problem, path=weights, value=error.value, fix=error.fix) from None
 
     def score_bins(self, binned: BinnedViews) -> Float:
         """(B,) probabilities in [0, 1]."""

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from wheretolook.attributes import LandmarkDescriber, ViewLandmarks, image_cells
-from wheretolook.errors import ConfigError, WeightsError
+from wheretolook.errors import ConfigError
 from wheretolook.fisher.metrics import METRICS, metric_of
 from wheretolook.geometry import Float
 from wheretolook.learning.matchability import Matchability
@@ -19,7 +19,7 @@ from wheretolook.learning.set_network import expected_parts
 from wheretolook.localization_map import LocalizationMap
 from wheretolook.rendering.types import check_poses
 from wheretolook.scoring.base import Scorer
-from wheretolook.scoring.learned import check_field_of_view
+from wheretolook.scoring.learned import check_field_of_view, naming
 
 BINS = 30
 """Bins along each side of the image, of which those expected to hold a found landmark are counted."""
@@ -53,10 +53,8 @@ class Expectation:
         """
         known = cls._of_maps.setdefault(localization_map, {})
         if str(weights) not in known:
-            try:
+            with naming(weights):
                 known[str(weights)] = cls(localization_map, Matchability.load(weights, localization_map.device))
-            except WeightsError as error:
-                raise WeightsError(error.problem, path=weights, value=error.value, fix=error.fix) from None
         return known[str(weights)]
 
     def sums(self, cam_from_world: Float) -> Float:

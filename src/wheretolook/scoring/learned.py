@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import ClassVar
 
@@ -54,10 +55,8 @@ class LearnedScorer(BinnedScorer):
             WeightsError: the file cannot be used, or was trained for another field of view than the map's camera.
         """
         network = load_classifier(weights)
-        try:
+        with naming(weights):
             return cls(localization_map, network, read_training(weights).get("variant"))
-        except WeightsError as error:
-            raise WeightsError(error.problem, path=weights, value=error.value, fix=error.fix) from None
 
     def score_bins(self, binned: BinnedViews) -> Float:
         """(B,) probabilities in [0, 1]."""
@@ -105,6 +104,15 @@ def channel_scales(trained: PinholeCamera, camera: Camera, channels: tuple[str, 
     """What channels of a camera's views are multiplied by to be as those of the camera of the training views."""
     scale = {"u": trained.width / camera.width, "v": trained.height / camera.height}
     return [scale.get(name, 1.0) for name in channels]
+
+
+@contextmanager
+def naming(weights: str | Path) -> Iterator[None]:
+    """Let a WeightsError name the file of the weights that are used."""
+    try:
+        yield
+    except WeightsError as error:
+        raise WeightsError(error.problem, path=weights, value=error.value, fix=error.fix) from None
 
 
 def check_field_of_view(trained: PinholeCamera, camera: Camera) -> None:

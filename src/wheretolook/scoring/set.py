@@ -9,13 +9,12 @@ import numpy as np
 import torch
 
 from wheretolook.attributes import LandmarkDescriber
-from wheretolook.errors import WeightsError
 from wheretolook.geometry import Float
 from wheretolook.learning.set import SetModel
 from wheretolook.localization_map import LocalizationMap
 from wheretolook.rendering.types import check_poses
 from wheretolook.scoring.base import Scorer
-from wheretolook.scoring.learned import check_field_of_view
+from wheretolook.scoring.learned import check_field_of_view, naming
 
 MOST = 1024
 """Landmarks of a view that are looked at; of more, so many evenly spread ones stand for all. The network has learnt
@@ -50,10 +49,8 @@ class SetScorer(Scorer):
             WeightsError: the file cannot be used, or was trained for another field of view than the map's camera.
         """
         model = SetModel.load(weights, localization_map.device)
-        try:
+        with naming(weights):
             return cls(localization_map, model)
-        except WeightsError as error:
-            raise WeightsError(error.problem, path=weights, value=error.value, fix=error.fix) from None
 
     def score(self, cam_from_world: Float) -> Float:
         """(B,) probabilities in [0, 1]."""

@@ -8,14 +8,13 @@ from typing import ClassVar
 import numpy as np
 import torch
 
-from wheretolook.errors import WeightsError
 from wheretolook.geometry import Float
 from wheretolook.learning.sphere import SphereModel, on_lattice
 from wheretolook.learning.sphere_views import LocationDescriber
 from wheretolook.localization_map import LocalizationMap, shared_locations
 from wheretolook.rendering.types import check_poses
 from wheretolook.scoring.base import Scorer
-from wheretolook.scoring.learned import check_field_of_view
+from wheretolook.scoring.learned import check_field_of_view, naming
 
 
 class SphereScorer(Scorer):
@@ -49,10 +48,8 @@ class SphereScorer(Scorer):
             MapError: the map has no mapping cameras.
         """
         model = SphereModel.load(weights)
-        try:
+        with naming(weights):
             return cls(localization_map, model)
-        except WeightsError as error:
-            raise WeightsError(error.problem, path=weights, value=error.value, fix=error.fix) from None
 
     def score(self, cam_from_world: Float) -> Float:
         """(B,) probabilities in [0, 1]."""

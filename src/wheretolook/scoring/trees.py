@@ -8,13 +8,12 @@ from typing import ClassVar
 import numpy as np
 
 from wheretolook.attributes import LandmarkDescriber, pool
-from wheretolook.errors import WeightsError
 from wheretolook.geometry import Float
 from wheretolook.learning.trees import BoostedTrees
 from wheretolook.localization_map import LocalizationMap
 from wheretolook.rendering.types import check_poses
 from wheretolook.scoring.base import BLOCK, Scorer
-from wheretolook.scoring.learned import check_field_of_view
+from wheretolook.scoring.learned import check_field_of_view, naming
 
 
 class TreesScorer(Scorer):
@@ -44,10 +43,8 @@ class TreesScorer(Scorer):
             WeightsError: the file cannot be used, or was trained for another field of view than the map's camera.
         """
         trees = BoostedTrees.load(weights)
-        try:
+        with naming(weights):
             return cls(localization_map, trees)
-        except WeightsError as error:
-            raise WeightsError(error.problem, path=weights, value=error.value, fix=error.fix) from None
 
     def score(self, cam_from_world: Float) -> Float:
         """(B,) probabilities in [0, 1]."""

@@ -148,7 +148,8 @@ def plan_path(
                 fix="Give a point where the camera can be, off walls and furniture.",
             )  # fmt: skip
     if np.linalg.norm(ends[1] - ends[0]) < SAME_M:
-        raise PlanningError("the start is the goal", value=tuple(ends[0].tolist()), fix="Ask the map for the best view.")
+        fix = "Ask the map for the best view there."
+        raise PlanningError("the start is the goal", value=tuple(ends[0].tolist()), fix=fix)
     problem = _Problem(ends, low, high, space, viewpoint_map, config)
     orientations = problem.start_orientations(start_axis)
     with tqdm(total=round(config.time_s, 1), desc="plan", unit="s", disable=not progress) as bar:

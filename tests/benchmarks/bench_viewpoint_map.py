@@ -98,6 +98,7 @@ def main() -> None:
     free_space = FreeSpace(mesh, device=args.device)
     free = np.flatnonzero(free_space.is_free(grid.centers()))[: args.voxels]
     points = on_surface(mesh, args.landmarks, np.random.default_rng(0))
+    points = points[np.argsort(-np.linalg.norm(points - points[0], axis=1))]  # the last ten lie together
     made = room_map(args.landmarks, grid.centers()[:1], args.device)  # for its attributes
     landmarks = replace(made.landmarks, points=points)
     occlusion = MeshOcclusion(MeshRaycaster(mesh, args.device), two_sided=free_space.two_sided)

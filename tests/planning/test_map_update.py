@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from planning.rooms import DIRECTIONS, GRID, build, free_voxels, joined, occlusion, room_landmarks, room_map
+from planning.rooms import CAMERA, DIRECTIONS, GRID, build, free_voxels, joined, occlusion, room_landmarks, room_map
+from scoring.test_scorers import NO_STATISTICS, some_convolutions, some_trees
 from wheretolook.errors import ConfigError
 from wheretolook.geometry import PinholeCamera
+from wheretolook.learning.matchability import Matchability
+from wheretolook.learning.set import SetModel
+from wheretolook.learning.set_network import MatchabilityNetwork, SetNetwork
 from wheretolook.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.planning import ViewpointMap, build_viewpoint_map, update_viewpoint_map
@@ -139,3 +144,23 @@ def test_methods_that_call_themselves_local_are(method: str) -> None:
     hidden = ~occlusion().unoccluded(before.locations, landmarks.points[len(OLD) :]).any(axis=1)
     assert hidden.any()
     np.testing.assert_allclose(after.scores[hidden], before.scores[hidden], rtol=1e-6)
+
+
+@pytest.mark.parametrize("method", ["trees", "conv", "set", "expected-bins", "fisher-trace-expected"])
+def test_methods_that_have_learnt_update_as_if_built_anew(method: str, tmp_path: Path) -> None:
+    weights, landmarks = tmp_path / "some.safetensors", joined(OLD, seen_by_some())
+    if method == "trees":
+        some_trees(room_map(OLD)).save(weights)
+    elif method == "conv":
+        some_convolutions().save(weights)
+    elif method == "set":
+        SetModel(SetNetwork(NO_STATISTICS, pooled=2), CAMERA).save(weights)
+    else:
+        Matchability(MatchabilityNetwork(NO_STATISTICS), CAMERA).save(weights)
+    before, after = (make_scorer(method, room_map(of), weights=weights) for of in (OLD, landmarks))
+    old = build_viewpoint_map(before, GRID, free_voxels(), DIRECTIONS)
+    new, changed = old.updated(after)
+    assert after.local and 0 < len(changed) < len(old.scores)
+    anew = build_viewpoint_map(after, GRID, free_voxels(), DIRECTIONS)
+    np.testing.assert_allclose(new.scores, anew.scores, rtol=1e-5)
+    np.testing.assert_array_equal(new.n_visible, anew.n_visible)

@@ -106,7 +106,7 @@ def save_viewpoint_map(viewpoint_map: ViewpointMap, folder: str | Path) -> None:
     Raises:
         MapFormatError: the folder holds something else.
     """
-    folder = Path(folder)
+    folder = Path(folder).resolve()  # which has a name, also for "."
     if folder.exists() and not (folder.is_dir() and ((folder / DESCRIPTION).is_file() or not any(folder.iterdir()))):
         raise MapFormatError("something else is here", path=folder, fix="Name a new folder, or remove this.")
     partial = folder.with_name(folder.name + ".partial")
@@ -133,9 +133,12 @@ def save_viewpoint_map(viewpoint_map: ViewpointMap, folder: str | Path) -> None:
         "sha256": checksums,
     }
     write_json(partial / DESCRIPTION, content)
+    before = folder.with_name(folder.name + ".before")
+    shutil.rmtree(before, ignore_errors=True)
     if folder.exists():
-        shutil.rmtree(folder)  # who has mapped its files keeps them
+        folder.rename(before)  # so that one of the two is whole at any moment
     partial.rename(folder)
+    shutil.rmtree(before, ignore_errors=True)  # who has mapped its files keeps them
 
 
 def load_viewpoint_map(folder: str | Path, mmap: bool = False) -> ViewpointMap:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.errors import PlanningError
-from wheretolook.geometry import Float
+from wheretolook.geometry import Float, rotation_looking_along
 from wheretolook.planning.turns import turns_deg, turns_from_deg, within
 from wheretolook.planning.viewpoint_map import ViewpointMap
 
@@ -63,7 +63,7 @@ class TurnLimit:
         """
         if start is None:
             return np.ones(len(self.directions), dtype=bool)
-        return within(turns_from_deg(start, self.directions), self.max_turn_deg)
+        return within(turns_from_deg(start, rotation_looking_along(self.directions)), self.max_turn_deg)
 
 
 @dataclass(frozen=True, eq=False)

@@ -43,12 +43,12 @@ def angles_to_axis_deg(directions: Float, axis: Float) -> Float:
     return np.degrees(2 * np.arcsin(np.minimum(chord / 2, 1)))
 
 
-def turns_from_deg(current: ArrayLike, directions: Float) -> Float:
-    """Rotation angles (D,) in degrees from one orientation to cameras without roll that look along directions (D, 3).
+def turns_from_deg(current: ArrayLike, rotations: Float) -> Float:
+    """Rotation angles (D,) in degrees from one orientation to others.
 
     Args:
         current: (3,) axis of a camera without roll, or (3, 3) cam_from_world rotation.
-        directions: unit vectors in the world.
+        rotations: (D, 3, 3) cam_from_world.
 
     Raises:
         ValueError: `current` has another shape, is not finite, no rotation, or an axis of no length.
@@ -58,7 +58,7 @@ def turns_from_deg(current: ArrayLike, directions: Float) -> Float:
         given = rotation_looking_along(check_axis(given))
     if given.shape != (3, 3) or not np.allclose(given @ given.T, np.eye(3), atol=1e-6):
         raise ValueError(f"an orientation is an axis (3,) or a rotation (3, 3), got {given}")
-    return _angles_deg(given.reshape(1, 9), rotation_looking_along(directions).reshape(-1, 9))[0]
+    return _angles_deg(given.reshape(1, 9), rotations.reshape(-1, 9))[0]
 
 
 def turns_deg(directions: Float) -> Float:

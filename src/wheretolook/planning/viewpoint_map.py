@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.geometry import Float
+from wheretolook.geometry import Float, rotation_looking_along
 from wheretolook.grid import VoxelGrid
 from wheretolook.planning.turns import angles_to_axis_deg, check_axis, turns_from_deg, within
 
@@ -212,7 +212,7 @@ class ViewpointMap:
             ValueError: the point or `current` is not finite, or an axis has no length.
         """
         row = self.row(point)
-        return self._best_of(row, within(turns_from_deg(current, self.directions), max_turn_deg))
+        return self._best_of(row, within(turns_from_deg(current, self._rotations), max_turn_deg))
 
     def best_many(self, points: ArrayLike) -> ViewChoices:
         """The best orientation at each of world points (N, 3) m.
@@ -284,6 +284,10 @@ class ViewpointMap:
         axes = self.directions.copy()
         axes.flags.writeable = False
         return list(axes)
+
+    @cached_property
+    def _rotations(self) -> Float:
+        return rotation_looking_along(self.directions)
 
     @cached_property
     def _best_of_rows(self) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.int64]]:

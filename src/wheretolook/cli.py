@@ -33,6 +33,11 @@ STAGES = {
     "label": ("label", "Render and localize every viewpoint, measure the pose error. Resumes.", ("label", "tracking")),
     "train": ("train", "Train one network for each input variant.", ("train", "tracking")),
     "evaluate": ("evaluate", "Score all methods on the test scenes.", ("evaluate", "occlusion", "tracking")),
+    "viewpoint-map": (
+        "viewpoint_map",
+        "Score every direction at every free voxel of a scene, for planners to look up. Needs no labels.",
+        ("viewpoint_map", "occlusion", "scenes.free_space"),
+    ),
     "release": (
         "release",
         "Make a compact copy, data/release; given that copy and weights trained on it, evaluate and write its card.",
@@ -56,6 +61,7 @@ stages, in order; each reads what the one before it left in <data>/<name>/
   wheretolook map --config configs/demo.yaml --map.n_images 120
   wheretolook label --config configs/paper.yaml --engine ray     on a Ray cluster; the default is local
   wheretolook evaluate --list-methods    what can be compared
+  wheretolook viewpoint-map --config configs/demo.yaml --scene apartment-000 --out room.map
   wheretolook --version
 """
 
@@ -95,7 +101,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _usage() -> str:
     rows = [*((name, entry[1]) for name, entry in STAGES.items()), ("demo", DEMO)]
-    return USAGE.format(stages="\n".join(f"  {name:<10}{text}" for name, text in rows))
+    return USAGE.format(stages="\n".join(f"  {name:<15}{text}" for name, text in rows))
 
 
 def _method_list() -> str:
@@ -137,7 +143,8 @@ def parse_experiment(command: str, arguments: list[str]) -> Experiment | None:
     """
     from wheretolook.config import Experiment
 
-    arguments = [_SHORT.get(name, name) + equals + value for name, equals, value in
+    short = {**_SHORT, **_SHORT_OF.get(command, {})}
+    arguments = [short.get(name, name) + equals + value for name, equals, value in
                  (argument.partition("=") for argument in arguments)]  # fmt: skip
     if command == "demo" and not any(argument.startswith("--config") for argument in arguments):
         arguments = ["--config", str(_default_config()), *arguments]
@@ -213,12 +220,33 @@ def _help(parser: ArgumentParser, command: str) -> str:
 
     for group in parser._action_groups:
         group._group_actions = [action for action in group._group_actions if belongs(action.dest)]
-    more = "\nWhat evaluate.methods may name: wheretolook evaluate --list-methods\n" if command == "evaluate" else ""
-    return str(parser.format_help()) + more
+    return str(parser.format_help()) + _MORE_HELP.get(command, "")
 
 
 _SHORT = {"--engine": "--label.engine"}
 """Flags that may be given without their group."""
+
+_SHORT_OF = {
+    "viewpoint-map": {f"--{name}": f"--viewpoint_map.{name}" for name in ("scene", "method", "weights", "out")},
+}
+"""The same, of one sub-command alone, since others have flags of such names in their own groups."""
+
+_MORE_HELP = {
+    "evaluate": "\nWhat evaluate.methods may name: wheretolook evaluate --list-methods\n",
+    "viewpoint-map": """
+Reads a scene's mesh and map, as the scenes and map stages leave them; --scene, --method, --weights and --out stand for
+the settings of viewpoint_map. For example, with the weights that ship:
+
+  wheretolook viewpoint-map --config configs/demo.yaml --scene apartment-000 \\
+      --weights data/release/weights/mlp-2d+z.safetensors --out apartment.map
+
+The folder holds plain arrays and LAYOUT.txt, which says how C++ or any language reads them. In Python:
+
+  from wheretolook.planning import ViewpointMap
+  viewpoint_map = ViewpointMap.load("apartment.map", mmap=True)
+  choice = viewpoint_map.best((1.0, 2.0, 1.5))    # None where no camera can be, else axis, score, n_visible
+""",
+}
 
 _GROUPS = {group.partition(".")[0] for _, _, groups in STAGES.values() for group in groups}
 

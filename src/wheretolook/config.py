@@ -14,6 +14,7 @@ from wheretolook.geometry import PinholeCamera
 from wheretolook.labelling.config import LabelConfig
 from wheretolook.learning.config import TrainConfig
 from wheretolook.mapping.config import MapConfig
+from wheretolook.planning.config import ViewpointMapConfig
 from wheretolook.sampling import SampleConfig
 from wheretolook.scenes.free_space import FreeSpaceConfig
 from wheretolook.scenes.procedural import ApartmentConfig
@@ -100,6 +101,7 @@ class Experiment:
         label: stage 4, localization errors.
         train: stage 5, the network.
         evaluate: stage 6, scores of all methods.
+        viewpoint_map: what planners query.
         tracking: where MLflow keeps its runs.
     """
 
@@ -114,6 +116,7 @@ class Experiment:
     label: LabelConfig = field(default_factory=LabelConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
     evaluate: EvaluateConfig = field(default_factory=EvaluateConfig)
+    viewpoint_map: ViewpointMapConfig = field(default_factory=ViewpointMapConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
 
     @property

@@ -53,3 +53,11 @@ class StorageError(WhereToLookError):
 
 class WeightsError(WhereToLookError):
     """Trained weights are missing or do not fit the network or the inputs asked for."""
+
+
+class MapFormatError(WhereToLookError):
+    """A saved viewpoint map is missing, damaged or of another version."""
+
+
+class PlanningError(WhereToLookError):
+    """A path leaves the viewpoint map, or cannot be looked along within the limits."""

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
     from wheretolook.learning.training import TrainedModel
     from wheretolook.mapping.extraction import ExtractorConfig
+    from wheretolook.planning import ViewpointMap
 
 STAGES = ("scenes", "map", "sample", "label")
 """Stages that work scene by scene, in order."""
@@ -265,6 +266,43 @@ def evaluate(experiment: Experiment, say: Say = print, tick: Tick = lambda work:
     )
     tick(1)
     return scores
+
+
+def viewpoint_map(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> dict[str, ViewpointMap]:
+    """For planners: every direction scored at every free voxel of a scene, `<scene>/viewpoint-map/`.
+
+    Needs the map stage only. It is built anew each time.
+
+    Returns:
+        The viewpoint map of each scene asked for, by the scene's name.
+
+    Raises:
+        ConfigError: no such scene or method, or the method needs weights. WeightsError: the weights cannot be used.
+        SceneError: there is no mesh, or no voxel is free. MapFormatError: something else is where the map belongs.
+    """
+    from wheretolook.planning.scene_map import scene_viewpoint_map
+
+    dataset, config = _dataset(experiment, "map"), experiment.viewpoint_map
+    scenes = {scene.name: scene for scene in dataset.scenes}
+    if config.scene and config.scene not in scenes:
+        fix = f"There are {', '.join(scenes)}."
+        raise ConfigError("there is no such scene", path=dataset.root, value=config.scene, fix=fix)
+    built: dict[str, ViewpointMap] = {}
+    for name in [config.scene] if config.scene else scenes:
+        scene = scenes[name]
+        with _naming(scene.mesh):
+            found = scene_viewpoint_map(
+                scene, dataset.camera, config, experiment.occlusion, experiment.scenes.free_space,
+                experiment.warp_device,
+            )  # fmt: skip
+        folder = config.out or scene.folder / "viewpoint-map"
+        found.save(folder)
+        built[name] = found
+        n_rows, n_directions = found.scores.shape
+        say(f"{name}: {n_directions} directions at {n_rows} free voxels of {len(found.grid)}, scored by "
+            f"{found.origin.scorer} -> {folder}")  # fmt: skip
+        tick(1)
+    return built
 
 
 def release(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> Dataset:

@@ -31,10 +31,13 @@ class Scorer(ABC):
     Attributes:
         name: short name of the method, as in tables and on the command line.
         inputs: input variant of a learned method, "" for others.
+        local: whether a score depends on no landmarks but those with a free line of sight from the view's location. A
+            viewpoint map then need not be built anew where added landmarks are hidden. False where it is not known.
     """
 
     name: ClassVar[str]
     inputs: str = ""
+    local: bool = False
 
     def __init__(self, localization_map: LocalizationMap) -> None:
         self.localization_map = localization_map

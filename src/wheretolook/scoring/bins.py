@@ -18,6 +18,7 @@ class BinsScorer(BinnedScorer):
     """
 
     name: ClassVar[str] = "bins"
+    local = True
 
     def score_bins(self, binned: BinnedViews) -> Float:
         """(B,) in [0, 1)."""

@@ -31,6 +31,7 @@ class ConvScorer(BinnedScorer):
     """
 
     name: ClassVar[str] = "conv"
+    local = True
 
     def __init__(self, localization_map: LocalizationMap, network: ConvNetwork) -> None:
         super().__init__(localization_map, network.spec.bins, landmark_channels=True)

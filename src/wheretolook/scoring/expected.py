@@ -101,6 +101,7 @@ class ExpectedScorer(Scorer):
         if kind not in (INLIERS, FILLED):
             raise ConfigError("unknown expectation", value=kind, fix=f"There are {INLIERS} and {FILLED}.")
         self.inputs = kind
+        self.local = kind == FILLED  # the share of the map's landmarks falls with every landmark that is added
         self._expectation = Expectation.of_map(localization_map, weights)
 
     def score(self, cam_from_world: Float) -> Float:
@@ -125,6 +126,7 @@ class ExpectedFisherScorer(Scorer):
     """
 
     name: ClassVar[str] = "fisher"
+    local = True
 
     def __init__(self, localization_map: LocalizationMap, weights: str | Path, metric: str) -> None:
         super().__init__(localization_map)

@@ -126,6 +126,7 @@ class FisherScorer(Scorer):
     """
 
     name: ClassVar[str] = "fisher"
+    local = True
 
     def __init__(
         self,
@@ -151,6 +152,7 @@ class ProbeScorer(Scorer):
     """Views by how near their axis is to a certain axis of each location; such a method chooses without comparing."""
 
     name: ClassVar[str] = "probe"
+    local = True
 
     def __init__(self, localization_map: LocalizationMap) -> None:
         super().__init__(localization_map)

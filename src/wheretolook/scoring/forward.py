@@ -29,6 +29,7 @@ class ForwardScorer(Scorer):
     """
 
     name: ClassVar[str] = "forward"
+    local = True
 
     def __init__(self, localization_map: LocalizationMap, heading: ArrayLike | None = None, seed: int = 0) -> None:
         super().__init__(localization_map)

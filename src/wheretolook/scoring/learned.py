@@ -36,6 +36,7 @@ class LearnedScorer(BinnedScorer):
     """
 
     name: ClassVar[str] = "mlp"
+    local = True
 
     def __init__(self, localization_map: LocalizationMap, network: ViewpointNetwork, inputs: str | None = None) -> None:
         super().__init__(localization_map, network.spec.bins, not {*network.spec.channels} <= {*CHANNELS})

@@ -24,6 +24,7 @@ class RandomScorer(Scorer):
     """
 
     name: ClassVar[str] = "random"
+    local = True
 
     def __init__(self, localization_map: LocalizationMap, seed: int = 0) -> None:
         super().__init__(localization_map)

@@ -33,6 +33,7 @@ class SetScorer(Scorer):
     """
 
     name: ClassVar[str] = "set"
+    local = True
 
     def __init__(self, localization_map: LocalizationMap, model: SetModel) -> None:
         super().__init__(localization_map)

@@ -28,6 +28,7 @@ class TreesScorer(Scorer):
     """
 
     name: ClassVar[str] = "trees"
+    local = True
 
     def __init__(self, localization_map: LocalizationMap, trees: BoostedTrees) -> None:
         super().__init__(localization_map)

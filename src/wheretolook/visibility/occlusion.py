@@ -38,10 +38,12 @@ class OcclusionModel(ABC):
     Attributes:
         name: of the model, as in `OcclusionConfig`.
         uses_all_cores: whether `unoccluded` occupies all cores of a CPU by itself.
+        landmarks_hide: whether landmarks hide one another, so that those added change what is seen of the others.
     """
 
     name: str = "custom"
     uses_all_cores: bool = False
+    landmarks_hide: bool = False
 
     @abstractmethod
     def unoccluded(self, locations: Float, points: Float) -> NDArray[np.bool_]:

@@ -1,0 +1,207 @@
+"""A viewpoint map on disk: plain arrays in a folder that any language reads, with the layout written beside them."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import asdict
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wheretolook.dataset import write_json, write_text
+from wheretolook.errors import MapFormatError
+from wheretolook.grid import VoxelGrid
+from wheretolook.planning.viewpoint_map import MapOrigin, ViewpointMap
+
+FORMAT, VERSION = "wheretolook viewpoint map", 1
+
+DESCRIPTION, LAYOUT = "viewpoint_map.json", "LAYOUT.txt"
+
+ARRAYS = {
+    "row_of_voxel": ("<i4", "V"),
+    "directions": ("<f8", "D, 3"),
+    "ranked": ("<u2", "L, D"),
+    "scores": ("<f4", "L, D"),
+    "n_visible": ("<u4", "L, D"),
+    "landmark_ids": ("<i8", "N"),
+    "landmark_digests": ("<u8", "N, 2"),
+}
+"""Type, little-endian, and shape of each array; each is a file `<name>.npy`."""
+
+_REBUILD = "Build it anew with `wheretolook viewpoint-map`, or get the folder again."
+
+_TEXT = """\
+A viewpoint map, version {version}: where to point a camera so that it knows where it is.
+
+For every free voxel of a scene, every direction of a lattice is ranked by how well a camera there would localize.
+
+FRAMES AND UNITS
+  World: metres, z up. A direction is the unit vector, in the world, that the camera's optical axis points along. The
+  camera (x right, y down, z forward) does not roll: its x axis is level. If it looks straight up or down, x is world x.
+  With direction f, the rows of the rotation cam_from_world are
+    right = (f.y, -f.x, 0) / |(f.y, -f.x, 0)|,  down = f x right,  forward = f.
+
+FILES
+  viewpoint_map.json  format, version, grid, sizes, and what the map was made from
+{files}
+  V voxels, L free voxels, D directions, N landmarks; the numbers are in viewpoint_map.json under "sizes".
+
+  Arrays are .npy files, version 1.0: 6 bytes magic, 2 bytes version, then H as a little-endian uint16, then H bytes of
+  text, then the values from byte 10 + H on (a multiple of 64, so a file can be memory-mapped as it is): little-endian,
+  row-major, not compressed.
+
+FROM A POINT TO ITS VOXEL
+  "grid" has lower and upper (corners, metres) and shape (voxels along x, y, z). For p within lower and upper, both
+  included, and for each axis a:
+    i[a] = min(floor((p[a] - lower[a]) / size[a]), shape[a] - 1),  size[a] = (upper[a] - lower[a]) / shape[a]
+    voxel = (i[x] * shape[y] + i[y]) * shape[z] + i[z]
+    row = row_of_voxel[voxel]; -1: not free, there is nothing here for a camera. Rows count up with voxels.
+  Scores were computed at the voxel's centre, lower + (i + 0.5) * size.
+
+FROM A ROW TO ITS DIRECTIONS
+  ranked[row * D + k] is the id of the k-th best direction, k = 0 the best; ties go by rising id.
+  scores[row * D + id], n_visible[row * D + id] and directions[id * 3 + axis] belong to a direction's id.
+  A score is what the scorer under "origin" gives: a calibrated probability if the scorer's is one. It is stored in
+  single precision; the ranks are those of the double. n_visible is the number of landmarks in view.
+
+IN C++, the best direction at a point (for little-endian machines):
+
+  template <class T> const T* values(const char* npy) {{   // npy: the whole file, mapped or read
+    return reinterpret_cast<const T*>(npy + 10 + (uint8_t(npy[8]) | uint8_t(npy[9]) << 8));
+  }}
+  int64_t voxel = 0;
+  for (int a = 0; a < 3; ++a) {{
+    if (!(p[a] >= lower[a] && p[a] <= upper[a])) return -1;
+    double size = (upper[a] - lower[a]) / shape[a];
+    voxel = voxel * shape[a] + std::min<int64_t>((p[a] - lower[a]) / size, shape[a] - 1);
+  }}
+  int32_t row = values<int32_t>(row_of_voxel_npy)[voxel];
+  return row < 0 ? -1 : values<uint16_t>(ranked_npy)[row * int64_t(D)];
+
+TO UPDATE
+  landmark_ids and landmark_digests (of each landmark's position, and of its attributes: the first 8 bytes of BLAKE2b)
+  tell `ViewpointMap.updated` which landmarks were added; a planner has no use for them.
+"""
+
+_MEANINGS = {
+    "row_of_voxel": "row of each voxel in the arrays by row, -1 if it is not free",
+    "directions": "unit optical axes in the world",
+    "ranked": "ids of the directions, the best first",
+    "scores": "by direction id",
+    "n_visible": "landmarks in view, by direction id",
+    "landmark_ids": "of the map's landmarks, ascending",
+    "landmark_digests": "of these",
+}
+
+
+def save_viewpoint_map(viewpoint_map: ViewpointMap, folder: str | Path) -> None:
+    """Write a folder; one that holds a viewpoint map already is replaced once the new one is complete.
+
+    The same map gives the same bytes. The layout is described in the folder's own `LAYOUT.txt`.
+
+    Raises:
+        MapFormatError: the folder holds something else.
+    """
+    folder = Path(folder).resolve()  # which has a name, also for "."
+    if folder.exists() and not (folder.is_dir() and ((folder / DESCRIPTION).is_file() or not any(folder.iterdir()))):
+        raise MapFormatError("something else is here", path=folder, fix="Name a new folder, or remove this.")
+    partial = folder.with_name(folder.name + ".partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    checksums = {}
+    for name, (kind, _) in ARRAYS.items():
+        np.save(partial / f"{name}.npy", np.ascontiguousarray(getattr(viewpoint_map, name), dtype=kind))
+        checksums[f"{name}.npy"] = _sha256(partial / f"{name}.npy")
+    grid = viewpoint_map.grid
+    n_rows, n_directions = viewpoint_map.scores.shape
+    files = "\n".join(
+        f"  {name + '.npy':<20}{np.dtype(kind).name:<9}({shape + ')':<7}{_MEANINGS[name]}"
+        for name, (kind, shape) in ARRAYS.items()
+    )
+    write_text(partial / LAYOUT, _TEXT.format(version=VERSION, files=files))
+    content = {
+        "format": FORMAT,
+        "version": VERSION,
+        "grid": {name: [*map(float, getattr(grid, name))] for name in ("lower", "upper")}
+        | {"shape": [*map(int, grid.shape)]},
+        "sizes": {"V": len(grid), "L": n_rows, "D": n_directions, "N": len(viewpoint_map.landmark_ids)},
+        "origin": asdict(viewpoint_map.origin),
+        "sha256": checksums,
+    }
+    write_json(partial / DESCRIPTION, content)
+    before = folder.with_name(folder.name + ".before")
+    shutil.rmtree(before, ignore_errors=True)
+    if folder.exists():
+        folder.rename(before)  # so that one of the two is whole at any moment
+    partial.rename(folder)
+    shutil.rmtree(before, ignore_errors=True)  # who has mapped its files keeps them
+
+
+def load_viewpoint_map(folder: str | Path, mmap: bool = False) -> ViewpointMap:
+    """Read what `save_viewpoint_map` wrote.
+
+    Args:
+        folder: of the map.
+        mmap: map the files into memory, read-only, and read only what is asked for. Sizes and types are checked all
+            the same, but not the checksums, for which every byte would have to be read.
+
+    Raises:
+        MapFormatError: there is no map, it is damaged, or of another version.
+    """
+    folder = Path(folder)
+    path = folder / DESCRIPTION
+    if not path.is_file():
+        raise MapFormatError("there is no viewpoint map in this folder", path=folder, fix=_REBUILD)
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        found = content.get("format"), content.get("version")
+    except (OSError, ValueError, AttributeError) as error:
+        raise MapFormatError(f"damaged description: {error}", path=path, fix=_REBUILD) from error
+    if found != (FORMAT, VERSION):
+        raise MapFormatError(f"not a viewpoint map of version {VERSION}", path=path, value=found, fix=_REBUILD)
+    try:
+        corners = content["grid"]
+        grid = VoxelGrid(tuple(corners["lower"]), tuple(corners["upper"]), tuple(corners["shape"]))
+        origin, sizes, checksums = MapOrigin(**content["origin"]), dict(content["sizes"]), dict(content["sha256"])
+        expected = {
+            name: tuple(int(sizes.get(side, side)) for side in shape.split(", ")) for name, (_, shape) in ARRAYS.items()
+        }
+    except Exception as error:  # any value may be damaged
+        raise MapFormatError(f"damaged description: {error}", path=path, fix=_REBUILD) from error
+    arrays: dict[str, Any] = {}
+    for name, shape in expected.items():
+        arrays[name] = _read(folder / f"{name}.npy", ARRAYS[name][0], shape, mmap)
+        if not mmap and _sha256(folder / f"{name}.npy") != checksums.get(f"{name}.npy"):
+            raise MapFormatError("damaged: the checksum differs", path=folder / f"{name}.npy", fix=_REBUILD)
+    try:
+        return ViewpointMap(grid=grid, origin=origin, **arrays)
+    except ValueError as error:
+        raise MapFormatError(f"the arrays do not fit together: {error}", path=folder, fix=_REBUILD) from error
+
+
+def _read(path: Path, kind: str, shape: tuple[int, ...], mmap: bool) -> NDArray[Any]:
+    if not path.is_file():
+        raise MapFormatError("this file is missing", path=path, fix=_REBUILD)
+    try:
+        # the plain array over the mapped memory: NumPy's class for it is slow to index
+        array = np.asarray(np.load(path, mmap_mode="r" if mmap else None, allow_pickle=False))
+    except Exception as error:  # a damaged header raises many kinds of errors
+        raise MapFormatError(f"not a readable array: {error}", path=path, fix=_REBUILD) from error
+    if array.shape != shape or array.dtype != np.dtype(kind) or not array.flags.c_contiguous:
+        raise MapFormatError(
+            f"not an array of {np.dtype(kind).name} of shape {shape}", path=path, value=(array.dtype.name, array.shape),
+            fix=_REBUILD,
+        )  # fmt: skip
+    return array
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        digest = sha256()
+        while block := file.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()

@@ -1,0 +1,441 @@
+"""Paths on which a robot can localize: RRT* over position and orientation of the camera (paper, Sec. 4.3; OMPL)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from tqdm.auto import tqdm
+
+from wheretolook.errors import ConfigError, PlanningError
+from wheretolook.geometry import Float
+from wheretolook.planning.sequences import TurnLimit, best_sequence
+from wheretolook.planning.viewpoint_map import ViewpointMap
+
+TABLE_STEP_DEG = 2.0
+"""Step of yaw and pitch of the table that finds the map's direction nearest to an axis."""
+
+SHORTEST_SHARE = 0.3
+"""Share of the time in which a short path is looked for, whose views are then chosen; it may cost least."""
+
+SAME_M = 1e-6
+"""Points nearer to each other are the same."""
+
+STARTS = 12
+"""Orientations that a path may start with where none is given."""
+
+
+class Space(Protocol):
+    """Where a camera may be: `wheretolook.scenes.free_space.FreeSpace`, or anything that answers the same."""
+
+    def is_free(self, points: ArrayLike) -> NDArray[np.bool_]:
+        """Whether a camera may be at points (N, 3) m; (N,)."""
+
+    def segments_are_free(self, a: ArrayLike, b: ArrayLike) -> NDArray[np.bool_]:
+        """Whether it may go straight from points a to points b, (N, 3) m each; (N,)."""
+
+
+@dataclass(frozen=True)
+class PathConfig:
+    """What a path costs, and what a camera on it can do.
+
+    The cost of a path is its length, `turn_weight_m` for every radian that the camera turns, and `score_weight` for
+    every metre times one less the score of the views along it.
+
+    Args:
+        score_weight: metres that a metre without any hope to localize costs beside its length (the paper's lambda).
+        turn_weight_m: metres that turning by one radian costs.
+        pitch_deg: least and greatest pitch of the optical axis, degrees above the horizon.
+        max_turn_deg_per_m: the camera turns by no more while it moves by a metre.
+        spacing_m: distance of the views along a path.
+        step_m: longest straight piece that the planner adds at once.
+        time_s: time to plan. The path only gets better with time.
+    """
+
+    score_weight: float = 3.0
+    turn_weight_m: float = 0.1
+    pitch_deg: tuple[float, float] = (-40.0, 40.0)
+    max_turn_deg_per_m: float = 150.0
+    spacing_m: float = 0.2
+    step_m: float = 1.0
+    time_s: float = 5.0
+
+    def __post_init__(self) -> None:
+        low, high = self.pitch_deg
+        if not -90 < low <= high < 90:
+            raise ConfigError("pitch_deg needs a range inside -90 to 90", value=self.pitch_deg)
+        for name in ("max_turn_deg_per_m", "spacing_m", "step_m", "time_s"):
+            if not getattr(self, name) > 0:
+                raise ConfigError(f"{name} must be positive", value=getattr(self, name))
+        for name in ("score_weight", "turn_weight_m"):
+            if not getattr(self, name) >= 0:
+                raise ConfigError(f"{name} must not be negative", value=getattr(self, name))
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedPath:
+    """A path of a camera, sampled at its corners and every `PathConfig.spacing_m` or a little less.
+
+    Attributes:
+        positions: (W, 3) world, metres.
+        axes: (W, 3) unit optical axes in the world.
+        scores: (W,) of the viewpoint map at the views, 0 where it knows nothing; NaN without a map.
+        cost: of the path (`PathConfig`), its scores taken from view to view.
+    """
+
+    positions: Float
+    axes: Float
+    scores: Float
+    cost: float
+
+    @property
+    def length_m(self) -> float:
+        """Length of the path."""
+        return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
+
+    @property
+    def turn_deg(self) -> float:
+        """By how much the camera turns on its way, in all."""
+        cosines = (self.axes[1:] * self.axes[:-1]).sum(1).clip(-1, 1)
+        return float(np.degrees(np.arccos(cosines)).sum())
+
+
+def plan_path(
+    start: ArrayLike,
+    goal: ArrayLike,
+    space: Space,
+    bounds: ArrayLike,
+    viewpoint_map: ViewpointMap | None = None,
+    config: PathConfig = PathConfig(),
+    start_axis: ArrayLike | None = None,
+    progress: bool = True,
+) -> PlannedPath:
+    """Plan a path on which the camera sees what it needs to know where it is.
+
+    RRT* (Karaman and Frazzoli 2011) looks for a short path, then for places and views together. Along either, the views
+    are chosen anew, exactly (`best_sequence`), and what costs least is kept.
+
+    Without a viewpoint map the path is the shortest that is found, and the camera looks forward along it.
+
+    Args:
+        start, goal: (3,) world, metres.
+        space: where the camera may be.
+        bounds: (2, 3) lowest and highest corner of the space to plan in.
+        viewpoint_map: what the views along a path are worth, in [0, 1].
+        config: costs and limits.
+        start_axis: (3,) optical axis to start with; None lets the planner choose.
+        progress: show a progress bar.
+
+    Returns:
+        The best path found in the time given.
+
+    Raises:
+        PlanningError: the start or the goal is not free or lies outside the bounds; they are the same; the axis is
+            beyond the camera's limits; or no path was found in time.
+        ValueError: a point is not finite.
+    """
+    ends = np.asarray([start, goal], dtype=np.float64)
+    low, high = np.asarray(bounds, dtype=np.float64)
+    if not np.isfinite(ends).all():
+        raise ValueError(f"start and goal must be finite, got {ends.tolist()}")
+    for name, point in zip(("start", "goal"), ends, strict=True):
+        if not ((point >= low) & (point <= high)).all() or not space.is_free(point[None])[0]:
+            raise PlanningError(
+                f"the {name} is not in free space", value=tuple(point.tolist()),
+                fix="Give a point where the camera can be, off walls and furniture.",
+            )  # fmt: skip
+    if np.linalg.norm(ends[1] - ends[0]) < SAME_M:
+        fix = "Ask the map for the best view there."
+        raise PlanningError("the start is the goal", value=tuple(ends[0].tolist()), fix=fix)
+    problem = _Problem(ends, low, high, space, viewpoint_map, config)
+    orientations = problem.start_orientations(start_axis)
+    with tqdm(total=round(config.time_s, 1), desc="plan", unit="s", disable=not progress) as bar:
+        if viewpoint_map is None:
+            return problem.path(problem.solve([(0.0, 0.0)], config.time_s, bar))
+        shortest = _Problem(ends, low, high, space, None, config)
+        found = []
+        try:
+            route = shortest.solve([(0.0, 0.0)], SHORTEST_SHARE * config.time_s, bar)
+            found.append(problem.best_views(route, None if start_axis is None else _axes(*np.array(orientations).T)[0]))
+        except PlanningError:
+            pass  # it may be found yet
+        try:
+            found.append(problem.path(problem.solve(orientations, (1 - SHORTEST_SHARE) * config.time_s, bar)))
+        except PlanningError:
+            if not any(path is not None for path in found):
+                raise
+    return min((path for path in found if path is not None), key=lambda path: path.cost)
+
+
+class _Problem:
+    """One planning problem: five numbers x, y, z, yaw, pitch; a path without a map leaves the last two alone."""
+
+    def __init__(
+        self, ends: Float, low: Float, high: Float, space: Space, viewpoint_map: ViewpointMap | None, config: PathConfig
+    ) -> None:
+        self.ends, self.low, self.high, self.space, self.config = ends, low, high, space, config
+        self.map = viewpoint_map
+        self.pitch = tuple(map(math.radians, config.pitch_deg))
+        if viewpoint_map is not None:
+            self._score = viewpoint_map.scores.item
+            self._table = _nearest_directions(viewpoint_map.directions)
+
+    def start_orientations(self, axis: ArrayLike | None) -> list[tuple[float, float]]:
+        """Yaw and pitch to start with, in radians."""
+        if self.map is None:
+            return [(0.0, 0.0)]
+        if axis is None:
+            middle = (self.pitch[0] + self.pitch[1]) / 2
+            return [(2 * math.pi * k / STARTS - math.pi, middle) for k in range(STARTS)]
+        x, y, z = np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis)
+        yaw, pitch = math.atan2(y, x), math.asin(z)
+        if not self.pitch[0] - 1e-6 <= pitch <= self.pitch[1] + 1e-6:
+            raise PlanningError(
+                "the camera cannot be pitched as it should start", value=f"{math.degrees(pitch):.1f} deg",
+                fix=f"Start within {self.config.pitch_deg} degrees, or widen pitch_deg.",
+            )  # fmt: skip
+        return [(yaw, min(max(pitch, self.pitch[0]), self.pitch[1]))]
+
+    def motion_cost(self, a: tuple[float, ...], b: tuple[float, ...]) -> float:
+        """Cost of going straight from one state to another."""
+        length = math.dist(a[:3], b[:3])
+        if self.map is None:
+            return length
+        config = self.config
+        n = max(1, math.ceil(length / config.spacing_m))
+        turn, worth = _wrapped(b[3] - a[3]), 0.0
+        for k in range(n):
+            t = (k + 0.5) / n
+            at = (a[0] + t * (b[0] - a[0]), a[1] + t * (b[1] - a[1]), a[2] + t * (b[2] - a[2]))
+            worth += self.score(at, a[3] + t * turn, a[4] + t * (b[4] - a[4]))
+        return length * (1 + config.score_weight * (1 - worth / n)) + config.turn_weight_m * _angle(a[3:], b[3:])
+
+    def score(self, point: tuple[float, float, float], yaw: float, pitch: float) -> float:
+        """Score of a view, 0 where the map knows nothing."""
+        assert self.map is not None
+        row = self.map.row(point)
+        if row < 0:
+            return 0.0
+        rows, columns = self._table.shape
+        i = int((pitch + math.pi / 2) / math.pi * rows)
+        j = int((yaw + math.pi) / (2 * math.pi) * columns) % columns
+        return float(self._score(row, int(self._table[min(max(i, 0), rows - 1), j])))
+
+    def motion_is_possible(self, a: tuple[float, ...], b: tuple[float, ...]) -> bool:
+        """Whether the camera can go straight from one state to another."""
+        if self.map is not None:
+            most = math.radians(self.config.max_turn_deg_per_m) * math.dist(a[:3], b[:3])
+            # the sum of both angles: what a camera on two axes turns is no less than the axis does
+            if abs(_wrapped(b[3] - a[3])) + abs(b[4] - a[4]) > most:
+                return False
+        return bool(self.space.segments_are_free([a[:3]], [b[:3]])[0])
+
+    def solve(self, orientations: list[tuple[float, float]], time_s: float, bar: Any) -> Float:
+        """States (S, 5) of the best path that is found in a time.
+
+        Raises:
+            PlanningError: there is none.
+        """
+        from ompl import base, geometric, util
+
+        util.setLogLevel(util.LOG_NONE)
+        space = base.CompoundStateSpace()
+        place = base.RealVectorStateSpace(4)
+        bounds = base.RealVectorBounds(4)
+        # without a map nothing depends on where the camera looks: the pitch has next to no range, the yaw no weight
+        pitch = self.pitch if self.map is not None else (-1e-6, 1e-6)
+        for index, (low, high) in enumerate(zip((*self.low, pitch[0]), (*self.high, pitch[1]), strict=True)):
+            bounds.setLow(index, float(low))
+            bounds.setHigh(index, float(high))
+        place.setBounds(bounds)
+        space.addSubspace(place, 1.0)
+        space.addSubspace(base.SO2StateSpace(), 0.2 if self.map is not None else 1e-6)
+        information = base.SpaceInformation(space)
+        information.setStateValidityChecker(lambda state: bool(self.space.is_free([_numbers(state)[:3]])[0]))
+
+        possible, cost_of = self.motion_is_possible, self.motion_cost
+
+        class Motions(base.MotionValidator):
+            def checkMotion(self, a: Any, b: Any, *rest: Any) -> bool:
+                return possible(_numbers(a), _numbers(b))
+
+        class Costs(base.OptimizationObjective):
+            def stateCost(self, state: Any) -> Any:
+                return base.Cost(0.0)
+
+            def motionCost(self, a: Any, b: Any) -> Any:
+                return base.Cost(cost_of(_numbers(a), _numbers(b)))
+
+        information.setMotionValidator(Motions(information))
+        information.setup()
+        definition = base.ProblemDefinition(information)
+        for yaw, start_pitch in orientations:
+            state = space.allocState()
+            _write(state, (*self.ends[0], start_pitch, yaw))
+            definition.addStartState(state)
+        around_goal = base.GoalSpace(information)
+        around_goal.setSpace(self._goal_space(base, pitch))
+        definition.setGoal(around_goal)
+        objective = Costs(information)
+        definition.setOptimizationObjective(objective)
+        planner = geometric.RRTstar(information)
+        planner.setProblemDefinition(definition)
+        planner.setRange(self.config.step_m)
+        planner.setup()
+        slices = max(1, round(time_s / 0.25))
+        for _ in range(slices):
+            planner.solve(time_s / slices)
+            bar.update(time_s / slices)
+        if not definition.hasExactSolution():
+            raise PlanningError(
+                "no path was found in time", value=f"{time_s:g} s",
+                fix="Give it more time, or loosen the camera's limits.",
+            )  # fmt: skip
+        found = definition.getSolutionPath()
+        return np.array([_numbers(found.getState(index)) for index in range(found.getStateCount())])
+
+    def _goal_space(self, base: Any, pitch: tuple[float, ...]) -> Any:
+        """The goal with every orientation."""
+        space, place, bounds = base.CompoundStateSpace(), base.RealVectorStateSpace(4), base.RealVectorBounds(4)
+        for index, value in enumerate(self.ends[1]):
+            bounds.setLow(index, float(value) - 1e-9)
+            bounds.setHigh(index, float(value) + 1e-9)
+        bounds.setLow(3, pitch[0])
+        bounds.setHigh(3, pitch[1])
+        place.setBounds(bounds)
+        space.addSubspace(place, 1.0)
+        space.addSubspace(base.SO2StateSpace(), 1.0)
+        return space
+
+    def path(self, states: Float) -> PlannedPath:
+        """The path through some states (S, 5), sampled; its views are the planner's or better ones."""
+        corners, _, along = self._samples(states)
+        positions = _between(corners, states[:, :3], along)
+        if self.map is None:
+            return PlannedPath(positions, _forward(positions), np.full(len(positions), np.nan), float(corners[-1]))
+        yaw, pitch = np.unwrap(states[:, 3]), states[:, 4]
+        planned = self._costed(positions, _axes(np.interp(along, corners, yaw), np.interp(along, corners, pitch)))
+        turned = self.best_views(states, planned.axes[0])
+        return planned if turned is None or planned.cost <= turned.cost else turned
+
+    def best_views(self, states: Float, start: Float | None) -> PlannedPath | None:
+        """The places of states (S, 5) with the best views that a camera can turn to one after the other.
+
+        Args:
+            states: of which only the places count.
+            start: (3,) axis to start with; None for any.
+
+        Returns:
+            None where the map's directions are too coarse for so small turns.
+        """
+        corners, even, along = self._samples(states)
+        places = _between(corners, states[:, :3], even)
+        views = self._turned(places if start is None else places[1:], start, float(even[-1]) / (len(even) - 1))
+        if views is None:
+            return None
+        axes = views if start is None else np.concatenate([start[None], views])
+        return self._costed(_between(corners, states[:, :3], along), _turning(even, axes, along))
+
+    def _samples(self, states: Float) -> tuple[Float, Float, Float]:
+        """Arc lengths along a path: of its corners (S,), of even steps, and of both together."""
+        pieces = np.linalg.norm(np.diff(states[:, :3], axis=0), axis=1)
+        corners = np.concatenate([[0.0], np.cumsum(pieces)])
+        even = np.linspace(0, corners[-1], max(1, math.ceil(corners[-1] / self.config.spacing_m - 1e-9)) + 1)
+        along = np.union1d(even, corners)  # without its corners a path would lead through those of the walls
+        return corners, even, along[np.append(True, np.diff(along) > 1e-9)]
+
+    def _turned(self, positions: Float, start: Float | None, step: float) -> Float | None:
+        """The best axes (W, 3) at places (W, 3) a step apart, that a camera can turn to one after the other."""
+        assert self.map is not None
+        limit = TurnLimit.of(self.map.directions, self.config.max_turn_deg_per_m * step)
+        inside = np.abs(limit.directions[:, 2] - np.mean(np.sin(self.pitch))) <= np.ptp(np.sin(self.pitch)) / 2
+        rows = self.map.rows(positions)
+        scores = np.where((rows >= 0)[:, None], self.map.scores[rows], 0.0)
+        try:
+            return limit.directions[best_sequence(np.where(inside, scores, -np.inf), limit, start).direction_ids]
+        except PlanningError:
+            return None  # the lattice is too coarse for so small turns
+
+    def _costed(self, positions: Float, axes: Float) -> PlannedPath:
+        """A path with its scores and what it costs."""
+        assert self.map is not None
+        rows, nearest = self.map.rows(positions), (axes @ self.map.directions.T).argmax(1)
+        scores = np.where(rows >= 0, self.map.scores[rows, nearest], 0.0).astype(np.float64)
+        path = PlannedPath(positions, axes, scores, 0.0)
+        steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+        missed = float((steps * (1 - (scores[1:] + scores[:-1]) / 2)).sum())
+        turning = self.config.turn_weight_m * math.radians(path.turn_deg)
+        return replace(path, cost=path.length_m + turning + self.config.score_weight * missed)
+
+
+def _between(knots: Float, values: Float, at: Float) -> Float:
+    """Values (S, C) at knots (S,), linearly between them."""
+    return np.column_stack([np.interp(at, knots, column) for column in values.T])
+
+
+def _axes(yaw: Float, pitch: Float) -> Float:
+    """Unit axes (W, 3) by yaw and pitch (W,), radians."""
+    return np.stack([np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)], axis=1)
+
+
+def _turning(knots: Float, axes: Float, at: Float) -> Float:
+    """Unit axes (S, 3) at knots (S,), turning evenly between them (Shoemake 1985)."""
+    after = np.clip(np.searchsorted(knots, at, side="right"), 1, len(knots) - 1)
+    a, b = axes[after - 1], axes[after]
+    t = ((at - knots[after - 1]) / (knots[after] - knots[after - 1]))[:, None]
+    angle = np.arccos((a * b).sum(1, keepdims=True).clip(-1, 1))
+    # where there is next to nothing to turn, the mean is as good
+    some = angle > 1e-6
+    sine = np.where(some, np.sin(angle), 1.0)
+    weights = [np.where(some, np.sin(part * angle) / sine, part) for part in (1 - t, t)]
+    between = weights[0] * a + weights[1] * b
+    return np.asarray(between / np.linalg.norm(between, axis=1, keepdims=True))
+
+
+def _forward(positions: Float) -> Float:
+    """Unit axes (W, 3) that look along a path (W, 3), level; where it goes straight up or down, as before."""
+    steps = np.gradient(positions, axis=0)[:, :2] if len(positions) > 1 else np.array([[1.0, 0.0]])
+    length = np.linalg.norm(steps, axis=1)
+    known = length > 1e-9
+    if not known.any():
+        steps, known = np.tile([1.0, 0.0], (len(steps), 1)), np.ones(len(steps), dtype=bool)
+        length = np.ones(len(steps))
+    last = np.maximum.accumulate(np.where(known, np.arange(len(steps)), int(np.argmax(known))))
+    level = (steps / np.maximum(length, 1e-9)[:, None])[last]
+    return np.column_stack([level, np.zeros(len(level))])
+
+
+def _numbers(state: Any) -> tuple[float, float, float, float, float]:
+    """x, y, z, yaw, pitch of a state."""
+    place = state[0]
+    return place[0], place[1], place[2], state[1].value, place[3]
+
+
+def _write(state: Any, numbers: tuple[float, ...]) -> None:
+    """Set x, y, z, pitch, yaw of a state."""
+    for index in range(4):
+        state[0][index] = float(numbers[index])
+    state[1].value = float(numbers[4])
+
+
+def _wrapped(angle: float) -> float:
+    """The same angle in (-pi, pi]."""
+    return math.remainder(angle, 2 * math.pi)
+
+
+def _angle(a: tuple[float, ...], b: tuple[float, ...]) -> float:
+    """Angle between two axes, each by yaw and pitch, in radians."""
+    cosine = math.sin(a[1]) * math.sin(b[1]) + math.cos(a[1]) * math.cos(b[1]) * math.cos(a[0] - b[0])
+    return math.acos(min(1.0, max(-1.0, cosine)))
+
+
+def _nearest_directions(directions: Float) -> NDArray[np.int64]:
+    """The direction nearest to the middle of every cell of pitch (rows) and yaw (columns)."""
+    pitch = np.radians(np.arange(-90 + TABLE_STEP_DEG / 2, 90, TABLE_STEP_DEG))
+    yaw = np.radians(np.arange(-180 + TABLE_STEP_DEG / 2, 180, TABLE_STEP_DEG))
+    up, around = np.meshgrid(pitch, yaw, indexing="ij")
+    axes = np.stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)], axis=-1)
+    return np.asarray((axes @ directions.T).argmax(-1))

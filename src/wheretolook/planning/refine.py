@@ -1,0 +1,119 @@
+"""Views without a viewpoint map: any direction scored, and a grid's best made better by a local search.
+
+A scorer answers for any pose, on a lattice or off it: `scorer.score(cam_from_world)`. The paper notes that its function
+may be asked so, beyond its 500 directions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from wheretolook.geometry import Float, poses_looking_along
+from wheretolook.planning.turns import angles_to_axis_deg
+from wheretolook.scoring.base import Scorer
+
+COMPASS = np.stack([np.cos(np.arange(8) * np.pi / 4), np.sin(np.arange(8) * np.pi / 4)], axis=1)
+"""Steps (8, 2) in the plane that touches the sphere at the current axis."""
+
+
+@dataclass(frozen=True, eq=False)
+class RefinedViews:
+    """Axes found by a local search, B of them.
+
+    Attributes:
+        axes: (B, 3) unit optical axes in the world.
+        scores: (B,) of these, never less than those of the start.
+        start_scores: (B,) of the axes that the search began with.
+        n_scored: views that were scored in all.
+    """
+
+    axes: Float
+    scores: Float
+    start_scores: Float
+    n_scored: int
+
+
+def score_directions(scorer: Scorer, locations: ArrayLike, directions: ArrayLike) -> Float:
+    """Scores (L, D) of cameras without roll at locations (L, 3) m that look along each of directions (D, 3).
+
+    Raises:
+        ValueError: a location or a direction is not finite, or a direction has no length.
+    """
+    at, axes = np.asarray(locations, dtype=np.float64).reshape(-1, 3), np.asarray(directions, dtype=np.float64)
+    poses = poses_looking_along(np.repeat(at, len(axes), axis=0), np.tile(axes, (len(at), 1)))
+    return scorer.score(poses).reshape(len(at), len(axes))
+
+
+def refine_directions(
+    scorer: Scorer,
+    locations: ArrayLike,
+    axes: ArrayLike,
+    max_angle_deg: float = 10.0,
+    first_step_deg: float = 4.0,
+    last_step_deg: float = 0.25,
+) -> RefinedViews:
+    """Make axes better by a pattern search on the sphere (Hooke and Jeeves 1961; compass search, Kolda et al. 2003).
+
+    Eight axes around the current one are scored, one step away; the best of them is taken if it is better, otherwise
+    the step is halved. All views are searched together, so that the scorer gets batches. Scores need no derivative, and
+    may jump, as counts of bins do.
+
+    Args:
+        scorer: any method.
+        locations: (B, 3) metres.
+        axes: (B, 3) to begin with, such as the best of a lattice; of any length.
+        max_angle_deg: the axes found are no farther from the first than this; the default is above the distance of
+            neighbours on a lattice of 500 directions.
+        first_step_deg: about half that distance is a good step to begin with.
+        last_step_deg: the search ends when the step falls below this.
+
+    Raises:
+        ValueError: locations or axes are not finite, of no length or not as many, or an angle is not positive.
+    """
+    at, start = (np.asarray(values, dtype=np.float64).reshape(-1, 3) for values in (locations, axes))
+    length = np.linalg.norm(start, axis=1, keepdims=True)
+    if at.shape != start.shape or not np.isfinite(at).all() or not np.all((length > 0) & (length < np.inf)):
+        raise ValueError(f"locations and axes must be finite vectors, as many of both, got {at.shape}, {start.shape}")
+    if not (max_angle_deg > 0 and first_step_deg > 0 and last_step_deg > 0):
+        raise ValueError("angles must be positive")
+    start = start / length
+    current, step_deg = start.copy(), np.full(len(start), float(min(first_step_deg, max_angle_deg)))
+    start_scores = scorer.score(poses_looking_along(at, start))
+    scores, n_scored = start_scores.copy(), len(start)
+    while len(active := np.flatnonzero(step_deg >= last_step_deg)):
+        candidates = _around(current[active], step_deg[active])
+        candidates = _within(candidates, start[active, None], max_angle_deg)
+        found = scorer.score(poses_looking_along(np.repeat(at[active], 8, axis=0), candidates.reshape(-1, 3)))
+        n_scored += len(found)
+        found = found.reshape(-1, 8)
+        best = found.argmax(axis=1)
+        value = found[np.arange(len(active)), best]
+        better = value > scores[active]
+        moved = active[better]
+        current[moved], scores[moved] = candidates[better, best[better]], value[better]
+        step_deg[active[~better]] /= 2
+    return RefinedViews(current, scores, start_scores, n_scored)
+
+
+def _around(axes: Float, step_deg: Float) -> Float:
+    """Eight unit vectors (B, 8, 3) at angles of `step_deg` (B,) around axes (B, 3)."""
+    smallest = np.eye(3)[np.abs(axes).argmin(axis=1)]  # never along the axis
+    u = np.cross(axes, smallest)
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    v = np.cross(axes, u)
+    angle = np.radians(step_deg)[:, None, None]
+    across = COMPASS[:, :1] * u[:, None] + COMPASS[:, 1:] * v[:, None]
+    return np.asarray(np.cos(angle) * axes[:, None] + np.sin(angle) * across)
+
+
+def _within(candidates: Float, start: Float, max_angle_deg: float) -> Float:
+    """Candidates (B, 8, 3), those too far from their start (B, 1, 3) pulled back to the border."""
+    angle = angles_to_axis_deg(candidates, start)[..., None]
+    outside: NDArray[np.bool_] = angle > max_angle_deg
+    limit = np.radians(max_angle_deg)
+    across = candidates - (candidates * start).sum(-1, keepdims=True) * start
+    across /= np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-12)
+    return np.where(outside, np.cos(limit) * start + np.sin(limit) * across, candidates)

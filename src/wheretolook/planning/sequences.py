@@ -1,0 +1,235 @@
+"""Where to look along a path that is given: one direction for each waypoint, under a limit on the turns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from wheretolook.errors import PlanningError
+from wheretolook.geometry import Float, rotation_looking_along
+from wheretolook.planning.turns import turns_deg, turns_from_deg, within
+from wheretolook.planning.viewpoint_map import ViewpointMap
+
+SPACING_M = 0.2
+"""Between waypoints, as in the Active Localization Benchmark."""
+
+MAX_TURN_DEG = 30.0
+"""From one waypoint to the next, as in the Active Localization Benchmark."""
+
+TURN_PENALTY = 0.02
+"""ActLoc's lambda: what each cell of its lattice, 20 degrees, costs the greedy rule."""
+
+CELL_DEG = 20.0
+"""Step of ActLoc's lattice of yaws and pitches."""
+
+
+@dataclass(frozen=True, eq=False)
+class TurnLimit:
+    """Which directions follow on which: those that a camera without roll reaches by one rotation within the limit.
+
+    Attributes:
+        directions: (D, 3) unit optical axes in the world.
+        max_turn_deg: largest angle of the rotation between two waypoints, included.
+        neighbours: (D, K) int64, ids reachable from each direction, itself among them, ascending; where there are
+            fewer than K, D fills up.
+    """
+
+    directions: Float
+    max_turn_deg: float
+    neighbours: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, directions: ArrayLike, max_turn_deg: float = MAX_TURN_DEG) -> TurnLimit:
+        """For a lattice (D, 3), such as `direction_lattice` gives: Fibonacci's, ActLoc's yaws and pitches, or another.
+
+        Raises:
+            ValueError: directions of another shape, not of unit length, or a limit that is none.
+        """
+        axes = np.asarray(directions, dtype=np.float64)
+        if axes.ndim != 2 or axes.shape[1] != 3 or not np.allclose(np.linalg.norm(axes, axis=1), 1, atol=1e-6):
+            raise ValueError(f"directions must be unit vectors (D, 3), got an array of shape {axes.shape}")
+        reachable = within(turns_deg(axes), max_turn_deg)
+        most = int(reachable.sum(axis=1).max(initial=0))
+        ids = np.where(reachable, np.arange(len(axes)), len(axes))
+        return cls(axes, float(max_turn_deg), np.sort(ids, axis=1)[:, :most])
+
+    def from_start(self, start: ArrayLike | None) -> NDArray[np.bool_]:
+        """Which directions (D,) the first waypoint may have: all, or those within the limit of the camera's start.
+
+        Args:
+            start: (3,) axis of a camera without roll, (3, 3) cam_from_world rotation, or None.
+        """
+        if start is None:
+            return np.ones(len(self.directions), dtype=bool)
+        return within(turns_from_deg(start, rotation_looking_along(self.directions)), self.max_turn_deg)
+
+
+@dataclass(frozen=True, eq=False)
+class ViewSequence:
+    """One direction for each of W waypoints.
+
+    Attributes:
+        direction_ids: (W,) int64.
+        scores: (W,) float64, of these.
+    """
+
+    direction_ids: NDArray[np.int64]
+    scores: Float
+
+    @property
+    def total(self) -> float:
+        """Sum of the scores."""
+        return float(self.scores.sum())
+
+
+def best_sequence(scores: ArrayLike, limit: TurnLimit, start: ArrayLike | None = None) -> ViewSequence:
+    """The directions with the greatest sum of scores of all that keep to the limit, exactly.
+
+    Dynamic programming over directions (Viterbi 1967), O(W D K). The same input gives the same sequence: of equal sums
+    the last waypoint takes the lowest id, and so on backwards.
+
+    Args:
+        scores: (W, D) of each waypoint and direction; -inf forbids one.
+        limit: on the turn between waypoints.
+        start: orientation before the first waypoint, see `TurnLimit.from_start`; None leaves the first one free.
+
+    Raises:
+        PlanningError: no sequence keeps to the limit; names the waypoint that cannot be reached.
+        ValueError: scores of another shape, NaN or +inf.
+    """
+    values = _check(scores, limit)
+    n, d = values.shape
+    before = np.zeros((n, d), dtype=np.int64)  # the direction at the waypoint before
+    total = np.where(limit.from_start(start), values[0], -np.inf)
+    _check_reached(total, 0, limit, start)
+    rows = np.arange(d)
+    for waypoint in range(1, n):
+        candidates = np.append(total, -np.inf)[limit.neighbours]  # turns are as long there as back
+        chosen = candidates.argmax(axis=1)
+        before[waypoint] = limit.neighbours[rows, chosen]
+        total = candidates[rows, chosen] + values[waypoint]
+        _check_reached(total, waypoint, limit, start)
+    ids = np.empty(n, dtype=np.int64)
+    ids[-1] = total.argmax()
+    for waypoint in range(n - 1, 0, -1):
+        ids[waypoint - 1] = before[waypoint, ids[waypoint]]
+    return ViewSequence(ids, values[np.arange(n), ids])
+
+
+def greedy_sequence(
+    scores: ArrayLike,
+    limit: TurnLimit,
+    start: ArrayLike | None = None,
+    turn_penalty: float = TURN_PENALTY,
+    keep_limit: bool = True,
+) -> ViewSequence:
+    """ActLoc's rule, to compare with: at each waypoint the greatest score less a penalty on the turn just made.
+
+    score - lambda (|rows| + |columns|), where rows and columns are the steps of 20 degrees between pitches and, the
+    short way round, between yaws (ActLoc, CoRL 2025, planning.py). On another lattice steps are fractions. ActLoc's
+    code has no limit on turns and does not penalize the first waypoint; with `keep_limit` its choice is among the
+    directions within the limit, so that both rules are judged alike.
+
+    Args:
+        scores: (W, D) of each waypoint and direction; -inf forbids one.
+        limit: directions, and the limit on turns.
+        start: orientation before the first waypoint, which then has to be within the limit; None leaves it free.
+        turn_penalty: lambda, at least 0.
+        keep_limit: whether the limit holds.
+
+    Raises:
+        PlanningError: from where the rule has led, no direction keeps to the limit; names the waypoint.
+        ValueError: scores of another shape, NaN or +inf, or a negative penalty.
+    """
+    values = _check(scores, limit)
+    if not turn_penalty >= 0:
+        raise ValueError(f"the penalty must be at least 0, got {turn_penalty}")
+    n, d = values.shape
+    penalty = turn_penalty * _cells(limit.directions)
+    ids = np.empty(n, dtype=np.int64)
+    for waypoint in range(n):
+        if waypoint == 0:
+            allowed, worth = limit.from_start(start if keep_limit else None), values[0]
+        else:
+            allowed, worth = np.ones(d, dtype=bool), values[waypoint] - penalty[ids[waypoint - 1]]
+            if keep_limit:
+                near = limit.neighbours[ids[waypoint - 1]]
+                allowed = np.bincount(near, minlength=d + 1)[:d] > 0
+        worth = np.where(allowed, worth, -np.inf)
+        _check_reached(worth, waypoint, limit, start)
+        ids[waypoint] = worth.argmax()
+    return ViewSequence(ids, values[np.arange(n), ids])
+
+
+def resample_path(points: ArrayLike, spacing_m: float = SPACING_M) -> Float:
+    """Waypoints (W, 3) m along a polyline (P, 3) m: its first point, one every `spacing_m` along it, and its last.
+
+    The last leg may be shorter than the others.
+
+    Raises:
+        ValueError: fewer than one point, another shape, not finite, or a spacing that is not positive.
+    """
+    path = np.asarray(points, dtype=np.float64)
+    if path.ndim != 2 or path.shape[1:] != (3,) or len(path) < 1 or not np.isfinite(path).all():
+        raise ValueError(f"a path is (P, 3) finite metres, P > 0, got an array of shape {path.shape}")
+    if not 0 < spacing_m < np.inf:
+        raise ValueError(f"the spacing must be a distance above 0 m, got {spacing_m}")
+    at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+    # a remainder that is only rounding adds no waypoint
+    stops = np.append(np.arange(0, at[-1] - 1e-9 * spacing_m, spacing_m), at[-1])
+    return np.stack([np.interp(stops, at, column) for column in path.T], axis=1)
+
+
+def path_scores(viewpoint_map: ViewpointMap, waypoints: ArrayLike, interpolated: bool = True) -> Float:
+    """Scores (W, D) of all directions of a viewpoint map at waypoints (W, 3) m.
+
+    Args:
+        viewpoint_map: the map.
+        waypoints: of a path.
+        interpolated: between voxels, or of the voxel that holds the waypoint.
+
+    Raises:
+        PlanningError: a waypoint lies outside the map or in a voxel that is not free; names the first.
+        ValueError: waypoints of another shape, or not finite.
+    """
+    rows = viewpoint_map.rows(waypoints)
+    points = np.asarray(waypoints, dtype=np.float64)
+    if (rows < 0).any():
+        number = int(np.argmax(rows < 0))
+        raise PlanningError(
+            f"waypoint {number} is not in a free voxel of the viewpoint map", value=tuple(points[number].tolist()),
+            fix="Lead the path through free voxels, or refine the grid.",
+        )  # fmt: skip
+    if not interpolated:
+        return viewpoint_map.scores[rows].astype(np.float64)
+    found = [viewpoint_map.interpolated(point) for point in points]
+    return np.array([values for values in found if values is not None]).reshape(len(points), -1)
+
+
+def _check(scores: ArrayLike, limit: TurnLimit) -> Float:
+    values = np.asarray(scores, dtype=np.float64)
+    if values.ndim != 2 or values.shape[1] != len(limit.directions) or len(values) < 1:
+        raise ValueError(f"scores must have shape (W, {len(limit.directions)}), W > 0, got {values.shape}")
+    if not np.all(values < np.inf):  # NaN is not less
+        raise ValueError("scores must be numbers below infinity")
+    return values
+
+
+def _check_reached(worth: Float, waypoint: int, limit: TurnLimit, start: ArrayLike | None) -> None:
+    if np.isneginf(worth).all():
+        from_where = "the start" if waypoint == 0 and start is not None else f"waypoint {waypoint - 1}"
+        reach = f" within {limit.max_turn_deg:g} degrees of {from_where}" if waypoint or start is not None else ""
+        raise PlanningError(
+            f"waypoint {waypoint} has no direction that is allowed{reach}", value=waypoint,
+            fix="Raise the limit, put waypoints closer, allow more directions, or use a finer lattice.",
+        )  # fmt: skip
+
+
+def _cells(directions: Float) -> Float:
+    """Steps of 20 degrees between the pitches of directions and, the short way round, their yaws, added up; (D, D)."""
+    yaw = np.degrees(np.arctan2(directions[:, 1], directions[:, 0]))
+    pitch = np.degrees(np.arcsin(np.clip(directions[:, 2], -1, 1)))
+    across = np.abs(yaw[:, None] - yaw)
+    return np.asarray((np.abs(pitch[:, None] - pitch) + np.minimum(across, 360 - across)) / CELL_DEG)

@@ -1,0 +1,79 @@
+"""How far a camera turns from one orientation to another."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from wheretolook.geometry import Float, rotation_looking_along
+
+TOLERANCE_DEG = 1e-5
+"""An angle that exceeds its limit by no more than this is within it: 20 degrees are at most 20, rounding or not."""
+
+
+def within(angles_deg: Float, limit_deg: float) -> NDArray[np.bool_]:
+    """Which angles are at most the limit, up to rounding.
+
+    Raises:
+        ValueError: the limit is negative or NaN.
+    """
+    if not limit_deg >= 0:
+        raise ValueError(f"a limit of an angle must be at least 0 degrees, got {limit_deg}")
+    return np.asarray(angles_deg <= limit_deg + TOLERANCE_DEG)
+
+
+def check_axis(axis: ArrayLike) -> Float:
+    """An axis (3,) of any length as a unit vector.
+
+    Raises:
+        ValueError: another shape, not finite, or of no length.
+    """
+    given = np.asarray(axis, dtype=np.float64)
+    length = np.linalg.norm(given)
+    if given.shape != (3,) or not 0 < length < np.inf:
+        raise ValueError(f"an axis is a finite vector (3,) of some length, got {given}")
+    return np.asarray(given / length)
+
+
+def angles_to_axis_deg(directions: Float, axis: Float) -> Float:
+    """Angles (D,) in degrees between unit directions (D, 3) and a unit axis (3,), accurate at small angles too."""
+    chord = np.linalg.norm(directions - axis, axis=-1)
+    return np.degrees(2 * np.arcsin(np.minimum(chord / 2, 1)))
+
+
+def turns_from_deg(current: ArrayLike, rotations: Float) -> Float:
+    """Rotation angles (D,) in degrees from one orientation to others.
+
+    Args:
+        current: (3,) axis of a camera without roll, or (3, 3) cam_from_world rotation.
+        rotations: (D, 3, 3) cam_from_world.
+
+    Raises:
+        ValueError: `current` has another shape, is not finite, no rotation, or an axis of no length.
+    """
+    given: Float = np.asarray(current, dtype=np.float64)
+    if given.shape == (3,):
+        given = rotation_looking_along(check_axis(given))
+    if given.shape != (3, 3) or not np.allclose(given @ given.T, np.eye(3), atol=1e-6):
+        raise ValueError(f"an orientation is an axis (3,) or a rotation (3, 3), got {given}")
+    return _angles_deg(given.reshape(1, 9), rotations.reshape(-1, 9))[0]
+
+
+def turns_deg(directions: Float) -> Float:
+    """Rotation angles (D, D) in degrees between cameras without roll that look along directions (D, 3).
+
+    It is the rotation of the whole camera that counts, as in the Active Localization Benchmark (evaluate_plan.py): 40
+    degrees of yaw are 40 degrees at every pitch, though the axis of a camera that looks 60 degrees down moves by 20.
+    """
+    rotations = rotation_looking_along(directions).reshape(-1, 9)
+    angles = _angles_deg(rotations, rotations)
+    np.fill_diagonal(angles, 0)
+    return np.maximum(angles, angles.T)  # as far there as back, to the last bit
+
+
+def _angles_deg(a: NDArray[Any], b: NDArray[Any]) -> Float:
+    """Between rotations (A, 9) and (B, 9): |A - B|_F^2 = 6 - 2 <A, B> = 8 sin^2(angle / 2); (A, B)."""
+    square = np.clip((6 - 2 * (a @ b.T)) / 8, 0, 1)
+    return np.degrees(2 * np.arcsin(np.sqrt(square)))

@@ -1,0 +1,304 @@
+"""The viewpoint map: for every free voxel its orientations, ranked by a score, to be looked up by a planner.
+
+A query does the arithmetic of a perfect hash and reads a few numbers, so it takes the same time on a map of any size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from math import isfinite
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from wheretolook.geometry import Float, rotation_looking_along
+from wheretolook.grid import VoxelGrid
+from wheretolook.planning.turns import angles_to_axis_deg, check_axis, turns_from_deg, within
+
+if TYPE_CHECKING:
+    from wheretolook.scoring.base import Scorer
+
+Point = Sequence[float] | NDArray[Any]
+
+
+class ViewChoice(NamedTuple):
+    """One orientation at a voxel.
+
+    Attributes:
+        direction_id: row in the map's directions.
+        axis: (3,) unit optical axis in the world, read-only; the camera does not roll (`poses_looking_along`).
+        score: as the map's scorer gives it: a probability if the scorer's is one.
+        n_visible: landmarks in view from the voxel's centre.
+    """
+
+    direction_id: int
+    axis: Float
+    score: float
+    n_visible: int
+
+
+@dataclass(frozen=True, eq=False)
+class ViewChoices:
+    """The best orientation at each of N points.
+
+    Attributes:
+        found: (N,) bool; False where a point lies outside the grid or in a voxel that is not free.
+        direction_id: (N,) int64; -1 where not found.
+        score: (N,) float32; NaN where not found.
+        n_visible: (N,) int64; 0 where not found.
+    """
+
+    found: NDArray[np.bool_]
+    direction_id: NDArray[np.int64]
+    score: NDArray[np.float32]
+    n_visible: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class MapOrigin:
+    """What a viewpoint map was made from.
+
+    Attributes:
+        scorer: name of the method.
+        inputs: its input variant, "" if it has none.
+        lattice: name of the directions' lattice, "" for others.
+        camera: intrinsics: "model" ("PINHOLE", or COLMAP's name of another), "width", "height" in pixels and "params"
+            in COLMAP's order.
+        occlusion: name of the occlusion model.
+        landmarks: 16 hexadecimal digits that change with any landmark.
+    """
+
+    scorer: str
+    inputs: str
+    lattice: str
+    camera: dict[str, Any]
+    occlusion: str
+    landmarks: str
+
+
+@dataclass(frozen=True, eq=False)
+class ViewpointMap:
+    """Ranked orientations of every free voxel.
+
+    A point is answered for by the voxel that holds it, whose scores were computed at its centre; `interpolated` is
+    smooth between centres. Outside the grid, and in voxels that are not free, there is no camera to turn: queries of
+    one point then return None, batches say `found = False`. What is not finite raises a ValueError.
+
+    `wheretolook.planning.build_viewpoint_map` makes one.
+
+    Attributes:
+        grid: V voxels of the world, metres, z up.
+        row_of_voxel: (V,) int32, row of each free voxel in the arrays below, -1 for others; rows count up with voxels.
+        directions: (D, 3) float64 unit optical axes in the world.
+        ranked: (L, D) uint16, ids of the directions at each of L free voxels: by falling score before it was rounded
+            to single precision, then by rising id.
+        scores: (L, D) float32, by direction id. Single precision, not half or bytes: it needs no scale, so that scores
+            that are no probabilities fit and an update changes nothing elsewhere; C++ reads it as it is; and it adds
+            but a fifth to the size.
+        n_visible: (L, D) uint32, landmarks in view, by direction id.
+        landmark_ids: (N,) int64, of the landmarks it was built from, ascending.
+        landmark_digests: (N, 2) uint64, digests of each one's position and of its attributes; they tell an update what
+            has changed.
+        origin: what it was made from.
+    """
+
+    grid: VoxelGrid
+    row_of_voxel: NDArray[np.int32]
+    directions: Float
+    ranked: NDArray[np.uint16]
+    scores: NDArray[np.float32]
+    n_visible: NDArray[np.uint32]
+    landmark_ids: NDArray[np.int64]
+    landmark_digests: NDArray[np.uint64]
+    origin: MapOrigin
+
+    def __post_init__(self) -> None:
+        cells = (int(self.row_of_voxel.max(initial=-1)) + 1, len(self.directions))
+        for name in ("ranked", "scores", "n_visible"):
+            if getattr(self, name).shape != cells:
+                raise ValueError(f"{name} must be of shape {cells}, got {getattr(self, name).shape}")
+        if len(self.row_of_voxel) != len(self.grid):
+            raise ValueError(f"row_of_voxel must be of length {len(self.grid)}, got {len(self.row_of_voxel)}")
+
+    @classmethod
+    def load(cls, folder: str | Path, mmap: bool = False) -> ViewpointMap:
+        """Read what `save` wrote, see `wheretolook.planning.map_file.load_viewpoint_map`."""
+        from wheretolook.planning.map_file import load_viewpoint_map
+
+        return load_viewpoint_map(folder, mmap)
+
+    def save(self, folder: str | Path) -> None:
+        """Write a folder that needs no Python to be read, see `wheretolook.planning.map_file.save_viewpoint_map`."""
+        from wheretolook.planning.map_file import save_viewpoint_map
+
+        save_viewpoint_map(self, folder)
+
+    def updated(self, scorer: Scorer, progress: str | None = None) -> tuple[ViewpointMap, NDArray[np.int64]]:
+        """The map with landmarks added, see `wheretolook.planning.map_building.update_viewpoint_map`."""
+        from wheretolook.planning.map_building import update_viewpoint_map
+
+        return update_viewpoint_map(self, scorer, progress)
+
+    @property
+    def voxel_of_row(self) -> NDArray[np.int64]:
+        """Ids of the free voxels, (L,), ascending."""
+        return np.flatnonzero(self.row_of_voxel >= 0)
+
+    @property
+    def locations(self) -> Float:
+        """Centres of the free voxels, (L, 3) metres."""
+        return self.grid.centers()[self.voxel_of_row]
+
+    def row(self, point: Point) -> int:
+        """Row of the free voxel that holds a world point (3,) m; -1 if none does.
+
+        Raises:
+            ValueError: a coordinate is not finite.
+        """
+        x, y, z = point
+        x, y, z = float(x), float(y), float(z)  # NumPy's scalars are slow
+        x0, y0, z0, x1, y1, z1, dx, dy, dz, nx, ny, nz, rows = self._hash
+        if x0 <= x <= x1 and y0 <= y <= y1 and z0 <= z <= z1:
+            i, j, k = int((x - x0) / dx), int((y - y0) / dy), int((z - z0) / dz)
+            # the grid is closed at its upper faces, as in `VoxelGrid.location_ids`
+            i, j, k = i if i < nx else nx - 1, j if j < ny else ny - 1, k if k < nz else nz - 1
+            return int(rows((i * ny + j) * nz + k))
+        if not (isfinite(x) and isfinite(y) and isfinite(z)):
+            raise ValueError(f"a point must be finite, got {(x, y, z)}")
+        return -1
+
+    def best(self, point: Point) -> ViewChoice | None:
+        """The best orientation at a world point (3,) m."""
+        row = self.row(point)
+        return None if row < 0 else self._choice(row, self.ranked.item(row, 0))
+
+    def best_n(self, point: Point, n: int) -> list[ViewChoice] | None:
+        """The n best orientations at a world point (3,) m, or all if there are fewer, the best first."""
+        if n < 1:
+            raise ValueError(f"n must be at least 1, got {n}")
+        row = self.row(point)
+        return None if row < 0 else [self._choice(row, choice) for choice in self.ranked[row, :n].tolist()]
+
+    def best_in_cone(self, point: Point, axis: ArrayLike, half_angle_deg: float) -> ViewChoice | None:
+        """The best orientation whose optical axis is at most `half_angle_deg` from a world axis (3,).
+
+        Returns None also if no direction of the lattice lies in the cone.
+
+        Raises:
+            ValueError: the point or the axis is not finite, or the axis has no length.
+        """
+        row = self.row(point)
+        inside = within(angles_to_axis_deg(self.directions, check_axis(axis)), half_angle_deg)
+        return self._best_of(row, inside)
+
+    def best_reachable(self, point: Point, current: ArrayLike, max_turn_deg: float) -> ViewChoice | None:
+        """The best orientation that the camera reaches by a single rotation of at most `max_turn_deg`.
+
+        The angle of the rotation is that of the whole camera, as the Active Localization Benchmark measures it. Near
+        the vertical, cameras that do not roll turn farther than their axes.
+
+        Args:
+            point: (3,) m in the world.
+            current: (3,) axis of a camera without roll, or (3, 3) cam_from_world rotation.
+            max_turn_deg: largest angle, included.
+
+        Returns None also if no direction of the lattice is so near.
+
+        Raises:
+            ValueError: the point or `current` is not finite, or an axis has no length.
+        """
+        row = self.row(point)
+        return self._best_of(row, within(turns_from_deg(current, self._rotations), max_turn_deg))
+
+    def best_many(self, points: ArrayLike) -> ViewChoices:
+        """The best orientation at each of world points (N, 3) m.
+
+        Raises:
+            ValueError: points of another shape, or not finite.
+        """
+        rows = self.rows(points)
+        found = rows >= 0
+        direction, score, n_visible = self._best_of_rows  # their last row is for points that are not found
+        return ViewChoices(found, direction[rows], score[rows], n_visible[rows])
+
+    def rows(self, points: ArrayLike) -> NDArray[np.int64]:
+        """Rows (N,) of the free voxels that hold world points (N, 3) m; -1 where none does.
+
+        Raises:
+            ValueError: points of another shape, or not finite.
+        """
+        at = np.asarray(points, dtype=np.float64)
+        if at.ndim != 2 or at.shape[1] != 3:
+            raise ValueError(f"points must have shape (N, 3), got {at.shape}")
+        if not np.isfinite(at).all():
+            raise ValueError("points must be finite")
+        ids = self.grid.location_ids(at)
+        return np.where(ids >= 0, self.row_of_voxel[ids], -1).astype(np.int64)
+
+    def interpolated(self, point: Point) -> Float | None:
+        """Scores of all directions at a world point (3,) m, trilinear between the centres of voxels.
+
+        Neighbours that are not free, or not there, are left out, and the weights of the others made to sum to 1 again;
+        the voxel that holds the point must be free itself.
+
+        Returns:
+            (D,) float64.
+        """
+        if self.row(point) < 0:
+            return None
+        at = (np.asarray(point, dtype=np.float64) - self.grid.lower) / self.grid.voxel_m - 0.5
+        low = np.floor(at).astype(np.int64)
+        corners = low + _CORNERS
+        weights = np.prod(np.where(_CORNERS == 1, at - low, 1 - (at - low)), axis=1)
+        exists = ((corners >= 0) & (corners < self.grid.shape)).all(axis=1)
+        _, ny, nz = self.grid.shape
+        i, j, k = corners[exists].T
+        rows = self.row_of_voxel[(i * ny + j) * nz + k]
+        weights = weights[exists][rows >= 0]
+        # the voxel of the point is free and holds at least an eighth of the weight
+        return np.asarray(weights / weights.sum() @ self.scores[rows[rows >= 0]].astype(np.float64))
+
+    def _best_of(self, row: int, allowed: NDArray[np.bool_]) -> ViewChoice | None:
+        if row < 0 or not allowed.any():
+            return None
+        ranked = self.ranked[row]
+        return self._choice(row, ranked.item(allowed[ranked].argmax()))
+
+    def _choice(self, row: int, direction: int) -> ViewChoice:
+        return ViewChoice(
+            direction, self._axes[direction], self.scores.item(row, direction), self.n_visible.item(row, direction)
+        )
+
+    @cached_property
+    def _hash(self) -> tuple[Any, ...]:
+        """What `row` needs, as plain numbers."""
+        grid = self.grid
+        return (*map(float, (*grid.lower, *grid.upper, *grid.voxel_m)), *map(int, grid.shape), self.row_of_voxel.item)
+
+    @cached_property
+    def _axes(self) -> list[Float]:
+        axes = self.directions.copy()
+        axes.flags.writeable = False
+        return list(axes)
+
+    @cached_property
+    def _rotations(self) -> Float:
+        return rotation_looking_along(self.directions)
+
+    @cached_property
+    def _best_of_rows(self) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.int64]]:
+        """Direction, score and count of the best direction of each row, and behind them those of no row."""
+        best = self.ranked[:, 0].astype(np.int64)
+        rows = np.arange(len(best))
+        return (
+            np.append(best, -1),
+            np.append(self.scores[rows, best], np.float32(np.nan)),
+            np.append(self.n_visible[rows, best].astype(np.int64), 0),
+        )
+
+
+_CORNERS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(8, 3)

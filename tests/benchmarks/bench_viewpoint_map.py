@@ -1,0 +1,142 @@
+"""The viewpoint map: time of a query, of a batch, of building and updating it, and of views along a path.
+
+    python tests/benchmarks/bench_viewpoint_map.py [--device cuda] [--weights data/release/weights/set.safetensors]
+
+A generated apartment with landmarks on its surfaces and true occlusion; 512 free voxels (as many as 8 x 8 x 8) and 500
+directions. The scorer is "bins" unless weights are given. Queries are timed over points at random in free voxels, each
+repeat over all of them; what is printed is the time of one. Prints medians of the repeats and their range.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import tempfile
+from dataclasses import replace
+from itertools import cycle
+from pathlib import Path
+
+import numpy as np
+from bench_fisher import timed
+from bench_scorers import room_map
+from bench_visibility import on_surface
+
+from wheretolook.grid import VoxelGrid, fibonacci_sphere
+from wheretolook.localization_map import LocalizationMap
+from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.planning import (
+    TurnLimit,
+    ViewpointMap,
+    best_sequence,
+    build_viewpoint_map,
+    greedy_sequence,
+    refine_directions,
+)
+from wheretolook.rendering import MeshRaycaster
+from wheretolook.scenes.free_space import FreeSpace
+from wheretolook.scenes.procedural import ApartmentConfig, generate_apartment
+from wheretolook.scoring import Scorer, load_scorer, make_scorer
+from wheretolook.visibility import MeshOcclusion
+
+
+def rows_of(landmarks: Landmarks, rows: slice) -> Landmarks:
+    """Some of the landmarks."""
+    return Landmarks(**{name: None if value is None else value[rows] for name, value in vars(landmarks).items()})
+
+
+def queries(viewpoint_map: ViewpointMap, repeats: int) -> None:
+    """Single points and batches, in memory."""
+    rng = np.random.default_rng(0)
+    grid = viewpoint_map.grid
+    rows = rng.integers(0, len(viewpoint_map.scores), 1_000_000)
+    points = viewpoint_map.locations[rows] + rng.uniform(-0.5, 0.5, (len(rows), 3)) * grid.voxel_m
+    arrays, tuples = list(points[:5000]), points[:5000].tolist()
+    axis, n = np.array([0.6, -0.8, 0.0]), len(arrays)
+
+    def each(query, asked=arrays):
+        def work() -> None:
+            for point in asked:
+                query(point)
+
+        return work
+
+    unit, units = 1e6 / n, f"us for each of {n:,}"
+    timed("best, point an array", each(viewpoint_map.best), repeats, unit, units)
+    timed("best, point a tuple", each(viewpoint_map.best, tuples), repeats, unit, units)
+    timed("best 10", each(lambda p: viewpoint_map.best_n(p, 10)), repeats, unit, units)
+    timed("best in a cone of 30 degrees", each(lambda p: viewpoint_map.best_in_cone(p, axis, 30)), repeats, unit, units)
+    timed("best within a turn of 30 degrees", each(lambda p: viewpoint_map.best_reachable(p, axis, 30)), repeats, unit,
+          units)  # fmt: skip
+    timed("all directions, interpolated", each(viewpoint_map.interpolated), repeats, unit, units)
+    median = timed(f"best, a batch of {len(points):,}", lambda: viewpoint_map.best_many(points), repeats)
+    print(f"{'':62} {len(points) / median / 1e6:.1f} million points a second")
+
+
+def sequences(repeats: int, n: int = 200, d: int = 500) -> None:
+    """Views along a path."""
+    scores = np.random.default_rng(0).random((n, d))
+    directions = fibonacci_sphere(d)
+    limit = TurnLimit.of(directions)
+    timed(f"turn limit of {d} directions", lambda: TurnLimit.of(directions), repeats, 1e3, "ms")
+    timed(f"best sequence, {n} waypoints", lambda: best_sequence(scores, limit), repeats, 1e3, "ms")
+    timed(f"greedy sequence, {n} waypoints", lambda: greedy_sequence(scores, limit), repeats, 1e3, "ms")
+
+
+def main() -> None:
+    """Print a table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--weights", type=Path)
+    parser.add_argument("--landmarks", type=int, default=25_000)
+    parser.add_argument("--voxels", type=int, default=512)
+    parser.add_argument("--directions", type=int, default=500)
+    parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--builds", type=int, default=3)
+    args = parser.parse_args()
+    mesh = generate_apartment(ApartmentConfig(), 0, device=args.device)
+    grid = VoxelGrid.over(mesh.bounds, (24, 24, 8))
+    free_space = FreeSpace(mesh, device=args.device)
+    free = np.flatnonzero(free_space.is_free(grid.centers()))[: args.voxels]
+    points = on_surface(mesh, args.landmarks, np.random.default_rng(0))
+    points = points[np.argsort(-np.linalg.norm(points - points[0], axis=1))]  # the last ten lie together
+    made = room_map(args.landmarks, grid.centers()[:1], args.device)  # for its attributes
+    landmarks = replace(made.landmarks, points=points)
+    occlusion = MeshOcclusion(MeshRaycaster(mesh, args.device), two_sided=free_space.two_sided)
+    directions = fibonacci_sphere(args.directions)
+
+    def scorer_on(some: Landmarks) -> Scorer:
+        one = LocalizationMap(some, made.camera, occlusion, args.device)
+        return load_scorer(args.weights, one) if args.weights else make_scorer("bins", one)
+
+    scorer = scorer_on(landmarks)
+    print(f"{len(free)} voxels x {len(directions)} directions, {len(landmarks):,} landmarks, "
+          f"{len(mesh.triangles):,} triangles, {scorer.name}, on {args.device}, "
+          f"{len(os.sched_getaffinity(0))} cores")  # fmt: skip
+    timed("build", lambda: build_viewpoint_map(scorer, grid, free, directions), args.builds)
+    before = build_viewpoint_map(scorer_on(rows_of(landmarks, slice(0, -10))), grid, free, directions)
+    viewpoint_map, changed = before.updated(scorer)
+    timed(f"update, 10 landmarks added that {len(changed)} voxels see", lambda: before.updated(scorer), args.builds)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "map"
+        timed("save", lambda: viewpoint_map.save(path), args.repeats, 1e3, "ms")
+        size = sum(file.stat().st_size for file in path.iterdir())
+        timed(f"load, {size / 1e6:.1f} MB", lambda: ViewpointMap.load(path), args.repeats, 1e3, "ms")
+        timed("load, memory-mapped", lambda: ViewpointMap.load(path, mmap=True), args.repeats, 1e3, "ms")
+        queries(ViewpointMap.load(path, mmap=True), args.repeats)
+    sequences(args.repeats)
+    best = directions[viewpoint_map.ranked[:, 0]]
+    rows = cycle(range(len(best)))
+
+    def refine_one() -> None:
+        row = next(rows)
+        refine_directions(scorer, viewpoint_map.locations[row], best[row])
+
+    timed("refine the best direction of one location", refine_one, 50, 1e3, "ms")
+    some = slice(0, 64)
+    found = refine_directions(scorer, viewpoint_map.locations[some], best[some])
+    gain = found.scores - found.start_scores
+    print(f"{'':62} {np.mean(gain > 0):.0%} of 64 gain, by {gain.mean():.4f} in score on average")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,66 @@
+"""Viewpoint maps of a room with a cabinet in it, which hides landmarks from some voxels."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+
+from box_scenes import ROOM, furnished_room
+from synthetic_dataset import make_landmarks
+from wheretolook.geometry import Float, PinholeCamera
+from wheretolook.grid import VoxelGrid, direction_lattice
+from wheretolook.localization_map import LocalizationMap
+from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.planning import ViewpointMap, build_viewpoint_map
+from wheretolook.rendering import MeshRaycaster
+from wheretolook.scenes.free_space import FreeSpace
+from wheretolook.scoring import make_scorer
+from wheretolook.visibility import MeshOcclusion, OcclusionModel
+
+CAMERA = PinholeCamera(160, 120, 80.0)
+GRID = VoxelGrid((0.0, 0.0, 0.0), ROOM, (5, 4, 3))
+DIRECTIONS = direction_lattice(60)
+
+
+def room_landmarks(n: int, seed: int = 0, first_id: int = 0) -> Landmarks:
+    """Landmarks with attributes at random on the room's walls; the cabinet stands before some."""
+    rng = np.random.default_rng(seed)
+    landmarks = make_landmarks(rng, n)
+    points = rng.uniform(0, ROOM, (n, 3))
+    wall = rng.integers(0, 2, n)
+    points[np.arange(n), wall] = np.array(ROOM)[wall] * rng.integers(0, 2, n)
+    return replace(landmarks, ids=first_id + landmarks.ids, points=points)
+
+
+def joined(a: Landmarks, b: Landmarks) -> Landmarks:
+    """The landmarks of both."""
+    values = {
+        name: None if value is None else np.concatenate([value, getattr(b, name)]) for name, value in vars(a).items()
+    }
+    order = np.argsort(values["ids"])
+    return Landmarks(**{name: None if value is None else value[order] for name, value in values.items()})
+
+
+@cache
+def occlusion() -> MeshOcclusion:
+    """By the room's mesh."""
+    return MeshOcclusion(MeshRaycaster(furnished_room(), "cpu"))
+
+
+@cache
+def free_voxels() -> tuple[int, ...]:
+    """Ids of the voxels where a camera can be."""
+    free = FreeSpace(furnished_room()).is_free(GRID.centers())
+    return tuple(np.flatnonzero(free).tolist())
+
+
+def room_map(landmarks: Landmarks, model: OcclusionModel | None = None) -> LocalizationMap:
+    """What a scorer is built from."""
+    return LocalizationMap(landmarks, CAMERA, model or occlusion())
+
+
+def build(landmarks: Landmarks, method: str = "bins", directions: Float = DIRECTIONS) -> ViewpointMap:
+    """The viewpoint map of the room."""
+    return build_viewpoint_map(make_scorer(method, room_map(landmarks)), GRID, free_voxels(), directions, "fibonacci")

@@ -1,0 +1,123 @@
+"""Paths between walls: never through them, never beyond what the camera can do, and past what can be seen."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from wheretolook.errors import ConfigError, PlanningError
+from wheretolook.grid import VoxelGrid, fibonacci_sphere
+from wheretolook.planning.path_planning import PathConfig, plan_path
+from wheretolook.planning.viewpoint_map import MapOrigin, ViewpointMap
+
+LOW, HIGH = np.array([0.0, 0.0, 0.5]), np.array([6.0, 4.0, 1.7])
+WALL = ((2.9, 0.0), (3.1, 3.0))  # from the floor to the ceiling, with a gap at y > 3
+
+
+class Room:
+    """A box with one wall across most of it."""
+
+    def is_free(self, points):
+        points = np.atleast_2d(np.asarray(points, dtype=float))
+        inside = ((points >= LOW) & (points <= HIGH)).all(1)
+        low, high = np.array(WALL)
+        return inside & ((points[:, :2] < low) | (points[:, :2] > high)).any(1)
+
+    def segments_are_free(self, a, b):
+        a, b = np.atleast_2d(np.asarray(a, dtype=float)), np.atleast_2d(np.asarray(b, dtype=float))
+        t = np.linspace(0, 1, 400)[:, None, None]
+        points = a * (1 - t) + b * t
+        return self.is_free(points.reshape(-1, 3)).reshape(points.shape[:2]).all(0)
+
+
+BOUNDS = (LOW, HIGH)
+START, GOAL = (1.0, 1.0, 1.1), (5.0, 1.0, 1.1)
+QUICK = PathConfig(time_s=1.5, pitch_deg=(-30, 30))
+
+
+def looking_north() -> ViewpointMap:
+    """Everywhere the same: the nearer to +y a view looks, the better."""
+    grid, directions = VoxelGrid(tuple(LOW), tuple(HIGH), (6, 4, 2)), fibonacci_sphere(200)
+    scores = np.tile(((1 + directions[:, 1]) / 2) ** 2, (len(grid), 1)).astype(np.float32)
+    return ViewpointMap(
+        grid=grid,
+        row_of_voxel=np.arange(len(grid), dtype=np.int32),
+        directions=directions,
+        ranked=np.argsort(-scores, axis=1, kind="stable").astype(np.uint16),
+        scores=scores,
+        n_visible=np.ones_like(scores, dtype=np.uint32),
+        landmark_ids=np.zeros(0, np.int64),
+        landmark_digests=np.zeros((0, 2), np.uint64),
+        origin=MapOrigin("made", "", "fibonacci", {}, "none", "0" * 16),
+    )
+
+
+def check(path, config=QUICK) -> None:
+    """Inside the free space, from start to goal, and within the camera's limits."""
+    room = Room()
+    np.testing.assert_allclose(path.positions[[0, -1]], [START, GOAL], atol=1e-6)
+    assert room.is_free(path.positions).all()
+    assert room.segments_are_free(path.positions[:-1], path.positions[1:]).all()
+    steps = np.linalg.norm(np.diff(path.positions, axis=0), axis=1)
+    assert steps.max() <= config.spacing_m + 1e-9
+    np.testing.assert_allclose(np.linalg.norm(path.axes, axis=1), 1, atol=1e-9)
+    pitch = np.degrees(np.arcsin(path.axes[:, 2]))
+    assert config.pitch_deg[0] - 1e-6 <= pitch.min() and pitch.max() <= config.pitch_deg[1] + 1e-6
+
+
+def turns_deg(path) -> np.ndarray:
+    return np.degrees(np.arccos((path.axes[1:] * path.axes[:-1]).sum(1).clip(-1, 1)))
+
+
+def test_forward_takes_the_short_way_through_the_gap() -> None:
+    path = plan_path(START, GOAL, Room(), BOUNDS, config=QUICK, progress=False)
+    check(path)
+    shortest = 2 * np.hypot(1.9, 2.0) + 0.2  # round both corners of the wall
+    assert shortest - 0.01 <= path.length_m <= 1.15 * shortest
+    assert path.cost == pytest.approx(path.length_m, rel=1e-6) and np.isnan(path.scores).all()
+    travel = np.diff(path.positions, axis=0)[:, :2]
+    travel /= np.linalg.norm(travel, axis=1, keepdims=True)
+    assert np.quantile((path.axes[1:-1, :2] * travel[1:]).sum(1), 0.2) > 0.7 and np.all(path.axes[:, 2] == 0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_camera_looks_where_it_localizes(seed: int) -> None:
+    views, rng = looking_north(), np.random.default_rng(seed)
+    axis = np.append(rng.normal(size=2), 0.0)
+    path = plan_path(START, GOAL, Room(), BOUNDS, views, QUICK, start_axis=axis, progress=False)
+    check(path)
+    np.testing.assert_allclose(path.axes[0], axis / np.linalg.norm(axis), atol=1e-6)
+    steps = np.linalg.norm(np.diff(path.positions, axis=0), axis=1)
+    assert (turns_deg(path) <= QUICK.max_turn_deg_per_m * steps + 1e-6).all()
+    later = path.axes[len(path.axes) // 3 :, 1]
+    assert later.mean() > 0.8  # north, once there was time to turn
+    assert np.isfinite(path.scores).all() and path.scores.mean() > 0.7
+    assert path.length_m < 1.4 * (2 * np.hypot(1.9, 2.0) + 0.2) and path.turn_deg > 0
+
+
+def test_what_cannot_be_planned_is_named() -> None:
+    views = looking_north()
+    for start, goal, name in (((3.0, 1.0, 1.1), GOAL, "start"), (START, (5.0, 1.0, 9.0), "goal")):
+        with pytest.raises(PlanningError, match=f"the {name} is not in free space"):
+            plan_path(start, goal, Room(), BOUNDS, views, QUICK, progress=False)
+    with pytest.raises(PlanningError, match="the start is the goal"):
+        plan_path(START, START, Room(), BOUNDS, views, QUICK, progress=False)
+    with pytest.raises(PlanningError, match="cannot be pitched"):
+        plan_path(START, GOAL, Room(), BOUNDS, views, QUICK, start_axis=(0.1, 0, 1), progress=False)
+    with pytest.raises(ValueError, match="finite"):
+        plan_path((np.nan, 0, 1), GOAL, Room(), BOUNDS, views, QUICK, progress=False)
+
+    class Closed(Room):
+        def segments_are_free(self, a, b):
+            return super().segments_are_free(a, b) & ((np.atleast_2d(a)[:, 0] < 3) == (np.atleast_2d(b)[:, 0] < 3))
+
+    with pytest.raises(PlanningError, match="no path was found"):
+        plan_path(START, GOAL, Closed(), BOUNDS, views, PathConfig(time_s=0.5), progress=False)
+
+
+def test_impossible_options() -> None:
+    for name, value in (
+        ("pitch_deg", (40, -40)), ("time_s", 0), ("score_weight", -1), ("spacing_m", 0), ("max_turn_deg_per_m", 0),
+    ):  # fmt: skip
+        with pytest.raises(ConfigError, match=name):
+            PathConfig(**{name: value})

@@ -1,0 +1,75 @@
+"""The local search about a direction."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+import pytest
+
+from planning.rooms import DIRECTIONS, GRID, free_voxels, room_landmarks, room_map
+from wheretolook.geometry import Float
+from wheretolook.planning import refine_directions, score_directions
+from wheretolook.scoring import Scorer, make_scorer
+
+
+class Towards(Scorer):
+    """Half of one plus the cosine to an axis."""
+
+    name: ClassVar[str] = "towards"
+    axis = np.array([0.3, -0.5, 0.2]) / np.linalg.norm([0.3, -0.5, 0.2])
+
+    def score(self, cam_from_world: Float) -> Float:
+        return (1 + cam_from_world[:, 2, :3] @ self.axis) / 2
+
+
+def angle_deg(a: Float, b: Float) -> Float:
+    return np.degrees(2 * np.arcsin(np.linalg.norm(a - b, axis=-1) / 2))
+
+
+def test_a_smooth_maximum_is_found_within_the_last_step() -> None:
+    scorer = Towards(room_map(room_landmarks(10)))
+    near = DIRECTIONS[np.argsort(-DIRECTIONS @ scorer.axis)[:3]]
+    found = refine_directions(scorer, np.ones((3, 3)), 5 * near, 90, last_step_deg=0.1)
+    assert angle_deg(found.axes, scorer.axis).max() < 0.1
+    np.testing.assert_allclose(found.scores, scorer.score(np.concatenate([np.zeros((3, 2, 4)), np.concatenate(
+        [found.axes, np.zeros((3, 1))], axis=1)[:, None]], axis=1)))  # fmt: skip
+    assert np.all(found.scores > found.start_scores)
+
+
+def test_the_angle_keeps_to_its_limit_and_reaches_it() -> None:
+    scorer = Towards(room_map(room_landmarks(10)))
+    start = np.array([[1.0, 0, 0], [0, 0, 1], [0, 0, -1], [0, 1, 0]])
+    found = refine_directions(scorer, np.ones((4, 3)), start, 10)
+    np.testing.assert_allclose(np.linalg.norm(found.axes, axis=1), 1)
+    turned = angle_deg(found.axes, start)
+    assert turned.max() < 10 + 1e-6
+    np.testing.assert_allclose(turned, 10, atol=0.5)
+    np.testing.assert_allclose(angle_deg(found.axes, scorer.axis), angle_deg(start, scorer.axis) - 10, atol=0.5)
+
+
+@pytest.mark.parametrize("method", ["bins", "visible", "fisher-logdet-exact", "random"])
+def test_no_method_gets_worse_and_batches_change_nothing(method: str) -> None:
+    scorer = make_scorer(method, room_map(room_landmarks(400)))
+    locations = GRID.centers()[list(free_voxels())]
+    scores = score_directions(scorer, locations, DIRECTIONS)
+    assert scores.shape == (len(locations), len(DIRECTIONS))
+    best = DIRECTIONS[scores.argmax(axis=1)]
+    found = refine_directions(scorer, locations, best)
+    np.testing.assert_allclose(found.start_scores, scores.max(axis=1), rtol=1e-12)
+    assert np.all(found.scores >= found.start_scores)
+    assert np.mean(found.scores > found.start_scores) > 0.3
+    again = [score_directions(scorer, [at], [axis])[0, 0] for at, axis in zip(locations, found.axes, strict=True)]
+    np.testing.assert_allclose(again, found.scores, rtol=1e-6)
+    assert angle_deg(found.axes, best).max() <= 10 + 1e-6
+    alone = refine_directions(scorer, locations[4], best[4])
+    np.testing.assert_allclose(alone.axes[0], found.axes[4], atol=1e-12)
+
+
+def test_bad_input_is_refused() -> None:
+    scorer = Towards(room_map(room_landmarks(10)))
+    for locations, axes in (([[0, 0, np.nan]], [[1, 0, 0]]), ([[0, 0, 0]], [[0, 0, 0]]), ([[0, 0, 0]], DIRECTIONS)):
+        with pytest.raises(ValueError, match="finite vectors"):
+            refine_directions(scorer, locations, axes)
+    with pytest.raises(ValueError, match="positive"):
+        refine_directions(scorer, [[0, 0, 0]], [[1, 0, 0]], 0)

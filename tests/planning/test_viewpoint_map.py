@@ -1,0 +1,193 @@
+"""Queries of a viewpoint map against brute force over its arrays, and its build against the scorer."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from planning.rooms import CAMERA, DIRECTIONS, GRID, build, free_voxels, room_landmarks, room_map
+from wheretolook.errors import ConfigError, SceneError
+from wheretolook.geometry import poses_looking_along, rotation_angle_deg, rotation_looking_along
+from wheretolook.planning import ViewChoice, ViewpointMap, build_viewpoint_map
+from wheretolook.scoring import make_scorer
+
+
+@pytest.fixture(scope="module")
+def viewpoint_map() -> ViewpointMap:
+    return build(room_landmarks(400))
+
+
+def points_about(n: int, seed: int = 0) -> np.ndarray:
+    """Points in the grid and around it."""
+    return np.random.default_rng(seed).uniform(np.array(GRID.lower) - 0.5, np.array(GRID.upper) + 0.5, (n, 3))
+
+
+def row_by_hand(viewpoint_map: ViewpointMap, point: np.ndarray) -> int:
+    """The nearest voxel centre, if the point lies in the grid and the voxel is free."""
+    if np.any(point < GRID.lower) or np.any(point > GRID.upper):
+        return -1
+    voxel = int(np.linalg.norm((GRID.centers() - point) / GRID.voxel_m, ord=np.inf, axis=1).argmin())
+    return [*viewpoint_map.voxel_of_row].index(voxel) if voxel in viewpoint_map.voxel_of_row else -1
+
+
+def best_by_hand(viewpoint_map: ViewpointMap, row: int, allowed: np.ndarray) -> int | None:
+    """The allowed direction of highest score; bins' scores differ by more than rounding or are the same."""
+    if row < 0 or not allowed.any():
+        return None
+    return int(np.where(allowed, viewpoint_map.scores[row], -1).argmax())
+
+
+def id_of(choice: ViewChoice | None) -> int | None:
+    return None if choice is None else choice.direction_id
+
+
+def test_every_direction_of_every_free_voxel_has_its_score_and_count(viewpoint_map: ViewpointMap) -> None:
+    one = room_map(room_landmarks(400))
+    centers = GRID.centers()[list(free_voxels())]
+    assert 10 < len(centers) < len(GRID)
+    np.testing.assert_array_equal(viewpoint_map.locations, centers)
+    views = poses_looking_along(np.repeat(centers, len(DIRECTIONS), axis=0), np.tile(DIRECTIONS, (len(centers), 1)))
+    scores = make_scorer("bins", one).score(views)
+    np.testing.assert_array_equal(viewpoint_map.scores.ravel(), scores.astype(np.float32))
+    np.testing.assert_array_equal(viewpoint_map.n_visible.ravel(), np.diff(one.visible_landmarks(views).starts))
+    order = np.lexsort([np.tile(np.arange(60), (len(centers), 1)), -scores.reshape(-1, 60)], axis=1)
+    np.testing.assert_array_equal(viewpoint_map.ranked, order)
+    origin = viewpoint_map.origin
+    assert (origin.scorer, origin.inputs, origin.lattice, origin.occlusion) == ("bins", "", "fibonacci", "mesh")
+    assert origin.camera == {"model": "PINHOLE", "width": 160, "height": 120, "params": [80.0, 80.0, 80.0, 60.0]}
+    assert CAMERA.matrix[0, 2] == 80
+
+
+def test_queries_equal_brute_force(viewpoint_map: ViewpointMap) -> None:
+    rng = np.random.default_rng(1)
+    points = points_about(400)
+    everything = np.ones(len(DIRECTIONS), dtype=bool)
+    found = 0
+    many = viewpoint_map.best_many(points)
+    for number, point in enumerate(points):
+        row = row_by_hand(viewpoint_map, point)
+        assert viewpoint_map.row(point) == viewpoint_map.row(point.tolist()) == row
+        best, expected = viewpoint_map.best(point), best_by_hand(viewpoint_map, row, everything)
+        assert id_of(best) == expected
+        assert many.found[number] == (row >= 0)
+        if best is None:
+            assert viewpoint_map.best_n(point, 3) is None
+            assert viewpoint_map.interpolated(point) is None
+            assert (many.direction_id[number], many.n_visible[number]) == (-1, 0) and np.isnan(many.score[number])
+        else:
+            found += 1
+            assert (many.direction_id[number], many.score[number], many.n_visible[number]) == (
+                best.direction_id, best.score, best.n_visible,
+            )  # fmt: skip
+            np.testing.assert_array_equal(best.axis, DIRECTIONS[expected])
+            assert (best.score, best.n_visible) == (
+                viewpoint_map.scores[row, expected], viewpoint_map.n_visible[row, expected],
+            )  # fmt: skip
+            top = viewpoint_map.best_n(point, 7)
+            assert top is not None and top[0].direction_id == expected
+            np.testing.assert_array_equal([c.score for c in top], np.sort(viewpoint_map.scores[row])[::-1][:7])
+            assert len(viewpoint_map.best_n(point, 1000) or []) == 60
+        axis, limit = rng.normal(size=3), rng.uniform(1, 90)
+        in_cone = np.degrees(np.arccos(np.clip(DIRECTIONS @ axis / np.linalg.norm(axis), -1, 1))) <= limit
+        assert id_of(viewpoint_map.best_in_cone(point, axis, limit)) == best_by_hand(viewpoint_map, row, in_cone)
+        near = rotation_angle_deg(rotation_looking_along(axis), rotation_looking_along(DIRECTIONS)) <= limit
+        reachable = best_by_hand(viewpoint_map, row, near)
+        assert id_of(viewpoint_map.best_reachable(point, axis, limit)) == reachable
+        assert id_of(viewpoint_map.best_reachable(point, rotation_looking_along(axis), limit)) == reachable
+    assert 50 < found < 350
+
+
+def test_a_limit_includes_its_border_and_a_cone_may_be_empty(viewpoint_map: ViewpointMap) -> None:
+    point = viewpoint_map.locations[0]
+    for axis in DIRECTIONS:
+        at = viewpoint_map.best_in_cone(point, axis, 0)
+        assert at is not None
+        np.testing.assert_array_equal(at.axis, axis)
+        assert id_of(viewpoint_map.best_reachable(point, axis, 0)) == at.direction_id
+        assert id_of(viewpoint_map.best_in_cone(point, 3 * axis, 180)) == id_of(viewpoint_map.best(point))
+    between = DIRECTIONS[30] + DIRECTIONS[31]
+    assert viewpoint_map.best_in_cone(point, between, 0.1) is None
+    assert viewpoint_map.best_reachable(point, between, 0.1) is None
+
+
+def test_the_grid_is_closed_and_what_is_outside_has_no_answer(viewpoint_map: ViewpointMap) -> None:
+    corners = np.array([GRID.lower, GRID.upper])
+    everywhere = build_viewpoint_map(
+        make_scorer("bins", room_map(room_landmarks(50))), GRID, free_voxels(), DIRECTIONS[:3]
+    )
+    np.testing.assert_array_equal(everywhere.rows(corners), [everywhere.row(corner) for corner in corners])
+    for beyond in (np.nextafter(corners[0], -1), np.nextafter(corners[1], 10), np.array([1e9, 1, 1])):
+        assert viewpoint_map.best(beyond) is None
+        assert not viewpoint_map.best_many(beyond[None]).found[0]
+    assert viewpoint_map.best_many(np.empty((0, 3))).found.shape == (0,)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_points_that_are_not_finite_are_refused(viewpoint_map: ViewpointMap, bad: float) -> None:
+    point = np.array([1.0, bad, 1.0])
+    axis = (1, 0, 0)
+    for query in (
+        lambda: viewpoint_map.best(point),
+        lambda: viewpoint_map.best_n(point, 2),
+        lambda: viewpoint_map.best_in_cone(point, axis, 10),
+        lambda: viewpoint_map.best_reachable(point, axis, 10),
+        lambda: viewpoint_map.interpolated(point),
+        lambda: viewpoint_map.best_many(point[None]),
+        lambda: viewpoint_map.best_in_cone((1, 1, 1), (0, bad, 0), 10),
+        lambda: viewpoint_map.best_reachable((1, 1, 1), (0, bad, 0), 10),
+    ):
+        with pytest.raises(ValueError, match="finite"):
+            query()
+
+
+def test_questions_without_sense_are_refused(viewpoint_map: ViewpointMap) -> None:
+    with pytest.raises(ValueError, match="n must be"):
+        viewpoint_map.best_n((1, 1, 1), 0)
+    with pytest.raises(ValueError, match="at least 0 degrees"):
+        viewpoint_map.best_in_cone((1, 1, 1), (1, 0, 0), -1)
+    with pytest.raises(ValueError, match="axis"):
+        viewpoint_map.best_reachable((1, 1, 1), (0, 0, 0), 10)
+    with pytest.raises(ValueError, match="rotation"):
+        viewpoint_map.best_reachable((1, 1, 1), 2 * np.eye(3), 10)
+    with pytest.raises(ValueError, match="shape"):
+        viewpoint_map.best_many((1, 1, 1))
+
+
+def test_interpolation_meets_the_voxels_at_their_centres(viewpoint_map: ViewpointMap) -> None:
+    for row, center in enumerate(viewpoint_map.locations):
+        np.testing.assert_allclose(viewpoint_map.interpolated(center), viewpoint_map.scores[row], atol=1e-6)
+
+
+def test_interpolation_lies_between_free_neighbours_and_is_trilinear(viewpoint_map: ViewpointMap) -> None:
+    centers, n_between = GRID.centers(), 0
+    for point in points_about(400, seed=2):
+        scores = viewpoint_map.interpolated(point)
+        if scores is None:
+            continue
+        weights = np.clip(1 - np.abs((centers - point) / GRID.voxel_m), 0, None).prod(axis=1)
+        weights = np.where(viewpoint_map.row_of_voxel >= 0, weights, 0)
+        used = np.flatnonzero(weights > 0)
+        neighbours = viewpoint_map.scores[viewpoint_map.row_of_voxel[used]].astype(np.float64)
+        np.testing.assert_allclose(scores, weights[used] / weights[used].sum() @ neighbours, atol=1e-12)
+        assert np.all(scores >= neighbours.min(0) - 1e-12) and np.all(scores <= neighbours.max(0) + 1e-12)
+        n_between += 1 < len(used) < 8
+    assert n_between > 20  # some neighbours were not free, or not there
+
+
+def test_what_cannot_be_built_is_refused() -> None:
+    scorer = make_scorer("bins", room_map(room_landmarks(50)))
+    with pytest.raises(SceneError, match="no voxel is free"):
+        build_viewpoint_map(scorer, GRID, [], DIRECTIONS)
+    with pytest.raises(ConfigError, match="outside the grid"):
+        build_viewpoint_map(scorer, GRID, [len(GRID)], DIRECTIONS)
+    with pytest.raises(ConfigError, match="65,536 directions"):
+        build_viewpoint_map(scorer, GRID, [0], np.ones((65_537, 3)))
+    with pytest.raises(ValueError, match="of some length"):
+        build_viewpoint_map(scorer, GRID, [0], [[0, 0, 0]])
+
+
+def test_the_blocks_of_a_build_do_not_matter(viewpoint_map: ViewpointMap, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("wheretolook.planning.map_building.VIEWS_AT_ONCE", 150)
+    again = build(room_landmarks(400))
+    for name in ("ranked", "scores", "n_visible"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(viewpoint_map, name))

@@ -26,10 +26,20 @@ STAGES = {
     "scenes": ("make_scenes", "Make or load the textured meshes.", ("scenes",)),
     "map": (
         "make_maps",
-        "Build a COLMAP map of every scene from renders along a walk.",
+        "Build a COLMAP map of every scene from renders along a walk, or of a folder of photographs: --images FOLDER.",
         ("map", "scenes.free_space", "label.workers"),
     ),
-    "sample": ("sample", "Choose viewpoints by the landmarks they see.", ("sample", "occlusion", "scenes.free_space")),
+    "sample": (
+        "sample",
+        "Choose viewpoints by the landmarks they see.",
+        (
+            "sample",
+            "occlusion",
+            "scenes.free_space",
+            "scenes.mapped_space",
+            "map.photographs.assume_metric",
+        ),
+    ),
     "label": ("label", "Render and localize every viewpoint, measure the pose error. Resumes.", ("label", "tracking")),
     "train": ("train", "Train one network for each input variant.", ("train", "tracking")),
     "evaluate": ("evaluate", "Score all methods on the test scenes.", ("evaluate", "occlusion", "tracking")),
@@ -59,6 +69,7 @@ stages, in order; each reads what the one before it left in <data>/<name>/
   wheretolook STAGE --help         the settings a stage reads, with their defaults
   wheretolook demo                 is configs/demo.yaml unless --config names another
   wheretolook map --config configs/demo.yaml --map.n_images 120
+  wheretolook map --name photos --images FOLDER       a scene known from photographs alone
   wheretolook label --config configs/paper.yaml --engine ray     on a Ray cluster; the default is local
   wheretolook evaluate --list-methods    what can be compared
   wheretolook viewpoint-map --config configs/demo.yaml --scene apartment-000 --out room.map
@@ -223,7 +234,7 @@ def _help(parser: ArgumentParser, command: str) -> str:
     return str(parser.format_help()) + _MORE_HELP.get(command, "")
 
 
-_SHORT = {"--engine": "--label.engine"}
+_SHORT = {"--engine": "--label.engine", "--images": "--map.photographs.images"}
 """Flags that may be given without their group."""
 
 _SHORT_OF = {

@@ -17,6 +17,7 @@ from wheretolook.mapping.config import MapConfig
 from wheretolook.planning.config import ViewpointMapConfig
 from wheretolook.sampling import SampleConfig
 from wheretolook.scenes.free_space import FreeSpaceConfig
+from wheretolook.scenes.mapped_space import MappedSpaceConfig
 from wheretolook.scenes.procedural import ApartmentConfig
 from wheretolook.tracking import TrackingConfig
 from wheretolook.visibility.config import OcclusionConfig
@@ -65,6 +66,7 @@ class ScenesConfig:
         apartment: what an apartment is like.
         meshes: scenes from meshes of one's own, beside the apartments.
         free_space: where a camera may be.
+        mapped_space: where it may be in a scene of photographs, which has no mesh.
     """
 
     train: int = 3
@@ -74,6 +76,7 @@ class ScenesConfig:
     apartment: ApartmentConfig = field(default_factory=ApartmentConfig)
     meshes: tuple[MeshSource, ...] = ()
     free_space: FreeSpaceConfig = field(default_factory=FreeSpaceConfig)
+    mapped_space: MappedSpaceConfig = field(default_factory=MappedSpaceConfig)
 
     def __post_init__(self) -> None:
         if min(self.train, self.val, self.test) < 0 or self.train + self.val + self.test + len(self.meshes) == 0:
@@ -94,7 +97,7 @@ class Experiment:
         device: "cpu", "cuda", "cuda:<index>", or "auto" for the first GPU there is.
         camera: the camera that will look, and with which the map's images are rendered.
         scenes: stage 1, meshes.
-        map: stage 2, COLMAP maps.
+        map: stage 2, COLMAP maps, of meshes or of photographs.
         occlusion: how stage 3 finds out which landmarks nothing stands in front of. Stage 6 takes its settings, but the
             names of models from `evaluate.occlusions`.
         sample: stage 3, viewpoints and what they see.

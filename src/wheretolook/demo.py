@@ -19,6 +19,7 @@ from wheretolook.grid import direction_lattice
 from wheretolook.rendering import WarpRenderer
 from wheretolook.scenes.loading import load_mesh
 from wheretolook.scoring import load_scorer
+from wheretolook.stamps import STAGES
 from wheretolook.table import LOCALIZED, is_good, poses
 from wheretolook.tracking import ui_command
 
@@ -36,7 +37,7 @@ def run_demo(experiment: Experiment) -> None:
     """
     config = experiment.scenes
     n_scenes = config.train + config.val + config.test + len(config.meshes)
-    cost = {name: seconds * (n_scenes if name in stages.STAGES else 1) for name, seconds in SECONDS.items()}
+    cost = {name: seconds * (n_scenes if name in STAGES else 1) for name, seconds in SECONDS.items()}
     steps: dict[str, Callable[..., object]] = {
         "scenes": stages.make_scenes,
         "map": stages.make_maps,

@@ -19,6 +19,7 @@ from wheretolook.visibility import OcclusionModel, StoredOcclusion, survey
 
 if TYPE_CHECKING:
     from wheretolook.scenes.free_space import FreeSpace
+    from wheretolook.scenes.mapped_space import MappedSpace
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ class SampleConfig:
         return self.max_directions[split] if isinstance(self.max_directions, dict) else self.max_directions
 
 
-def free_locations(grid: VoxelGrid, free_space: FreeSpace) -> NDArray[np.int64]:
+def free_locations(grid: VoxelGrid, free_space: FreeSpace | MappedSpace) -> NDArray[np.int64]:
     """Ids of the grid's locations in free space, ascending.
 
     Raises:
@@ -80,7 +81,7 @@ def free_locations(grid: VoxelGrid, free_space: FreeSpace) -> NDArray[np.int64]:
         raise SceneError(
             f"none of the {len(grid)} locations is in free space",
             value=(grid.lower, grid.upper),
-            fix="Refine sample.grid, lower the clearance, or check the mesh's units (metres) and up axis.",
+            fix="Refine sample.grid, lower the clearance, or check the scene's units (metres) and up axis.",
         )
     return ids
 

@@ -6,7 +6,6 @@ from. Called again, it reuses what is there if its settings and inputs are the s
 
 from __future__ import annotations
 
-import hashlib
 import json
 import shutil
 import time
@@ -21,17 +20,20 @@ from typing import TYPE_CHECKING, Any
 from wheretolook.config import Experiment
 from wheretolook.dataset import Dataset, SceneFolder, Split, write_json
 from wheretolook.errors import ConfigError, MapError, SceneError, TableError
+from wheretolook.stamps import forget_stamp, is_done, read_stamp, stage_key, write_stamp
 from wheretolook.table import fingerprint, write_table
 
 if TYPE_CHECKING:
     import pandas as pd
 
+    from wheretolook.geometry import PinholeCamera
     from wheretolook.learning.training import TrainedModel
     from wheretolook.mapping.extraction import ExtractorConfig
     from wheretolook.planning import ViewpointMap
-
-STAGES = ("scenes", "map", "sample", "label")
-"""Stages that work scene by scene, in order."""
+    from wheretolook.scenes.free_space import FreeSpace
+    from wheretolook.scenes.mapped_space import MappedSpace
+    from wheretolook.visibility import OcclusionModel
+    from wheretolook.visibility.config import OcclusionConfig
 
 Say = Callable[[str], None]
 Tick = Callable[[float], None]
@@ -66,12 +68,12 @@ def make_scenes(experiment: Experiment, say: Say = print, tick: Tick = lambda wo
         keys[scene] = [_mesh_fingerprint(source.path), source.up]
 
     for scene, make in sources.items():
-        key = _key("scenes", keys[scene])
-        if not _is_done(scene, "scenes", key, scene.mesh):
+        key = stage_key("scenes", keys[scene])
+        if not is_done(scene, "scenes", key, scene.mesh):
             mesh = make()
             scene.folder.mkdir(parents=True, exist_ok=True)
             save_glb(mesh, scene.mesh)
-            _stamp(scene, "scenes", key)
+            write_stamp(scene, "scenes", key)
             say(f"{scene.name}: {len(mesh.triangles):,} triangles -> {scene.mesh}")
         else:
             say(f"{scene.name}: reusing {scene.mesh}")
@@ -79,7 +81,7 @@ def make_scenes(experiment: Experiment, say: Say = print, tick: Tick = lambda wo
     dataset = Dataset(root, experiment.camera, tuple(sources))
     if (root / "dataset.json").is_file() and Dataset.load(root).camera != experiment.camera:
         for scene in dataset.scenes:  # what was made with another camera is no longer valid
-            _stamp(scene, "scenes", _read_stamps(scene)["scenes"])
+            write_stamp(scene, "scenes", read_stamp(scene, "scenes") or "")
     dataset.save()
     return dataset
 
@@ -87,21 +89,29 @@ def make_scenes(experiment: Experiment, say: Say = print, tick: Tick = lambda wo
 def make_maps(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> Dataset:
     """Stage 2: a COLMAP model of every scene with its landmarks' attributes, `<scene>/map/`.
 
+    With `map.photographs.images`, of a scene made of the photographs there; see `map_photograph_scene`.
+
     Raises:
         SceneError, MapError: a mesh cannot be read, or no landmark could be triangulated.
     """
+    if experiment.map.photographs.images is not None:
+        from wheretolook.photograph_scenes import map_photograph_scene
+
+        _refuse_release(experiment.root)
+        return map_photograph_scene(experiment, say, tick)
     from wheretolook.mapping.building import build_map
     from wheretolook.rendering import MeshRaycaster, WarpRenderer
     from wheretolook.scenes.free_space import FreeSpace
     from wheretolook.scenes.loading import load_mesh
 
     dataset, device = _dataset(experiment, "scenes"), experiment.warp_device
+    settings = {name: value for name, value in asdict(experiment.map).items() if name != "photographs"}
     for scene in dataset.scenes:
         seed = zlib.crc32(scene.name.encode()) % 2**31  # the scene's own, whichever scenes are beside it
-        key = _key("map", [asdict(experiment.map), asdict(experiment.scenes.free_space), asdict(dataset.camera), seed,
+        key = stage_key("map", [settings, asdict(experiment.scenes.free_space), asdict(dataset.camera), seed,
                            _existing(scene.mesh, SceneError, "scenes")])  # fmt: skip
         model = [scene.map / name for name in ("cameras.bin", "images.bin", "points3D.bin")]
-        if not _is_done(scene, "map", key, scene.landmarks, *model):
+        if not is_done(scene, "map", key, scene.landmarks, *model):
             mesh = load_mesh(scene.mesh)
             raycaster = MeshRaycaster(mesh, device)
             with _naming(scene.mesh):
@@ -117,7 +127,7 @@ def make_maps(experiment: Experiment, say: Say = print, tick: Tick = lambda work
                     raycaster=raycaster,
                     device=device,
                 )
-            _stamp(scene, "map", key)
+            write_stamp(scene, "map", key)
             say(f"{scene.name}: {report.n_landmarks:,} landmarks from {report.n_registered} images, median "
                 f"{report.median_distance_to_mesh_cm:.2f} cm from the mesh -> {scene.map}")  # fmt: skip
         else:
@@ -131,32 +141,34 @@ def sample(experiment: Experiment, say: Say = print, tick: Tick = lambda work: N
 
     Every voxel's free location is looked from in every direction; the landmarks it sees are counted exactly.
 
+    A scene of photographs is free near where these were taken, and occluded by hidden-point removal.
+
     Raises:
-        SceneError: no location is free. MapError: there is no map.
+        SceneError: no location is free. MapError: there is no map, or one without a scale.
     """
     from wheretolook.grid import VoxelGrid
     from wheretolook.mapping.landmarks import Landmarks
+    from wheretolook.photograph_scenes import is_photographed, occlusion_without_mesh, require_metres
     from wheretolook.sampling import free_locations, sample_viewpoints
-    from wheretolook.scene_occlusion import scene_occlusion
-    from wheretolook.scenes.free_space import FreeSpace
-    from wheretolook.scenes.loading import load_mesh
 
     dataset, device = _dataset(experiment, "map"), experiment.warp_device
     for scene in dataset.scenes:
         chosen = {name: value for name, value in asdict(experiment.sample).items() if name != "memory_gb"}
         chosen["max_directions"] = experiment.sample.directions_of(scene.split)
-        key = _key("sample", [chosen, experiment.occlusion.settings(), asdict(experiment.scenes.free_space),
-                              asdict(dataset.camera), _existing(scene.mesh, SceneError, "scenes"),
-                              _existing(scene.landmarks, MapError, "map")])  # fmt: skip
-        if not _is_done(scene, "sample", key, scene.table, scene.occlusion):
-            mesh, landmarks = load_mesh(scene.mesh), Landmarks.load(scene.landmarks)
-            grid = VoxelGrid.over(mesh.bounds, experiment.sample.grid)
-            with _naming(scene.mesh):
-                free_space = FreeSpace(mesh, experiment.scenes.free_space, device)
-                free = free_locations(grid, free_space)
-                occlusion = scene_occlusion(
-                    scene, dataset.camera, experiment.occlusion, device, mesh, free_space.two_sided
-                )
+        occlusion_config, space_config, source = experiment.occlusion, asdict(experiment.scenes.free_space), scene.mesh
+        if photographed := is_photographed(scene):
+            require_metres(scene, experiment.map.photographs.assume_metric)
+            occlusion_config, source = occlusion_without_mesh(experiment.occlusion), scene.mapping_cameras
+            space_config = asdict(experiment.scenes.mapped_space)
+        key = stage_key("sample", [chosen, occlusion_config.settings(), space_config, asdict(dataset.camera),
+                                   _existing(source, SceneError, "map" if photographed else "scenes"),
+                                   _existing(scene.landmarks, MapError, "map")])  # fmt: skip
+        if not is_done(scene, "sample", key, scene.table, scene.occlusion):
+            landmarks = Landmarks.load(scene.landmarks)
+            with _naming(source):
+                space, occlusion = _space_and_occlusion(scene, dataset.camera, experiment, occlusion_config)
+                grid = VoxelGrid.over(space.bounds, experiment.sample.grid)
+                free = free_locations(grid, space)
                 # depth images that have not seen all of the scene may put free space behind surfaces
                 free = free[~occlusion.inside_geometry(grid.centers()[free])]
                 table, stored = sample_viewpoints(
@@ -165,9 +177,11 @@ def sample(experiment: Experiment, say: Say = print, tick: Tick = lambda work: N
                 )  # fmt: skip
             stored.save(scene.occlusion)
             write_table(table, scene.table)
-            _stamp(scene, "sample", key)
+            write_stamp(scene, "sample", key)
             say(f"{scene.name}: {len(table):,} viewpoints at {table['location_id'].nunique()} of {len(free)} free "
                 f"locations -> {scene.table}")  # fmt: skip
+            if photographed and occlusion_config != experiment.occlusion:
+                say(f"{scene.name}: occlusion by {occlusion_config.model}, as there is no mesh")
         else:
             say(f"{scene.name}: reusing {scene.table}")
         tick(1)
@@ -179,11 +193,15 @@ def label(experiment: Experiment, say: Say = print, tick: Tick = lambda work: No
 
     Resumes after an interruption, see `wheretolook.labelling.label_scenes`. How the labels came out goes to
     `<dataset>/results/labels.*` and an MLflow run.
+
+    Raises:
+        SceneError: a mesh is missing, or a scene is known from photographs alone.
     """
     from wheretolook.labelling import LabelTask, label_scenes
     from wheretolook.labelling.labeller import storing
     from wheretolook.labelling.report import LABELS_MD, log_labels
     from wheretolook.labelling.shard import SceneJob
+    from wheretolook.photograph_scenes import refuse_labelling
     from wheretolook.table import is_good
 
     def report(scene: SceneFolder, table: pd.DataFrame) -> None:
@@ -194,14 +212,16 @@ def label(experiment: Experiment, say: Say = print, tick: Tick = lambda work: No
     dataset, config = _dataset(experiment, "sample"), experiment.label
     scenes: dict[str, tuple[SceneFolder, str]] = {}
     tasks: list[LabelTask] = []
+    for scene in dataset.scenes:
+        refuse_labelling(scene)
     for scene in sorted(dataset.scenes, key=lambda scene: scene.split == "train"):  # those to evaluate on come first
         table, extractor = scene.read_table(), _extractor_of(scene)
-        key = _key("label", [asdict(config.localizer), asdict(extractor), asdict(dataset.camera),
+        key = stage_key("label", [asdict(config.localizer), asdict(extractor), asdict(dataset.camera),
                              _existing(scene.mesh, SceneError, "scenes"),
-                             _existing(scene.landmarks, MapError, "map"), _read_stamp(scene, "sample"),
+                             _existing(scene.landmarks, MapError, "map"), read_stamp(scene, "sample"),
                              *(["store_matches"] if config.store_matches else [])])  # fmt: skip
         shards = scene.folder / "shards"
-        if _is_done(scene, "label", key, scene.table):
+        if is_done(scene, "label", key, scene.table):
             shutil.rmtree(shards, ignore_errors=True)  # killed before it could remove them
             report(scene, table)
             continue
@@ -219,11 +239,11 @@ def label(experiment: Experiment, say: Say = print, tick: Tick = lambda work: No
                 replacing = True
                 summary.unlink(missing_ok=True)
                 for other, _ in scenes.values():
-                    _forget(other, "label")
+                    forget_stamp(other, "label")
             with storing(scene.table):
                 write_table(labelled.table, scene.table)
                 write_json(scene.label_manifest, labelled.manifest)
-                _stamp(scene, "label", key)
+                write_stamp(scene, "label", key)
             shutil.rmtree(labelled.task.shards, ignore_errors=True)
             for step, spent in labelled.seconds.items():
                 seconds[step] = seconds.get(step, 0.0) + spent
@@ -333,9 +353,9 @@ def release(experiment: Experiment, say: Say = print, tick: Tick = lambda work: 
     if not is_release(dataset):
         copy = copy_dataset(dataset, experiment)
         for scene, source in zip(copy.scenes, dataset.scenes, strict=True):
-            stamp = _read_stamp(source, "label")
+            stamp = read_stamp(source, "label")
             assert stamp is not None  # `_dataset` has seen it
-            _stamp(scene, "label", stamp)
+            write_stamp(scene, "label", stamp)
         say(f"{len(copy.scenes)} scenes -> {copy.root}: {size_text(sizes(copy.root, weights=False))}")
         say("next: train on it, then `wheretolook release` with its own configuration")
         return copy
@@ -357,6 +377,24 @@ def release(experiment: Experiment, say: Say = print, tick: Tick = lambda work: 
     return dataset
 
 
+def _space_and_occlusion(
+    scene: SceneFolder, camera: PinholeCamera, experiment: Experiment, occlusion: OcclusionConfig
+) -> tuple[FreeSpace | MappedSpace, OcclusionModel]:
+    """Free space of a scene, by its mesh or else its mapping cameras, and which landmarks its locations see."""
+    from wheretolook.photograph_scenes import is_photographed, mapped_space
+    from wheretolook.scene_occlusion import scene_occlusion
+    from wheretolook.scenes.free_space import FreeSpace
+    from wheretolook.scenes.loading import load_mesh
+
+    device = experiment.warp_device
+    if is_photographed(scene):
+        space = mapped_space(scene, experiment.scenes.mapped_space, experiment.map.photographs.assume_metric)
+        return space, scene_occlusion(scene, camera, occlusion, device)
+    mesh = load_mesh(scene.mesh)
+    free_space = FreeSpace(mesh, experiment.scenes.free_space, device)
+    return free_space, scene_occlusion(scene, camera, occlusion, device, mesh, free_space.two_sided)
+
+
 def _dataset(experiment: Experiment, needs: str) -> Dataset:
     """The dataset, once the stage that is needed has been through all of its scenes with what they now hold."""
     dataset = Dataset.load(experiment.root)
@@ -368,7 +406,7 @@ def _dataset(experiment: Experiment, needs: str) -> Dataset:
             fix="Run the scenes stage with this configuration, or give the experiment another name.",
         )  # fmt: skip
     for scene in dataset.scenes:
-        if _read_stamp(scene, needs) is None:
+        if read_stamp(scene, needs) is None:
             raise TableError(
                 f"the {needs} stage has not been run for this scene, or not since an earlier stage remade its input",
                 path=scene.folder, fix=f"Run `wheretolook {needs}`.",
@@ -408,11 +446,6 @@ def _extractor_of(scene: SceneFolder) -> ExtractorConfig:
         raise MapError("the map's report is missing or damaged", path=path, fix="Run the map stage again.") from error
 
 
-def _key(stage: str, parts: list[Any]) -> str:
-    text = json.dumps([stage, parts], sort_keys=True, default=str)
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-
 def _existing(path: Path, error: type[SceneError] | type[MapError], stage: str) -> str:
     """Fingerprint of a file that an earlier stage makes."""
     if not path.is_file():
@@ -430,38 +463,3 @@ def _mesh_fingerprint(path: Path) -> str:
     elif path.suffix.lower() != ".glb":  # materials and textures lie beside it
         files = sorted(file for file in path.parent.iterdir() if file.is_file())
     return " ".join(f"{file.resolve()}:{file.stat().st_size}:{file.stat().st_mtime_ns}" for file in files)
-
-
-def _stamp_path(scene: SceneFolder) -> Path:
-    return scene.folder / "stages.json"
-
-
-def _read_stamps(scene: SceneFolder) -> dict[str, str]:
-    try:
-        return dict(json.loads(_stamp_path(scene).read_text()))
-    except (OSError, ValueError):
-        return {}
-
-
-def _read_stamp(scene: SceneFolder, stage: str) -> str | None:
-    return _read_stamps(scene).get(stage)
-
-
-def _stamp(scene: SceneFolder, stage: str, key: str) -> None:
-    """Record a finished stage. The scene's later stages worked on what is now replaced: their stamps go."""
-    earlier = STAGES[: STAGES.index(stage)]
-    stamps = {name: stamp for name, stamp in _read_stamps(scene).items() if name in earlier}
-    write_json(_stamp_path(scene), {**stamps, stage: key})
-
-
-def _forget(scene: SceneFolder, stage: str) -> None:
-    """Take a stage's stamp away, and those of later ones."""
-    earlier = STAGES[: STAGES.index(stage)]
-    stamps = _read_stamps(scene)
-    kept = {name: stamp for name, stamp in stamps.items() if name in earlier}
-    if kept != stamps:
-        write_json(_stamp_path(scene), kept)
-
-
-def _is_done(scene: SceneFolder, stage: str, key: str, *results: Path) -> bool:
-    return _read_stamp(scene, stage) == key and all(result.exists() for result in results)

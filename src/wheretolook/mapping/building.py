@@ -117,12 +117,9 @@ def build_map(
         MapError: the images give no landmark, or `out_dir` holds something that is not a map.
         SceneError: there is no floor to walk on.
     """
-    config, out_dir, clock = config or MapConfig(), Path(out_dir), _Clock()
-    if out_dir.exists() and not (out_dir / REPORT_FILE).is_file() and (not out_dir.is_dir() or any(out_dir.iterdir())):
-        raise MapError(
-            "will not be replaced: it is not a map built here", path=out_dir, fix="Give another folder, or remove it."
-        )
-    with _partial_folder(out_dir) as partial, Processes(workers) as processes:
+    config, out_dir, clock = config or MapConfig(), Path(out_dir), Clock()
+    refuse_foreign_folder(out_dir)
+    with partial_folder(out_dir) as partial, Processes(workers) as processes:
         with clock("walk"):
             walk = plan_walk(free_space, mesh.bounds, config.n_images, config.walk, seed)
             poses = poses_looking_along(walk.positions, walk.directions)
@@ -149,17 +146,10 @@ def build_map(
             progress=progress,
         )
         with clock("filter_and_write"):
-            errors = {i: point.error for i, point in model.points3D.items()}
-            removed = [i for i, error in errors.items() if not error <= config.max_reprojection_error_px]
-            if len(removed) == len(errors):
-                raise MapError(
-                    "the images give no landmark",
-                    path=out_dir,
-                    value=f"{len(errors)} triangulated, {len(removed)} removed",
-                    fix="Map with more images (n_images), or check that the scene has texture.",
-                )
-            for i in removed:
-                model.delete_point3D(i)
+            n_removed = remove_inaccurate(
+                model, config.max_reprojection_error_px, out_dir,
+                fix="Map with more images (n_images), or check that the scene has texture.",
+            )  # fmt: skip
             model.write_binary(str(partial))
         with clock("landmarks"):
             landmarks = load_colmap_landmarks(partial, database, config.max_reprojection_error_px)
@@ -175,7 +165,7 @@ def build_map(
             n_keypoints=sum(len(k) for k in keypoints),
             n_pairs=len(pairs),
             n_landmarks=len(landmarks),
-            n_landmarks_removed=len(removed),
+            n_landmarks_removed=n_removed,
             median_track_length=float(np.median(landmarks.track_length)),
             mean_reprojection_error_px=float(landmarks.reprojection_error_px.mean()),
             median_distance_to_mesh_cm=float(np.median(distance_cm)),
@@ -191,7 +181,33 @@ def build_map(
     return report
 
 
-class _Clock:
+def refuse_foreign_folder(out_dir: Path) -> None:
+    """Raise MapError if a folder, or a file in its place, holds anything but a map built here."""
+    if out_dir.exists() and not (out_dir / REPORT_FILE).is_file() and (not out_dir.is_dir() or any(out_dir.iterdir())):
+        raise MapError(
+            "will not be replaced: it is not a map built here", path=out_dir, fix="Give another folder, or remove it."
+        )
+
+
+def remove_inaccurate(model: Any, max_reprojection_error_px: float, out_dir: Path, fix: str) -> int:
+    """Remove a reconstruction's points with a larger mean reprojection error. Returns how many.
+
+    Raises:
+        MapError: none is left.
+    """
+    errors = {i: point.error for i, point in model.points3D.items()}
+    removed = [i for i, error in errors.items() if not error <= max_reprojection_error_px]
+    if len(removed) == len(errors):
+        value = f"{len(errors)} triangulated, {len(removed)} removed"
+        raise MapError("the images give no landmark", path=out_dir, value=value, fix=fix)
+    for i in removed:
+        model.delete_point3D(i)
+    return len(removed)
+
+
+class Clock:
+    """Wall-clock time of each step, `seconds`."""
+
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
 
@@ -203,7 +219,7 @@ class _Clock:
 
 
 @contextmanager
-def _partial_folder(out_dir: Path) -> Iterator[Path]:
+def partial_folder(out_dir: Path) -> Iterator[Path]:
     """An empty folder beside `out_dir` that takes its place if the block succeeds and is removed if it does not."""
     partial, old = (out_dir.with_name(f".{out_dir.name}.{suffix}") for suffix in ("partial", "replaced"))
     for leftover in (partial, old):

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 from wheretolook.errors import ConfigError
 from wheretolook.mapping.extraction import ExtractorConfig
+from wheretolook.mapping.photograph_config import PhotographsConfig
 from wheretolook.mapping.walk import WalkConfig
 
 
@@ -24,6 +25,8 @@ class MapConfig:
             a third as many, and fewer viewpoints that localize.
         max_reprojection_error_px: landmarks with a larger mean reprojection error are removed from the map (the
             paper's 0.5 px).
+        photographs: a folder of photographs to map instead of a mesh; of the rest, only `extractor` and `keep_database`
+            then count.
         keep_images: keep the rendered images, as `images/` in the map's folder.
         keep_database: keep COLMAP's database of keypoints and matches, as `database.db`.
     """
@@ -36,6 +39,7 @@ class MapConfig:
     min_triangulation_angle_deg: float = 1.5
     two_view_landmarks: bool = True
     max_reprojection_error_px: float = 0.5
+    photographs: PhotographsConfig = field(default_factory=PhotographsConfig)
     keep_images: bool = False
     keep_database: bool = False
 

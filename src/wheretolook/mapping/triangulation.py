@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -64,6 +64,7 @@ def triangulate_known_poses(
     import pycolmap
 
     processes = processes or Processes(1)
+    folder = database.parent
     seed %= 2**31  # COLMAP keeps it in an int
     pycolmap.set_random_seed(seed)
     with clock("database"):
@@ -71,9 +72,12 @@ def triangulate_known_poses(
         for index, found in enumerate(keypoints):
             points = [pycolmap.Point2D(p) for p in found.pixels.astype(np.float64)]
             model.images[index + 1].points2D = pycolmap.Point2DList(points)
-        _fill_database(database, model, map(_stored, keypoints))
-    with clock("match"):
-        _match(database, camera, keypoints, pairs, processes, progress)
+        stored = [stored_keypoints(found) for found in keypoints]
+        fill_database(database, model, stored)
+    with clock("match"), pycolmap.Database.open(str(database)) as db:
+        matches = match_pairs(stored, pairs, folder, processes, progress)
+        for (i, j), matched in zip(pairs.tolist(), matches, strict=True):
+            db.write_matches(i + 1, j + 1, matched)
     with clock("verify"):
         verification = pycolmap.TwoViewGeometryOptions()
         verification.ransac.max_error = max_epipolar_error_px
@@ -89,45 +93,49 @@ def triangulate_known_poses(
         options.triangulation.random_seed = options.mapper.random_seed = seed
         options.triangulation.ignore_two_view_tracks = not two_view_landmarks
         options.triangulation.min_angle = options.mapper.filter_min_tri_angle = min_triangulation_angle_deg
-        folder = database.parent
         with quiet_colmap("ERROR"):  # it warns of every image it cannot read colours from
             model = pycolmap.triangulate_points(model, str(database), str(folder), str(folder), options=options)
         model.update_point_3d_errors()
     with clock("color"):
-        for point in model.points3D.values():
-            seen = [colors[e.image_id - 1][e.point2D_idx] for e in point.track.elements]
-            point.color = np.rint(np.mean(seen, axis=0)).astype(np.uint8)
+        color_points(model, colors)
     return model
 
 
-def _match(
-    database: Path,
-    camera: PinholeCamera,
-    keypoints: Sequence[Keypoints],
-    pairs: NDArray[np.int64],
-    processes: Processes,
-    progress: bool,
-) -> None:
-    """Match pairs of images and write the matches to the database.
+def color_points(model: Any, colors: Sequence[NDArray[np.uint8]]) -> None:
+    """Give a reconstruction's points the mean colour of their keypoints, (N_i, 3) uint8 of the image of id i + 1."""
+    for point in model.points3D.values():
+        seen = [colors[e.image_id - 1][e.point2D_idx] for e in point.track.elements]
+        point.color = np.rint(np.mean(seen, axis=0)).astype(np.uint8)
+
+
+Stored = tuple[NDArray[np.float32], NDArray[np.uint8]]
+"""Pixels (N, 2) and descriptors (N, 128) of an image's keypoints, as in a COLMAP database."""
+
+
+def match_pairs(
+    stored: Sequence[Stored], pairs: NDArray[np.int64], folder: Path, processes: Processes, progress: bool = True
+) -> Generator[NDArray[np.uint32], None, None]:
+    """Match pairs of images, without geometric verification.
 
     In processes: pycolmap's BLAS is built without locks, and when two threads call it, now and then both get the same
     buffer. The nearest neighbours of a pair then come out wrong, and another map with them.
+
+    Args:
+        stored: keypoints of the images.
+        pairs: (P, 2) indices of the images to match.
+        folder: where small databases may lie meanwhile.
+        processes: match.
+        progress: show a progress bar.
+
+    Yields:
+        (M, 2) indices of matched keypoints, pair by pair.
     """
-    import pycolmap
-
     chunks = [pairs[start : start + _PAIRS_AT_A_TIME] for start in range(0, len(pairs), _PAIRS_AT_A_TIME)]
-    jobs = (_MatchJob.of(chunk, camera, keypoints, database.parent) for chunk in chunks)
-    with (
-        tqdm(total=len(pairs), desc="map: match", disable=not progress, unit="pair") as bar,
-        pycolmap.Database.open(str(database)) as db,
-    ):
-        for chunk, matches in zip(chunks, processes.map(_match_job, jobs), strict=True):
-            for (i, j), found in zip(chunk.tolist(), matches, strict=True):
-                db.write_matches(i + 1, j + 1, found)
-            bar.update(len(chunk))
-
-
-_Stored = tuple[NDArray[np.float32], NDArray[np.uint8]]
+    jobs = (_MatchJob.of(chunk, stored, folder) for chunk in chunks)
+    with tqdm(total=len(pairs), desc="map: match", disable=not progress, unit="pair") as bar:
+        for matches in processes.map(_match_job, jobs):
+            yield from matches
+            bar.update(len(matches))
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,20 +144,18 @@ class _MatchJob:
 
     Attributes:
         pairs: (P, 2) indices into `stored`.
-        stored: pixels and descriptors of the images, as in a database.
-        camera: intrinsics of the images.
+        stored: keypoints of the images.
         folder: where to put the database.
     """
 
     pairs: NDArray[np.int64]
-    stored: list[_Stored]
-    camera: PinholeCamera
+    stored: list[Stored]
     folder: Path
 
     @staticmethod
-    def of(pairs: NDArray[np.int64], camera: PinholeCamera, keypoints: Sequence[Keypoints], folder: Path) -> _MatchJob:
+    def of(pairs: NDArray[np.int64], stored: Sequence[Stored], folder: Path) -> _MatchJob:
         images, renumbered = np.unique(pairs, return_inverse=True)
-        return _MatchJob(renumbered.reshape(-1, 2), [_stored(keypoints[i]) for i in images], camera, folder)
+        return _MatchJob(renumbered.reshape(-1, 2), [stored[i] for i in images], folder)
 
 
 def _match_job(job: _MatchJob) -> list[NDArray[np.uint32]]:
@@ -160,7 +166,9 @@ def _match_job(job: _MatchJob) -> list[NDArray[np.uint32]]:
     with TemporaryDirectory(dir=job.folder) as folder:
         database, listed = Path(folder) / "database.db", Path(folder) / "pairs.txt"
         anywhere = np.tile(np.eye(3, 4), (len(job.stored), 1, 1))
-        _fill_database(database, _posed_model(job.camera, anywhere), job.stored)
+        fill_database(
+            database, _posed_model(PinholeCamera(), anywhere), job.stored
+        )  # any camera: only verification asks
         listed.write_text("".join(f"{image_name(i)} {image_name(j)}\n" for i, j in job.pairs))
         pairing = pycolmap.ImportedPairingOptions(match_list_path=str(listed))
         with quiet_colmap():
@@ -186,11 +194,13 @@ def _posed_model(camera: PinholeCamera, cam_from_world: NDArray[np.floating[Any]
     return model
 
 
-def _stored(keypoints: Keypoints) -> _Stored:
+def stored_keypoints(keypoints: Keypoints) -> Stored:
+    """Keypoints as a database holds them."""
     return keypoints.pixels, quantize_descriptors(keypoints.descriptors)
 
 
-def _fill_database(database: Path, model: Any, stored: Iterable[_Stored]) -> None:
+def fill_database(database: Path, model: Any, stored: Iterable[Stored]) -> None:
+    """Make a COLMAP database of a reconstruction's cameras and images, and of their keypoints in the order of ids."""
     import pycolmap
 
     with pycolmap.Database.open(str(database)) as db:

@@ -1,0 +1,92 @@
+"""Which way is up in a map, from how its photographs were held."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from wheretolook.geometry import Float
+
+_ITERATIONS = 50
+_SOFT = np.sin(np.radians(0.5))  # residuals below count like this one, so that weights stay finite
+_LEAST_TURN = np.sin(np.radians(5.0))
+_CLEARLY = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class Gravity:
+    """The direction up, and how well the photographs agree on it.
+
+    Attributes:
+        up: (3,) unit vector in the frame of the poses.
+        method: "level" when up is the direction most nearly at right angles to the images' x axes; "mean" when the
+            cameras turned too little for that and it is the mean of the images' own; "given" when a direction in the
+            cameras was given.
+        residual_deg: (M,) how far each photograph is off: its roll for "level", else the angle between its up and `up`.
+    """
+
+    up: Float
+    method: Literal["level", "mean", "given"]
+    residual_deg: Float
+
+    @property
+    def rotation(self) -> Float:
+        """(3, 3), the least rotation that takes `up` to z."""
+        return rotation_to_z(self.up)
+
+
+def estimate_gravity(cam_from_world: ArrayLike, up_in_camera: tuple[float, float, float] | None = None) -> Gravity:
+    """Estimate the direction up from poses (M, 3, 4).
+
+    People tilt a camera up and down at will but hardly roll it: the images' x axes are level, so up is the direction d
+    of least sum |x . d|, which a minority of rolled photographs does not move. Iteratively reweighted least squares.
+
+    Args:
+        cam_from_world: poses of the photographs.
+        up_in_camera: up in every camera's frame, if it is known; any length.
+    """
+    rotation = np.asarray(cam_from_world, dtype=np.float64)[:, :, :3]
+    direction = np.array([0.0, -1.0, 0.0]) if up_in_camera is None else np.asarray(up_in_camera, dtype=np.float64)
+    ups = np.einsum("mji,j->mi", rotation, direction / np.linalg.norm(direction))
+    mean = _median_direction(ups)
+    if up_in_camera is None:
+        level = _level_direction(rotation[:, 0])
+        if level is not None:
+            up = level if level @ mean > 0 else -level
+            return Gravity(up, "level", np.degrees(np.arcsin(np.clip(np.abs(rotation[:, 0] @ up), 0, 1))))
+    residual_deg = np.degrees(np.arccos(np.clip(ups @ mean, -1, 1)))
+    return Gravity(mean, "mean" if up_in_camera is None else "given", residual_deg)
+
+
+def rotation_to_z(up: ArrayLike) -> Float:
+    """The least rotation (3, 3) that takes a direction (3,) to z; about x when it points down."""
+    a = np.asarray(up, dtype=np.float64)
+    x, y, z = a / np.linalg.norm(a)
+    if z < -1 + 1e-12:
+        return np.diag([1.0, -1.0, -1.0])
+    skew = np.array([[0.0, 0.0, -x], [0.0, 0.0, -y], [x, y, 0.0]])
+    rotation: Float = np.eye(3) + skew + skew @ skew / (1 + z)
+    return rotation
+
+
+def _level_direction(axes: Float) -> Float | None:
+    """The direction most nearly at right angles to unit axes (M, 3); None if they leave it open."""
+    weights = np.ones(len(axes))
+    for _ in range(_ITERATIONS):
+        values, vectors = np.linalg.eigh((axes.T * weights) @ axes / weights.sum())
+        weights = 1 / np.maximum(np.abs(axes @ vectors[:, 0]), _SOFT)
+    least, middle = np.sqrt(np.maximum(values[:2], 0))
+    return vectors[:, 0] if middle > _LEAST_TURN and middle > _CLEARLY * least else None
+
+
+def _median_direction(directions: Float) -> Float:
+    """The unit vector of least sum of angles to unit vectors (M, 3), about: Weiszfeld's iteration on the sphere."""
+    at: Float = directions.mean(0)
+    for _ in range(_ITERATIONS):
+        at = at / max(float(np.linalg.norm(at)), 1e-12)
+        weights = 1 / np.maximum(np.linalg.norm(directions - at, axis=1), _SOFT)
+        at = (directions * weights[:, None]).sum(0) / weights.sum()
+    return at / max(float(np.linalg.norm(at)), 1e-12)

@@ -1,0 +1,284 @@
+"""A map from photographs alone: mapped incrementally, turned upright, given a scale."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm.auto import tqdm
+
+from wheretolook.errors import ConfigError, MapError
+from wheretolook.geometry import Float
+from wheretolook.mapping.building import (
+    DATABASE_FILE,
+    LANDMARKS_FILE,
+    REPORT_FILE,
+    Clock,
+    partial_folder,
+    refuse_foreign_folder,
+    remove_inaccurate,
+)
+from wheretolook.mapping.cameras import CAMERAS_FILE, colmap_poses, save_mapping_poses
+from wheretolook.mapping.config import MapConfig
+from wheretolook.mapping.gravity import estimate_gravity
+from wheretolook.mapping.incremental import MappedPhotographs, map_incrementally, photograph_features
+from wheretolook.mapping.landmarks import load_colmap_landmarks
+from wheretolook.mapping.markers import Marker, MarkerView, detect_markers, marker_detector, place_marker
+from wheretolook.mapping.photograph_config import KnownDistance, ScaleConfig
+from wheretolook.mapping.photographs import photograph_cameras, read_photograph
+from wheretolook.mapping.processes import Processes
+from wheretolook.mapping.scale import (
+    MapScale,
+    read_marker_table,
+    read_positions,
+    scale_from_distance,
+    scale_from_markers,
+    scale_from_positions,
+)
+from wheretolook.mapping.similarity import Similarity
+from wheretolook.mapping.triangulation import color_points
+
+
+@dataclass(frozen=True)
+class PhotographMapReport:
+    """What came out of mapping photographs; `report.json`.
+
+    Attributes:
+        n_images: photographs in the folder.
+        n_registered: photographs the map could place.
+        unregistered: names of the others.
+        model_sizes: photographs in each model that did not connect with another; the first is the map.
+        n_keypoints: keypoints of all photographs.
+        n_landmarks: landmarks after the filter.
+        n_landmarks_removed: points the filter removed.
+        median_track_length: observations of a landmark.
+        mean_reprojection_error_px: mean over the landmarks.
+        cameras: COLMAP's intrinsics of the reduced photographs.
+        n_known_focal: how many of the cameras started from a focal length given or of EXIF data.
+        gravity: how up was found ("level", "mean", "given", or "positions"), and the residuals' median and maximum in
+            degrees.
+        scale: where the scale comes from, its factor and residuals; see `MapScale`.
+        seed: seed of COLMAP.
+        config: the configuration, as a dictionary.
+        seconds: wall-clock time of each step.
+    """
+
+    n_images: int
+    n_registered: int
+    unregistered: list[str]
+    model_sizes: list[int]
+    n_keypoints: int
+    n_landmarks: int
+    n_landmarks_removed: int
+    median_track_length: float
+    mean_reprojection_error_px: float
+    cameras: list[dict[str, Any]]
+    n_known_focal: int
+    gravity: dict[str, Any]
+    scale: MapScale
+    seed: int
+    config: dict[str, Any]
+    seconds: dict[str, float]
+
+
+def map_photographs(
+    config: MapConfig,
+    out_dir: str | Path = "map",
+    work: str | Path = "photographs",
+    seed: int = 0,
+    workers: int = 1,
+    device: str = "cpu",
+    progress: bool = True,
+) -> PhotographMapReport:
+    """Map the photographs in `config.photographs.images`.
+
+    The result is a COLMAP model with `landmarks.npz`, `cameras.npz` and `report.json` beside it, as `build_map` makes:
+    z up, and in metres if the report's scale has a source. Its folder appears when all is done. The origin is the mean
+    of the cameras' positions, the heading arbitrary, unless positions are given.
+
+    Args:
+        config: `photographs`, `extractor` and `keep_database` count.
+        out_dir: folder to make; an earlier map there is replaced.
+        work: folder where finished steps are kept, so that another run, for instance with another source of scale,
+            does not start over.
+        seed: of COLMAP's sampling.
+        workers: processes that extract and match, threads of COLMAP's bundle adjustment. The same seed gives the same
+            map with one worker; with more, COLMAP adds up large problems in another order each time.
+        device: where keypoints are extracted, "cpu" or a CUDA device.
+        progress: show progress bars.
+
+    Returns:
+        The content of `report.json`.
+
+    Raises:
+        MapError: the photographs are missing, unreadable or do not overlap; the scale asked for cannot be had from
+            them; or `out_dir` holds something that is not a map.
+        ConfigError: a table of markers or positions is damaged, or there is no such camera model or dictionary.
+    """
+    settings, out_dir, work, clock = config.photographs, Path(out_dir), Path(work), Clock()
+    if settings.images is None:
+        raise ConfigError("no folder of photographs was named", fix="Set map.photographs.images.")
+    refuse_foreign_folder(out_dir)
+    known = _KnownScale.read(settings.scale)  # a damaged table is told before the work
+    work.mkdir(parents=True, exist_ok=True)
+    with partial_folder(out_dir) as partial, Processes(workers) as processes:
+        with clock("extract"):
+            features = photograph_features(
+                settings.images, work, settings.max_side_px, config.extractor, processes, device, progress
+            )
+        with clock("map"):
+            cameras = photograph_cameras(settings.images, features.names, features.full_sizes, features.sizes, settings)
+            mapped = map_incrementally(
+                work, features, cameras, settings.exhaustive_up_to, settings.overlap, seed, processes, progress
+            )
+        model, names = mapped.model, _registered(mapped)
+        with clock("gravity"):
+            poses = np.stack([model.images[number].cam_from_world().matrix() for number in names])
+            gravity = estimate_gravity(poses, settings.up_in_camera)
+            residual_deg = {"median_deg": float(np.median(gravity.residual_deg)),
+                            "max_deg": float(gravity.residual_deg.max())}  # fmt: skip
+            centers = np.stack([model.images[number].projection_center() for number in names])
+            upright = Similarity(1.0, gravity.rotation, -gravity.rotation @ centers.mean(0))
+        with clock("scale"):
+            scale, to_world = _scale(mapped, settings.images, known, upright, features.full_sizes, progress)
+            to_world.transform_model(model)
+        with clock("filter_and_write"):
+            model.update_point_3d_errors()
+            n_removed = remove_inaccurate(
+                model, settings.max_reprojection_error_px, out_dir,
+                fix="Raise map.photographs.max_reprojection_error_px, or take sharper photographs.",
+            )  # fmt: skip
+            color_points(model, features.colors)
+            model.write_binary(str(partial))
+        with clock("landmarks"):
+            landmarks = load_colmap_landmarks(partial, mapped.database, settings.max_reprojection_error_px)
+            landmarks.save(partial / LANDMARKS_FILE)
+            save_mapping_poses(colmap_poses(partial), partial / CAMERAS_FILE)
+        if config.keep_database:
+            shutil.copyfile(mapped.database, partial / DATABASE_FILE)
+        registered = set(names.values())
+        report = PhotographMapReport(
+            n_images=len(features.names),
+            n_registered=len(registered),
+            unregistered=[name for name in features.names if name not in registered],
+            model_sizes=mapped.model_sizes,
+            n_keypoints=sum(len(pixels) for pixels, _ in features.stored),
+            n_landmarks=len(landmarks),
+            n_landmarks_removed=n_removed,
+            median_track_length=float(np.median(landmarks.track_length)),
+            mean_reprojection_error_px=float(landmarks.reprojection_error_px.mean()),
+            cameras=[_describe(camera) for _, camera in sorted(model.cameras.items())],
+            n_known_focal=cameras.n_known_focal,
+            gravity={"method": "positions" if known.positions else gravity.method, **residual_deg},
+            scale=scale,
+            seed=seed,
+            config=asdict(config),
+            seconds={**clock.seconds, "total": sum(clock.seconds.values())},
+        )
+        (partial / REPORT_FILE).write_text(json.dumps(asdict(report), indent=2, default=str) + "\n")
+    return report
+
+
+@dataclass(frozen=True, eq=False)
+class _KnownScale:
+    """What gives the scale, its tables read."""
+
+    config: ScaleConfig
+    sizes_m: Mapping[int, float] | float
+    positions: Mapping[str, Float]
+
+    @staticmethod
+    def read(config: ScaleConfig) -> _KnownScale:
+        if config.has_marker_sizes or (config.distance is not None and config.distance.marker_ids):
+            marker_detector(config.dictionary)  # says if there is no such dictionary
+        sizes = config.marker_size_m if config.marker_table is None else read_marker_table(config.marker_table)
+        return _KnownScale(config, sizes, {} if config.positions is None else read_positions(config.positions))
+
+
+def _scale(
+    mapped: MappedPhotographs, folder: Path, known: _KnownScale, upright: Similarity, full_sizes: Any, progress: bool
+) -> tuple[MapScale, Similarity]:
+    """The scale, and the similarity from COLMAP's frame to the world."""
+    model, names, config = mapped.model, _registered(mapped), known.config
+    centers = {name: model.images[number].projection_center() for number, name in names.items()}
+    if known.positions:
+        return scale_from_positions(centers, known.positions)
+    scale = MapScale()
+    if config.has_marker_sizes:
+        views = _marker_views(mapped, folder, config.dictionary, full_sizes, progress)
+        if not isinstance(known.sizes_m, float | int):
+            views = {marker: seen for marker, seen in views.items() if marker in known.sizes_m}
+        markers, unused = _place(views)
+        scale = scale_from_markers(markers, known.sizes_m, config.tolerance_percent, unused)
+    elif config.distance is not None:
+        wanted = config.distance.marker_ids
+        views = _marker_views(mapped, folder, config.dictionary, full_sizes, progress) if wanted else {}
+        ends = [_end(end, config.distance, centers, views, folder)
+                for end in (config.distance.first, config.distance.second)]  # fmt: skip
+        scale = scale_from_distance(ends[0], ends[1], config.distance.distance_m)
+    return scale, replace(upright, scale=scale.factor, translation=scale.factor * upright.translation)
+
+
+def _marker_views(
+    mapped: MappedPhotographs, folder: Path, dictionary: str, full_sizes: Any, progress: bool
+) -> dict[int, list[MarkerView]]:
+    """Where placed photographs see markers, by marker. Searched for at full size, told in the map's pixels."""
+    found: dict[int, list[MarkerView]] = {}
+    for number, name in tqdm(_registered(mapped).items(), "map: markers", disable=not progress, unit="image"):
+        image = mapped.model.images[number]
+        camera = mapped.model.cameras[image.camera_id]
+        reduction = np.array([camera.width, camera.height]) / full_sizes[number - 1]
+        rgb = read_photograph(folder / name)
+        for marker, corners in detect_markers(rgb, dictionary, folder / name).items():
+            view = MarkerView(name, camera, image.cam_from_world().matrix(), corners * reduction)
+            found.setdefault(marker, []).append(view)
+    return dict(sorted(found.items()))
+
+
+def _place(views: Mapping[int, list[MarkerView]]) -> tuple[list[Marker], dict[str, str]]:
+    """Markers placed, and why others could not be: a false detection in one photograph must not cost the map."""
+    markers, unused = [], {}
+    for marker, seen in views.items():
+        try:
+            markers.append(place_marker(marker, seen))
+        except MapError as error:
+            unused[f"marker {marker}"] = f"{error.problem}: {error.value}"
+    return markers, unused
+
+
+def _end(
+    end: str,
+    distance: KnownDistance,
+    centers: Mapping[str, Float],
+    views: Mapping[int, list[MarkerView]],
+    folder: Path,
+) -> Float:
+    """An end of a known distance, (3,) in COLMAP's frame."""
+    if end.startswith("marker:"):
+        number = int(end.removeprefix("marker:"))
+        if number not in views:
+            raise MapError(
+                f"no placed photograph sees marker {number}", path=folder, value=distance, fix="Name another."
+            )
+        return place_marker(number, views[number]).center
+    if end not in centers:
+        raise MapError(
+            "the map has no such photograph", path=folder, value=end,
+            fix="Name one that was placed, relative to its folder; markers are written marker:7.",
+        )  # fmt: skip
+    return centers[end]
+
+
+def _registered(mapped: MappedPhotographs) -> dict[int, str]:
+    """Names of the photographs with a pose, by id, in the order of ids."""
+    return {number: image.name for number, image in sorted(mapped.model.images.items()) if image.has_pose}
+
+
+def _describe(camera: Any) -> dict[str, Any]:
+    size = {"model": camera.model_name, "width": camera.width, "height": camera.height}
+    return {**size, "params": [float(value) for value in camera.params]}

@@ -1,0 +1,169 @@
+"""Photographs in a folder: their pixels, upright and reduced, and the cameras that took them."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wheretolook.camera_models import ColmapCamera
+from wheretolook.errors import ConfigError, MapError
+from wheretolook.mapping.colmap_model import quiet_colmap
+from wheretolook.mapping.photograph_config import PhotographsConfig
+
+if TYPE_CHECKING:
+    import pycolmap
+
+SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
+
+
+def list_photographs(folder: Path) -> list[str]:
+    """Names of the photographs in a folder and its folders, relative to it, sorted.
+
+    Raises:
+        MapError: there is no such folder, or it holds fewer than two photographs.
+    """
+    if not folder.is_dir():
+        raise MapError("there is no such folder", path=folder, fix="Give the folder of the photographs.")
+    files = (path for path in folder.rglob("*") if path.is_file() and path.suffix.lower() in SUFFIXES)
+    names = sorted(path.relative_to(folder).as_posix() for path in files)
+    if len(names) < 2:
+        raise MapError(
+            "a map needs at least two photographs", path=folder, value=len(names),
+            fix=f"Files that end in {', '.join(SUFFIXES)} count.",
+        )  # fmt: skip
+    return names
+
+
+def read_photograph(path: Path) -> NDArray[np.uint8]:
+    """Pixels (H, W, 3) uint8 RGB, turned upright as its EXIF orientation says.
+
+    Raises:
+        MapError: the file cannot be read.
+    """
+    import cv2
+
+    try:
+        bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    except cv2.error as error:
+        raise MapError(f"cannot read this photograph: {error.err}", path=path, fix="Remove it.") from error
+    if bgr is None:
+        raise MapError("cannot read this photograph", path=path, fix="Remove it, or copy it again.")
+    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+
+def reduce_photograph(rgb: NDArray[np.uint8], max_side_px: int) -> NDArray[np.uint8]:
+    """The photograph (H, W, 3) with at most `max_side_px` pixels along its longer side; 0 keeps its size."""
+    import cv2
+
+    height, width = rgb.shape[:2]
+    ratio = max_side_px / max(height, width)
+    if max_side_px == 0 or ratio >= 1:
+        return rgb
+    size = max(1, round(width * ratio)), max(1, round(height * ratio))
+    return np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+@dataclass(frozen=True, eq=False)
+class PhotographCameras:
+    """Intrinsics of photographs as the mapping starts from them.
+
+    Attributes:
+        cameras: `pycolmap.Camera`s of the reduced photographs, with ids from 1.
+        camera_of: (I,) int64, each photograph's row in `cameras`.
+        given: whether the intrinsics are to be kept as they are.
+    """
+
+    cameras: list[pycolmap.Camera]
+    camera_of: NDArray[np.int64]
+    given: bool
+
+    @property
+    def n_known_focal(self) -> int:
+        """Cameras whose focal length was given or is in the EXIF data."""
+        return sum(bool(camera.has_prior_focal_length) for camera in self.cameras)
+
+
+def photograph_cameras(
+    folder: Path, names: list[str], full_sizes: NDArray[np.int64], sizes: NDArray[np.int64], config: PhotographsConfig
+) -> PhotographCameras:
+    """Intrinsics of photographs, given or from their EXIF data.
+
+    Args:
+        folder: of the photographs.
+        names: of the I photographs.
+        full_sizes: (I, 2) width and height as taken, upright.
+        sizes: (I, 2) width and height as mapped.
+        config: the camera, and whether photographs share one.
+
+    Raises:
+        ConfigError: COLMAP has no such camera, or intrinsics are given for photographs of different sizes.
+    """
+    given = len(config.camera_params) > 0
+    if given and len(np.unique(full_sizes, axis=0)) > 1:
+        raise ConfigError(
+            "camera_params are for photographs of one size", path=folder, value=np.unique(full_sizes, axis=0).tolist(),
+            fix="Leave camera_params out, or map the photographs of each size apart.",
+        )  # fmt: skip
+    if given:
+        width, height = full_sizes[0].tolist()
+        ColmapCamera(config.camera_model, width, height, config.camera_params)  # says what does not fit
+    keys: dict[Any, int] = {}
+    cameras: list[pycolmap.Camera] = []
+    camera_of = []
+    for index, name in enumerate(names):
+        full, reduced = full_sizes[index].tolist(), sizes[index].tolist()
+        focal, is_known = (0.0, True) if given else _exif_focal(folder / name, config.camera_model)
+        shared = (str(Path(name).parent), *full, round(focal, 3)) if config.shared_camera else name
+        if shared not in keys:
+            keys[shared] = len(cameras)
+            cameras.append(_camera(len(cameras) + 1, full, reduced, focal, is_known, config))
+        camera_of.append(keys[shared])
+    return PhotographCameras(cameras, np.array(camera_of, dtype=np.int64), given)
+
+
+def photograph_pairs(n: int, exhaustive_up_to: int, overlap: int) -> NDArray[np.int64]:
+    """Pairs (P, 2) of n photographs to match, i < j.
+
+    All of few. Of many, each with the `overlap` that follow it and as many at distances that double, as COLMAP's
+    sequential matching does: that needs no vocabulary, but photographs in the order they were taken.
+    """
+    if n <= exhaustive_up_to:
+        return np.array(list(itertools.combinations(range(n), 2)), dtype=np.int64).reshape(-1, 2)
+    steps = sorted({*range(1, overlap + 1), *(2**power for power in range(overlap))})
+    return np.array([(i, i + step) for i in range(n) for step in steps if i + step < n], dtype=np.int64)
+
+
+def _camera(
+    camera_id: int, full: list[int], reduced: list[int], focal_px: float, is_known: bool, config: PhotographsConfig
+) -> pycolmap.Camera:
+    import pycolmap
+
+    if config.camera_params:
+        camera = pycolmap.Camera(
+            camera_id=camera_id, model=config.camera_model, width=full[0], height=full[1],
+            params=list(config.camera_params),
+        )  # fmt: skip
+    else:
+        camera = pycolmap.Camera.create_from_model_name(camera_id, config.camera_model, focal_px, *full)
+    camera.rescale(*reduced)
+    camera.has_prior_focal_length = is_known
+    return camera
+
+
+def _exif_focal(path: Path, camera_model: str) -> tuple[float, bool]:
+    """Focal length in pixels of the full photograph, and whether its EXIF data told it."""
+    import pycolmap
+
+    if camera_model not in pycolmap.CameraModelId.__members__ or camera_model == "INVALID":
+        raise ConfigError("COLMAP has no such camera model", value=camera_model, fix="For instance SIMPLE_RADIAL.")
+    try:
+        with quiet_colmap():
+            camera = pycolmap.infer_camera_from_image(path, pycolmap.ImageReaderOptions(camera_model=camera_model))
+    except (ValueError, RuntimeError) as error:
+        raise MapError(f"cannot read this photograph: {error}", path=path, fix="Remove it.") from error
+    return float(camera.mean_focal_length()), bool(camera.has_prior_focal_length)

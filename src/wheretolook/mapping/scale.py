@@ -1,0 +1,210 @@
+"""How many metres a unit of a map from photographs has: from markers, a known distance, or known positions."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from wheretolook.errors import ConfigError, MapError
+from wheretolook.geometry import Float
+from wheretolook.mapping.markers import Marker
+from wheretolook.mapping.similarity import Similarity, fit_similarity
+
+Source = Literal["markers", "distance", "positions", "unknown"]
+REPORT_FILE = "report.json"
+
+
+@dataclass(frozen=True)
+class MapScale:
+    """The scale of a map from photographs; `scale` in its `report.json`.
+
+    Attributes:
+        source: what the scale comes from; "unknown" if nothing said it, and the map is not in metres.
+        factor: metres of a unit of COLMAP's own frame; 1 if unknown.
+        residuals: how far each marker's side (in percent) or photograph's position (in metres) is off. Empty for a
+            single distance, which cannot contradict itself.
+        unit: of the residuals: "percent", "m", or "" where there are none.
+        unused: what was seen but could not be used, and why.
+    """
+
+    source: Source = "unknown"
+    factor: float = 1.0
+    residuals: dict[str, float] = field(default_factory=dict)
+    unit: Literal["percent", "m", ""] = ""
+    unused: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def is_metric(self) -> bool:
+        """Whether the map is in metres."""
+        return self.source != "unknown"
+
+    def describe(self) -> str:
+        """One clause for a log."""
+        if not self.is_metric:
+            return "scale UNKNOWN: no markers, distance or positions were given, so lengths are not in metres"
+        text = f"scale from {self.source}"
+        if self.residuals:
+            off = np.abs(list(self.residuals.values()))
+            text += f", off by {np.median(off):.3g} {self.unit} (median), {off.max():.3g} {self.unit} (most)"
+        return text + (f"; not used: {', '.join(self.unused)}" if self.unused else "")
+
+
+def scale_from_markers(
+    markers: Sequence[Marker],
+    size_m: Mapping[int, float] | float,
+    tolerance_percent: float = 5.0,
+    unused: Mapping[str, str] | None = None,
+) -> MapScale:
+    """The median, over the sides of all markers, of size over length.
+
+    Args:
+        markers: at least one, placed in the map.
+        size_m: side of every marker, or of each by its id.
+        tolerance_percent: how far a side may be off.
+        unused: markers that could not be placed, and why.
+
+    Raises:
+        MapError: there is no marker, or sides of one marker or of several do not agree.
+    """
+    if not markers:
+        reasons = "; ".join((unused or {}).values())
+        raise MapError(
+            "no marker gives the map its scale", value=reasons or "no marker of a known size was found",
+            fix="Check scale.dictionary and the sizes, and let at least two photographs see a marker whole.",
+        )  # fmt: skip
+    sizes = [size_m if isinstance(size_m, float | int) else size_m[marker.marker_id] for marker in markers]
+    lengths = np.stack([marker.sides for marker in markers])
+    factor = float(np.median(np.array(sizes)[:, None] / lengths))
+    off = 100 * (factor * lengths / np.array(sizes)[:, None] - 1)
+    residuals = {
+        f"marker {marker.marker_id} side {side}": float(off[row, side])
+        for row, marker in enumerate(markers)
+        for side in range(4)
+    }
+    if np.abs(off).max() > tolerance_percent:
+        worst = ", ".join(
+            f"marker {marker.marker_id}: {' '.join(f'{value:+.1f}' for value in row)} %"
+            for marker, row in zip(markers, off, strict=True)
+            if np.abs(row).max() > tolerance_percent
+        )
+        raise MapError(
+            f"the markers do not agree on a scale: sides off by more than {tolerance_percent:g} %", value=worst,
+            fix="Measure the black squares; give markers of different sizes in a marker_table.",
+        )  # fmt: skip
+    return MapScale("markers", factor, residuals, "percent", dict(unused or {}))
+
+
+def scale_from_distance(first: ArrayLike, second: ArrayLike, distance_m: float) -> MapScale:
+    """The scale that makes a distance between two points (3,) of the map that many metres.
+
+    Raises:
+        MapError: the points are in the same place.
+    """
+    length = float(np.linalg.norm(np.asarray(first) - np.asarray(second)))
+    if not length > 0:
+        raise MapError("the two ends of the known distance are in the same place", value=length, fix="Give others.")
+    return MapScale("distance", distance_m / length)
+
+
+def scale_from_positions(centers: Mapping[str, Float], positions: Mapping[str, Float]) -> tuple[MapScale, Similarity]:
+    """The scale, and the similarity that takes the map to the frame of known camera positions.
+
+    Args:
+        centers: where the map has the photographs, by name.
+        positions: where they were taken, metres, z up. Photographs that the map lacks are not used.
+
+    Raises:
+        MapError: fewer than three of them are in the map, or all are on a line.
+    """
+    names = [name for name in positions if name in centers]
+    source = np.array([centers[name] for name in names]).reshape(-1, 3)
+    target = np.array([positions[name] for name in names]).reshape(-1, 3)
+    similarity = fit_similarity(source, target)
+    off = np.linalg.norm(similarity.apply(source) - target, axis=1)
+    unused = {name: "not in the map" for name in positions if name not in centers}
+    residuals = dict(zip(names, off.tolist(), strict=True))
+    return MapScale("positions", similarity.scale, residuals, "m", unused), similarity
+
+
+def read_marker_table(path: Path) -> dict[int, float]:
+    """Side in metres of each marker by its id, from a CSV file with the columns `id` and `size_m`.
+
+    Raises:
+        ConfigError: the file is missing or not such a table, or a marker has two sizes.
+    """
+    sizes: dict[int, float] = {}
+    for row in _rows(path, ("id", "size_m")):
+        try:
+            marker, size = int(row["id"]), float(row["size_m"])
+        except ValueError as error:
+            raise ConfigError("not a marker's id and size", path=path, value=row, fix="Write 7,0.15.") from error
+        if not 0 < size < np.inf:
+            raise ConfigError("a marker's size must be positive", path=path, value=row)
+        if sizes.setdefault(marker, size) != size:
+            raise ConfigError(
+                f"marker {marker} has two sizes", path=path, value=(sizes[marker], size), fix="Leave one of them."
+            )
+    return sizes
+
+
+def read_positions(path: Path) -> dict[str, Float]:
+    """Positions (3,) in metres by photograph: CSV with columns `image`, `x`, `y`, `z`, or JSON `{image: [x, y, z]}`.
+
+    Raises:
+        ConfigError: the file is missing or not such a table, or a photograph has two positions.
+    """
+    if path.suffix.lower() == ".json":
+        try:
+            rows = list(json.loads(path.read_text()).items())
+        except (OSError, ValueError, AttributeError) as error:
+            raise ConfigError(f"not a file of positions: {error}", path=path, fix="{image: [x, y, z]}") from error
+    else:
+        rows = [(row["image"], [row["x"], row["y"], row["z"]]) for row in _rows(path, ("image", "x", "y", "z"))]
+    positions: dict[str, Float] = {}
+    for name, values in rows:
+        try:
+            at = np.array(values, dtype=np.float64)
+        except (TypeError, ValueError):
+            at = np.zeros(0)
+        if at.shape != (3,) or not np.isfinite(at).all():
+            raise ConfigError("not a position", path=path, value=(name, values), fix="Give x, y, z in metres.")
+        if not np.array_equal(positions.setdefault(name, at), at):
+            raise ConfigError("a photograph has two positions", path=path, value=name, fix="Leave one of them.")
+    return positions
+
+
+def read_scale(map_dir: Path) -> MapScale | None:
+    """The scale that a map's report tells; None for maps of known poses, which are in metres by construction.
+
+    Raises:
+        MapError: the report is damaged.
+    """
+    path = map_dir / REPORT_FILE
+    try:
+        scale = json.loads(path.read_text()).get("scale")
+        return None if scale is None else MapScale(**scale)
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, TypeError, AttributeError) as error:
+        raise MapError(f"the map's report is damaged: {error}", path=path, fix="Run the map stage again.") from error
+
+
+def _rows(path: Path, columns: tuple[str, ...]) -> list[dict[str, str]]:
+    try:
+        with path.open(newline="") as file:
+            reader = csv.DictReader(file, skipinitialspace=True)
+            rows = [{name: (row[name] or "").strip() for name in columns} for row in reader]
+    except (OSError, UnicodeDecodeError, KeyError, csv.Error) as error:
+        raise ConfigError(
+            f"not a table with the columns {', '.join(columns)}: {error}", path=path, fix="Write a CSV file with them."
+        ) from error
+    if not rows:
+        raise ConfigError("the table is empty", path=path, value=0, fix=f"Its columns are {', '.join(columns)}.")
+    return rows

@@ -1,0 +1,91 @@
+"""A textured room with markers of known size on its walls, and photographs taken in it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from mapping.conftest import box_room
+from wheretolook.geometry import Float, PinholeCamera, poses_looking_along
+from wheretolook.rendering import WarpRenderer
+from wheretolook.scenes.mesh import TexturedMesh
+
+CAMERA = PinholeCamera(480, 360, 330.0)
+DICTIONARY = "DICT_4X4_50"
+_BLACK, _MARGIN = 96, 16  # pixels of a marker's texture: its black square, and the white around it
+
+
+@dataclass(frozen=True)
+class WallMarker:
+    """A marker on a wall: the centre in metres, directions of its right and down, and the side of its black square."""
+
+    marker_id: int
+    center: tuple[float, float, float]
+    right: tuple[float, float, float] = (1.0, 0.0, 0.0)
+    size_m: float = 0.4
+
+    @property
+    def corners(self) -> Float:
+        """Corners (4, 3) of the black square, clockwise from the top left."""
+        across = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]) * self.size_m / 2
+        return np.array(self.center) + across[:, :1] * self.right + across[:, 1:] * [[0.0, 0.0, -1.0]]
+
+
+MARKERS = (
+    WallMarker(3, (1.6, 3.99, 1.5)),
+    WallMarker(7, (2.6, 3.99, 1.0)),
+    WallMarker(11, (3.4, 3.99, 1.7)),
+)
+"""On the wall y = 4 m, seen from inside the room."""
+
+
+def marker_room(markers: tuple[WallMarker, ...] = MARKERS, dictionary: str = DICTIONARY) -> TexturedMesh:
+    """`box_room` with markers, each on a white square. No texture repeats: a mapping would take places for one."""
+    room = box_room()
+    vertices, uvs, textures = [room.vertices], [room.corner_uvs / 2], list(room.textures)
+    for marker in markers:
+        center = np.array(marker.center)
+        vertices.append((center + (marker.corners - center) * (1 + 2 * _MARGIN / _BLACK)).astype(np.float32))
+        corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], dtype=np.float32)
+        uvs.append(corners[[[0, 3, 2], [0, 2, 1]]])  # the front faces the room
+        kind = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
+        black = cv2.aruco.generateImageMarker(kind, marker.marker_id, _BLACK)
+        textures.append(np.repeat(np.pad(black, _MARGIN, constant_values=255)[..., None], 3, axis=2))
+    first = len(room.vertices) + 4 * np.arange(len(markers))[:, None, None]
+    added = (first + np.array([[0, 3, 2], [0, 2, 1]])).reshape(-1, 3)
+    return TexturedMesh(
+        np.concatenate(vertices),
+        np.concatenate([room.triangles, added]).astype(np.int32),
+        np.concatenate(uvs),
+        np.concatenate([room.triangle_texture, np.repeat(len(room.textures) + np.arange(len(markers)), 2)]).astype(
+            np.int32
+        ),
+        tuple(textures),
+    )
+
+
+def hand_held_poses(n: int = 14, seed: int = 0) -> Float:
+    """Poses (n, 3, 4) of someone who walks along a room, looks about, and rolls the camera by a degree or so."""
+    rng = np.random.default_rng(seed)
+    along = np.linspace(0, 1, n)
+    positions = np.stack([1.2 + 2.6 * along, 1.3 + 0.4 * np.sin(7 * along), 1.4 + 0.2 * np.cos(9 * along)], axis=1)
+    yaw, pitch = np.radians(90 + 28 * np.sin(5 * along)), np.radians(rng.uniform(-8, 8, n))
+    axes = np.stack([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)], axis=1)
+    poses = poses_looking_along(positions, axes)
+    roll = np.radians(rng.normal(scale=1.0, size=n))
+    turn = np.zeros((n, 3, 3))
+    turn[:, 0, 0] = turn[:, 1, 1] = np.cos(roll)
+    turn[:, 0, 1], turn[:, 1, 0], turn[:, 2, 2] = -np.sin(roll), np.sin(roll), 1
+    return turn @ poses
+
+
+def take_photographs(mesh: TexturedMesh, poses: Float, folder: Path, camera: PinholeCamera = CAMERA) -> list[str]:
+    """Render photographs of poses (B, 3, 4) into a folder. Returns their names."""
+    folder.mkdir(parents=True, exist_ok=True)
+    names = [f"photo-{index:02d}.png" for index in range(len(poses))]
+    for name, rgb in zip(names, WarpRenderer(mesh).render(camera, poses).rgb, strict=True):
+        cv2.imwrite(str(folder / name), rgb[..., ::-1])
+    return names

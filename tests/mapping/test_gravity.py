@@ -1,0 +1,68 @@
+"""Up, from how cameras were held."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from wheretolook.geometry import poses_looking_along
+from wheretolook.mapping.gravity import estimate_gravity, rotation_to_z
+
+TURN = Rotation.from_euler("xyz", [40, -65, 110], degrees=True).as_matrix()
+"""From the world to the arbitrary frame of a mapping."""
+
+
+def looking(yaw_deg: np.ndarray, pitch_deg: np.ndarray, roll_deg: np.ndarray) -> np.ndarray:
+    yaw, pitch = np.radians(yaw_deg), np.radians(pitch_deg)
+    axes = np.stack([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)], axis=1)
+    poses = poses_looking_along(np.zeros((len(yaw), 3)), axes)
+    roll = Rotation.from_euler("z", np.asarray(roll_deg)[:, None], degrees=True).as_matrix()
+    poses[:, :, :3] = roll @ poses[:, :, :3] @ TURN.T
+    return poses
+
+
+def off_deg(up: np.ndarray) -> float:
+    return float(np.degrees(np.arccos(np.clip(up @ TURN[:, 2], -1, 1))))
+
+
+def test_level_cameras_give_up_exactly_whatever_their_pitch() -> None:
+    yaw = np.linspace(-60, 60, 9)
+    gravity = estimate_gravity(looking(yaw, np.full(9, -35.0), np.zeros(9)))
+    assert gravity.method == "level"
+    assert off_deg(gravity.up) < 1e-4
+    np.testing.assert_allclose(gravity.residual_deg, 0, atol=1e-4)
+    np.testing.assert_allclose(gravity.rotation @ gravity.up, (0, 0, 1), atol=1e-12)
+
+
+def test_rolled_photographs_do_not_move_it() -> None:
+    rng = np.random.default_rng(0)
+    yaw, roll = rng.uniform(0, 360, 20), rng.normal(scale=1.0, size=20)
+    roll[:5] = 90.0  # held upright, without saying so
+    gravity = estimate_gravity(looking(yaw, rng.uniform(-20, 20, 20), roll))
+    assert off_deg(gravity.up) < 1.0
+    assert np.median(gravity.residual_deg) < 2 and (gravity.residual_deg[:5] > 45).all()
+
+
+def test_cameras_that_do_not_turn_leave_it_to_their_mean() -> None:
+    gravity = estimate_gravity(looking(np.full(6, 30.0), np.array([-2.0, -1, 0, 0, 1, 2]), np.zeros(6)))
+    assert gravity.method == "mean"
+    assert off_deg(gravity.up) < 0.1
+    assert gravity.residual_deg.max() == pytest.approx(2, abs=0.1)
+
+
+def test_up_can_be_given_in_the_camera() -> None:
+    down = looking(np.linspace(0, 300, 7), np.full(7, -89.9), np.zeros(7))
+    gravity = estimate_gravity(down, up_in_camera=(0.0, 0.0, -2.0))
+    assert gravity.method == "given"
+    assert off_deg(gravity.up) < 0.2
+
+
+def test_rotation_to_z_is_the_least() -> None:
+    for direction in np.random.default_rng(1).normal(size=(20, 3)):
+        rotation = rotation_to_z(direction)
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+        np.testing.assert_allclose(rotation @ direction, (0, 0, np.linalg.norm(direction)), atol=1e-12)
+        angle = np.arccos(direction[2] / np.linalg.norm(direction))
+        assert np.trace(rotation) == pytest.approx(1 + 2 * np.cos(angle))
+    np.testing.assert_allclose(rotation_to_z((0, 0, -3)) @ (0, 0, -3), (0, 0, 3))

@@ -1,0 +1,237 @@
+"""A room with markers, mapped from its photographs alone and held against the truth; and the stages upon it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+
+from mapping.marker_rooms import CAMERA, MARKERS, hand_held_poses, marker_room, take_photographs
+from wheretolook import stages
+from wheretolook.cli import main
+from wheretolook.config import Experiment, ScenesConfig
+from wheretolook.dataset import Dataset
+from wheretolook.errors import ConfigError, MapError, SceneError
+from wheretolook.geometry import camera_centers
+from wheretolook.mapping import incremental
+from wheretolook.mapping.cameras import colmap_poses
+from wheretolook.mapping.config import MapConfig
+from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.mapping.photograph_config import KnownDistance, PhotographsConfig, ScaleConfig
+from wheretolook.mapping.photograph_map import map_photographs
+from wheretolook.mapping.similarity import fit_similarity
+from wheretolook.sampling import SampleConfig
+from wheretolook.scenes.mapped_space import MappedSpaceConfig
+from wheretolook.scoring import VisibleScorer
+from wheretolook.table import UNLABELLED, poses
+
+TRUTH = hand_held_poses()
+CENTERS = camera_centers(TRUTH)
+PARAMS = (CAMERA.focal_px, CAMERA.cx, CAMERA.cy)
+
+
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("photographs") / "room"
+    take_photographs(marker_room(), TRUTH, folder)
+    cv2.imwrite(str(folder / "photo-99.png"), np.random.default_rng(0).integers(0, 255, (360, 480, 3), dtype=np.uint8))
+    return folder
+
+
+def config_of(photographs: Path, **scale: object) -> MapConfig:
+    known = ScaleConfig(**scale)  # type: ignore[arg-type]
+    return MapConfig(
+        photographs=PhotographsConfig(photographs, camera_model="SIMPLE_PINHOLE", camera_params=PARAMS, scale=known)
+    )
+
+
+@pytest.fixture(scope="module")
+def mapped(photographs: Path, tmp_path_factory: pytest.TempPathFactory):
+    folder = tmp_path_factory.mktemp("mapped")
+    config = config_of(photographs, marker_size_m=MARKERS[0].size_m)
+    return folder, map_photographs(config, folder / "map", folder / "work", progress=False)
+
+
+@pytest.fixture
+def no_second_mapping(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fail where a finished step is done again."""
+
+    def again(*arguments: object, **named: object) -> None:
+        raise AssertionError("done again")
+
+    for name in ("_extract", "match_pairs", "_reconstruct"):
+        monkeypatch.setattr(incremental, name, again)
+
+
+def test_photographs_are_placed_at_their_true_scale_and_upright(mapped, photographs: Path) -> None:
+    folder, report = mapped
+    assert report.n_images == len(TRUTH) + 1 and report.n_registered == len(TRUTH)
+    assert report.unregistered == ["photo-99.png"] and report.model_sizes == [len(TRUTH)]
+    centers = camera_centers(colmap_poses(folder / "map"))
+    similarity = fit_similarity(centers, CENTERS)
+    assert similarity.scale == pytest.approx(1, abs=0.01)
+    assert np.degrees(np.arccos(similarity.rotation[2, 2])) < 2  # z of the map against true z
+    assert np.linalg.norm(similarity.apply(centers) - CENTERS, axis=1).max() < 0.02
+    np.testing.assert_allclose(centers.mean(0), 0, atol=1e-6)
+
+
+def test_residuals_tell_the_quality_of_scale_and_gravity(mapped) -> None:
+    _, report = mapped
+    assert report.scale.source == "markers" and report.scale.unit == "percent"
+    assert len(report.scale.residuals) == 4 * len(MARKERS)
+    assert max(map(abs, report.scale.residuals.values())) < 1
+    assert report.gravity["method"] == "level" and report.gravity["median_deg"] < 2
+
+
+def test_the_map_is_as_any_other(mapped) -> None:
+    folder, report = mapped
+    landmarks = Landmarks.load(folder / "map" / "landmarks.npz")
+    assert len(landmarks) == report.n_landmarks > 1000
+    assert landmarks.descriptors is not None and (landmarks.track_length >= 2).all()
+    model = pycolmap.Reconstruction(str(folder / "map"))
+    assert model.num_reg_images() == len(TRUTH) and model.num_points3D() == len(landmarks)
+    (camera,) = model.cameras.values()
+    assert tuple(camera.params) == PARAMS  # given, and kept
+    assert np.ptp([point.color for point in model.points3D.values()]) > 100
+    content = json.loads((folder / "map" / "report.json").read_text())
+    assert content["scale"]["source"] == "markers" and content["unregistered"] == ["photo-99.png"]
+    assert "images" in content["config"]["photographs"]
+
+
+@pytest.mark.usefixtures("no_second_mapping")
+def test_other_sources_of_scale_reuse_the_mapping(mapped, photographs: Path, tmp_path: Path) -> None:
+    folder, _ = mapped
+
+    def scaled(**scale: object):
+        return map_photographs(config_of(photographs, **scale), tmp_path / "map", folder / "work", progress=False)
+
+    apart = float(np.linalg.norm(CENTERS[0] - CENTERS[10]))
+    by_cameras = scaled(distance=KnownDistance("photo-00.png", "photo-10.png", apart))
+    assert by_cameras.scale.source == "distance" and by_cameras.scale.residuals == {}
+    assert fit_similarity(camera_centers(colmap_poses(tmp_path / "map")), CENTERS).scale == pytest.approx(1, abs=0.01)
+    apart = float(np.linalg.norm(np.subtract(MARKERS[0].center, MARKERS[2].center)))
+    by_markers = scaled(distance=KnownDistance("marker:3", "marker:11", apart))
+    assert by_markers.scale.factor == pytest.approx(by_cameras.scale.factor, rel=0.01)
+
+    table = tmp_path / "positions.csv"
+    rows = "".join(f"photo-{index:02d}.png,{x},{y},{z}\n" for index, (x, y, z) in enumerate(CENTERS.tolist()))
+    table.write_text("image,x,y,z\n" + rows)
+    by_positions = scaled(positions=table)
+    assert by_positions.scale.unit == "m" and max(by_positions.scale.residuals.values()) < 0.02
+    np.testing.assert_allclose(camera_centers(colmap_poses(tmp_path / "map")), CENTERS, atol=0.02)
+    assert by_positions.gravity["method"] == "positions"
+
+    unknown = scaled()
+    assert unknown.scale.source == "unknown" and not unknown.scale.is_metric
+    assert "UNKNOWN" in unknown.scale.describe()
+    with pytest.raises(MapError, match=r"no such photograph.*nowhere\.png"):
+        scaled(distance=KnownDistance("photo-00.png", "nowhere.png", 1.0))
+    with pytest.raises(MapError, match="marker 40"):
+        scaled(distance=KnownDistance("photo-00.png", "marker:40", 1.0))
+    with pytest.raises(MapError, match="no marker of a known size was found"):
+        scaled(marker_size_m=0.4, dictionary="DICT_APRILTAG_36H11")
+
+
+@pytest.mark.usefixtures("no_second_mapping")
+def test_mixed_sizes_are_refused_and_a_table_resolves_them(mapped, photographs: Path, tmp_path: Path) -> None:
+    folder, _ = mapped
+    table = tmp_path / "markers.csv"
+    table.write_text("id,size_m\n3,0.4\n7,0.4\n11,0.25\n")
+    config = config_of(photographs, marker_table=table)
+    with pytest.raises(MapError, match=r"do not agree.*marker 11"):
+        map_photographs(config, tmp_path / "map", folder / "work", progress=False)
+    table.write_text("id,size_m\n3,0.4\n11,0.4\n")
+    report = map_photographs(config, tmp_path / "map", folder / "work", progress=False)
+    assert len(report.scale.residuals) == 8 and report.scale.unused == {}
+
+
+def test_photographs_that_do_not_overlap_are_refused(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    for index in range(4):
+        blobs = cv2.GaussianBlur(rng.normal(size=(240, 320, 3)), (0, 0), 3)
+        cv2.imwrite(str(tmp_path / f"{index}.png"), np.clip(128 + 600 * blobs, 0, 255).astype(np.uint8))
+    with pytest.raises(MapError, match="do not overlap enough"):
+        map_photographs(MapConfig(photographs=PhotographsConfig(tmp_path)), tmp_path / "map", tmp_path / "work",
+                        progress=False)  # fmt: skip
+    assert not (tmp_path / "map").exists()
+
+
+def test_plain_walls_are_refused(tmp_path: Path) -> None:
+    for index in range(3):
+        cv2.imwrite(str(tmp_path / f"{index}.png"), np.full((60, 80, 3), 100 + index, np.uint8))
+    with pytest.raises(MapError, match="do not overlap enough"):
+        map_photographs(MapConfig(photographs=PhotographsConfig(tmp_path)), tmp_path / "map", tmp_path / "work",
+                        progress=False)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def experiment(mapped, photographs: Path, tmp_path_factory: pytest.TempPathFactory) -> Experiment:
+    """The map stage done, without a scale, from keypoints and matches found before."""
+    experiment = Experiment(
+        name="photos",
+        data=tmp_path_factory.mktemp("data"),
+        device="cpu",
+        map=config_of(photographs),
+        sample=SampleConfig(grid=(6, 4, 3), directions=60, keep=10),
+        scenes=ScenesConfig(mapped_space=MappedSpaceConfig(max_camera_distance_m=0.6)),
+    )
+    shutil.copytree(mapped[0] / "work", experiment.root / "room" / "photographs")
+    said: list[str] = []
+    stages.make_maps(experiment, said.append)
+    assert any("scale UNKNOWN" in line for line in said) and any("photo-99.png" in line for line in said)
+    return experiment
+
+
+def test_sampling_needs_metres(experiment: Experiment) -> None:
+    with pytest.raises(MapError, match=r"no scale, and this needs metres.*assume_metric"):
+        stages.sample(experiment)
+
+
+def test_a_scene_of_photographs_is_sampled_and_scored_but_not_labelled(experiment: Experiment) -> None:
+    scale = ScaleConfig(marker_size_m=MARKERS[0].size_m)
+    photographs = replace(experiment.map.photographs, scale=scale)
+    metric = replace(experiment, map=replace(experiment.map, photographs=photographs))
+    said: list[str] = []
+    stages.make_maps(metric, said.append)
+    assert any("scale from markers" in line for line in said)
+    dataset = stages.sample(metric, said.append)
+    assert any("occlusion by hidden-points" in line for line in said)
+    (scene,) = dataset.scenes
+    table = scene.read_table()
+    assert (
+        table["location_id"].nunique() > 5 and (table["n_visible"] > 0).all() and (table["status"] == UNLABELLED).all()
+    )
+    views = poses(table)
+    to_cameras = np.linalg.norm(camera_centers(views)[:, None] - camera_centers(scene.mapping_poses()), axis=2).min(1)
+    assert to_cameras.max() <= 0.6
+    localization_map = scene.localization_map(dataset.camera)
+    shares = VisibleScorer(localization_map).score(views)
+    np.testing.assert_allclose(shares * len(localization_map.landmarks), table["n_visible"], atol=2)
+    with pytest.raises(SceneError, match="photographs alone"):
+        stages.label(metric)
+    said.clear()
+    stages.make_maps(metric, said.append)
+    stages.sample(metric, said.append)
+    assert sum("reusing" in line for line in said) == 2
+
+
+def test_photographs_do_not_join_scenes_with_meshes(photographs: Path, tmp_path: Path) -> None:
+    experiment = Experiment(name="mixed", data=tmp_path, device="cpu", map=config_of(photographs))
+    scene = tmp_path / "mixed" / "apartment-000"
+    scene.mkdir(parents=True)
+    (scene / "mesh.glb").write_bytes(b"")
+    Dataset(tmp_path / "mixed", experiment.camera, (stages.SceneFolder(scene, "train"),)).save()
+    with pytest.raises(ConfigError, match="dataset of their own: --name"):
+        stages.make_maps(experiment)
+
+
+def test_the_command_line_names_bad_folders(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["map", "--data", str(tmp_path), "--images", str(tmp_path / "nothing")]) == 2
+    assert "nothing: there is no such folder" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,118 @@
+"""Photographs in folders: pixels, cameras, pairs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from wheretolook.errors import ConfigError, MapError
+from wheretolook.mapping.photograph_config import PhotographsConfig
+from wheretolook.mapping.photographs import (
+    list_photographs,
+    photograph_cameras,
+    photograph_pairs,
+    read_photograph,
+    reduce_photograph,
+)
+
+ORIENTATION, EXIF_IFD, FOCAL_35MM = 0x0112, 0x8769, 0xA405
+
+
+def save(path: Path, rgb: np.ndarray, orientation: int = 1, focal_mm: int = 0) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    exif = Image.Exif()
+    exif[ORIENTATION] = orientation
+    if focal_mm:
+        exif.get_ifd(EXIF_IFD)[FOCAL_35MM] = focal_mm
+    Image.fromarray(rgb).save(path, exif=exif, quality=95)
+
+
+def sized(height: int, width: int) -> np.ndarray:
+    return np.full((height, width, 3), 90, np.uint8)
+
+
+def cameras_of(folder: Path, config: PhotographsConfig, reduction: float = 1.0):
+    names = list_photographs(folder)
+    full = np.array([read_photograph(folder / name).shape[1::-1] for name in names])
+    return photograph_cameras(folder, names, full, (full * reduction).astype(np.int64), config)
+
+
+def test_photographs_are_listed_by_name(tmp_path: Path) -> None:
+    for name in ("b.JPG", "a.png", "hall/c.jpg"):
+        save(tmp_path / name, sized(20, 30))
+    (tmp_path / "notes.txt").write_text("not a photograph")
+    assert list_photographs(tmp_path) == ["a.png", "b.JPG", "hall/c.jpg"]
+
+
+def test_folders_without_photographs_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(MapError, match="no such folder"):
+        list_photographs(tmp_path / "nothing")
+    save(tmp_path / "one.jpg", sized(20, 30))
+    with pytest.raises(MapError, match=r"at least two photographs.*got 1"):
+        list_photographs(tmp_path)
+    (tmp_path / "two.jpg").write_bytes(b"\xff\xd8 truncated")
+    with pytest.raises(MapError, match=r"two\.jpg"):
+        read_photograph(tmp_path / "two.jpg")
+
+
+def test_photographs_are_turned_upright_and_reduced(tmp_path: Path) -> None:
+    rgb = sized(40, 60)
+    rgb[:, :20] = (250, 10, 10)  # red at the left
+    save(tmp_path / "turned.jpg", rgb, orientation=6)  # to be shown turned by 90 degrees clockwise
+    upright = read_photograph(tmp_path / "turned.jpg")
+    assert upright.shape == (60, 40, 3)
+    assert upright[5, 20, 0] > 200 > upright[50, 20, 0]
+    assert reduce_photograph(upright, 30).shape == (30, 20, 3)
+    assert reduce_photograph(upright, 0) is upright and reduce_photograph(upright, 60) is upright
+
+
+def test_exif_tells_the_focal_length_and_who_shares_a_camera(tmp_path: Path) -> None:
+    for name in ("a.jpg", "b.jpg"):
+        save(tmp_path / name, sized(240, 360), focal_mm=28)
+    save(tmp_path / "c.jpg", sized(240, 360), focal_mm=50)
+    save(tmp_path / "d.jpg", sized(240, 360))
+    save(tmp_path / "e.jpg", sized(240, 360), orientation=6, focal_mm=28)
+    found = cameras_of(tmp_path, PhotographsConfig(), reduction=0.5)
+    assert found.camera_of.tolist() == [0, 0, 1, 2, 3] and found.n_known_focal == 3 and not found.given
+    wide, tele, unknown, turned = found.cameras
+    assert (wide.width, wide.height, wide.model_name) == (180, 120, "SIMPLE_RADIAL")
+    assert tele.mean_focal_length() / wide.mean_focal_length() == pytest.approx(50 / 28, rel=0.01)
+    assert wide.mean_focal_length() == pytest.approx(28 / 36 * 180, rel=0.05)
+    assert unknown.mean_focal_length() == pytest.approx(1.2 * 180) and not unknown.has_prior_focal_length
+    assert (turned.width, turned.height) == (120, 180)
+    assert turned.mean_focal_length() == pytest.approx(wide.mean_focal_length())
+    apart = cameras_of(tmp_path, PhotographsConfig(shared_camera=False))
+    assert apart.camera_of.tolist() == [0, 1, 2, 3, 4]
+
+
+def test_intrinsics_can_be_given(tmp_path: Path) -> None:
+    for name in ("a.jpg", "b.jpg"):
+        save(tmp_path / name, sized(240, 360))
+    config = PhotographsConfig(camera_model="PINHOLE", camera_params=(300.0, 310.0, 181.0, 119.0))
+    found = cameras_of(tmp_path, config, reduction=0.5)
+    assert found.given and found.cameras[0].params.tolist() == [150.0, 155.0, 90.5, 59.5]
+    with pytest.raises(ConfigError, match="needs a positive size and the parameters"):
+        cameras_of(tmp_path, PhotographsConfig(camera_model="PINHOLE", camera_params=(300.0,)))
+    with pytest.raises(ConfigError, match="no such camera model"):
+        cameras_of(tmp_path, PhotographsConfig(camera_model="POLAROID"))
+    save(tmp_path / "c.jpg", sized(360, 240))
+    with pytest.raises(ConfigError, match="photographs of one size"):
+        cameras_of(tmp_path, config)
+
+
+def test_few_are_matched_all_with_all_and_many_in_turn() -> None:
+    assert photograph_pairs(4, 10, 2).tolist() == [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]]
+    pairs = photograph_pairs(100, 60, 10)
+    steps = pairs[:, 1] - pairs[:, 0]
+    assert set(steps.tolist()) == {*range(1, 11), 16, 32, 64}
+    assert len(np.unique(pairs, axis=0)) == len(pairs) < 100 * 13
+
+
+def test_settings_out_of_range_are_refused() -> None:
+    for settings in ({"max_side_px": -1}, {"overlap": 0}, {"up_in_camera": (0.0, 0.0, 0.0)},
+                     {"max_reprojection_error_px": 0.0}):  # fmt: skip
+        with pytest.raises(ConfigError):
+            PhotographsConfig(**settings)

@@ -26,14 +26,9 @@ from wheretolook.table import fingerprint, write_table
 if TYPE_CHECKING:
     import pandas as pd
 
-    from wheretolook.geometry import PinholeCamera
     from wheretolook.learning.training import TrainedModel
     from wheretolook.mapping.extraction import ExtractorConfig
     from wheretolook.planning import ViewpointMap
-    from wheretolook.scenes.free_space import FreeSpace
-    from wheretolook.scenes.mapped_space import MappedSpace
-    from wheretolook.visibility import OcclusionModel
-    from wheretolook.visibility.config import OcclusionConfig
 
 Say = Callable[[str], None]
 Tick = Callable[[float], None]
@@ -150,6 +145,7 @@ def sample(experiment: Experiment, say: Say = print, tick: Tick = lambda work: N
     from wheretolook.mapping.landmarks import Landmarks
     from wheretolook.photograph_scenes import is_photographed, occlusion_without_mesh, require_metres
     from wheretolook.sampling import free_locations, sample_viewpoints
+    from wheretolook.scene_space import space_and_occlusion
 
     dataset, device = _dataset(experiment, "map"), experiment.warp_device
     for scene in dataset.scenes:
@@ -166,7 +162,7 @@ def sample(experiment: Experiment, say: Say = print, tick: Tick = lambda work: N
         if not is_done(scene, "sample", key, scene.table, scene.occlusion):
             landmarks = Landmarks.load(scene.landmarks)
             with _naming(source):
-                space, occlusion = _space_and_occlusion(scene, dataset.camera, experiment, occlusion_config)
+                space, occlusion = space_and_occlusion(scene, dataset.camera, experiment, occlusion_config)
                 grid = VoxelGrid.over(space.bounds, experiment.sample.grid)
                 free = free_locations(grid, space)
                 # depth images that have not seen all of the scene may put free space behind surfaces
@@ -300,7 +296,9 @@ def viewpoint_map(experiment: Experiment, say: Say = print, tick: Tick = lambda 
         ConfigError: no such scene or method, or the method needs weights. WeightsError: the weights cannot be used.
         SceneError: there is no mesh, or no voxel is free. MapFormatError: something else is where the map belongs.
     """
+    from wheretolook.photograph_scenes import is_photographed, occlusion_without_mesh
     from wheretolook.planning.scene_map import scene_viewpoint_map
+    from wheretolook.scene_space import space_and_occlusion
 
     dataset, config = _dataset(experiment, "map"), experiment.viewpoint_map
     scenes = {scene.name: scene for scene in dataset.scenes}
@@ -310,11 +308,11 @@ def viewpoint_map(experiment: Experiment, say: Say = print, tick: Tick = lambda 
     built: dict[str, ViewpointMap] = {}
     for name in [config.scene] if config.scene else scenes:
         scene = scenes[name]
-        with _naming(scene.mesh):
-            found = scene_viewpoint_map(
-                scene, dataset.camera, config, experiment.occlusion, experiment.scenes.free_space,
-                experiment.warp_device,
-            )  # fmt: skip
+        photographed = is_photographed(scene)
+        hides = occlusion_without_mesh(experiment.occlusion) if photographed else experiment.occlusion
+        with _naming(scene.map if photographed else scene.mesh):
+            space, occlusion = space_and_occlusion(scene, dataset.camera, experiment, hides)
+            found = scene_viewpoint_map(scene, dataset.camera, config, space, occlusion, experiment.warp_device)
         folder = config.out or scene.folder / "viewpoint-map"
         found.save(folder)
         built[name] = found
@@ -375,24 +373,6 @@ def release(experiment: Experiment, say: Say = print, tick: Tick = lambda work: 
     say(f"the card -> {write_card(dataset)}")
     say(size_text(sizes(dataset.root)))
     return dataset
-
-
-def _space_and_occlusion(
-    scene: SceneFolder, camera: PinholeCamera, experiment: Experiment, occlusion: OcclusionConfig
-) -> tuple[FreeSpace | MappedSpace, OcclusionModel]:
-    """Free space of a scene, by its mesh or else its mapping cameras, and which landmarks its locations see."""
-    from wheretolook.photograph_scenes import is_photographed, mapped_space
-    from wheretolook.scene_occlusion import scene_occlusion
-    from wheretolook.scenes.free_space import FreeSpace
-    from wheretolook.scenes.loading import load_mesh
-
-    device = experiment.warp_device
-    if is_photographed(scene):
-        space = mapped_space(scene, experiment.scenes.mapped_space, experiment.map.photographs.assume_metric)
-        return space, scene_occlusion(scene, camera, occlusion, device)
-    mesh = load_mesh(scene.mesh)
-    free_space = FreeSpace(mesh, experiment.scenes.free_space, device)
-    return free_space, scene_occlusion(scene, camera, occlusion, device, mesh, free_space.two_sided)
 
 
 def _dataset(experiment: Experiment, needs: str) -> Dataset:

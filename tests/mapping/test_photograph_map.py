@@ -26,6 +26,7 @@ from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.mapping.photograph_config import KnownDistance, PhotographsConfig, ScaleConfig
 from wheretolook.mapping.photograph_map import map_photographs
 from wheretolook.mapping.similarity import fit_similarity
+from wheretolook.planning.config import ViewpointMapConfig
 from wheretolook.sampling import SampleConfig
 from wheretolook.scenes.mapped_space import MappedSpaceConfig
 from wheretolook.scoring import VisibleScorer
@@ -216,6 +217,11 @@ def test_a_scene_of_photographs_is_sampled_and_scored_but_not_labelled(experimen
     with pytest.raises(SceneError, match="photographs alone"):
         stages.label(metric)
     said.clear()
+    views_of_map = ViewpointMapConfig(grid=(6, 4, 3), directions=40, method="visible")
+    (found,) = stages.viewpoint_map(replace(metric, viewpoint_map=views_of_map), said.append).values()
+    assert found.origin.occlusion == "hidden-points" and set(found.voxel_of_row) <= set(table["location_id"])
+    best = found.best(camera_centers(views)[0])
+    assert best is not None and best.n_visible > 0
     stages.make_maps(metric, said.append)
     stages.sample(metric, said.append)
     assert sum("reusing" in line for line in said) == 2

@@ -11,42 +11,38 @@ from wheretolook.planning.config import ViewpointMapConfig
 from wheretolook.planning.map_building import build_viewpoint_map
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.sampling import free_locations
-from wheretolook.scene_occlusion import scene_occlusion
-from wheretolook.scenes.free_space import FreeSpace, FreeSpaceConfig
-from wheretolook.scenes.loading import load_mesh
+from wheretolook.scenes.free_space import FreeSpace
+from wheretolook.scenes.mapped_space import MappedSpace
 from wheretolook.scoring import Scorer, load_scorer, make_scorer
-from wheretolook.visibility.config import OcclusionConfig
+from wheretolook.visibility import OcclusionModel
 
 
 def scene_viewpoint_map(
     scene: SceneFolder,
     camera: PinholeCamera,
     config: ViewpointMapConfig,
-    occlusion: OcclusionConfig,
-    free_space: FreeSpaceConfig,
+    space: FreeSpace | MappedSpace,
+    occlusion: OcclusionModel,
     device: str = "cpu",
 ) -> ViewpointMap:
-    """Build the viewpoint map of a scene from its mesh and its map, with progress bars.
+    """Build the viewpoint map of a scene, with progress bars.
 
     Args:
         scene: its files.
         camera: that will look.
         config: voxels, directions and method.
+        space: where a camera can be.
         occlusion: which landmarks nothing stands in front of.
-        free_space: where a camera can be.
         device: where kernels run.
 
     Raises:
-        SceneError: the mesh is missing or cannot be used, or no voxel is free. MapError: there are no landmarks.
+        SceneError: no voxel is free. MapError: there are no landmarks.
         ConfigError: no such method, or it needs weights. WeightsError: the weights cannot be used.
     """
-    mesh = load_mesh(scene.mesh)
-    grid = VoxelGrid.over(mesh.bounds, config.grid)
-    space = FreeSpace(mesh, free_space, device)
+    grid = VoxelGrid.over(space.bounds, config.grid)
     free = free_locations(grid, space)
-    hides = scene_occlusion(scene, camera, occlusion, device, mesh, space.two_sided)
-    free = free[~hides.inside_geometry(grid.centers()[free])]  # as in the sample stage
-    one = LocalizationMap(Landmarks.load(scene.landmarks), camera, hides, device, scene.mapping_poses())
+    free = free[~occlusion.inside_geometry(grid.centers()[free])]  # as in the sample stage
+    one = LocalizationMap(Landmarks.load(scene.landmarks), camera, occlusion, device, scene.mapping_poses())
     directions = direction_lattice(config.directions, config.lattice)
     return build_viewpoint_map(
         _scorer(one, config), grid, free, directions, config.lattice, f"viewpoint map {scene.name}"

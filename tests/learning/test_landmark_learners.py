@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import json
+import weakref
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,7 +22,7 @@ from wheretolook.fisher import information
 from wheretolook.learning.config import MatchabilityConfig, SetConfig, TrainConfig
 from wheretolook.learning.data import training_scenes
 from wheretolook.learning.landmark_views import AttributeStatistics, LandmarkLoader, load_landmark_views
-from wheretolook.learning.matchability import Matchability
+from wheretolook.learning.matchability import LandmarkBatches, Matchability
 from wheretolook.learning.set import SetModel
 from wheretolook.learning.set_network import (
     EXPECTED,
@@ -215,6 +217,47 @@ def trained(dataset: Dataset, tracking: TrackingConfig) -> dict[str, Path]:
     models = train(dataset, FEW, tracking, progress=False)
     assert all(not model.reused for model in models)
     return {model.variant: model.path for model in models}
+
+
+@pytest.mark.parametrize("world_size", [2, 3])
+def test_processes_share_out_every_batch(dataset: Dataset, world_size: int) -> None:
+    views = load_landmark_views(dataset, training_scenes(dataset), TrainConfig(), 40, progress=False)
+    rows = torch.arange(101)  # the last batch has one view: some processes get none
+    whole = list(LandmarkLoader(views, rows, 20, width=8, shuffle_seed=3))
+    loaders = [LandmarkLoader(views, rows, 20, 8, 3, rank, world_size) for rank in range(world_size)]
+    for batch, shares in zip(whole, zip(*loaders, strict=True), strict=True):
+        assert {share.total for share in shares} == {len(batch.labels)}
+        assert torch.equal(torch.cat([share.inputs[2] for share in shares]), batch.inputs[2])
+        at = 0
+        for share in shares:
+            values, taken = share.inputs[:2]
+            for one, many in zip(values, taken, strict=True):
+                assert torch.equal(one[:many], batch.inputs[0][at][:many])
+                at += 1
+    found = torch.rand(1000) < 0.5
+    alone = [LandmarkBatches(views.values, found, torch.arange(1000), 300, 5)]
+    together = [LandmarkBatches(views.values, found, torch.arange(1000), 300, 5, rank, world_size)
+                for rank in range(world_size)]  # fmt: skip
+    for batch, shares in zip(alone[0], zip(*together, strict=True), strict=True):
+        assert torch.equal(torch.cat([share.labels for share in shares]), batch.labels)
+
+
+def test_a_batch_of_one_view_or_none_is_learnt_from() -> None:
+    network = SetNetwork(NO_STATISTICS, pooled=2).train()
+    for n in (0, 1):
+        taken = torch.full((n,), 3)
+        network(torch.randn(n, 3, len(ATTRIBUTES)), taken, taken, torch.zeros(n)).sum().backward()
+    assert all(torch.isfinite(parameter.grad).all() for parameter in network.parameters())
+
+
+def test_maps_of_expected_scorers_can_go(dataset: Dataset, trained: dict[str, Path]) -> None:
+    localization_map = dataset.split("test")[0].localization_map(CAMERA)
+    scorer = make_scorer("expected-inliers", localization_map, weights=trained["matchability"])
+    scorer.score(poses(dataset.split("test")[0].read_table())[:3])
+    gone = weakref.ref(localization_map)
+    del scorer, localization_map
+    gc.collect()
+    assert gone() is None
 
 
 def test_who_is_found_is_learnt(dataset: Dataset, trained: dict[str, Path]) -> None:

@@ -110,13 +110,7 @@ def load_views(
         MapError: a scene has no landmarks.
         ConfigError: the views do not fit into shared memory.
     """
-    tables: list[pd.DataFrame] = []
-    for scene in scenes:
-        table = scene.read_table()
-        table = table[table["status"] != UNLABELLED]
-        if table.empty:
-            raise TableError("no viewpoint has a label", path=scene.table, fix="Run the label stage.")
-        tables.append(table)
+    tables = [labelled_rows(scene) for scene in scenes]
     total, bins = sum(map(len, tables)), config.bins
     channels = ALL_CHANNELS if landmark_channels else CHANNELS
     n_bytes = total * bins**2 * (len(channels) * torch.float32.itemsize + torch.bool.itemsize)
@@ -146,6 +140,19 @@ def load_views(
         np.concatenate([table["location_id"].to_numpy(np.int64) for table in tables]),
         channels,
     )
+
+
+def labelled_rows(scene: SceneFolder, matches: bool = False) -> pd.DataFrame:
+    """The labelled viewpoints of a scene, on request with their matches; see `wheretolook.table.read_table`.
+
+    Raises:
+        TableError: there is no table, no labelled viewpoint, or the matches are asked for but not stored.
+    """
+    table = scene.read_table(matches)
+    table = table[table["status"] != UNLABELLED]
+    if table.empty:
+        raise TableError("no viewpoint has a label", path=scene.table, fix="Run the label stage.")
+    return table
 
 
 def _share(*tensors: Tensor) -> None:

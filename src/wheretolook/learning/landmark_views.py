@@ -10,16 +10,18 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
+from lightning.pytorch import LightningDataModule
 from numpy.typing import NDArray
 from torch import Tensor
 from tqdm.auto import tqdm
 
 from wheretolook.attributes import LandmarkDescriber, ViewLandmarks
 from wheretolook.dataset import Dataset, SceneFolder
-from wheretolook.errors import TableError
 from wheretolook.learning.config import TrainConfig
-from wheretolook.learning.data import Batch
-from wheretolook.table import LOCALIZED, UNLABELLED, is_good, poses
+from wheretolook.learning.data import Batch, has_room, labelled_rows, training_scenes, validation_views
+from wheretolook.learning.fit import home_device
+from wheretolook.learning.learner import Task
+from wheretolook.table import LOCALIZED, is_good, poses
 
 BLOCK = 2048
 """Views described at a time: some million landmarks."""
@@ -121,15 +123,12 @@ def load_landmark_views(
             for but not stored.
         MapError: a scene has no landmarks.
     """
-    tables = [(scene, scene.read_table(matches=matches)) for scene in scenes]
+    tables = [(scene, labelled_rows(scene, matches)) for scene in scenes]
     blocks: list[LandmarkViews] = []
     generator = torch.Generator().manual_seed(config.seed)
     total = sum(len(table) for _, table in tables)
     with tqdm(total=total, desc="describe views", unit="view", disable=not progress) as bar:
-        for number, (scene, whole) in enumerate(tables):
-            table = whole[whole["status"] != UNLABELLED]
-            if table.empty:
-                raise TableError("no viewpoint has a label", path=scene.table, fix="Run the label stage.")
+        for number, (scene, table) in enumerate(tables):
             describer = LandmarkDescriber(scene.localization_map(dataset.camera, device))
             cam_from_world, good = poses(table), is_good(table, config.max_error_m, config.max_error_deg)
             for begin in range(0, len(table), BLOCK):
@@ -196,39 +195,90 @@ def _joined(blocks: Sequence[LandmarkViews]) -> LandmarkViews:
 class LandmarkLoader:
     """Batches of views for `wheretolook.learning.set_network.SetNetwork`: a window of each view's landmarks.
 
+    With several processes, every one cuts the same batches and keeps its share of each; a share can be empty.
+
     Args:
         views: the views.
         rows: rows of `views` to go through, (n,).
-        batch_size: views a batch.
+        batch_size: views a batch, over all processes.
         width: landmarks a view at most.
         shuffle_seed: seed of order and windows; None goes through the views in order, from their first landmark.
+        rank: number of this process.
+        world_size: number of processes.
     """
 
     def __init__(
-        self, views: LandmarkViews, rows: Tensor, batch_size: int, width: int, shuffle_seed: int | None = None
+        self,
+        views: LandmarkViews,
+        rows: Tensor,
+        batch_size: int,
+        width: int,
+        shuffle_seed: int | None = None,
+        rank: int = 0,
+        world_size: int = 1,
     ) -> None:
         self.views, self.rows, self.batch_size, self.width = views, rows.to(views.labels.device), batch_size, width
-        self.shuffle_seed, self._pass = shuffle_seed, 0
+        self.shuffle_seed, self.rank, self.world_size, self._pass = shuffle_seed, rank, world_size, 0
 
     def __len__(self) -> int:
         return ceil(len(self.rows) / self.batch_size)
 
     def __iter__(self) -> Iterator[Batch]:
-        rows, device = self.rows, self.rows.device
+        views, rows, device = self.views, self.rows, self.rows.device
         generator = torch.Generator(device)
         if self.shuffle_seed is not None:
             generator.manual_seed(1_000_003 * self.shuffle_seed + self._pass)
             self._pass += 1  # another order every time
             rows = rows[torch.randperm(len(rows), generator=generator, device=device)]
         for part in rows.split(self.batch_size):
-            starts, lengths = self.views.starts[part], self.views.starts[part + 1] - self.views.starts[part]
-            taken = lengths.clamp(max=self.width)
             first = torch.zeros(len(part), device=device)
             if self.shuffle_seed is not None:  # landmarks lie in random order, so any window is a random sample
-                first = torch.rand(len(part), generator=generator, device=device) * lengths
-            place = (first.long()[:, None] + torch.arange(int(taken.max()), device=device)) % lengths.clamp(min=1)[
-                :, None
-            ]
-            entries = (starts[:, None] + place).clamp(max=len(self.views.values) - 1)
-            inputs = (self.views.values[entries].float(), taken, self.views.visible[part], self.views.axis_height[part])
-            yield Batch(inputs, self.views.labels[part], len(part))
+                first = torch.rand(len(part), generator=generator, device=device)
+            share, first = (whole.tensor_split(self.world_size)[self.rank] for whole in (part, first))
+            starts, lengths = views.starts[share], views.starts[share + 1] - views.starts[share]
+            taken = lengths.clamp(max=self.width)
+            steps = torch.arange(int(taken.max()) if len(taken) else 0, device=device)
+            place = ((first * lengths).long()[:, None] + steps) % lengths.clamp(min=1)[:, None]
+            entries = (starts[:, None] + place).clamp(max=len(views.values) - 1)
+            inputs = (views.values[entries].float(), taken, views.visible[share], views.axis_height[share])
+            yield Batch(inputs, views.labels[share], len(part))
+
+
+class LandmarkDataModule(LightningDataModule):
+    """What `LandmarkViews` of a dataset have in common for learning: their split, and where they are kept.
+
+    Args:
+        task: what to learn from.
+        most: landmarks kept of a view.
+        matches: whether to tell which landmarks were found.
+
+    Attributes:
+        views: of train and val scenes.
+        train_rows, val_rows: rows of `views`, (n,).
+        statistics: over the training views' landmarks.
+
+    Raises:
+        TableError: no train scene, no labels, or no stored matches where they are asked for.
+    """
+
+    def __init__(self, task: Task, most: int, matches: bool = False) -> None:
+        super().__init__()
+        self.config, dataset, device = task.config, task.dataset, home_device(task.config)
+        scenes = training_scenes(dataset)
+        self.views = load_landmark_views(dataset, scenes, self.config, most, device, task.progress, matches)
+        held_out = torch.from_numpy(validation_views(dataset, self.views.scene, self.views.location, self.config))
+        self.train_rows, self.val_rows = (torch.nonzero(side)[:, 0] for side in (~held_out, held_out))
+        of_train = (~held_out).repeat_interleave(self.views.starts.diff())
+        self.statistics = AttributeStatistics.of(self.views.values[of_train].float())
+
+    def setup(self, stage: str | None = None) -> None:
+        """Bring the views to the device that trains, if it has room for them."""
+        if self.trainer is not None:
+            device = self.trainer.strategy.root_device
+            if device != self.views.labels.device and has_room(device, self.views.n_bytes):
+                self.views = self.views.to(device)
+
+    @property
+    def share(self) -> tuple[int, int]:
+        """Number of this process, and number of all that train."""
+        return (0, 1) if self.trainer is None else (self.trainer.global_rank, self.trainer.world_size)

@@ -7,14 +7,12 @@ from math import ceil
 from typing import ClassVar
 
 import torch
-from lightning.pytorch import LightningDataModule
 from torch import Tensor, nn
 
 from wheretolook.learning.config import MATCHABILITY
-from wheretolook.learning.data import Batch, has_room, training_scenes, validation_views
-from wheretolook.learning.fit import home_device
+from wheretolook.learning.data import Batch
 from wheretolook.learning.landmark_model import LandmarkModel
-from wheretolook.learning.landmark_views import AttributeStatistics, load_landmark_views
+from wheretolook.learning.landmark_views import LandmarkDataModule
 from wheretolook.learning.learner import Learnt, Task, class_counts, fit_network, predict
 from wheretolook.learning.platt import fit_platt
 from wheretolook.learning.set_network import MatchabilityNetwork
@@ -34,21 +32,30 @@ class Matchability(LandmarkModel):
 
 
 class LandmarkBatches:
-    """Batches of landmarks in view, and whether each was found.
+    """Batches of landmarks in view, and whether each was found; several processes share out each batch.
 
     Args:
         values: (E, len(ATTRIBUTES)).
         found: (E,) bool.
         rows: which of them, (n,).
-        batch_size: landmarks a batch.
+        batch_size: landmarks a batch, over all processes.
         shuffle_seed: seed of their order; None goes through them in order.
+        rank: number of this process.
+        world_size: number of processes.
     """
 
     def __init__(
-        self, values: Tensor, found: Tensor, rows: Tensor, batch_size: int, shuffle_seed: int | None = None
+        self,
+        values: Tensor,
+        found: Tensor,
+        rows: Tensor,
+        batch_size: int,
+        shuffle_seed: int | None = None,
+        rank: int = 0,
+        world_size: int = 1,
     ) -> None:
         self.values, self.found, self.rows, self.batch_size = values, found, rows.to(values.device), batch_size
-        self.shuffle_seed, self._pass = shuffle_seed, 0
+        self.shuffle_seed, self.rank, self.world_size, self._pass = shuffle_seed, rank, world_size, 0
 
     def __len__(self) -> int:
         return ceil(len(self.rows) / self.batch_size)
@@ -60,47 +67,46 @@ class LandmarkBatches:
             self._pass += 1  # another order every time
             rows = rows[torch.randperm(len(rows), generator=generator, device=rows.device)]
         for part in rows.split(self.batch_size):
-            yield Batch((self.values[part].float(),), self.found[part].float(), len(part))
+            share = part.tensor_split(self.world_size)[self.rank]
+            yield Batch((self.values[share].float(),), self.found[share].float(), len(part))
 
 
-class MatchabilityData(LightningDataModule):
+class MatchabilityData(LandmarkDataModule):
     """Landmarks in view of a dataset's labelled viewpoints, whose matches are stored.
 
     Args:
         task: what to learn from.
-
-    Attributes:
-        train, val: batches.
-        statistics: over the training landmarks.
 
     Raises:
         TableError: no train scene, no labels, or no stored matches.
     """
 
     def __init__(self, task: Task) -> None:
-        super().__init__()
-        config, dataset, device = task.config, task.dataset, home_device(task.config)
-        most = config.matchability.landmarks
-        views = load_landmark_views(
-            dataset, training_scenes(dataset), config, most, device, task.progress, matches=True
-        )
-        held_out = torch.from_numpy(validation_views(dataset, views.scene, views.location, config))
-        views = views.to(device) if has_room(device, views.n_bytes) else views
-        assert views.found is not None
-        sides = held_out.repeat_interleave(views.starts.cpu().diff())
-        rows = [torch.nonzero(side)[:, 0] for side in (~sides, sides)]
-        self.statistics = AttributeStatistics.of(views.values[rows[0].to(views.values.device)].float())
-        batch = config.batch_size * most
-        self.train = LandmarkBatches(views.values, views.found, rows[0], batch, config.seed)
-        self.val = LandmarkBatches(views.values, views.found, rows[1], 8 * batch)
+        super().__init__(task, task.config.matchability.landmarks, matches=True)
+
+    @property
+    def found(self) -> Tensor:
+        """Whether the localizer found each entry's landmark, (E,) bool."""
+        assert self.views.found is not None
+        return self.views.found
+
+    def entries(self, rows: Tensor) -> Tensor:
+        """Entries (n,) of the landmarks of some views."""
+        chosen = torch.zeros(len(self.views), dtype=torch.bool)
+        chosen[rows] = True
+        return torch.nonzero(chosen.repeat_interleave(self.views.starts.cpu().diff()))[:, 0]
 
     def train_dataloader(self) -> LandmarkBatches:
         """Shuffled landmarks of the training views."""
-        return self.train
+        return self._loader(self.train_rows, 1, self.config.seed)
 
     def val_dataloader(self) -> LandmarkBatches:
         """Landmarks of the validation views, in order."""
-        return self.val
+        return self._loader(self.val_rows, 8)
+
+    def _loader(self, rows: Tensor, batches: int, shuffle_seed: int | None = None) -> LandmarkBatches:
+        size = batches * self.config.batch_size * self.config.matchability.landmarks
+        return LandmarkBatches(self.views.values, self.found, self.entries(rows), size, shuffle_seed, *self.share)
 
 
 def learn_matchability(task: Task) -> Learnt:
@@ -114,5 +120,5 @@ def learn_matchability(task: Task) -> Learnt:
     network = MatchabilityNetwork(data.statistics, options.width, options.hidden)
     metrics, history = fit_network(network, data, task)
     logits, found = predict(network, data)
-    counts = class_counts(train=data.train.found[data.train.rows].cpu().numpy(), val=found)
+    counts = class_counts(train=data.found.cpu()[data.entries(data.train_rows)].numpy(), val=found)
     return Learnt(Matchability(network, task.dataset.camera, *fit_platt(logits, found)), metrics, counts, history)

@@ -5,15 +5,13 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 import torch
-from lightning.pytorch import LightningDataModule
 from torch import Tensor, nn
 
 from wheretolook.attributes import ViewLandmarks
 from wheretolook.learning.config import MATCHABILITY, SET, weights_name
-from wheretolook.learning.data import check_classes, has_room, training_scenes, validation_views
-from wheretolook.learning.fit import home_device
+from wheretolook.learning.data import check_classes
 from wheretolook.learning.landmark_model import LandmarkModel
-from wheretolook.learning.landmark_views import AttributeStatistics, LandmarkLoader, load_landmark_views
+from wheretolook.learning.landmark_views import LandmarkDataModule, LandmarkLoader
 from wheretolook.learning.learner import Learnt, Task, class_counts, fit_network, predict
 from wheretolook.learning.matchability import Matchability
 from wheretolook.learning.platt import fit_platt
@@ -33,44 +31,32 @@ class SetModel(LandmarkModel):
             return self.scale * logits.double() + self.offset
 
 
-class SetData(LightningDataModule):
+class SetData(LandmarkDataModule):
     """The labelled viewpoints of a dataset, by the landmarks they see.
 
     Args:
         task: what to learn from.
-
-    Attributes:
-        views: of train and val scenes.
-        train_rows, val_rows: rows of `views`, (n,).
-        statistics: over the training views' landmarks.
 
     Raises:
         TableError: no train scene, no labels, or labels of one class only.
     """
 
     def __init__(self, task: Task) -> None:
-        super().__init__()
-        self.config, dataset, device = task.config, task.dataset, home_device(task.config)
-        most = MOST_OF_WINDOW * self.config.set.landmarks
-        views = load_landmark_views(dataset, training_scenes(dataset), self.config, most, device, task.progress)
-        held_out = torch.from_numpy(validation_views(dataset, views.scene, views.location, self.config))
-        self.train_rows, self.val_rows = (torch.nonzero(side)[:, 0] for side in (~held_out, held_out))
+        super().__init__(task, MOST_OF_WINDOW * task.config.set.landmarks)
         for name, rows in (("training", self.train_rows), ("validation", self.val_rows)):
-            check_classes(name, views.labels[rows].numpy() > 0, dataset, self.config)
-        of_train = (~held_out).repeat_interleave(views.starts.diff())
-        self.statistics = AttributeStatistics.of(views.values[of_train].float())
-        self.views = views.to(device) if has_room(device, views.n_bytes) else views
+            check_classes(name, self.views.labels[rows].numpy() > 0, task.dataset, self.config)
 
     def train_dataloader(self) -> LandmarkLoader:
         """Shuffled views, another sample of each one's landmarks every time."""
-        options = self.config
-        return LandmarkLoader(self.views, self.train_rows, options.batch_size, options.set.landmarks, options.seed)
+        return self._loader(self.train_rows, 1, self.config.seed)
 
     def val_dataloader(self) -> LandmarkLoader:
         """Views in order, with the same landmarks every time."""
-        return LandmarkLoader(
-            self.views, self.val_rows, self.config.batch_size, MOST_OF_WINDOW * self.config.set.landmarks
-        )
+        return self._loader(self.val_rows, MOST_OF_WINDOW)
+
+    def _loader(self, rows: Tensor, windows: int, shuffle_seed: int | None = None) -> LandmarkLoader:
+        width = windows * self.config.set.landmarks
+        return LandmarkLoader(self.views, rows, self.config.batch_size, width, shuffle_seed, *self.share)
 
 
 MOST_OF_WINDOW = 2

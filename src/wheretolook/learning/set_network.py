@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import batch_norm
 
 from wheretolook.attributes import ATTRIBUTES, POSE_ATTRIBUTES, ViewLandmarks
 from wheretolook.learning.landmark_views import AttributeStatistics
@@ -174,8 +175,13 @@ class SetNetwork(nn.Module):
         features = [expected_statistics(sums[:, :N_EXPECTED], visible), axis_height[:, None]]
         if self.attention is not None:
             features.append(sums[:, N_EXPECTED + 1 :] / (sums[:, N_EXPECTED : N_EXPECTED + 1] + 1e-6))
-        features = self.standard(torch.cat(features, 1))
-        return (self.linear(features) + self.decide(features)).squeeze(-1)
+        joined = torch.cat(features, 1)
+        if self.training and len(joined) < 2:  # one view has no spread of its own; a process's share may be empty
+            standard = self.standard
+            joined = batch_norm(joined, standard.running_mean, standard.running_var, standard.weight, standard.bias)
+        else:
+            joined = self.standard(joined)
+        return (self.linear(joined) + self.decide(joined)).squeeze(-1)
 
 
 N_EXPECTED = 1 + 15 + 5

@@ -16,13 +16,13 @@ from torch.nn.utils.rnn import pad_sequence
 from tqdm.auto import tqdm
 
 from wheretolook.dataset import Dataset, SceneFolder
-from wheretolook.errors import MapError, TableError
+from wheretolook.errors import MapError
 from wheretolook.geometry import Float, split_poses
 from wheretolook.learning.config import SphereConfig, TrainConfig
-from wheretolook.learning.data import Batch, has_room
+from wheretolook.learning.data import Batch, has_room, labelled_rows
 from wheretolook.localization_map import LocalizationMap, shared_locations
 from wheretolook.mapping.cameras import CAMERAS_FILE
-from wheretolook.table import UNLABELLED, is_good, poses
+from wheretolook.table import is_good, poses
 
 FEATURES = (
     *(f"offset_{axis}" for axis in "xyz"), *(f"towards_{axis}" for axis in "xyz"), *(f"looks_{axis}" for axis in "xyz"),
@@ -148,13 +148,7 @@ def load_sphere_views(
         TableError: a scene has no table or no labelled viewpoint, or its occlusion does not fit.
         MapError: a scene has no landmarks, or its mapping cameras are not known.
     """
-    tables = []
-    for scene in scenes:
-        table = scene.read_table()
-        table = table[table["status"] != UNLABELLED]
-        if table.empty:
-            raise TableError("no viewpoint has a label", path=scene.table, fix="Run the label stage.")
-        tables.append(table)
+    tables = [labelled_rows(scene) for scene in scenes]
     tokens: list[Tensor] = []
     rows: list[NDArray[np.int64]] = []
     axes: list[Float] = []

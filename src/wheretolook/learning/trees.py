@@ -15,15 +15,15 @@ from tqdm.auto import tqdm
 
 from wheretolook.attributes import POOLED, LandmarkDescriber, pool
 from wheretolook.dataset import Dataset, SceneFolder
-from wheretolook.errors import ConfigError, TableError, WeightsError
+from wheretolook.errors import ConfigError, WeightsError
 from wheretolook.geometry import PinholeCamera
 from wheretolook.learning.config import TREES, TreesConfig
-from wheretolook.learning.data import check_classes, training_scenes, validation_views
+from wheretolook.learning.data import check_classes, labelled_rows, training_scenes, validation_views
 from wheretolook.learning.fit import home_device
 from wheretolook.learning.learner import Learnt, Task, class_counts
 from wheretolook.learning.platt import fit_platt
 from wheretolook.learning.weights import check_kind, read_weights, write_weights
-from wheretolook.table import UNLABELLED, is_good, poses
+from wheretolook.table import is_good, poses
 
 BLOCK = 4096
 """Views described at a time: some million landmarks."""
@@ -192,14 +192,11 @@ def load_pooled(
     values: list[NDArray[np.float32]] = []
     labels: list[NDArray[np.bool_]] = []
     location: list[NDArray[np.int64]] = []
-    tables = [(scene, scene.read_table()) for scene in scenes]
+    tables = [(scene, labelled_rows(scene)) for scene in scenes]
     with tqdm(
         total=sum(len(table) for _, table in tables), desc="pool views", unit="view", disable=not progress
     ) as bar:
-        for scene, whole in tables:
-            table = whole[whole["status"] != UNLABELLED]
-            if table.empty:
-                raise TableError("no viewpoint has a label", path=scene.table, fix="Run the label stage.")
+        for scene, table in tables:
             describer = LandmarkDescriber(scene.localization_map(dataset.camera, device))
             cam_from_world = poses(table)
             for begin in range(0, len(table), BLOCK):

@@ -12,7 +12,9 @@ from tqdm.auto import tqdm
 
 from wheretolook.errors import ConfigError, PlanningError
 from wheretolook.geometry import Float
+from wheretolook.grid import axes_of_angles
 from wheretolook.planning.sequences import TurnLimit, best_sequence
+from wheretolook.planning.turns import check_axis
 from wheretolook.planning.viewpoint_map import ViewpointMap
 
 TABLE_STEP_DEG = 2.0
@@ -135,7 +137,7 @@ def plan_path(
     Raises:
         PlanningError: the start or the goal is not free or lies outside the bounds; they are the same; the axis is
             beyond the camera's limits; or no path was found in time.
-        ValueError: a point is not finite.
+        ValueError: a point is not finite, or the axis has no direction.
     """
     ends = np.asarray([start, goal], dtype=np.float64)
     low, high = np.asarray(bounds, dtype=np.float64)
@@ -159,7 +161,9 @@ def plan_path(
         found = []
         try:
             route = shortest.solve([(0.0, 0.0)], SHORTEST_SHARE * config.time_s, bar)
-            found.append(problem.best_views(route, None if start_axis is None else _axes(*np.array(orientations).T)[0]))
+            found.append(
+                problem.best_views(route, None if start_axis is None else axes_of_angles(np.degrees(orientations[0])))
+            )
         except PlanningError:
             pass  # it may be found yet
         try:
@@ -190,7 +194,7 @@ class _Problem:
         if axis is None:
             middle = (self.pitch[0] + self.pitch[1]) / 2
             return [(2 * math.pi * k / STARTS - math.pi, middle) for k in range(STARTS)]
-        x, y, z = np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis)
+        x, y, z = check_axis(axis)
         yaw, pitch = math.atan2(y, x), math.asin(z)
         if not self.pitch[0] - 1e-6 <= pitch <= self.pitch[1] + 1e-6:
             raise PlanningError(
@@ -316,8 +320,8 @@ class _Problem:
         positions = _between(corners, states[:, :3], along)
         if self.map is None:
             return PlannedPath(positions, _forward(positions), np.full(len(positions), np.nan), float(corners[-1]))
-        yaw, pitch = np.unwrap(states[:, 3]), states[:, 4]
-        planned = self._costed(positions, _axes(np.interp(along, corners, yaw), np.interp(along, corners, pitch)))
+        angles = np.column_stack([np.unwrap(states[:, 3]), states[:, 4]])
+        planned = self._costed(positions, axes_of_angles(np.degrees(_between(corners, angles, along))))
         turned = self.best_views(states, planned.axes[0])
         return planned if turned is None or planned.cost <= turned.cost else turned
 
@@ -351,7 +355,8 @@ class _Problem:
         """The best axes (W, 3) at places (W, 3) a step apart, that a camera can turn to one after the other."""
         assert self.map is not None
         limit = TurnLimit.of(self.map.directions, self.config.max_turn_deg_per_m * step)
-        inside = np.abs(limit.directions[:, 2] - np.mean(np.sin(self.pitch))) <= np.ptp(np.sin(self.pitch)) / 2
+        low, high = np.sin(self.pitch)
+        inside = (limit.directions[:, 2] >= low) & (limit.directions[:, 2] <= high)
         rows = self.map.rows(positions)
         scores = np.where((rows >= 0)[:, None], self.map.scores[rows], 0.0)
         try:
@@ -374,11 +379,6 @@ class _Problem:
 def _between(knots: Float, values: Float, at: Float) -> Float:
     """Values (S, C) at knots (S,), linearly between them."""
     return np.column_stack([np.interp(at, knots, column) for column in values.T])
-
-
-def _axes(yaw: Float, pitch: Float) -> Float:
-    """Unit axes (W, 3) by yaw and pitch (W,), radians."""
-    return np.stack([np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)], axis=1)
 
 
 def _turning(knots: Float, axes: Float, at: Float) -> Float:
@@ -434,8 +434,7 @@ def _angle(a: tuple[float, ...], b: tuple[float, ...]) -> float:
 
 def _nearest_directions(directions: Float) -> NDArray[np.int64]:
     """The direction nearest to the middle of every cell of pitch (rows) and yaw (columns)."""
-    pitch = np.radians(np.arange(-90 + TABLE_STEP_DEG / 2, 90, TABLE_STEP_DEG))
-    yaw = np.radians(np.arange(-180 + TABLE_STEP_DEG / 2, 180, TABLE_STEP_DEG))
-    up, around = np.meshgrid(pitch, yaw, indexing="ij")
-    axes = np.stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)], axis=-1)
+    pitch = np.arange(-90 + TABLE_STEP_DEG / 2, 90, TABLE_STEP_DEG)
+    yaw = np.arange(-180 + TABLE_STEP_DEG / 2, 180, TABLE_STEP_DEG)
+    axes = axes_of_angles(np.stack(np.meshgrid(yaw, pitch), axis=-1))
     return np.asarray((axes @ directions.T).argmax(-1))

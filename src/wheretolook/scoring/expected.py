@@ -39,8 +39,8 @@ class Expectation:
 
     def __init__(self, localization_map: LocalizationMap, matchability: Matchability) -> None:
         check_field_of_view(matchability.camera, localization_map.camera)
+        # not the map itself: who is its only owner could never go
         self.matchability, self.camera = matchability, localization_map.camera
-        self._describer = LandmarkDescriber(localization_map)
         self._poses: Float = np.empty((0, 3, 4))
         self._sums: Float = np.empty((0, 17))
 
@@ -57,14 +57,21 @@ class Expectation:
                 known[str(weights)] = cls(localization_map, Matchability.load(weights, localization_map.device))
         return known[str(weights)]
 
-    def sums(self, cam_from_world: Float) -> Float:
-        """Of poses (B, 3, 4), (B, 17): landmarks expected to be found; their information on the pose, 15 numbers (see
-        `wheretolook.fisher.information`, in the camera's axes); bins expected to hold one that is found.
+    def sums(self, describer: LandmarkDescriber, cam_from_world: Float) -> Float:
+        """What views can be expected to find.
+
+        Args:
+            describer: of the map.
+            cam_from_world: (B, 3, 4).
+
+        Returns:
+            (B, 17): landmarks expected to be found; their information on the pose, 15 numbers (see
+            `wheretolook.fisher.information`, in the camera's axes); bins expected to hold one that is found.
         """
         cam_from_world = check_poses(cam_from_world)
         if not np.array_equal(cam_from_world, self._poses):  # several methods ask for the same block of views
             sums = np.empty((len(cam_from_world), 17))
-            for rows, described, _ in self._describer.in_blocks(cam_from_world):
+            for rows, described, _ in describer.in_blocks(cam_from_world):
                 log_odds = self.matchability.log_odds(described.values)
                 parts = expected_parts(described.values, log_odds)[:, :16].double()
                 sums[rows, :16] = torch.segment_reduce(parts, "sum", lengths=described.counts, initial=0.0).cpu()
@@ -103,10 +110,11 @@ class ExpectedScorer(Scorer):
         self.inputs = kind
         self.local = kind == FILLED  # the share of the map's landmarks falls with every landmark that is added
         self._expectation = Expectation.of_map(localization_map, weights)
+        self._describer = LandmarkDescriber(localization_map)
 
     def score(self, cam_from_world: Float) -> Float:
         """(B,) in [0, 1]."""
-        sums = self._expectation.sums(cam_from_world)
+        sums = self._expectation.sums(self._describer, cam_from_world)
         if self.inputs == FILLED:
             return sums[:, 16] / BINS**2
         return sums[:, 0] / max(1, len(self.localization_map.landmarks))
@@ -134,8 +142,9 @@ class ExpectedFisherScorer(Scorer):
             raise ConfigError("unknown metric of information", value=metric, fix=f"There are {', '.join(METRICS)}.")
         self.metric, self.inputs = metric, f"{metric} expected"
         self._expectation = Expectation.of_map(localization_map, weights)
+        self._describer = LandmarkDescriber(localization_map)
 
     def score(self, cam_from_world: Float) -> Float:
         """(B,), not bounded by 1."""
-        numbers = self._expectation.sums(cam_from_world)[:, 1:16]
+        numbers = self._expectation.sums(self._describer, cam_from_world)[:, 1:16]
         return metric_of(numbers, self.metric, device=self.localization_map.device)

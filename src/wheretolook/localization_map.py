@@ -13,6 +13,7 @@ from wheretolook.camera_models import Camera, ColmapCamera
 from wheretolook.features import BinnedViews, bin_views
 from wheretolook.geometry import Float, PinholeCamera, camera_centers
 from wheretolook.mapping.cameras import colmap_poses
+from wheretolook.mapping.colmap_model import read_model
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
 from wheretolook.rendering.types import check_poses
 from wheretolook.visibility import NoOcclusion, OcclusionModel, VisibleSets, visible_landmarks
@@ -69,7 +70,10 @@ class LocalizationMap:
             MapError: no usable model in the folder.
             SceneError: the mesh cannot be used.
         """
-        landmarks = load_colmap_landmarks(Path(model), max_reprojection_error_px=max_reprojection_error_px)
+        reconstruction = read_model(model)
+        landmarks = load_colmap_landmarks(
+            Path(model), max_reprojection_error_px=max_reprojection_error_px, reconstruction=reconstruction
+        )
         occlusion = occlusion or NoOcclusion()
         if mesh is not None:
             from wheretolook.rendering import MeshRaycaster
@@ -80,7 +84,7 @@ class LocalizationMap:
             loaded = load_mesh(Path(mesh))
             two_sided = FreeSpace(loaded, device=device).two_sided
             occlusion = MeshOcclusion(MeshRaycaster(loaded, device), two_sided=two_sided)
-        return cls(landmarks, camera, occlusion, device, colmap_poses(model).astype(np.float32))
+        return cls(landmarks, camera, occlusion, device, colmap_poses(model, reconstruction).astype(np.float32))
 
     def bin_views(self, cam_from_world: Float, bins: int = 30, landmark_channels: bool = False) -> BinnedViews:
         """Bin the landmarks that views see. Views that share a location share its occlusion test.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,17 +12,24 @@ from wheretolook.errors import MapError
 from wheretolook.geometry import Float
 from wheretolook.mapping.colmap_model import MODEL_FILES, read_model
 
+if TYPE_CHECKING:
+    import pycolmap
+
 CAMERAS_FILE = "cameras.npz"
 """Lies beside the landmarks."""
 
 
-def colmap_poses(model_dir: str | Path) -> Float:
+def colmap_poses(model_dir: str | Path, reconstruction: pycolmap.Reconstruction | None = None) -> Float:
     """Poses cam_from_world (M, 3, 4) float64 of the images of a COLMAP model that have one, in the order of their ids.
+
+    Args:
+        model_dir: folder of the model.
+        reconstruction: the model, if it has been read already.
 
     Raises:
         MapError: the folder or a file is missing or corrupt, or no image has a pose.
     """
-    images = read_model(model_dir).images
+    images = (reconstruction or read_model(model_dir)).images
     posed = [images[number] for number in sorted(images) if images[number].has_pose]
     if not posed:
         raise MapError("the map has no images", path=model_dir, value=0, fix="Run the map stage again.")

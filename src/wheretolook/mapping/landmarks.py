@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -15,6 +15,9 @@ from wheretolook.errors import MapError
 from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 from wheretolook.mapping.colmap_model import ModelArrays, model_arrays, read_descriptors, read_model
 from wheretolook.mapping.extraction import quantize_descriptors, unit_descriptors
+
+if TYPE_CHECKING:
+    import pycolmap
 
 _BLOCK = 4096  # landmarks whose tracks are gathered at a time
 
@@ -125,6 +128,7 @@ def load_colmap_landmarks(
     database: str | Path | None = None,
     max_reprojection_error_px: float = 0.5,
     device: str = "cpu",
+    reconstruction: pycolmap.Reconstruction | None = None,
 ) -> Landmarks:
     """Landmarks of a COLMAP model, with their attributes.
 
@@ -133,11 +137,12 @@ def load_colmap_landmarks(
         database: the COLMAP database the model was built from, for descriptors and ambiguity.
         max_reprojection_error_px: landmarks with a larger mean reprojection error are left out (the paper's 0.5).
         device: torch device that searches for the nearest descriptors.
+        reconstruction: the model, if it has been read already.
 
     Raises:
         MapError: the folder, a file or the database is missing, corrupt, or does not match; or no landmark is left.
     """
-    reconstruction = read_model(model_dir)
+    reconstruction = reconstruction or read_model(model_dir)
     if reconstruction.num_points3D() == 0:
         raise MapError(
             "the model has no points", path=model_dir, fix="Triangulate it, or map with more overlap or texture."

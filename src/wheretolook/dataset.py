@@ -22,6 +22,9 @@ from wheretolook.visibility import StoredOcclusion
 
 Split = Literal["train", "val", "test"]
 
+RELEASE = "release"
+"""Name of the dataset, beside all others, that ships with its weights."""
+
 
 @dataclass(frozen=True)
 class SceneFolder:

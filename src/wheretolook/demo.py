@@ -60,9 +60,9 @@ def run_demo(experiment: Experiment) -> None:
             bar.set_description_str(f"demo {number}/{len(steps)} {name}")
             say, tick = partial(_say, name), partial(_tick, bar, SECONDS[name])
             step(experiment, say=say, tick=tick)
-        weights = experiment.evaluate.weights or sorted((experiment.root / "weights").glob("*.safetensors"))
-        if weights:
-            draw_overview(experiment, weights[-1])
+        given, own = experiment.evaluate.weights, experiment.root / "weights"
+        if given or any(own.glob("*.safetensors")):
+            draw_overview(experiment, given[-1] if given else own)
         bar.set_description_str("demo")
     _say_where(experiment, time.monotonic() - start)
 
@@ -75,7 +75,8 @@ def draw_overview(experiment: Experiment, weights: Path) -> Path:
 
     Args:
         experiment: all stages up to label have been run.
-        weights: file of a trained network; its camera must have the dataset's field of view.
+        weights: file of a trained scorer, or a folder of such files, of which the best is taken; its camera must have
+            the dataset's field of view.
 
     Returns:
         The picture's path.

@@ -297,7 +297,7 @@ def viewpoint_map(experiment: Experiment, say: Say = print, tick: Tick = lambda 
         SceneError: there is no mesh, or no voxel is free. MapFormatError: something else is where the map belongs.
     """
     from wheretolook.photograph_scenes import is_photographed, occlusion_without_mesh
-    from wheretolook.planning.scene_map import scene_viewpoint_map
+    from wheretolook.planning.scene_map import default_weights, scene_viewpoint_map
     from wheretolook.scene_space import space_and_occlusion
 
     dataset, config = _dataset(experiment, "map"), experiment.viewpoint_map
@@ -305,6 +305,9 @@ def viewpoint_map(experiment: Experiment, say: Say = print, tick: Tick = lambda 
     if config.scene and config.scene not in scenes:
         fix = f"There are {', '.join(scenes)}."
         raise ConfigError("there is no such scene", path=dataset.root, value=config.scene, fix=fix)
+    if not config.method and config.weights is None and (weights := default_weights(dataset)) is not None:
+        say(f"scored by {weights}")
+        config = replace(config, weights=weights)
     built: dict[str, ViewpointMap] = {}
     for name in [config.scene] if config.scene else scenes:
         scene = scenes[name]

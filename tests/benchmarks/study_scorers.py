@@ -8,12 +8,17 @@
 The protocol, fixed before the test scenes were looked at: options are chosen by the mean validation average precision
 over seeds; of all learners the one with the best mean ships, with the weights of its best seed; test scenes and scenes
 of others are scored once, with every seed's weights. Appends one row a training to `<out>/<part>.csv`; rows that are
-there are not made again. Weights lie in `<out>/<variant>-<seed>/weights`.
+there are not made again. Weights lie in `<out>/<variant>-<seed>/weights`, and those of other parts in
+`<out>/<part>/<condition>-<seed>.safetensors`.
+
+`--set '{"pooled": 8}'` changes the network that attributes, options and curves start from; `--choices '[{"head": 96},
+...]'` are the options to try.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -26,7 +31,8 @@ import torch
 from wheretolook.attributes import ATTRIBUTES
 from wheretolook.dataset import Dataset
 from wheretolook.learning import set as set_learner
-from wheretolook.learning.config import MATCHABILITY, SET, TrainConfig, weights_name
+from wheretolook.learning.config import MATCHABILITY, SET, SetConfig, TrainConfig, weights_name
+from wheretolook.learning.data import with_also
 from wheretolook.learning.fit import RunLog
 from wheretolook.learning.learner import Task
 from wheretolook.learning.set import SetData, learn_set
@@ -37,6 +43,13 @@ VARIANTS = ("2d+z", "2d+3d+landmark", "conv", "trees", "set", "sphere")
 
 OF_NETWORKS = {"balance": True, "batch_size": 4096, "noise_px": 1.0, "noise_m": 0.02, "epochs": 100}
 """Options of the paper's network: those of configs/release.yaml, with a third of its epochs."""
+
+
+CHOICES: list[dict[str, Any]] = [
+    {}, {"pooled": 8}, {"width": 96}, {"width": 24}, {"head": 96}, {"dropout": 0.3}, {"l2": 1e-4},
+    {"learning_rate": 1e-3}, {"epochs": 16}, {"from_matchability": False}, {"landmarks": 96}, {"enlarged": 3.0},
+]  # fmt: skip
+"""Options of the set network to try."""
 
 
 class Table:
@@ -106,11 +119,7 @@ def of_set_network(dataset: Dataset, args: argparse.Namespace, tracking: Trackin
         groups = {"none": (), **{name: (name,) for name in ATTRIBUTES[3:]}, "all": ATTRIBUTES[3:]}
         conditions = [(name, {"hidden": hidden}, whole) for name, hidden in groups.items()]
     if args.part == "options":
-        choices: list[dict[str, Any]] = [
-            {}, {"pooled": 8}, {"width": 96}, {"width": 24}, {"head": 96}, {"dropout": 0.3}, {"l2": 1e-4},
-            {"learning_rate": 1e-3}, {"epochs": 16}, {"from_matchability": False}, {"landmarks": 96},
-        ]  # fmt: skip
-        conditions = [(" ".join(f"{k}={v}" for k, v in one.items()) or "default", one, whole) for one in choices]
+        conditions = [(" ".join(f"{k}={v}" for k, v in one.items()) or "default", one, whole) for one in args.choices]
     if args.part == "curves":
         rows, rng = whole.numpy(), np.random.default_rng(0)
         scene = data.views.scene[rows]
@@ -124,7 +133,7 @@ def of_set_network(dataset: Dataset, args: argparse.Namespace, tracking: Trackin
             if table.has(condition=name, seed=seed):
                 continue
             data.train_rows = rows
-            settings = replace(TrainConfig(variants=(SET,), seed=seed).set, **options)
+            settings = replace(SetConfig(**args.set), **options)
             # as many steps, whatever there is to learn from
             epochs = min(200, round(settings.epochs * len(whole) / len(rows)))
             config = TrainConfig(variants=(SET,), seed=seed, set=replace(settings, epochs=epochs)).of_variant(SET)
@@ -133,6 +142,8 @@ def of_set_network(dataset: Dataset, args: argparse.Namespace, tracking: Trackin
             about = {"condition": name, "seed": seed}
             with start_run(tracking, f"study {args.part} {name}", "train", about) as (_, run):
                 learnt = learn_set(replace(task, config=config, run_log=RunLog(tracking, run)), data)
+            file = f"{name.replace(' ', '_').replace('=', '-') or 'default'}-{seed}.safetensors"
+            learnt.model.save(args.out / args.part / file, {"variant": SET, "condition": name, "seed": seed})
             table.add({"condition": name, "seed": seed, "views": len(rows), **metrics_of(learnt.metrics)})
 
 
@@ -142,12 +153,15 @@ def main() -> None:
     parser.add_argument("part", choices=("seeds", "attributes", "options", "curves"))
     parser.add_argument("--data", type=Path, default=Path("data"))
     parser.add_argument("--dataset", default="release")
+    parser.add_argument("--also", nargs="+", default=[], help="datasets whose train scenes help")
     parser.add_argument("--out", type=Path, default=Path("study"))
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
     parser.add_argument("--variants", nargs="+", default=list(VARIANTS))
+    parser.add_argument("--set", type=json.loads, default={}, help="options of the set network, JSON")
+    parser.add_argument("--choices", type=json.loads, default=CHOICES, help="options to try, a list of JSON objects")
     parser.add_argument("--progress", action="store_true")
     args = parser.parse_args()
-    whole = Dataset.load(args.data / args.dataset)
+    whole = with_also(Dataset.load(args.data / args.dataset), args.also)
     dataset = Dataset(whole.root, whole.camera, (*whole.split("train"), *whole.split("val")))
     part = seeds if args.part == "seeds" else of_set_network
     part(dataset, args, TrackingConfig(folder=str(args.out / "mlruns"), experiment="study"))

@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from safetensors.numpy import load_file, save_file
@@ -20,7 +21,7 @@ from wheretolook.errors import ConfigError, TableError, WeightsError
 from wheretolook.evaluation import EvaluateConfig, evaluate
 from wheretolook.fisher import information
 from wheretolook.learning.config import MatchabilityConfig, SetConfig, TrainConfig
-from wheretolook.learning.data import training_scenes
+from wheretolook.learning.data import labelled_rows, training_scenes
 from wheretolook.learning.landmark_views import AttributeStatistics, LandmarkLoader, load_landmark_views
 from wheretolook.learning.matchability import LandmarkBatches, Matchability
 from wheretolook.learning.set import SetModel
@@ -219,6 +220,49 @@ def trained(dataset: Dataset, tracking: TrackingConfig) -> dict[str, Path]:
     return {model.variant: model.path for model in models}
 
 
+def test_enlarged_views_are_those_of_an_enlarged_scene(dataset: Dataset) -> None:
+    views = load_landmark_views(dataset, training_scenes(dataset), TrainConfig(), 40, progress=False)
+    views = replace(views, axis_height=torch.arange(len(views)).float())  # tells who is who
+    rows = torch.arange(len(views))
+    plain, large = (next(iter(LandmarkLoader(views, rows, len(rows), 8, 3, enlarged=by))) for by in (1.0, 4.0))
+    changed = [DISTANCE, ATTRIBUTES.index("mapped_distance")]
+    same = [at for at in range(len(ATTRIBUTES)) if at not in changed]
+    torch.testing.assert_close(large.inputs[0][..., same], plain.inputs[0][..., same], equal_nan=True)
+    growth = (large.inputs[0] - plain.inputs[0])[..., changed]
+    assert torch.allclose(growth, growth[:, :1, :1], atol=1e-5)  # one for all landmarks of a view
+    growth = growth[:, 0, 0]
+    assert growth.min() < -1.2 and growth.max() > 1.2 and growth.abs().max() <= np.log(4) + 1e-5
+    table = pd.concat([labelled_rows(scene) for scene in training_scenes(dataset)], ignore_index=True)
+    table = table.iloc[large.inputs[3].long().numpy()]
+    error_m = table["error_m"].to_numpy() * growth.exp().numpy()
+    good = (table["status"] == LOCALIZED) & (error_m < 0.05) & (table["error_deg"] < 0.4)
+    assert np.array_equal(large.labels.numpy() > 0, good) and not torch.equal(large.labels, plain.labels)
+
+    # and the attributes are those of the same views in a scene of twice the size
+    scene = dataset.scenes[0]
+    localization_map = scene.localization_map(dataset.camera)
+    landmarks = localization_map.landmarks
+    twice = replace(landmarks, points=2 * landmarks.points, mapping_distance_m=2 * landmarks.mapping_distance_m)
+    cam_from_world = poses(labelled_rows(scene))[:20]
+    visible = localization_map.visible_landmarks(cam_from_world)
+    here = LandmarkDescriber(localization_map).describe(cam_from_world, visible).values
+    cam_from_world[:, :, 3] *= 2
+    there = LandmarkDescriber(LocalizationMap(twice, dataset.camera)).describe(cam_from_world, visible).values
+    torch.testing.assert_close(there[:, same], here[:, same], equal_nan=True, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(there[:, changed], here[:, changed] + np.log(2), rtol=1e-4, atol=1e-4)
+
+
+def test_landmarks_of_enlarged_views() -> None:
+    values = torch.randn(500, len(ATTRIBUTES), generator=torch.Generator().manual_seed(0))
+    found, rows = values[:, 0] > 0, torch.arange(500)
+    (plain,), (large,) = (list(LandmarkBatches(values, found, rows, 500, 1, enlarged=by)) for by in (1.0, 2.0))
+    growth = large.inputs[0] - plain.inputs[0]
+    assert torch.equal(large.labels, plain.labels) and 0.6 < float(growth.max()) <= np.log(2) + 1e-5
+    assert torch.allclose(growth[:, DISTANCE], growth[:, ATTRIBUTES.index("mapped_distance")], atol=1e-5)
+    growth[:, [DISTANCE, ATTRIBUTES.index("mapped_distance")]] = 0
+    assert not growth.any()
+
+
 @pytest.mark.parametrize("world_size", [2, 3])
 def test_processes_share_out_every_batch(dataset: Dataset, world_size: int) -> None:
     views = load_landmark_views(dataset, training_scenes(dataset), TrainConfig(), 40, progress=False)
@@ -403,3 +447,5 @@ def test_impossible_options() -> None:
         MatchabilityConfig(width=0)
     with pytest.raises(ConfigError, match="epochs"):
         SetConfig(epochs=0)
+    with pytest.raises(ConfigError, match="enlarged"):
+        MatchabilityConfig(enlarged=0.5)

@@ -24,7 +24,7 @@ CONFIG = TrainConfig(
     variants=("2d+3d", "trees", "set"),
     epochs=2,
     trees=TreesConfig(max_trees=5, min_leaf=5),
-    set=SetConfig(epochs=1, landmarks=16, batch_size=64),
+    set=SetConfig(epochs=1, landmarks=16, batch_size=64, enlarged=1.0),  # enlarged, labels follow from errors
     matchability=MatchabilityConfig(epochs=1),
     accelerator="cpu",
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import signal
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +20,7 @@ from wheretolook.learning.config import TrainConfig
 from wheretolook.learning.data import BatchLoader, ViewpointDataModule, balance_classes, hold_out_locations
 from wheretolook.learning.fit import EpochRecord
 from wheretolook.learning.network import InputStatistics
-from wheretolook.learning.training import train
+from wheretolook.learning.training import train, training_fingerprint
 from wheretolook.learning.weights import load_classifier
 from wheretolook.scoring import load_scorer
 from wheretolook.table import LOCALIZED, NO_POSE, UNLABELLED, is_good, write_table
@@ -243,6 +244,25 @@ def test_training_learns_the_rule_logs_a_run_and_is_reused(
     write_table(scene.read_table().iloc[:-1], scene.table)  # the test scene has no say in training
     third = train(dataset, config, tracking, progress=False)
     assert [model.reused for model in third] == [False, True]
+
+
+def test_other_datasets_are_learnt_from_too(dataset: Dataset, store: str) -> None:
+    other = make_dataset(dataset.root.parent / "other", ("val", "train", "test"), n_locations=5)
+    tracking, config = TrackingConfig(store, "also"), replace(SMALL, epochs=1, also=("other",))
+    (model,) = train(dataset, config, tracking, progress=False)
+    about = json.loads(model.path.with_suffix(".json").read_text())["about"]
+    together = Dataset(dataset.root, dataset.camera, (*dataset.scenes, *other.split("train")))
+    assert about["also"] == ["other"] and about["dataset_fingerprint"] == training_fingerprint(together)
+    views = client(tracking).get_run(model.run_id).data.params
+    assert int(views["n_train"]) + int(views["n_val"]) == (2 * 24 + 5) * 20
+    (again,) = train(dataset, config, tracking, progress=False)
+    (without,) = train(dataset, replace(config, also=()), tracking, progress=False)
+    assert again.reused and not without.reused
+    with pytest.raises(TableError, match=r"nowhere.*no dataset"):
+        train(dataset, replace(config, also=("nowhere",)), tracking, progress=False)
+    Dataset(other.root, replace(other.camera, width=other.camera.width + 2), other.scenes).save()
+    with pytest.raises(ConfigError, match="other was made for another camera"):
+        train(dataset, config, tracking, progress=False)
 
 
 def test_the_same_seed_gives_the_same_weights(dataset: Dataset, store: str) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +14,12 @@ from planning.rooms import CAMERA, build, occlusion, room_landmarks, room_map
 from wheretolook.cli import main
 from wheretolook.dataset import Dataset, SceneFolder, write_json
 from wheretolook.planning import ViewpointMap, build_viewpoint_map
+from wheretolook.planning.scene_map import default_weights
 from wheretolook.scenes.loading import save_glb
 from wheretolook.scoring import make_scorer
 
 LANDMARKS = room_landmarks(200)
+SHIPPED = Path(__file__).parents[2] / "data" / "release" / "weights"
 
 
 @pytest.fixture
@@ -59,6 +63,22 @@ def test_without_a_scene_all_are_made_with_the_method_named(dataset: Path) -> No
     for name in "ab":
         found = ViewpointMap.load(dataset / "data" / "rooms" / name / "viewpoint-map")
         assert (found.origin.scorer, found.origin.lattice, len(found.directions)) == ("visible", "yaw-pitch", 108)
+
+
+def test_the_best_weights_there_are_score(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    weights = dataset / "data" / "release" / "weights"
+    weights.mkdir(parents=True)
+    for suffix in ("safetensors", "json"):
+        shutil.copy(SHIPPED / f"set.{suffix}", weights)
+    assert run(dataset, "--scene", "a") == 0
+    assert "release/weights/set.safetensors" in capsys.readouterr().out
+    folder = dataset / "data" / "rooms" / "a" / "viewpoint-map"
+    assert ViewpointMap.load(folder).origin.scorer == "set"
+    assert run(dataset, "--scene", "a", "--method", "bins") == 0
+    assert ViewpointMap.load(folder).origin.scorer == "bins"
+    rooms = Dataset.load(dataset / "data" / "rooms")
+    assert default_weights(rooms) == weights / "set.safetensors"
+    assert default_weights(replace(rooms, camera=replace(CAMERA, focal_px=70.0))) is None
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,11 +13,13 @@ from scipy import ndimage
 
 from wheretolook.errors import ConfigError, SceneError
 from wheretolook.scenes.mesh import TexturedMesh
-from wheretolook.scenes.procedural import ApartmentConfig, decor, fixtures, furniture, generate_apartment
+from wheretolook.scenes.procedural import ApartmentConfig, atlas, decor, fixtures, furniture, generate_apartment
 from wheretolook.scenes.procedural import patches as patches_module
 from wheretolook.scenes.procedural.generator import furnish_apartment
 from wheretolook.scenes.procedural.materials import plain
+from wheretolook.scenes.procedural.noise import NoiseBank
 from wheretolook.scenes.procedural.plan import Plan, draw_plan
+from wheretolook.scenes.procedural.repetition import repeat_patterns
 from wheretolook.scenes.procedural.style import Style
 
 SEEDS = (0, 1, 2)
@@ -261,10 +264,51 @@ def test_plans_are_sound() -> None:
                 assert min(a.x1, b.x1) <= max(a.x0, b.x0) or min(a.y1, b.y1) <= max(a.y0, b.y0)
 
 
+def test_patterns_repeat() -> None:
+    config = replace(FAST, repetition=1.0)
+    _, patches, _, rng = furnish_apartment(config, 3)
+    plan, noise = atlas.plan_atlas(patches, 40.0, 2048), NoiseBank(rng)
+    painted = atlas.paint_charts(plan, noise)
+    covered = repeat_patterns(plan, painted, 1.0, np.random.default_rng(0), noise)
+    large = [
+        n for n, chart in enumerate(plan.charts)
+        if min(chart.width, chart.height) >= 0.7 * chart.texels_per_m
+        and not (chart.material.shared or chart.material.emissive)
+    ]  # fmt: skip
+    assert len(large) > 10
+    for number, (before, after) in enumerate(zip(painted, covered, strict=True)):
+        if number not in large:
+            assert after is before
+    wide = max(large, key=lambda n: plan.charts[n].width)
+    image, scale = covered[wide], plan.charts[wide].texels_per_m
+    periods = [p for p in range(1, image.shape[1]) if np.array_equal(image[:, p:], image[:, :-p])]
+    assert periods and 0.55 <= periods[0] / scale <= 2.05 and image.std() > 0.01
+    assert not any(np.array_equal(painted[wide][:, p:], painted[wide][:, :-p]) for p in periods)
+    few = repeat_patterns(plan, painted, 0.3, np.random.default_rng(0), noise)
+    assert 0.1 < np.mean([few[n] is not painted[n] for n in large]) < 0.5
+
+
+def test_an_enlarged_apartment_is_the_same_but_larger() -> None:
+    small, large = (generate_apartment(replace(FAST, enlarged=by), 7) for by in (1.0, 2.5))
+    np.testing.assert_allclose(large.vertices, 2.5 * small.vertices, rtol=1e-6)
+    assert large.textures[0].tobytes() == small.textures[0].tobytes()
+
+
+def test_varied_apartments_differ_by_their_seed() -> None:
+    varied = ApartmentConfig(vary=True)
+    drawn = [varied.of_seed(seed) for seed in range(40)]
+    assert varied.of_seed(3) == drawn[3] and len({config.area_m2 for config in drawn}) == 40
+    assert all(1 <= config.enlarged <= 3 and 35 <= config.area_m2 <= 130 for config in drawn)
+    assert 0.1 < np.mean([config.repetition == 0 for config in drawn]) < 0.5
+    assert CONFIG.of_seed(3) is CONFIG
+
+
 @pytest.mark.parametrize(
     ("options", "word"),
     [
         ({"n_rooms": 2}, "n_rooms"),
+        ({"repetition": -0.1}, "repetition"),
+        ({"enlarged": 0.0}, "enlarged"),
         ({"clutter": 1.5}, "clutter"),
         ({"area_m2": 5.0}, "area_m2"),
         ({"light_rays": 0}, "light_rays"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -118,6 +119,11 @@ def _check_hidden(names: tuple[str, ...]) -> None:
         raise ConfigError("hidden names an attribute that there is not", value=unknown[0], fix=known)
 
 
+def _check_enlarged(factor: float) -> None:
+    if not 1 <= factor < math.inf:
+        raise ConfigError("scenes can be enlarged by a factor of 1 or more", value=factor)
+
+
 @dataclass(frozen=True)
 class MatchabilityConfig(FittingConfig):
     """Options of the probability that a landmark in view is found.
@@ -126,6 +132,7 @@ class MatchabilityConfig(FittingConfig):
         landmarks: landmarks of a view to learn from, at most, chosen at random.
         width: units of each of two hidden layers.
         hidden: attributes (`wheretolook.attributes.ATTRIBUTES`) not to look at, to see what each is worth.
+        enlarged: greatest factor by which scenes come larger or smaller in training; 1 leaves them as they are.
     """
 
     epochs: int = 6
@@ -133,9 +140,11 @@ class MatchabilityConfig(FittingConfig):
     landmarks: int = 64
     width: int = 48
     hidden: tuple[str, ...] = ()
+    enlarged: float = 3.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        _check_enlarged(self.enlarged)
         if self.landmarks < 1 or self.width < 1:
             raise ConfigError("landmarks and width must be at least 1", value=(self.landmarks, self.width))
         if self.hidden:
@@ -154,6 +163,7 @@ class SetConfig(FittingConfig):
         dropout: share of the deciding layers' units dropped.
         from_matchability: start from `weights/matchability.safetensors` where the dataset has it.
         hidden: attributes (`wheretolook.attributes.ATTRIBUTES`) not to look at, to see what each is worth.
+        enlarged: greatest factor by which scenes come larger or smaller in training; 1 leaves them as they are.
     """
 
     epochs: int = 8
@@ -161,14 +171,16 @@ class SetConfig(FittingConfig):
     learning_rate: float = 3e-3
     landmarks: int = 192
     width: int = 48
-    pooled: int = 0
+    pooled: int = 8
     head: int = 48
     dropout: float = 0.1
     from_matchability: bool = True
     hidden: tuple[str, ...] = ()
+    enlarged: float = 3.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        _check_enlarged(self.enlarged)
         if min(self.landmarks, self.width, self.head) < 1 or self.pooled < 0 or not 0 <= self.dropout < 1:
             raise ConfigError(
                 "a set network needs landmarks, width and head >= 1, pooled >= 0 and a dropout below 1",
@@ -276,6 +288,7 @@ class TrainConfig:
         keep: "best" keeps the weights of the epoch with the best validation average precision, "last" those of the
             last epoch.
         patience: stop after so many epochs without a better validation average precision; null trains them all.
+        also: names of further datasets in the same folder; their train scenes are learnt from as well.
         seed: seed of the split, the balance, the initial weights, dropout, noise and the order of batches.
         accelerator: where to train: "auto", "cpu" or "gpu".
         devices: GPUs, or processes on the CPU, to train with. One step of many is one step of one: each takes its share
@@ -287,7 +300,7 @@ class TrainConfig:
         sphere: options of "sphere".
     """
 
-    variants: tuple[str, ...] = tuple(PAPER_VARIANTS)
+    variants: tuple[str, ...] = (*PAPER_VARIANTS, SET)
     epochs: int = 300
     batch_size: int = 128
     learning_rate: float = 1e-3
@@ -306,6 +319,7 @@ class TrainConfig:
     balance: bool = False
     keep: Literal["best", "last"] = "best"
     patience: int | None = None
+    also: tuple[str, ...] = ()
     seed: int = 0
     accelerator: Literal["auto", "cpu", "gpu"] = "auto"
     devices: int = 1

@@ -166,6 +166,23 @@ def _share(*tensors: Tensor) -> None:
         raise ConfigError(f"the views, {size:.1f} GB, do not fit into shared memory: {error}", fix=fix) from error
 
 
+def with_also(dataset: Dataset, names: Sequence[str]) -> Dataset:
+    """A dataset together with the train scenes of others beside it.
+
+    Raises:
+        TableError: there is no such dataset.
+        ConfigError: it was made for another camera.
+    """
+    scenes = list(dataset.scenes)
+    for name in names:
+        other = Dataset.load(dataset.root.parent / name)
+        if other.camera != dataset.camera:
+            fix = f"It must be {dataset.camera}, as that of {dataset.root}."
+            raise ConfigError(f"{other.root} was made for another camera", value=other.camera, fix=fix)
+        scenes += other.split("train")
+    return Dataset(dataset.root, dataset.camera, tuple(scenes))
+
+
 def training_scenes(dataset: Dataset) -> list[SceneFolder]:
     """The scenes that are read for training: train scenes, then val scenes.
 

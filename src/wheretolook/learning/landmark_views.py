@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from math import ceil
+from math import ceil, log
 from typing import Any
 
 import numpy as np
@@ -15,13 +15,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from wheretolook.attributes import LandmarkDescriber, ViewLandmarks
+from wheretolook.attributes import ATTRIBUTES, LandmarkDescriber, ViewLandmarks
 from wheretolook.dataset import Dataset, SceneFolder
 from wheretolook.learning.config import TrainConfig
 from wheretolook.learning.data import Batch, has_room, labelled_rows, training_scenes, validation_views
 from wheretolook.learning.fit import home_device
 from wheretolook.learning.learner import Task
 from wheretolook.table import LOCALIZED, is_good, poses
+
+DISTANCES = [ATTRIBUTES.index(name) for name in ("distance", "mapped_distance")]
+"""Attributes that are logarithms of distances: those that change when a scene is enlarged."""
 
 BLOCK = 2048
 """Views described at a time: some million landmarks."""
@@ -64,6 +67,7 @@ class LandmarkViews:
         visible: (B,) int64, landmarks that each view sees.
         axis_height: (B,) float32, z of the optical axis in the world.
         labels: (B,) float32, 1 where the viewpoint localizes.
+        error_m: (B,) float32, error of its position, infinite where it is not localized or its orientation is off.
         scene: (B,) int64, number of each view's scene in the order given.
         location: (B,) int64, location_id of each view, unique only within its scene.
         found: (E,) bool, whether the localizer found the landmark; None where that was not asked for.
@@ -74,6 +78,7 @@ class LandmarkViews:
     visible: Tensor
     axis_height: Tensor
     labels: Tensor
+    error_m: Tensor
     scene: NDArray[np.int64]
     location: NDArray[np.int64]
     found: Tensor | None = None
@@ -131,6 +136,7 @@ def load_landmark_views(
         for number, (scene, table) in enumerate(tables):
             describer = LandmarkDescriber(scene.localization_map(dataset.camera, device))
             cam_from_world, good = poses(table), is_good(table, config.max_error_m, config.max_error_deg)
+            error_m = np.where(is_good(table, np.inf, config.max_error_deg), table["error_m"], np.inf)
             for begin in range(0, len(table), BLOCK):
                 rows = slice(begin, begin + BLOCK)
                 described = describer.describe(cam_from_world[rows])
@@ -143,6 +149,7 @@ def load_landmark_views(
                         described.counts.cpu(),
                         torch.from_numpy(cam_from_world[rows, 2, 2].astype(np.float32)),
                         torch.from_numpy(good[rows].astype(np.float32)),
+                        torch.from_numpy(error_m[rows].astype(np.float32)),
                         np.full(len(described), number),
                         table["location_id"].to_numpy(np.int64)[rows],
                         None if found is None else found[kept.cpu()],
@@ -186,6 +193,7 @@ def _joined(blocks: Sequence[LandmarkViews]) -> LandmarkViews:
         torch.cat([block.visible for block in blocks]),
         torch.cat([block.axis_height for block in blocks]),
         torch.cat([block.labels for block in blocks]),
+        torch.cat([block.error_m for block in blocks]),
         np.concatenate([block.scene for block in blocks]),
         np.concatenate([block.location for block in blocks]),
         torch.cat(found) if found else None,
@@ -197,12 +205,18 @@ class LandmarkLoader:
 
     With several processes, every one cuts the same batches and keeps its share of each; a share can be empty.
 
+    Views can come enlarged: a scene and its map, made larger as a whole, look the same and give the same matches. All
+    distances grow with the scene, the error of the position too, and the label follows from that. So a network sees
+    rooms of every size without any of them being mapped.
+
     Args:
         views: the views.
         rows: rows of `views` to go through, (n,).
         batch_size: views a batch, over all processes.
         width: landmarks a view at most.
-        shuffle_seed: seed of order and windows; None goes through the views in order, from their first landmark.
+        shuffle_seed: seed of order, windows and sizes; None goes through the views in order, from their first landmark.
+        enlarged: shuffled views come from 1 / enlarged to enlarged times as large, evenly in the logarithm.
+        max_error_m: limit of a positive label, for enlarged views.
         rank: number of this process.
         world_size: number of processes.
     """
@@ -216,8 +230,11 @@ class LandmarkLoader:
         shuffle_seed: int | None = None,
         rank: int = 0,
         world_size: int = 1,
+        enlarged: float = 1.0,
+        max_error_m: float = 0.05,
     ) -> None:
         self.views, self.rows, self.batch_size, self.width = views, rows.to(views.labels.device), batch_size, width
+        self.enlarged, self.max_error_m = enlarged, max_error_m
         self.shuffle_seed, self.rank, self.world_size, self._pass = shuffle_seed, rank, world_size, 0
 
     def __len__(self) -> int:
@@ -231,17 +248,23 @@ class LandmarkLoader:
             self._pass += 1  # another order every time
             rows = rows[torch.randperm(len(rows), generator=generator, device=device)]
         for part in rows.split(self.batch_size):
-            first = torch.zeros(len(part), device=device)
+            first, growth = torch.zeros(len(part), device=device), None
             if self.shuffle_seed is not None:  # landmarks lie in random order, so any window is a random sample
                 first = torch.rand(len(part), generator=generator, device=device)
+                if self.enlarged > 1:
+                    growth = torch.rand(len(part), generator=generator, device=device) * 2 - 1
+                    growth = (growth * log(self.enlarged)).tensor_split(self.world_size)[self.rank]
             share, first = (whole.tensor_split(self.world_size)[self.rank] for whole in (part, first))
             starts, lengths = views.starts[share], views.starts[share + 1] - views.starts[share]
             taken = lengths.clamp(max=self.width)
             steps = torch.arange(int(taken.max()) if len(taken) else 0, device=device)
             place = ((first * lengths).long()[:, None] + steps) % lengths.clamp(min=1)[:, None]
             entries = (starts[:, None] + place).clamp(max=len(views.values) - 1)
-            inputs = (views.values[entries].float(), taken, views.visible[share], views.axis_height[share])
-            yield Batch(inputs, views.labels[share], len(part))
+            values, labels = views.values[entries].float(), views.labels[share]
+            if growth is not None:
+                values[..., DISTANCES] += growth[:, None, None]
+                labels = (views.error_m[share] * growth.exp() < self.max_error_m).float()
+            yield Batch((values, taken, views.visible[share], views.axis_height[share]), labels, len(part))
 
 
 class LandmarkDataModule(LightningDataModule):

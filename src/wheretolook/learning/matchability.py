@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from math import ceil
+from math import ceil, log
 from typing import ClassVar
 
 import torch
@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from wheretolook.learning.config import MATCHABILITY
 from wheretolook.learning.data import Batch
 from wheretolook.learning.landmark_model import LandmarkModel
-from wheretolook.learning.landmark_views import LandmarkDataModule
+from wheretolook.learning.landmark_views import DISTANCES, LandmarkDataModule
 from wheretolook.learning.learner import Learnt, Task, class_counts, fit_network, predict
 from wheretolook.learning.platt import fit_platt
 from wheretolook.learning.set_network import MatchabilityNetwork
@@ -42,6 +42,8 @@ class LandmarkBatches:
         shuffle_seed: seed of their order; None goes through them in order.
         rank: number of this process.
         world_size: number of processes.
+        enlarged: shuffled landmarks come from 1 / enlarged to enlarged times as far; see
+            `wheretolook.learning.landmark_views.LandmarkLoader`.
     """
 
     def __init__(
@@ -53,7 +55,9 @@ class LandmarkBatches:
         shuffle_seed: int | None = None,
         rank: int = 0,
         world_size: int = 1,
+        enlarged: float = 1.0,
     ) -> None:
+        self.enlarged = enlarged
         self.values, self.found, self.rows, self.batch_size = values, found, rows.to(values.device), batch_size
         self.shuffle_seed, self.rank, self.world_size, self._pass = shuffle_seed, rank, world_size, 0
 
@@ -68,7 +72,12 @@ class LandmarkBatches:
             rows = rows[torch.randperm(len(rows), generator=generator, device=rows.device)]
         for part in rows.split(self.batch_size):
             share = part.tensor_split(self.world_size)[self.rank]
-            yield Batch((self.values[share].float(),), self.found[share].float(), len(part))
+            values = self.values[share].float()
+            if self.shuffle_seed is not None and self.enlarged > 1:
+                growth = torch.rand(len(part), generator=generator, device=rows.device) * 2 - 1
+                growth = growth.tensor_split(self.world_size)[self.rank]
+                values[:, DISTANCES] += log(self.enlarged) * growth[:, None]
+            yield Batch((values,), self.found[share].float(), len(part))
 
 
 class MatchabilityData(LandmarkDataModule):
@@ -106,7 +115,10 @@ class MatchabilityData(LandmarkDataModule):
 
     def _loader(self, rows: Tensor, batches: int, shuffle_seed: int | None = None) -> LandmarkBatches:
         size = batches * self.config.batch_size * self.config.matchability.landmarks
-        return LandmarkBatches(self.views.values, self.found, self.entries(rows), size, shuffle_seed, *self.share)
+        return LandmarkBatches(
+            self.views.values, self.found, self.entries(rows), size, shuffle_seed, *self.share,
+            self.config.matchability.enlarged,
+        )  # fmt: skip
 
 
 def learn_matchability(task: Task) -> Learnt:

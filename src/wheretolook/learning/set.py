@@ -56,7 +56,10 @@ class SetData(LandmarkDataModule):
 
     def _loader(self, rows: Tensor, windows: int, shuffle_seed: int | None = None) -> LandmarkLoader:
         width = windows * self.config.set.landmarks
-        return LandmarkLoader(self.views, rows, self.config.batch_size, width, shuffle_seed, *self.share)
+        return LandmarkLoader(
+            self.views, rows, self.config.batch_size, width, shuffle_seed, *self.share, self.config.set.enlarged,
+            self.config.max_error_m,
+        )  # fmt: skip
 
 
 MOST_OF_WINDOW = 2

@@ -26,7 +26,7 @@ from wheretolook.learning.config import (
     needs_landmark_channels,
     weights_name,
 )
-from wheretolook.learning.data import ViewpointDataModule
+from wheretolook.learning.data import ViewpointDataModule, with_also
 from wheretolook.learning.fit import EpochRecord, RunLog, fit, home_device
 from wheretolook.learning.learner import Learner, Task
 from wheretolook.learning.network import NetworkSpec, ViewpointNetwork
@@ -38,7 +38,7 @@ from wheretolook.tracking import TrackingConfig, log, start_run
 if TYPE_CHECKING:
     from mlflow import MlflowClient
 
-NOT_DECIDING = ("variants", "accelerator", "devices", *LEARNERS)
+NOT_DECIDING = ("variants", "also", "accelerator", "devices", *LEARNERS)
 """Options that do not decide what the paper's network learns: where, with which random numbers, and others' own."""
 
 OF_ALL = ("max_error_m", "max_error_deg", "val_fraction", "seed")
@@ -89,10 +89,12 @@ def train(
         One model a variant, in the order of `config.variants`.
 
     Raises:
-        TableError: no train scene, no labels, or labels of one class only.
+        TableError: no train scene, no labels, or labels of one class only; or a dataset of `config.also` is missing.
         MapError: a scene has no landmarks.
-        ConfigError: there are fewer GPUs than asked for, or the views do not fit into memory shared by processes.
+        ConfigError: there are fewer GPUs than asked for, cameras of datasets differ, or the views do not fit into
+            memory shared by processes.
     """
+    dataset = with_also(dataset, config.also)
     fingerprint = training_fingerprint(dataset)
     data: ViewpointDataModule | None = None
     models = []
@@ -143,6 +145,8 @@ def _about(dataset: Dataset, config: TrainConfig, fingerprint: str, variant: str
         "camera": asdict(dataset.camera),
         "config": options,
     }
+    if config.also:
+        about["also"] = list(config.also)
     if variant == SET and config.set.from_matchability:
         start = dataset.root / "weights" / weights_name(MATCHABILITY)
         about["matchability_sha256"] = sha256(start) if start.is_file() else None

@@ -16,8 +16,9 @@ class ViewpointMapConfig:
     Args:
         scene: name of the scene's folder; empty for all scenes of the dataset.
         method: that scores the views, see `wheretolook evaluate --list-methods`; empty for the one that the weights are
-            of, or bins without weights.
-        weights: file of weights that the train stage wrote, for a method that has learnt.
+            of, or bins if there are none.
+        weights: file of weights that the train stage wrote, for a method that has learnt. Unless a method is named,
+            the best of the dataset, or else of the release, for cameras with their field of view.
         out: folder to write; empty for `<data>/<name>/<scene>/viewpoint-map`. Only with a scene.
         grid: voxels along x, y and z over the scene's bounds.
         directions: directions at each voxel.

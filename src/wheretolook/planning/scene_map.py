@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from wheretolook.dataset import SceneFolder
+from pathlib import Path
+
+from wheretolook.dataset import RELEASE, Dataset, SceneFolder
 from wheretolook.geometry import PinholeCamera
 from wheretolook.grid import VoxelGrid, direction_lattice
+from wheretolook.learning.config import MATCHABILITY
+from wheretolook.learning.weights import best_weights, read_weights
 from wheretolook.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.planning.config import ViewpointMapConfig
@@ -14,6 +18,7 @@ from wheretolook.sampling import free_locations
 from wheretolook.scenes.free_space import FreeSpace
 from wheretolook.scenes.mapped_space import MappedSpace
 from wheretolook.scoring import Scorer, load_scorer, make_scorer
+from wheretolook.scoring.learned import same_field_of_view
 from wheretolook.visibility import OcclusionModel
 
 
@@ -47,6 +52,21 @@ def scene_viewpoint_map(
     return build_viewpoint_map(
         _scorer(one, config), grid, free, directions, config.lattice, f"viewpoint map {scene.name}"
     )
+
+
+def default_weights(dataset: Dataset) -> Path | None:
+    """The best weights of a dataset, or else of the release beside it if they were trained for the same field of view.
+
+    Raises:
+        WeightsError: a record of training is damaged.
+    """
+    for folder in (dataset.root / "weights", dataset.root.parent / RELEASE / "weights"):
+        if any(path.stem != MATCHABILITY for path in folder.glob("*.safetensors")):
+            path = best_weights(folder)
+            trained = PinholeCamera(**read_weights(path)[1]["camera"])
+            if same_field_of_view(trained, dataset.camera):
+                return path
+    return None
 
 
 def _scorer(localization_map: LocalizationMap, config: ViewpointMapConfig) -> Scorer:

@@ -118,7 +118,7 @@ def naming(weights: str | Path) -> Iterator[None]:
 
 def check_field_of_view(trained: PinholeCamera, camera: Camera) -> None:
     """Raise a WeightsError if a camera's field of view is not that of the camera of the training views."""
-    if not _same_field_of_view(trained, camera):
+    if not same_field_of_view(trained, camera):
         raise WeightsError(
             f"the network was trained for a camera of {_describe(trained)}",
             value=_describe(camera),
@@ -126,7 +126,8 @@ def check_field_of_view(trained: PinholeCamera, camera: Camera) -> None:
         )
 
 
-def _same_field_of_view(trained: PinholeCamera, camera: Camera) -> bool:
+def same_field_of_view(trained: PinholeCamera, camera: Camera) -> bool:
+    """Whether weights trained for one camera serve another: image and focal length of the same proportions."""
     if isinstance(camera, ColmapCamera):
         return False
     spans = np.array([(one.width / one.focal_px, one.height / one.focal_px) for one in (trained, camera)])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from wheretolook.scenes.procedural.layout import Lamp
 from wheretolook.scenes.procedural.noise import NoiseBank
 from wheretolook.scenes.procedural.patches import Patch, Surface, join
 from wheretolook.scenes.procedural.plan import Plan, draw_plan
+from wheretolook.scenes.procedural.repetition import repeat_patterns
 from wheretolook.scenes.procedural.shell import build_shell
 from wheretolook.scenes.procedural.style import Style
 
@@ -30,7 +31,12 @@ class ApartmentConfig:
         texture_richness: 0 to 1; contrast of wood, stone and cloth, and how many pictures hang. Lower is harder to
             localize in.
         clutter: 0 to 1; books, plants, bottles and other small things. Lower is harder.
+        repetition: 0 to 1; share of large surfaces that repeat a strong pattern every 0.6 to 2 m, as in games. Such
+            views are full of features and yet hard to localize.
         dark_rooms: share of rooms whose lamp is off, some with their curtains closed. Higher is harder.
+        enlarged: how many times as large everything is, furniture and patterns too: halls with few, far landmarks.
+        vary: every apartment draws its area and the six numbers above from its seed, whatever they are set to: rooms
+            unlike each other, to learn from.
         texels_per_m: texture resolution of large surfaces; lowered if the atlas would not fit.
         texture_size: greatest width and height of the texture in texels.
         light_spacing_m: distance between light samples in metres.
@@ -41,7 +47,10 @@ class ApartmentConfig:
     area_m2: float | None = None
     texture_richness: float = 0.85
     clutter: float = 0.85
+    repetition: float = 0.0
     dark_rooms: float = 0.2
+    enlarged: float = 1.0
+    vary: bool = False
     texels_per_m: float = 125.0
     texture_size: int = 4096
     light_spacing_m: float = 0.1
@@ -52,12 +61,28 @@ class ApartmentConfig:
             raise ConfigError("n_rooms must be 3 to 6", value=self.n_rooms)
         if self.area_m2 is not None and not 25 <= self.area_m2 <= 200:
             raise ConfigError("area_m2 must be 25 to 200", value=self.area_m2)
-        for name in ("texture_richness", "clutter", "dark_rooms"):
+        for name in ("texture_richness", "clutter", "repetition", "dark_rooms"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ConfigError(f"{name} must be between 0 and 1", value=getattr(self, name))
-        for name in ("texels_per_m", "texture_size", "light_spacing_m", "light_rays"):
+        for name in ("enlarged", "texels_per_m", "texture_size", "light_spacing_m", "light_rays"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"{name} must be positive", value=getattr(self, name))
+
+    def of_seed(self, seed: int) -> ApartmentConfig:
+        """What the apartment of a seed is like: this, unless it is to `vary`."""
+        if not self.vary:
+            return self
+        rng = np.random.default_rng([seed, 2])
+        return replace(
+            self,
+            area_m2=float(rng.uniform(35, 130)),
+            texture_richness=float(rng.uniform(0.5, 1)),
+            clutter=float(rng.uniform(0.3, 1)),
+            repetition=float(rng.uniform(0.3, 1)) if rng.random() < 0.7 else 0.0,
+            dark_rooms=float(rng.uniform(0, 0.4)),
+            enlarged=float(np.exp(rng.uniform(0, np.log(3)))),
+            vary=False,
+        )
 
 
 def furnish_apartment(config: ApartmentConfig, seed: int) -> tuple[Plan, list[Patch], list[Lamp], np.random.Generator]:
@@ -89,10 +114,14 @@ def generate_apartment(config: ApartmentConfig, seed: int, device: str = "cpu") 
         ConfigError: there is no such device.
         SceneError: the texture is too small for the apartment.
     """
+    config = config.of_seed(seed)
     floor_plan, patches, lamps, rng = furnish_apartment(config, seed)
     surface = join(patches)
     plan = atlas.plan_atlas(patches, config.texels_per_m, config.texture_size)
-    painted = atlas.paint_charts(plan, NoiseBank(rng))
+    noise = NoiseBank(rng)
+    painted = atlas.paint_charts(plan, noise)
+    if config.repetition:
+        painted = repeat_patterns(plan, painted, config.repetition, np.random.default_rng([seed, 1]), noise)
     mean_colour = np.array([image[::2, ::2].mean((0, 1)) for image in painted])
     albedo = np.clip(mean_colour[plan.patch_chart], 0, 1) ** 2.2
 
@@ -105,7 +134,7 @@ def generate_apartment(config: ApartmentConfig, seed: int, device: str = "cpu") 
     light = lighting.bake(patches, surface, samples, albedo, windows, lamps, device=device, rays=config.light_rays)
     chart, factors = _light_charts(plan, patches, samples, light)
     return TexturedMesh(
-        vertices=surface.vertices.astype(np.float32),
+        vertices=(config.enlarged * surface.vertices).astype(np.float32),
         triangles=surface.triangles.astype(np.int32),
         corner_uvs=_uvs(plan, chart, surface),
         triangle_texture=np.zeros(len(surface.triangles), np.int32),

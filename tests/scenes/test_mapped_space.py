@@ -31,3 +31,15 @@ def test_bad_input_is_refused() -> None:
     for settings in ({"max_camera_distance_m": 0.0}, {"clearance_m": -0.1}):
         with pytest.raises(ConfigError):
             MappedSpaceConfig(**settings)
+
+
+def test_ways_are_free_where_every_point_of_them_is() -> None:
+    rng = np.random.default_rng(0)
+    cameras = rng.uniform((0, -1, 0.8), (3, 1, 1.2), (25, 3))
+    space = MappedSpace(np.concatenate([WALL, rng.uniform((0, -1, 0.5), (3, 1, 1.5), (12, 3))]), cameras,
+                        MappedSpaceConfig(max_camera_distance_m=0.6, clearance_m=0.2))  # fmt: skip
+    a, b = rng.uniform((0, -1, 0.7), (2.7, 1, 1.3), (2, 300, 3))
+    shares = np.linspace(0, 1, 2001)[:, None]
+    expected = [bool(space.is_free(start + shares * (end - start)).all()) for start, end in zip(a, b, strict=True)]
+    assert space.segments_are_free(a, b).tolist() == expected and 20 < sum(expected) < 280
+    assert space.segments_are_free(a[:1], a[:1]).tolist() == space.is_free(a[:1]).tolist()

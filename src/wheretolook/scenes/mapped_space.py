@@ -11,6 +11,9 @@ from scipy.spatial import cKDTree
 from wheretolook.errors import ConfigError, MapError
 from wheretolook.geometry import Float
 
+STEP_M = 0.02
+"""Distance of the points of a way that must be near mapping cameras."""
+
 _OUTLIERS = 0.01  # share of landmarks left out at either end of each axis: a wrong one may lie anywhere
 
 
@@ -73,3 +76,32 @@ class MappedSpace:
         free &= self._cameras.query(at)[0] <= self.config.max_camera_distance_m
         free &= self._landmarks.query(at)[0] >= self.config.clearance_m
         return free
+
+    def segments_are_free(self, a: ArrayLike, b: ArrayLike) -> NDArray[np.bool_]:
+        """Whether a camera can move straight from a (N, 3) to b (N, 3) metres.
+
+        Both ends must be free, no landmark may lie within the clearance of the way, and the way must stay near mapping
+        cameras (looked at every 2 cm).
+
+        Returns:
+            (N,) bool.
+        """
+        start, end = (np.asarray(points, dtype=np.float64).reshape(-1, 3) for points in (a, b))
+        free = self.is_free(start) & self.is_free(end)
+        for n in np.flatnonzero(free):
+            free[n] = self._is_clear(start[n], end[n]) and self._stays_near_cameras(start[n], end[n])
+        return free
+
+    def _is_clear(self, start: Float, end: Float) -> bool:
+        along = end - start
+        length = float(np.linalg.norm(along))
+        reach = length / 2 + self.config.clearance_m
+        near = self._landmarks.data[self._landmarks.query_ball_point((start + end) / 2, reach)]
+        share = np.clip((near - start) @ along / max(length**2, 1e-24), 0, 1)
+        distance = np.linalg.norm(near - start - share[:, None] * along, axis=1)
+        return bool((distance >= self.config.clearance_m).all())
+
+    def _stays_near_cameras(self, start: Float, end: Float) -> bool:
+        steps = max(2, int(np.ceil(np.linalg.norm(end - start) / STEP_M)) + 1)
+        points = start + np.linspace(0, 1, steps)[:, None] * (end - start)
+        return bool((self._cameras.query(points)[0] <= self.config.max_camera_distance_m).all())

@@ -94,6 +94,7 @@ class Experiment:
     Args:
         name: of the dataset's folder.
         data: folder of all datasets.
+        release_name: folder of the dataset's release.
         device: "cpu", "cuda", "cuda:<index>", or "auto" for the first GPU there is.
         camera: the camera that will look, and with which the map's images are rendered.
         scenes: stage 1, meshes.
@@ -110,6 +111,7 @@ class Experiment:
 
     name: str = "demo"
     data: Path = Path("data")
+    release_name: str = "release"
     device: str = "auto"
     camera: PinholeCamera = field(default_factory=PinholeCamera)
     scenes: ScenesConfig = field(default_factory=ScenesConfig)

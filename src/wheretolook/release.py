@@ -44,7 +44,7 @@ def is_release(dataset: Dataset) -> bool:
 
 
 def copy_dataset(dataset: Dataset, experiment: Experiment) -> Dataset:
-    """Write a compact copy of a labelled dataset to `<data>/release/`. The same dataset gives the same bytes.
+    """Write a compact copy of a labelled dataset to `<data>/<release_name>/`. The same dataset gives the same bytes.
 
     Tables are written compact (`wheretolook.table.COMPACT_SCHEMA`), without matches, landmarks without descriptors and
     in half precision, the mapping images' poses if they are known, and what labels were made with without the list of
@@ -62,7 +62,7 @@ def copy_dataset(dataset: Dataset, experiment: Experiment) -> Dataset:
         ConfigError: the release's folder holds another dataset, or a release of another one.
         TableError, MapError: a scene's table, landmarks or occlusion are missing or damaged.
     """
-    root = experiment.data / RELEASE
+    root = experiment.data / experiment.release_name
     before = _release_of(root, dataset.name)
     fingerprint = None if before is None else before.fingerprint()
     copied = [(scene, SceneFolder(root / scene.name, scene.split)) for scene in dataset.scenes]

@@ -327,7 +327,7 @@ def viewpoint_map(experiment: Experiment, say: Say = print, tick: Tick = lambda 
 
 
 def release(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> Dataset:
-    """Publish a labelled dataset: a compact copy of it, `<data>/release/`, and in the end its card.
+    """Publish a labelled dataset: a compact copy of it, `<data>/<release_name>/`, and in the end its card.
 
     For any dataset but a release this makes the copy. For the copy itself, once networks are trained on it, it chooses
     the weights that ship, evaluates them and writes the card. Either can be done again.

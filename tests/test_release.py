@@ -18,7 +18,7 @@ from wheretolook import release as releases
 from wheretolook import stages
 from wheretolook.cli import main, parse_experiment
 from wheretolook.config import Experiment, MeshSource, ScenesConfig
-from wheretolook.dataset import Dataset, write_json
+from wheretolook.dataset import RELEASE, Dataset, write_json
 from wheretolook.errors import ConfigError, StorageError, TableError, WeightsError
 from wheretolook.evaluation import EvaluateConfig, evaluate
 from wheretolook.evaluation.report import score_markdown
@@ -327,13 +327,13 @@ def test_a_damaged_manifest_is_named(folder: Path) -> None:
 def test_the_shipped_configurations_fit_each_other() -> None:
     release, paper = (parse_experiment("train", ["--config", str(CONFIGS / f"{n}.yaml")]) for n in ("release", "paper"))
     assert release is not None and paper is not None
-    assert release.name == releases.RELEASE and release.camera == paper.camera
+    assert release.name == RELEASE and release.camera == paper.camera
 
 
 @pytest.fixture(scope="module")
 def shipped() -> Dataset:
     """The release in the project's `data/`."""
-    return Dataset.load(CONFIGS.parent / "data" / releases.RELEASE)
+    return Dataset.load(CONFIGS.parent / "data" / RELEASE)
 
 
 def test_the_shipped_card_is_of_what_ships(shipped: Dataset) -> None:

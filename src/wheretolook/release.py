@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import wheretolook
-from wheretolook.dataset import RELEASE, Dataset, SceneFolder, write_json
+from wheretolook.dataset import Dataset, SceneFolder, write_json
 from wheretolook.errors import ConfigError, StorageError, TableError, WeightsError
 from wheretolook.learning.config import MATCHABILITY, NETWORKS, RELEASED, VARIANTS, weights_name
 from wheretolook.mapping.cameras import CAMERAS_FILE, save_mapping_poses
@@ -126,8 +126,7 @@ def choose_weights_to_ship(release: Dataset) -> Choice:
     Raises:
         WeightsError: there are no weights of the paper's network, or weights or their record do not fit the release.
     """
-    from wheretolook.learning.data import with_also
-    from wheretolook.learning.training import training_fingerprint
+    from wheretolook.learning.training import was_trained_on
     from wheretolook.learning.weights import read_record, read_training
 
     folder = release.root / "weights"
@@ -135,8 +134,7 @@ def choose_weights_to_ship(release: Dataset) -> Choice:
     precision: dict[Path, float] = {}
     for path in trained_weights(release):
         record, training = read_record(path), read_training(path)
-        now = training_fingerprint(with_also(release, training.get("also", ())))
-        if record["about"] != training or training.get("dataset_fingerprint") != now:
+        if record["about"] != training or not was_trained_on(release, training):
             raise WeightsError("these weights were not trained on this release", path=path, fix=fix)
         precision[path] = float(record["metrics"]["val_average_precision"])
     if not precision:

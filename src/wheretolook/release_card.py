@@ -324,11 +324,17 @@ def _learner_text(folder: Path) -> list[str]:
         for ships, record in records
         if ships and (variant := record["about"]["variant"]) in record["about"]["config"]
     ]
+    further = [
+        f"{_label(record['about']['variant'])}: {', '.join(record['about']['also'])}."
+        for _, record in records
+        if record["about"].get("also")
+    ]
     return [
         "Learnt from the same viewpoints, with what is known of each landmark (matchability: whether the localizer "
         "finds a landmark, from the stored matches; its metrics are of landmarks, not of viewpoints):",
         markdown_table(header, lines),
         "Options of those that ship. " + " ".join(options),
+        *(["From further datasets beside this one: " + " ".join(further)] if further else []),
     ]
 
 

@@ -14,13 +14,13 @@ import pytest
 import torch
 
 from synthetic_dataset import make_dataset
-from wheretolook.dataset import Dataset
+from wheretolook.dataset import Dataset, SceneFolder
 from wheretolook.errors import ConfigError, TableError
 from wheretolook.learning.config import TrainConfig
 from wheretolook.learning.data import BatchLoader, ViewpointDataModule, balance_classes, hold_out_locations
 from wheretolook.learning.fit import EpochRecord
 from wheretolook.learning.network import InputStatistics
-from wheretolook.learning.training import train, training_fingerprint
+from wheretolook.learning.training import train, training_fingerprint, was_trained_on
 from wheretolook.learning.weights import load_classifier
 from wheretolook.scoring import load_scorer
 from wheretolook.table import LOCALIZED, NO_POSE, UNLABELLED, is_good, write_table
@@ -255,11 +255,16 @@ def test_other_datasets_are_learnt_from_too(dataset: Dataset, store: str) -> Non
     assert about["also"] == ["other"] and about["dataset_fingerprint"] == training_fingerprint(together)
     views = client(tracking).get_run(model.run_id).data.params
     assert int(views["n_train"]) + int(views["n_val"]) == (2 * 24 + 5) * 20
+    assert was_trained_on(dataset, about) and not was_trained_on(dataset, {**about, "also": []})
     (again,) = train(dataset, config, tracking, progress=False)
     (without,) = train(dataset, replace(config, also=()), tracking, progress=False)
     assert again.reused and not without.reused
     with pytest.raises(TableError, match=r"nowhere.*no dataset"):
         train(dataset, replace(config, also=("nowhere",)), tracking, progress=False)
+    elsewhere = Dataset(dataset.root.parent / "moved" / "tiny", dataset.camera, dataset.scenes)  # without the other one
+    assert was_trained_on(elsewhere, about)
+    unknown = SceneFolder(other.scenes[2].folder, "train")
+    assert not was_trained_on(Dataset(elsewhere.root, dataset.camera, (*dataset.scenes, unknown)), about)
     Dataset(other.root, replace(other.camera, width=other.camera.width + 2), other.scenes).save()
     with pytest.raises(ConfigError, match="other was made for another camera"):
         train(dataset, config, tracking, progress=False)

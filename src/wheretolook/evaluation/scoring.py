@@ -66,14 +66,13 @@ def choose_weights(dataset: Dataset, config: EvaluateConfig, models: Sequence[Tr
 
 def _own_weights(dataset: Dataset) -> list[Path]:
     """The weights in the dataset's folder, which must be trained on what the dataset now holds."""
-    from wheretolook.learning.training import training_fingerprint
+    from wheretolook.learning.training import was_trained_on
 
     named = (dataset.root / "weights" / weights_name(variant) for variant in VARIANTS)
     weights = [path for path in named if path.is_file()]
-    now = training_fingerprint(dataset)
     for path in weights:
         # compact tables hold no matches: what has learnt from these has learnt from the dataset they were copied from
-        if weights_kind(path) != MATCHABILITY and read_training(path).get("dataset_fingerprint") != now:
+        if weights_kind(path) != MATCHABILITY and not was_trained_on(dataset, read_training(path)):
             raise WeightsError(
                 "these weights were trained on other data than the dataset now holds", path=path,
                 fix="Run the train stage again, remove the file, or name weights in evaluate.weights.",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from importlib import import_module
 from pathlib import Path
@@ -14,7 +15,8 @@ from lightning.pytorch import seed_everything
 from lightning.pytorch.utilities.seed import isolate_rng
 
 import wheretolook
-from wheretolook.dataset import Dataset, write_json
+from wheretolook.dataset import Dataset, SceneFolder, write_json
+from wheretolook.errors import TableError
 from wheretolook.features import INPUT_VARIANTS
 from wheretolook.learning.classifier import ViewpointClassifier
 from wheretolook.learning.config import (
@@ -129,6 +131,19 @@ def training_fingerprint(dataset: Dataset) -> str:
     return Dataset(dataset.root, dataset.camera, (*dataset.split("train"), *dataset.split("val"))).fingerprint()
 
 
+def was_trained_on(dataset: Dataset, training: Mapping[str, Any]) -> bool:
+    """Whether weights with a record of training were trained on what a dataset, and others beside it, now hold.
+
+    Where another dataset that they learnt from is not at hand, the landmarks of the dataset's own scenes tell.
+    """
+    try:
+        together = with_also(dataset, training.get("also", ()))
+    except TableError:
+        own = {scene.name: file_fingerprint(scene.landmarks) for scene in dataset.scenes if scene.split != "test"}
+        return own.items() <= dict(training.get("landmarks", {})).items()
+    return bool(training.get("dataset_fingerprint") == training_fingerprint(together))
+
+
 def _about(dataset: Dataset, config: TrainConfig, fingerprint: str, variant: str) -> dict[str, Any]:
     """What decides which weights come out, as JSON values."""
     of_network = [name for name in asdict(config) if name not in NOT_DECIDING]
@@ -138,7 +153,9 @@ def _about(dataset: Dataset, config: TrainConfig, fingerprint: str, variant: str
         "dataset": dataset.name,
         "dataset_fingerprint": fingerprint,
         "landmarks": {
-            scene.name: file_fingerprint(scene.landmarks) for scene in dataset.scenes if scene.split != "test"
+            _name(scene, dataset): file_fingerprint(scene.landmarks)
+            for scene in dataset.scenes
+            if scene.split != "test"
         },
         "code_version": wheretolook.__version__,
         "variant": variant,
@@ -151,6 +168,12 @@ def _about(dataset: Dataset, config: TrainConfig, fingerprint: str, variant: str
         start = dataset.root / "weights" / weights_name(MATCHABILITY)
         about["matchability_sha256"] = sha256(start) if start.is_file() else None
     return dict(json.loads(json.dumps(about)))
+
+
+def _name(scene: SceneFolder, dataset: Dataset) -> str:
+    """Name of a scene, with that of its dataset if it is of another one."""
+    folder = scene.folder.parent
+    return scene.name if folder == dataset.root else f"{folder.name}/{scene.name}"
 
 
 def _trained_before(path: Path, variant: str, about: dict[str, Any]) -> TrainedModel | None:

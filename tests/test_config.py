@@ -91,7 +91,7 @@ def test_every_stage_explains_itself(stage: str, capsys: pytest.CaptureFixture[s
     text = capsys.readouterr().out
     for group in cli.STAGES[stage][2] if stage in cli.STAGES else ():
         assert f"--{group}" in text
-    assert ("--label.shard_size" in text) == (stage in ("label", "demo"))
+    assert ("--label.shard_size" in text) == (stage in ("label", "compare-paths", "demo"))
 
 
 def test_usage_lists_every_stage(capsys: pytest.CaptureFixture[str]) -> None:

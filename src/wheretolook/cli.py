@@ -48,6 +48,11 @@ STAGES = {
         "Score every direction at every free voxel of a scene, for planners to look up. Needs no labels.",
         ("viewpoint_map", "occlusion", "scenes.free_space"),
     ),
+    "compare-paths": (
+        "compare_paths",
+        "Plan paths between random places by several methods, render what the camera sees, localize it. Resumes.",
+        ("paths", "occlusion", "scenes.free_space", "label", "tracking"),
+    ),
     "release": (
         "release",
         "Make a compact copy, data/release; given that copy and weights trained on it, evaluate and write its card.",
@@ -246,7 +251,8 @@ _MORE_HELP = {
     "evaluate": "\nWhat evaluate.methods may name: wheretolook evaluate --list-methods\n",
     "viewpoint-map": """
 Reads a scene's mesh and map, as the scenes and map stages leave them; --scene, --method, --weights and --out stand for
-the settings of viewpoint_map. For example, with the weights that ship:
+the settings of viewpoint_map. Without weights or a method, the best weights of the dataset, or else those that ship,
+score the views. For example, with the paper's network:
 
   wheretolook viewpoint-map --config configs/demo.yaml --scene apartment-000 \\
       --weights data/release/weights/mlp-2d+z.safetensors --out apartment.map

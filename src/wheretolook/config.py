@@ -14,7 +14,7 @@ from wheretolook.geometry import PinholeCamera
 from wheretolook.labelling.config import LabelConfig
 from wheretolook.learning.config import TrainConfig
 from wheretolook.mapping.config import MapConfig
-from wheretolook.planning.config import ViewpointMapConfig
+from wheretolook.planning.config import PathsConfig, ViewpointMapConfig
 from wheretolook.sampling import SampleConfig
 from wheretolook.scenes.free_space import FreeSpaceConfig
 from wheretolook.scenes.mapped_space import MappedSpaceConfig
@@ -106,6 +106,7 @@ class Experiment:
         train: stage 5, the network.
         evaluate: stage 6, scores of all methods.
         viewpoint_map: what planners query.
+        paths: planned paths of several methods, to be compared.
         tracking: where MLflow keeps its runs.
     """
 
@@ -122,7 +123,15 @@ class Experiment:
     train: TrainConfig = field(default_factory=TrainConfig)
     evaluate: EvaluateConfig = field(default_factory=EvaluateConfig)
     viewpoint_map: ViewpointMapConfig = field(default_factory=ViewpointMapConfig)
+    paths: PathsConfig = field(default_factory=PathsConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9._-]*", self.release_name):
+            raise ConfigError(
+                "a release's name becomes a folder's", value=self.release_name,
+                fix="Give it a name of letters, digits, '.', '_' and '-'.",
+            )  # fmt: skip
 
     @property
     def root(self) -> Path:

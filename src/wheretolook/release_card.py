@@ -141,9 +141,9 @@ def release_card(release: Dataset) -> str:
         "## To make it again",
         "```sh\n"
         f"for stage in scenes map sample label; do wheretolook $stage --config configs/{source}.yaml; done\n"
-        f"rm -r {root}/weights\n"
+        f"rm {root}/weights/mlp-*  # matchability stays: it has learnt from matches, which a release does not hold\n"
         f"wheretolook release --config configs/{source}.yaml   # tables and landmarks\n"
-        f"wheretolook train --config {config}\n"
+        f"wheretolook train --config {config}   # what else ships: by the options under Training\n"
         f"wheretolook release --config {config}   # chooses the weights, evaluates them, writes this page\n"
         "```",
         "## Licence",
@@ -320,7 +320,7 @@ def _learner_text(folder: Path) -> list[str]:
     ]
     header = ["beside it", "ships", *[name.replace("_", " ") for name in _LEARNER_METRICS]]
     options = [
-        f"{_label(variant)}: {_pairs(record['about']['config'][variant])}."
+        f"{_label(variant)}: {_pairs(record['about']['config'][variant])}, seed {record['about']['config']['seed']}."
         for ships, record in records
         if ships and (variant := record["about"]["variant"]) in record["about"]["config"]
     ]

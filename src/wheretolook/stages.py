@@ -54,7 +54,7 @@ def make_scenes(experiment: Experiment, say: Say = print, tick: Tick = lambda wo
         seed = config.seed + index
         scene = SceneFolder(root / f"apartment-{seed:03d}", split)
         sources[scene] = partial(generate_apartment, config.apartment, seed, device=experiment.warp_device)
-        keys[scene] = [asdict(config.apartment), seed]
+        keys[scene] = [config.apartment.key(), seed]
     for source in config.meshes:
         scene = SceneFolder(root / source.scene_name, source.split)
         if scene.name in {other.name for other in sources}:
@@ -305,7 +305,7 @@ def viewpoint_map(experiment: Experiment, say: Say = print, tick: Tick = lambda 
     if config.scene and config.scene not in scenes:
         fix = f"There are {', '.join(scenes)}."
         raise ConfigError("there is no such scene", path=dataset.root, value=config.scene, fix=fix)
-    if not config.method and config.weights is None and (weights := default_weights(dataset)) is not None:
+    if not config.method and config.weights is None and (weights := default_weights(dataset, say)) is not None:
         say(f"scored by {weights}")
         config = replace(config, weights=weights)
     built: dict[str, ViewpointMap] = {}
@@ -324,6 +324,25 @@ def viewpoint_map(experiment: Experiment, say: Say = print, tick: Tick = lambda 
             f"{found.origin.scorer} -> {folder}")  # fmt: skip
         tick(1)
     return built
+
+
+def compare_paths(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> pd.DataFrame:
+    """Paths planned by several methods, rendered and localized: `<dataset>/results/paths.{csv,md,png}`, MLflow runs.
+
+    Needs the map stage only. What was planned and localized before is used again.
+
+    Returns:
+        `wheretolook.planning.path_report.summarize_paths`.
+
+    Raises:
+        ConfigError: no such scene or method, or no weights. WeightsError: the weights cannot be used.
+        SceneError: a scene has no mesh, or too little room for starts and goals.
+    """
+    from wheretolook.planning.path_stage import compare_scenes
+
+    summary = compare_scenes(_dataset(experiment, "map"), experiment, _extractor_of, say)
+    tick(1)
+    return summary
 
 
 def release(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> Dataset:

@@ -6,10 +6,12 @@
     python tests/benchmarks/study_scorers.py curves ...       with fewer training scenes and viewpoints
 
 The protocol, fixed before the test scenes were looked at: options are chosen by the mean validation average precision
-over seeds; of all learners the one with the best mean ships, with the weights of its best seed; test scenes and scenes
-of others are scored once, with every seed's weights. Appends one row a training to `<out>/<part>.csv`; rows that are
-there are not made again. Weights lie in `<out>/<variant>-<seed>/weights`, and those of other parts in
-`<out>/<part>/<condition>-<seed>.safetensors`.
+over seeds; of all learners the one with the best mean ships, made by the train stage with the best seed; test scenes
+and scenes of others are scored once, with every seed's weights. (For the weights that ship it was twice: with two
+candidates, before the rooms of configs/varied.yaml got patterns that repeat, and then as said.)
+
+Appends one row a training to `<out>/<part>.csv`; rows that are there are not made again. Weights lie in
+`<out>/<variant>-<seed>/weights`, and those of other parts in `<out>/<part>/<condition>-<seed>.safetensors`.
 
 `--set '{"pooled": 8}'` changes the network that attributes, options and curves start from; `--choices '[{"head": 96},
 ...]'` are the options to try.
@@ -46,8 +48,8 @@ OF_NETWORKS = {"balance": True, "batch_size": 4096, "noise_px": 1.0, "noise_m": 
 
 
 CHOICES: list[dict[str, Any]] = [
-    {}, {"pooled": 8}, {"width": 96}, {"width": 24}, {"head": 96}, {"dropout": 0.3}, {"l2": 1e-4},
-    {"learning_rate": 1e-3}, {"epochs": 16}, {"from_matchability": False}, {"landmarks": 96}, {"enlarged": 3.0},
+    {}, {"pooled": 0}, {"pooled": 16}, {"width": 96}, {"width": 24}, {"head": 96}, {"dropout": 0.3}, {"l2": 1e-4},
+    {"learning_rate": 1e-3}, {"epochs": 16}, {"from_matchability": False}, {"landmarks": 96}, {"enlarged": 1.0},
 ]  # fmt: skip
 """Options of the set network to try."""
 

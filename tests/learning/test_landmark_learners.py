@@ -263,15 +263,16 @@ def test_landmarks_of_enlarged_views() -> None:
     assert not growth.any()
 
 
-@pytest.mark.parametrize("world_size", [2, 3])
-def test_processes_share_out_every_batch(dataset: Dataset, world_size: int) -> None:
+@pytest.mark.parametrize(("world_size", "enlarged"), [(2, 1.0), (3, 3.0)])
+def test_processes_share_out_every_batch(dataset: Dataset, world_size: int, enlarged: float) -> None:
     views = load_landmark_views(dataset, training_scenes(dataset), TrainConfig(), 40, progress=False)
     rows = torch.arange(101)  # the last batch has one view: some processes get none
-    whole = list(LandmarkLoader(views, rows, 20, width=8, shuffle_seed=3))
-    loaders = [LandmarkLoader(views, rows, 20, 8, 3, rank, world_size) for rank in range(world_size)]
+    whole = list(LandmarkLoader(views, rows, 20, width=8, shuffle_seed=3, enlarged=enlarged))
+    loaders = [LandmarkLoader(views, rows, 20, 8, 3, rank, world_size, enlarged) for rank in range(world_size)]
     for batch, shares in zip(whole, zip(*loaders, strict=True), strict=True):
         assert {share.total for share in shares} == {len(batch.labels)}
         assert torch.equal(torch.cat([share.inputs[2] for share in shares]), batch.inputs[2])
+        assert torch.equal(torch.cat([share.labels for share in shares]), batch.labels)
         at = 0
         for share in shares:
             values, taken = share.inputs[:2]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +18,13 @@ from synthetic_dataset import make_dataset
 from wheretolook.dataset import Dataset, SceneFolder
 from wheretolook.errors import ConfigError, TableError
 from wheretolook.learning.config import TrainConfig
-from wheretolook.learning.data import BatchLoader, ViewpointDataModule, balance_classes, hold_out_locations
+from wheretolook.learning.data import (
+    BatchLoader,
+    ViewpointDataModule,
+    balance_classes,
+    hold_out_locations,
+    with_also,
+)
 from wheretolook.learning.fit import EpochRecord
 from wheretolook.learning.network import InputStatistics
 from wheretolook.learning.training import train, training_fingerprint, was_trained_on
@@ -247,7 +254,7 @@ def test_training_learns_the_rule_logs_a_run_and_is_reused(
 
 
 def test_other_datasets_are_learnt_from_too(dataset: Dataset, store: str) -> None:
-    other = make_dataset(dataset.root.parent / "other", ("val", "train", "test"), n_locations=5)
+    other = make_dataset(dataset.root.parent / "other", ("val", "test", "test", "test", "train"), n_locations=5)
     tracking, config = TrackingConfig(store, "also"), replace(SMALL, epochs=1, also=("other",))
     (model,) = train(dataset, config, tracking, progress=False)
     about = json.loads(model.path.with_suffix(".json").read_text())["about"]
@@ -263,8 +270,18 @@ def test_other_datasets_are_learnt_from_too(dataset: Dataset, store: str) -> Non
         train(dataset, replace(config, also=("nowhere",)), tracking, progress=False)
     elsewhere = Dataset(dataset.root.parent / "moved" / "tiny", dataset.camera, dataset.scenes)  # without the other one
     assert was_trained_on(elsewhere, about)
-    unknown = SceneFolder(other.scenes[2].folder, "train")
-    assert not was_trained_on(Dataset(elsewhere.root, dataset.camera, (*dataset.scenes, unknown)), about)
+    assert not was_trained_on(Dataset(elsewhere.root, dataset.camera, dataset.scenes[1:]), about)
+    for names in (("tiny",), ("other", "other")):
+        with pytest.raises(ConfigError, match="learnt from twice"):
+            with_also(dataset, names)
+    leak = Dataset(other.root, other.camera, (SceneFolder(other.scenes[2].folder, "train"),))
+    shutil.copy(dataset.split("test")[0].landmarks, leak.scenes[0].landmarks)
+    leak.save()
+    with pytest.raises(ConfigError, match=r"other/scene-2.*is the scene .*tiny/scene-2 again"):
+        train(dataset, config, tracking, progress=False)
+    Dataset(other.root, other.camera, other.split("test")).save()
+    with pytest.raises(TableError, match=r"other.*no train scene"):
+        train(dataset, config, tracking, progress=False)
     Dataset(other.root, replace(other.camera, width=other.camera.width + 2), other.scenes).save()
     with pytest.raises(ConfigError, match="other was made for another camera"):
         train(dataset, config, tracking, progress=False)

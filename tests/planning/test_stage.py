@@ -79,6 +79,16 @@ def test_the_best_weights_there_are_score(dataset: Path, capsys: pytest.CaptureF
     rooms = Dataset.load(dataset / "data" / "rooms")
     assert default_weights(rooms) == weights / "set.safetensors"
     assert default_weights(replace(rooms, camera=replace(CAMERA, focal_px=70.0))) is None
+    own = dataset / "data" / "rooms" / "weights"
+    shutil.copytree(weights, own)  # learnt from other scenes than those of the dataset
+    shutil.copy(weights / "set.safetensors", own / "trees.safetensors")  # without a record
+    (own / "conv.safetensors").write_bytes(b"damaged")
+    said: list[str] = []
+    assert default_weights(rooms, said.append) == weights / "set.safetensors"
+    assert [text.split(":")[1].split("/")[-1] for text in said] == [
+        "conv.safetensors", "set.safetensors", "trees.safetensors",
+    ]  # fmt: skip
+    assert "other data" in said[1]
 
 
 @pytest.mark.parametrize(

@@ -294,6 +294,15 @@ def test_an_enlarged_apartment_is_the_same_but_larger() -> None:
     assert large.textures[0].tobytes() == small.textures[0].tobytes()
 
 
+def test_apartments_of_before_keep_their_key() -> None:
+    before = {
+        "n_rooms": None, "area_m2": None, "texture_richness": 0.85, "clutter": 0.85, "dark_rooms": 0.2,
+        "texels_per_m": 125.0, "texture_size": 4096, "light_spacing_m": 0.1, "light_rays": 24,
+    }  # fmt: skip
+    assert ApartmentConfig().key() == before  # or all that was made from them would be made again
+    assert ApartmentConfig(vary=True).key() == {**before, "vary": True}
+
+
 def test_varied_apartments_differ_by_their_seed() -> None:
     varied = ApartmentConfig(vary=True)
     drawn = [varied.of_seed(seed) for seed in range(40)]
@@ -309,6 +318,7 @@ def test_varied_apartments_differ_by_their_seed() -> None:
         ({"n_rooms": 2}, "n_rooms"),
         ({"repetition": -0.1}, "repetition"),
         ({"enlarged": 0.0}, "enlarged"),
+        ({"enlarged": float("inf")}, "enlarged"),
         ({"clutter": 1.5}, "clutter"),
         ({"area_m2": 5.0}, "area_m2"),
         ({"light_rays": 0}, "light_rays"),

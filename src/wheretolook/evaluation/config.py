@@ -47,7 +47,7 @@ class EvaluateConfig:
         heading: of the method "forward", in the world: one direction, or the waypoints of a path, whose direction of
             travel nearest to a location is the heading there. Empty for a horizontal heading drawn for each location.
         reference: method that every other is compared with, by name and inputs as in the table, such as "bins" or
-            "mlp 2d+z". Empty for the learned one with the inputs "2d+3d", or else the first learned one.
+            "mlp 2d+z". Empty for "set", or else the learned one with the inputs "2d+3d", or the first learned one.
     """
 
     methods: tuple[str, ...] = field(default_factory=_all_methods)

@@ -42,6 +42,9 @@ LEARNED = "mlp"
 PROBABILITIES = (LEARNED, "trees", "conv", "set", "sphere")
 """Methods whose scores are probabilities, learnt from labels."""
 
+BEST: Method = ("set", "")
+"""The method that others are compared with unless told otherwise: the best there is."""
+
 _PAIRED = ("difference", "difference_low", "difference_high", "p")
 _CALIBRATION = ("ece", "ece_scaled", "temperature")
 
@@ -85,8 +88,8 @@ def reference_method(methods: Iterable[Method], name: str) -> Method | None:
         known = f"There are {', '.join(named)}."
         raise ConfigError("the reference is none of the methods evaluated", value=name, fix=known)
     learned = [method for method in named.values() if method[0] in PROBABILITIES]
-    first = (LEARNED, "2d+3d") if (LEARNED, "2d+3d") in learned else next(iter(learned), None)
-    return named[name] if name else first
+    preferred = [method for method in (BEST, (LEARNED, "2d+3d")) if method in learned]
+    return named[name] if name else next(iter([*preferred, *learned]), None)
 
 
 def score_table(

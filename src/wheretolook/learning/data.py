@@ -20,7 +20,7 @@ from wheretolook.errors import ConfigError, TableError
 from wheretolook.features import ALL_CHANNELS, CHANNELS
 from wheretolook.learning.config import TrainConfig
 from wheretolook.learning.network import InputStatistics
-from wheretolook.table import UNLABELLED, is_good, poses
+from wheretolook.table import UNLABELLED, fingerprint, is_good, poses
 
 BLOCK = 4096
 """Views binned at a time."""
@@ -170,16 +170,28 @@ def with_also(dataset: Dataset, names: Sequence[str]) -> Dataset:
     """A dataset together with the train scenes of others beside it.
 
     Raises:
-        TableError: there is no such dataset.
-        ConfigError: it was made for another camera.
+        TableError: there is no such dataset, or it has no train scene.
+        ConfigError: it was made for another camera, is named twice or is the dataset itself, or one of its scenes is a
+            scene of the dataset under another name, of whatever split.
     """
+    if len({dataset.name, *names}) <= len(names):
+        fix = "Name other datasets in the same folder, each once."
+        raise ConfigError("a dataset would be learnt from twice", value=list(names), fix=fix)
     scenes = list(dataset.scenes)
     for name in names:
         other = Dataset.load(dataset.root.parent / name)
         if other.camera != dataset.camera:
             fix = f"It must be {dataset.camera}, as that of {dataset.root}."
             raise ConfigError(f"{other.root} was made for another camera", value=other.camera, fix=fix)
-        scenes += other.split("train")
+        scenes += training_scenes(Dataset(other.root, other.camera, other.split("train")))
+    if names:
+        seen: dict[str, SceneFolder] = {}
+        for scene in scenes:
+            landmarks = fingerprint(scene.landmarks) if scene.landmarks.is_file() else str(scene.folder)
+            if landmarks in seen:
+                fix = "Leave the dataset out of train.also: scenes must not cross splits."
+                raise ConfigError(f"this is the scene {seen[landmarks].folder} again", path=scene.folder, fix=fix)
+            seen[landmarks] = scene
     return Dataset(dataset.root, dataset.camera, tuple(scenes))
 
 

@@ -16,7 +16,7 @@ from lightning.pytorch.utilities.seed import isolate_rng
 
 import wheretolook
 from wheretolook.dataset import Dataset, SceneFolder, write_json
-from wheretolook.errors import TableError
+from wheretolook.errors import ConfigError, TableError
 from wheretolook.features import INPUT_VARIANTS
 from wheretolook.learning.classifier import ViewpointClassifier
 from wheretolook.learning.config import (
@@ -134,13 +134,15 @@ def training_fingerprint(dataset: Dataset) -> str:
 def was_trained_on(dataset: Dataset, training: Mapping[str, Any]) -> bool:
     """Whether weights with a record of training were trained on what a dataset, and others beside it, now hold.
 
-    Where another dataset that they learnt from is not at hand, the landmarks of the dataset's own scenes tell.
+    Where another dataset that they learnt from is not at hand, the dataset's own scenes tell.
     """
+    also = training.get("also", ())
+    if also and not all((dataset.root.parent / name / "dataset.json").is_file() for name in also):
+        return bool(training.get("own_fingerprint") == training_fingerprint(dataset))
     try:
-        together = with_also(dataset, training.get("also", ()))
-    except TableError:
-        own = {scene.name: file_fingerprint(scene.landmarks) for scene in dataset.scenes if scene.split != "test"}
-        return own.items() <= dict(training.get("landmarks", {})).items()
+        together = with_also(dataset, also)
+    except (TableError, ConfigError):
+        return False  # what lies there now cannot have been learnt from
     return bool(training.get("dataset_fingerprint") == training_fingerprint(together))
 
 
@@ -164,6 +166,8 @@ def _about(dataset: Dataset, config: TrainConfig, fingerprint: str, variant: str
     }
     if config.also:
         about["also"] = list(config.also)
+        own = tuple(scene for scene in dataset.scenes if scene.folder.parent == dataset.root)
+        about["own_fingerprint"] = training_fingerprint(Dataset(dataset.root, dataset.camera, own))
     if variant == SET and config.set.from_matchability:
         start = dataset.root / "weights" / weights_name(MATCHABILITY)
         about["matchability_sha256"] = sha256(start) if start.is_file() else None

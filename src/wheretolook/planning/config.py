@@ -1,8 +1,8 @@
-"""Settings of the viewpoint map."""
+"""Settings of the viewpoint map, of paths, and of their comparison."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from wheretolook.errors import ConfigError
@@ -36,3 +36,96 @@ class ViewpointMapConfig:
     def __post_init__(self) -> None:
         if self.out is not None and not self.scene:
             raise ConfigError("viewpoint_map.out is the folder of one scene", value=str(self.out), fix="Name a scene.")
+
+
+@dataclass(frozen=True)
+class PathConfig:
+    """What a path costs, and what a camera on it can do.
+
+    The cost of a path is its length, `turn_weight_m` for every radian that the camera turns, and `score_weight` for
+    every metre times one less the score of the views along it.
+
+    Args:
+        score_weight: metres that a metre without any hope to localize costs beside its length (the paper's lambda).
+        turn_weight_m: metres that turning by one radian costs.
+        pitch_deg: least and greatest pitch of the optical axis, degrees above the horizon.
+        max_turn_deg_per_m: the camera turns by no more while it moves by a metre.
+        spacing_m: distance of the views along a path.
+        step_m: longest straight piece that the planner adds at once.
+        time_s: time to plan. The path only gets better with time.
+    """
+
+    score_weight: float = 3.0
+    turn_weight_m: float = 0.1
+    pitch_deg: tuple[float, float] = (-40.0, 40.0)
+    max_turn_deg_per_m: float = 150.0
+    spacing_m: float = 0.2
+    step_m: float = 1.0
+    time_s: float = 5.0
+
+    def __post_init__(self) -> None:
+        low, high = self.pitch_deg
+        if not -90 < low <= high < 90:
+            raise ConfigError("pitch_deg needs a range inside -90 to 90", value=self.pitch_deg)
+        for name in ("max_turn_deg_per_m", "spacing_m", "step_m", "time_s"):
+            if not getattr(self, name) > 0:
+                raise ConfigError(f"{name} must be positive", value=getattr(self, name))
+        for name in ("score_weight", "turn_weight_m"):
+            if not getattr(self, name) >= 0:
+                raise ConfigError(f"{name} must not be negative", value=getattr(self, name))
+
+
+@dataclass(frozen=True)
+class PathsConfig:
+    """How methods are compared by planned paths.
+
+    Args:
+        scenes: names of scenes; none for all of the test split.
+        pairs: starts and goals in each scene.
+        seed: of these.
+        min_distance_m: least distance of a goal from its start.
+        height_m: range of the heights of starts and goals above the floor.
+        methods: "forward", the shortest path looking ahead, and methods that score views, see `wheretolook evaluate
+            --list-methods`. Scores that are no probabilities enter by their ranks.
+        weights: of the methods that have learnt; by default the best of the dataset, or else of the release.
+        grid: voxels of the viewpoint maps along x, y and z.
+        directions: directions at each voxel.
+        max_turn_deg: along a path that is given, the camera turns by no more from one waypoint to the next.
+        max_error_m: a view is good if it localizes with a smaller error of its position.
+        max_error_deg: and of its orientation.
+        resamples: of the pairs, for 95 % intervals.
+        planner: costs and limits of the paths, time to plan each.
+    """
+
+    scenes: tuple[str, ...] = ()
+    pairs: int = 20
+    seed: int = 0
+    min_distance_m: float = 3.0
+    height_m: tuple[float, float] = (1.2, 1.6)
+    methods: tuple[str, ...] = ("forward", "fisher-trace-gp", "set")
+    weights: Path | None = None
+    grid: tuple[int, int, int] = (8, 8, 8)
+    directions: int = 500
+    max_turn_deg: float = 30.0
+    max_error_m: float = 0.25
+    max_error_deg: float = 2.0
+    resamples: int = 2000
+    planner: PathConfig = field(default_factory=PathConfig)
+
+    def __post_init__(self) -> None:
+        positive = (
+            "pairs",
+            "min_distance_m",
+            "directions",
+            "max_turn_deg",
+            "max_error_m",
+            "max_error_deg",
+            "resamples",
+        )
+        for name in positive:
+            if not getattr(self, name) > 0:
+                raise ConfigError(f"{name} must be positive", value=getattr(self, name))
+        if not 0 < self.height_m[0] <= self.height_m[1]:
+            raise ConfigError("height_m needs a range above 0", value=self.height_m)
+        if "forward" not in self.methods or len(set(self.methods)) < len(self.methods):
+            raise ConfigError('methods need "forward" to compare with, and every name once', value=self.methods)

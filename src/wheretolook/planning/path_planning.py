@@ -10,12 +10,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
-from wheretolook.errors import ConfigError, PlanningError
+from wheretolook.errors import PlanningError
 from wheretolook.geometry import Float
 from wheretolook.grid import axes_of_angles
+from wheretolook.planning.config import PathConfig
 from wheretolook.planning.sequences import TurnLimit, best_sequence
 from wheretolook.planning.turns import check_axis
 from wheretolook.planning.viewpoint_map import ViewpointMap
+
+__all__ = ["PathConfig", "PlannedPath", "Space", "plan_path"]
 
 TABLE_STEP_DEG = 2.0
 """Step of yaw and pitch of the table that finds the map's direction nearest to an axis."""
@@ -38,43 +41,6 @@ class Space(Protocol):
 
     def segments_are_free(self, a: ArrayLike, b: ArrayLike) -> NDArray[np.bool_]:
         """Whether it may go straight from points a to points b, (N, 3) m each; (N,)."""
-
-
-@dataclass(frozen=True)
-class PathConfig:
-    """What a path costs, and what a camera on it can do.
-
-    The cost of a path is its length, `turn_weight_m` for every radian that the camera turns, and `score_weight` for
-    every metre times one less the score of the views along it.
-
-    Args:
-        score_weight: metres that a metre without any hope to localize costs beside its length (the paper's lambda).
-        turn_weight_m: metres that turning by one radian costs.
-        pitch_deg: least and greatest pitch of the optical axis, degrees above the horizon.
-        max_turn_deg_per_m: the camera turns by no more while it moves by a metre.
-        spacing_m: distance of the views along a path.
-        step_m: longest straight piece that the planner adds at once.
-        time_s: time to plan. The path only gets better with time.
-    """
-
-    score_weight: float = 3.0
-    turn_weight_m: float = 0.1
-    pitch_deg: tuple[float, float] = (-40.0, 40.0)
-    max_turn_deg_per_m: float = 150.0
-    spacing_m: float = 0.2
-    step_m: float = 1.0
-    time_s: float = 5.0
-
-    def __post_init__(self) -> None:
-        low, high = self.pitch_deg
-        if not -90 < low <= high < 90:
-            raise ConfigError("pitch_deg needs a range inside -90 to 90", value=self.pitch_deg)
-        for name in ("max_turn_deg_per_m", "spacing_m", "step_m", "time_s"):
-            if not getattr(self, name) > 0:
-                raise ConfigError(f"{name} must be positive", value=getattr(self, name))
-        for name in ("score_weight", "turn_weight_m"):
-            if not getattr(self, name) >= 0:
-                raise ConfigError(f"{name} must not be negative", value=getattr(self, name))
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 from wheretolook.dataset import RELEASE, Dataset, SceneFolder
+from wheretolook.errors import ConfigError, WeightsError
 from wheretolook.geometry import PinholeCamera
 from wheretolook.grid import VoxelGrid, direction_lattice
 from wheretolook.learning.config import MATCHABILITY
-from wheretolook.learning.weights import best_weights, read_weights
+from wheretolook.learning.training import was_trained_on
+from wheretolook.learning.weights import read_record, read_training, read_weights
 from wheretolook.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.planning.config import ViewpointMapConfig
@@ -54,18 +57,31 @@ def scene_viewpoint_map(
     )
 
 
-def default_weights(dataset: Dataset) -> Path | None:
-    """The best weights of a dataset, or else of the release beside it if they were trained for the same field of view.
+def default_weights(dataset: Dataset, say: Callable[[str], None] = print) -> Path | None:
+    """The best weights of a dataset, or else of the release beside it, that serve its camera's field of view.
 
-    Raises:
-        WeightsError: a record of training is damaged.
+    Args:
+        dataset: whose `weights` folder is looked into first.
+        say: told of files that cannot be used, and why.
     """
-    for folder in (dataset.root / "weights", dataset.root.parent / RELEASE / "weights"):
-        if any(path.stem != MATCHABILITY for path in folder.glob("*.safetensors")):
-            path = best_weights(folder)
-            trained = PinholeCamera(**read_weights(path)[1]["camera"])
-            if same_field_of_view(trained, dataset.camera):
-                return path
+    for root in (dataset.root, dataset.root.parent / RELEASE):
+        fitting: dict[Path, float] = {}
+        for path in sorted((root / "weights").glob("*.safetensors")):
+            if path.stem == MATCHABILITY:
+                continue
+            try:
+                header, training = read_weights(path)[1], read_training(path)
+                trained = PinholeCamera(**header["camera"])
+                precision = float(read_record(path)["metrics"]["val_average_precision"])
+            except (WeightsError, ConfigError, KeyError, TypeError, ValueError) as error:
+                say(f"not used: {path}: {error}")
+                continue
+            if root == dataset.root and not was_trained_on(dataset, training):
+                say(f"not used: {path}: trained on other data than the dataset now holds")
+            elif same_field_of_view(trained, dataset.camera):
+                fitting[path] = precision
+        if fitting:
+            return max(fitting, key=lambda path: fitting[path])
     return None
 
 

@@ -86,7 +86,8 @@ class MappedSpace:
         Returns:
             (N,) bool.
         """
-        start, end = (np.asarray(points, dtype=np.float64).reshape(-1, 3) for points in (a, b))
+        ends = (np.asarray(points, dtype=np.float64).reshape(-1, 3) for points in (a, b))
+        start, end = np.broadcast_arrays(*ends)
         free = self.is_free(start) & self.is_free(end)
         for n in np.flatnonzero(free):
             free[n] = self._is_clear(start[n], end[n]) and self._stays_near_cameras(start[n], end[n])

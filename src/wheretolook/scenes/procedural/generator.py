@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import math
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -35,7 +36,7 @@ class ApartmentConfig:
             views are full of features and yet hard to localize.
         dark_rooms: share of rooms whose lamp is off, some with their curtains closed. Higher is harder.
         enlarged: how many times as large everything is, furniture and patterns too: halls with few, far landmarks.
-        vary: every apartment draws its area and the six numbers above from its seed, whatever they are set to: rooms
+        vary: every apartment draws its area and the five numbers above from its seed, whatever they are set to: rooms
             unlike each other, to learn from.
         texels_per_m: texture resolution of large surfaces; lowered if the atlas would not fit.
         texture_size: greatest width and height of the texture in texels.
@@ -65,8 +66,16 @@ class ApartmentConfig:
             if not 0 <= getattr(self, name) <= 1:
                 raise ConfigError(f"{name} must be between 0 and 1", value=getattr(self, name))
         for name in ("enlarged", "texels_per_m", "texture_size", "light_spacing_m", "light_rays"):
-            if not getattr(self, name) > 0:
-                raise ConfigError(f"{name} must be positive", value=getattr(self, name))
+            if not 0 < getattr(self, name) < math.inf:
+                raise ConfigError(f"{name} must be a positive number", value=getattr(self, name))
+
+    def key(self) -> dict[str, Any]:
+        """What decides an apartment, but for its seed; options that came later only where they are not the default."""
+        later = ("repetition", "enlarged", "vary")
+        default = ApartmentConfig()
+        return {
+            name: value for name, value in asdict(self).items() if name not in later or value != getattr(default, name)
+        }
 
     def of_seed(self, seed: int) -> ApartmentConfig:
         """What the apartment of a seed is like: this, unless it is to `vary`."""

@@ -42,7 +42,7 @@ def repeat_patterns(
         if min(chart.width, chart.height) < LEAST_M * chart.texels_per_m or rng.random() >= share:
             continue
         which = int(rng.integers(PATTERNS))
-        side = round(periods_m[which] * chart.texels_per_m)
+        side = max(1, round(periods_m[which] * chart.texels_per_m))
         key = (which, chart.texels_per_m)
         if key not in tiles:
             canvas = Canvas(side, side, chart.texels_per_m, 0.0, 0.0, noise)

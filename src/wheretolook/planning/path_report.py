@@ -1,0 +1,99 @@
+"""What planned paths were worth: the share of their views that localize, with intervals, and what that costs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from wheretolook.planning.config import PathsConfig
+from wheretolook.planning.path_comparison import FORWARD
+from wheretolook.table import LOCALIZED
+
+ALL = "all"
+"""Name of the rows over all scenes."""
+
+
+def summarize_paths(paths: pd.DataFrame, views: pd.DataFrame, config: PathsConfig) -> pd.DataFrame:
+    """A row for each scene, and for all, task and method.
+
+    Args:
+        paths: `wheretolook.planning.path_comparison.ComparedPaths.paths` of all scenes, with a column `scene`.
+        views: their views, with `scene`, `status`, `error_m` and `error_deg`.
+        config: limits of the errors, resamples, seed.
+
+    Returns:
+        `localized`, the share of all views that localize, and `times_forward`, that share over the one of "forward",
+        both with the ends of 95 % intervals by resampling pairs within scenes; over the pairs that both planned,
+        `times_forward_length`; `failures` to plan, `turn_deg_per_m`, `promised`.
+    """
+    good = (
+        (views["status"] == LOCALIZED)
+        & (views["error_m"] < config.max_error_m)
+        & (views["error_deg"] < config.max_error_deg)
+    )
+    key = ["scene", "task", "method", "pair"]
+    counted = views.assign(good=good).groupby(key, sort=False)["good"].agg(["sum", "size"]).reset_index()
+    table = paths.merge(counted.rename(columns={"sum": "good", "size": "n"}), on=key, how="left")
+    table[["good", "n"]] = table[["good", "n"]].fillna(0)
+    scenes = list(dict.fromkeys(paths["scene"]))
+    rows = []
+    for scene in [*scenes, *([ALL] if len(scenes) > 1 else [])]:
+        here = table if scene == ALL else table[table["scene"] == scene]
+        draws = _draws(here, config)
+        for task, of_task in here.groupby("task", sort=False):
+            forward = of_task[of_task["method"] == FORWARD]
+            for method, of_method in of_task.groupby("method", sort=False):
+                rows.append({"scene": scene, "task": task, "method": method, **_row(of_method, forward, draws)})
+    return pd.DataFrame(rows)
+
+
+def _draws(table: pd.DataFrame, config: PathsConfig) -> NDArray[np.int64]:
+    """How often each pair of `_pairs_of` is drawn, (resamples, P): pairs within their scenes, with replacement."""
+    pairs = _pairs_of(table)
+    rng = np.random.default_rng(config.seed)
+    times = np.zeros((config.resamples, len(pairs)), dtype=np.int64)
+    scene = pairs.get_level_values("scene")
+    for name in dict.fromkeys(scene):
+        columns = np.flatnonzero(scene == name)
+        drawn = rng.integers(0, len(columns), (config.resamples, len(columns)))
+        for row, picks in enumerate(drawn):
+            np.add.at(times[row], columns[picks], 1)
+    return times
+
+
+def _pairs_of(table: pd.DataFrame) -> pd.MultiIndex:
+    return pd.MultiIndex.from_frame(table[["scene", "pair"]].drop_duplicates())
+
+
+def _row(of_method: pd.DataFrame, forward: pd.DataFrame, draws: NDArray[np.int64]) -> dict[str, Any]:
+    index = _pairs_of(forward)
+    one, base = (table.set_index(["scene", "pair"]).reindex(index) for table in (of_method, forward))
+    both = (one["planned"] & base["planned"]).fillna(False).to_numpy(bool)
+    counts = {name: table[["good", "n"]].fillna(0).to_numpy() for name, table in (("one", one), ("base", base))}
+
+    def share(name: str, weights: NDArray[Any]) -> NDArray[Any]:
+        good, n = (weights @ counts[name]).T
+        return np.divide(good, n, out=np.full(len(weights), np.nan), where=n > 0)
+
+    whole = np.ones((1, len(index)))
+    shares, ratios = share("one", draws), share("one", draws) / share("base", draws)
+    localized = float(share("one", whole)[0])
+    lengths = one["length_m"].to_numpy()[both].sum(), base["length_m"].to_numpy()[both].sum()
+    return {
+        "pairs": len(of_method),
+        "failures": int((~of_method["planned"]).sum()),
+        "views": int(counts["one"][:, 1].sum()),
+        "localized": localized,
+        "localized_low": float(np.nanpercentile(shares, 2.5)),
+        "localized_high": float(np.nanpercentile(shares, 97.5)),
+        "times_forward": float(localized / share("base", whole)[0]),
+        "times_forward_low": float(np.nanpercentile(ratios, 2.5)),
+        "times_forward_high": float(np.nanpercentile(ratios, 97.5)),
+        "times_forward_length": float(lengths[0] / lengths[1]) if lengths[1] else float("nan"),
+        "length_m": float(of_method["length_m"].mean()),
+        "turn_deg_per_m": float(of_method["turn_deg"].sum() / max(of_method["length_m"].sum(), 1e-9)),
+        "promised": float(of_method["promised"].mean()),
+    }

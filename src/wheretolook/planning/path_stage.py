@@ -1,0 +1,207 @@
+"""Planned paths of a dataset's scenes, rendered and localized, `<dataset>/results/paths/`; resumes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from wheretolook.config import Experiment
+from wheretolook.dataset import Dataset, SceneFolder, write_json, write_text
+from wheretolook.errors import ConfigError, SceneError
+from wheretolook.evaluation.report import markdown_table
+from wheretolook.evaluation.scores import PROBABILITIES
+from wheretolook.figures.style import save_figure
+from wheretolook.labelling.labeller import MANIFEST, LabelTask, label_scenes, storing
+from wheretolook.labelling.shard import SceneJob
+from wheretolook.mapping.extraction import ExtractorConfig
+from wheretolook.photograph_scenes import is_photographed
+from wheretolook.planning.config import PathsConfig, ViewpointMapConfig
+from wheretolook.planning.path_comparison import FORWARD, ComparedPaths, compare_paths, draw_pairs, shares_below
+from wheretolook.planning.path_report import summarize_paths
+from wheretolook.planning.scene_map import default_weights, scene_viewpoint_map
+from wheretolook.planning.viewpoint_map import ViewpointMap
+from wheretolook.scene_space import space_and_occlusion
+from wheretolook.scoring.registry import WEIGHTS_OF
+from wheretolook.stamps import stage_key
+from wheretolook.table import SCHEMA, UNLABELLED, fingerprint
+from wheretolook.tracking import TrackingConfig, log, start_run
+
+FOLDER = "paths"
+"""In `results/`: a folder for each scene with `paths.parquet` and `views.parquet`, and what was made of all of them."""
+
+Say = Callable[[str], None]
+
+
+def compare_scenes(
+    dataset: Dataset, experiment: Experiment, extractor_of: Callable[[SceneFolder], ExtractorConfig], say: Say = print
+) -> pd.DataFrame:
+    """Plan, render, localize and count; see `wheretolook.stages.compare_paths`.
+
+    Args:
+        dataset: its scenes have meshes and maps.
+        experiment: settings.
+        extractor_of: what a scene's map was made with.
+        say: told what was done.
+
+    Returns:
+        `wheretolook.planning.path_report.summarize_paths`.
+
+    Raises:
+        ConfigError: no such scene or method, or no weights. SceneError: a scene has no mesh, or too little room.
+    """
+    config = experiment.paths
+    scenes = _chosen(dataset, config)
+    planned = {scene.name: _plan(scene, dataset, experiment, say) for scene in scenes}
+    labelled = _localize(scenes, planned, dataset, experiment, extractor_of)
+    paths = pd.concat([one.paths.assign(scene=name) for name, one in planned.items()], ignore_index=True)
+    views = pd.concat([table.assign(scene=name) for name, table in labelled.items()], ignore_index=True)
+    summary = summarize_paths(paths, views, config)
+    folder = dataset.root / "results"
+    with storing(folder / "paths.csv"):
+        summary.to_csv(folder / "paths.csv", index=False, float_format="%.6g", lineterminator="\n")
+        write_text(folder / "paths.md", path_markdown(summary, config))
+        views.to_parquet(folder / FOLDER / "views.parquet", index=False)
+    from wheretolook.figures.paths import paths_figure
+
+    save_figure(paths_figure(summary), folder / "paths.png")
+    _log(dataset, config, summary, experiment.tracking)
+    say(path_markdown(summary, config))
+    say(f"-> {folder / 'paths.csv'}, paths.md, paths.png; every view in {folder / FOLDER}")
+    return summary
+
+
+def _chosen(dataset: Dataset, config: PathsConfig) -> list[SceneFolder]:
+    by_name = {scene.name: scene for scene in dataset.scenes}
+    for name in config.scenes:
+        if name not in by_name:
+            raise ConfigError(
+                "there is no such scene", path=dataset.root, value=name, fix=f"There are {', '.join(by_name)}."
+            )
+    scenes = [by_name[name] for name in config.scenes] or list(dataset.split("test"))
+    if not scenes:
+        raise ConfigError("the dataset has no test scene", path=dataset.root, fix="Name scenes in paths.scenes.")
+    for scene in scenes:
+        if is_photographed(scene) or not scene.mesh.is_file():
+            raise SceneError("without a mesh nothing can be rendered", path=scene.folder, fix="Choose other scenes.")
+    return scenes
+
+
+def _plan(scene: SceneFolder, dataset: Dataset, experiment: Experiment, say: Say) -> ComparedPaths:
+    """The paths of a scene: those that are there if they were planned with the same settings."""
+    config, folder = experiment.paths, dataset.root / "results" / FOLDER / scene.name
+    weights = config.weights or default_weights(dataset, say)
+    settings = {name: value for name, value in asdict(config).items() if name not in _OF_THE_REPORT}
+    key = stage_key("paths", [settings, asdict(experiment.scenes.free_space), asdict(experiment.occlusion),
+                              fingerprint(scene.mesh), fingerprint(scene.landmarks),
+                              None if weights is None else fingerprint(weights)])  # fmt: skip
+    files = {name: folder / f"{name}.parquet" for name in ("paths", "views")}
+    made = folder / "made.json"
+    if made.is_file() and all(file.is_file() for file in files.values()) and json.loads(made.read_text()) == key:
+        say(f"{scene.name}: reusing {folder}")
+        return ComparedPaths(**{name: pd.read_parquet(file) for name, file in files.items()})
+    space, occlusion = space_and_occlusion(scene, dataset.camera, experiment, experiment.occlusion)
+    maps: dict[str, ViewpointMap] = {}
+    for method in config.methods:
+        if method == FORWARD:
+            continue
+        if method in WEIGHTS_OF and weights is None:
+            raise ConfigError(f"{method} needs weights", path=dataset.root, fix="Train it, or name paths.weights.")
+        of_map = ViewpointMapConfig(
+            method=method, weights=weights if method in WEIGHTS_OF else None, grid=config.grid,
+            directions=config.directions,
+        )  # fmt: skip
+        built = scene_viewpoint_map(scene, dataset.camera, of_map, space, occlusion, experiment.warp_device)
+        maps[method] = built if method in PROBABILITIES else shares_below(built)
+    found = compare_paths(draw_pairs(space, config), space, maps, config, f"plan {scene.name}")
+    made.unlink(missing_ok=True)
+    with storing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, file in files.items():
+            getattr(found, name).to_parquet(file, index=False)
+        write_json(made, key)
+    failed, total = int((~found.paths["planned"]).sum()), len(found.paths)
+    say(f"{scene.name}: {total - failed} of {total} paths found, {len(found.views):,} views -> {folder}")
+    return found
+
+
+_OF_THE_REPORT = ("scenes", "max_error_m", "max_error_deg", "resamples", "weights")
+"""Settings that decide nothing about the paths of a scene."""
+
+
+def _localize(
+    scenes: list[SceneFolder], planned: dict[str, ComparedPaths], dataset: Dataset, experiment: Experiment,
+    extractor_of: Callable[[SceneFolder], ExtractorConfig],
+) -> dict[str, pd.DataFrame]:  # fmt: skip
+    """The views of each scene with what came of localizing them."""
+    config, tasks = experiment.label, []
+    for scene in scenes:
+        job = SceneJob(scene.mesh, scene.landmarks, dataset.camera, config.localizer, extractor_of(scene),
+                       experiment.warp_device)  # fmt: skip
+        shards = dataset.root / "results" / FOLDER / scene.name / "shards"
+        tasks.append(LabelTask(scene.name, job, _as_table(planned[scene.name].views), shards))
+    labelled: dict[str, pd.DataFrame] = {}
+    with closing(label_scenes(tasks, config, description="localize")) as results:
+        for one in results:
+            outcome = one.table[["status", "error_m", "error_deg", "n_inliers"]].reset_index(drop=True)
+            labelled[one.task.name] = pd.concat([planned[one.task.name].views, outcome], axis=1)
+    for task in tasks:  # views of paths that were planned with other settings
+        current = json.loads((task.shards / MANIFEST).read_text())["shards"]
+        for path in task.shards.glob("*.parquet"):
+            if path.name not in current:
+                path.unlink()
+    return labelled
+
+
+def _as_table(views: pd.DataFrame) -> pd.DataFrame:
+    """Views as rows of a table of viewpoints, to be labelled."""
+    n = len(views)
+    values: dict[str, Any] = {
+        "viewpoint_id": np.arange(n), "location_id": np.arange(n), "direction_id": np.zeros(n),
+        "n_visible": np.zeros(n), "visibility_rank": np.zeros(n), "status": np.full(n, UNLABELLED),
+        "error_m": np.full(n, np.nan), "error_deg": np.full(n, np.nan), "n_inliers": np.zeros(n),
+    }  # fmt: skip
+    types = {field.name: field.type.to_pandas_dtype() for field in SCHEMA if field.name != "status"}
+    columns = {name: values.get(name, views.get(name)) for name in SCHEMA.names}
+    return pd.DataFrame(columns).astype(types)
+
+
+def path_markdown(summary: pd.DataFrame, config: PathsConfig) -> str:
+    """The summary as Markdown, a table for each task."""
+    text = [f"Share of the views along paths that localize within {config.max_error_m:g} m and "
+            f"{config.max_error_deg:g}°, in % [95 % interval over pairs]."]  # fmt: skip
+    titles = {"planned": "Places and views planned", "given": "Views along a given path"}
+    for task, rows in summary.groupby("task", sort=False):
+        header = ["scene", "method", "localized", "times forward", "length / forward's", "turn, °/m", "not found"]
+        lines = [
+            [
+                str(row["scene"]), str(row["method"]),
+                f"{100 * row['localized']:.1f} [{100 * row['localized_low']:.1f}, {100 * row['localized_high']:.1f}]",
+                f"{row['times_forward']:.2f} [{row['times_forward_low']:.2f}, {row['times_forward_high']:.2f}]",
+                f"{row['times_forward_length']:.2f}", f"{row['turn_deg_per_m']:.0f}", f"{row['failures']}",
+            ]
+            for _, row in rows.iterrows()
+        ]  # fmt: skip
+        text += [f"{titles[str(task)]}:", markdown_table(header, lines)]
+    return "\n\n".join(text) + "\n"
+
+
+def _log(dataset: Dataset, config: PathsConfig, summary: pd.DataFrame, tracking: TrackingConfig) -> None:
+    """One run, and one nested in it for each task and method, with the numbers over all scenes."""
+    params = {"dataset": dataset.name, "pairs": config.pairs, "seed": config.seed, "time_s": config.planner.time_s,
+              "score_weight": config.planner.score_weight, "max_turn_deg": config.max_turn_deg}  # fmt: skip
+    last = summary[summary["scene"] == summary["scene"].iloc[-1]]
+    results = dataset.root / "results"
+    with start_run(tracking, f"paths {dataset.name}", "paths", params) as (client, run):
+        for name in ("paths.csv", "paths.md", "paths.png"):
+            client.log_artifact(run, str(results / name))
+        for _, row in last.iterrows():
+            about = {**params, "task": row["task"], "method": row["method"]}
+            with start_run(tracking, f"paths {row['task']} {row['method']}", "paths", about, parent=run) as (_, child):
+                numbers = {name: float(value) for name, value in row.items() if name not in ("scene", "task", "method")}
+                log(client, child, metrics={name: value for name, value in numbers.items() if np.isfinite(value)})

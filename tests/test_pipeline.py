@@ -320,3 +320,26 @@ def test_stages_are_plain_functions(demo: Path) -> None:
     dataset = stages.sample(experiment, say=said.append)
     assert len(said) == 2 and all("reusing" in line for line in said)
     assert dataset.name == "tiny"
+
+
+def test_planned_paths_are_rendered_and_localized(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    options = ["--paths.pairs", "2", "--paths.methods", "[forward,visible]", "--paths.grid", "[4, 4, 2]",
+               "--paths.directions", "40", "--paths.min_distance_m", "1", "--paths.planner.time_s", "0.5",
+               "--paths.planner.spacing_m", "0.5", "--paths.max_turn_deg", "60"]  # fmt: skip
+    assert run("compare-paths", copy, *options) == 0
+    root = copy / "data" / "tiny" / "results"
+    table = pd.read_csv(root / "paths.csv")
+    assert {*table["method"]} == {"forward", "visible", "visible greedy"} and {*table["pairs"]} == {2}
+    views = pd.read_parquet(root / "paths" / "views.parquet")
+    assert views["status"].isin(["localized", "no_pose", "too_few_matches"]).all()
+    planned = views[(views["task"] == "planned") & (views["method"] == "visible")]
+    good = (planned["status"] == "localized") & (planned["error_m"] < 0.25) & (planned["error_deg"] < 2)
+    said = table[(table["task"] == "planned") & (table["method"] == "visible")]["localized"]
+    assert said.iloc[0] == pytest.approx(good.mean(), abs=1e-5)
+    assert (root / "paths.png").stat().st_size > 5000 and "| visible" in capsys.readouterr().out
+    assert newest_run(TrackingConfig(str(copy / "mlruns")), "paths") is not None
+    before = (root / "paths" / "views.parquet").read_bytes()
+    assert run("compare-paths", copy, *options) == 0
+    assert "reusing" in capsys.readouterr().out and (root / "paths" / "views.parquet").read_bytes() == before
+    assert run("compare-paths", copy, "--paths.scenes", "[nowhere]") == 2
+    assert "There are" in capsys.readouterr().err

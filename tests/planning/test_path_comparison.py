@@ -1,0 +1,130 @@
+"""Methods compared by paths between the same places."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from box_scenes import furnished_room
+from planning.rooms import build, room_landmarks
+from wheretolook.errors import ConfigError, SceneError
+from wheretolook.figures.paths import paths_figure
+from wheretolook.geometry import camera_centers
+from wheretolook.planning.config import PathConfig, PathsConfig
+from wheretolook.planning.path_comparison import ComparedPaths, compare_paths, draw_pairs, shares_below
+from wheretolook.planning.path_report import summarize_paths
+from wheretolook.scenes.free_space import FreeSpace
+from wheretolook.table import poses
+
+QUICK = PathsConfig(
+    pairs=2, min_distance_m=1.5, height_m=(1.0, 1.4), methods=("forward", "bins"), max_turn_deg=30.0, resamples=200,
+    planner=PathConfig(time_s=0.6, pitch_deg=(-30, 30)),
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def space() -> FreeSpace:
+    return FreeSpace(furnished_room())
+
+
+@pytest.fixture(scope="module")
+def compared(space: FreeSpace) -> ComparedPaths:
+    bins = shares_below(build(room_landmarks(200), directions=np.asarray(_lattice())))
+    return compare_paths(draw_pairs(space, QUICK), space, {"bins": bins}, QUICK)
+
+
+def _lattice() -> np.ndarray:
+    from wheretolook.grid import direction_lattice
+
+    return direction_lattice(200)
+
+
+def test_pairs_are_far_apart_and_free(space: FreeSpace) -> None:
+    pairs = draw_pairs(space, replace(QUICK, pairs=3))
+    assert pairs.shape == (3, 2, 3) and space.is_free(pairs.reshape(-1, 3)).all()
+    assert (np.linalg.norm(pairs[:, 1] - pairs[:, 0], axis=1) >= 1.5).all()
+    heights = pairs.reshape(-1, 3)[:, 2] - space.floor_below(pairs.reshape(-1, 3))
+    assert ((heights > 0.999) & (heights < 1.401)).all()
+    np.testing.assert_array_equal(draw_pairs(space, replace(QUICK, pairs=3)), pairs)
+    with pytest.raises(SceneError, match=r"found only 0 .*min_distance_m"):
+        draw_pairs(space, replace(QUICK, min_distance_m=50.0))
+
+
+def test_scores_become_ranks() -> None:
+    one = build(room_landmarks(50))
+    ranks = shares_below(replace(one, scores=(1e6 * one.scores).astype(np.float32)))
+    flat = one.scores.ravel()
+    expected = [(flat < value).sum() / (flat.size - 1) for value in flat[:50]]
+    np.testing.assert_allclose(ranks.scores.ravel()[:50], expected, rtol=1e-5)
+    assert ranks.scores.min() == 0 and ranks.scores.max() <= 1
+
+
+def test_every_method_goes_the_same_way(compared: ComparedPaths, space: FreeSpace) -> None:
+    paths = compared.paths
+    assert paths["planned"].all()
+    assert {*zip(paths["task"], paths["method"], strict=True)} == {
+        ("planned", "forward"), ("planned", "bins"), ("given", "forward"), ("given", "bins"), ("given", "bins greedy"),
+    }  # fmt: skip
+    for (pair, task, method), rows in compared.views.groupby(["pair", "task", "method"]):
+        row = paths[(paths["pair"] == pair) & (paths["task"] == task) & (paths["method"] == method)].iloc[0]
+        cam_from_world = poses(rows)
+        centers = camera_centers(cam_from_world)
+        assert len(rows) == row["n_views"] and space.is_free(centers).all()
+        np.testing.assert_allclose(np.linalg.norm(np.diff(centers, axis=0), axis=1).sum(), row["length_m"], rtol=1e-6)
+        if task == "given" and method != "forward":
+            rotations = cam_from_world[:, :, :3]
+            cosines = (np.einsum("nij,nij->n", rotations[1:], rotations[:-1]) - 1) / 2
+            assert np.degrees(np.arccos(cosines.clip(-1, 1))).max(initial=0) <= 30.001
+    given = paths[paths["task"] == "given"].set_index(["pair", "method"])
+    for pair in (0, 1):
+        assert given.loc[(pair, "bins"), "promised"] >= given.loc[(pair, "bins greedy"), "promised"] - 1e-9
+        assert given.loc[(pair, "bins"), "length_m"] == given.loc[(pair, "forward"), "length_m"]
+
+
+def _labelled() -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Two pairs: forward localizes 1 of 4 and 2 of 4 views, ours 4 of 5 and 1 of 5; on the third ours found no way."""
+    paths, views = [], []
+    for pair, method, good, n, length in (
+        (0, "forward", 1, 4, 2.0), (1, "forward", 2, 4, 3.0), (2, "forward", 0, 2, 5.0),
+        (0, "set", 4, 5, 3.0), (1, "set", 1, 5, 3.0), (2, "set", 0, 0, np.nan),
+    ):  # fmt: skip
+        about = {"scene": "a", "pair": pair, "task": "planned", "method": method}
+        paths.append({**about, "planned": n > 0, "length_m": length, "turn_deg": 10 * length, "n_views": n,
+                      "promised": 0.5})  # fmt: skip
+        for number in range(n):
+            error = 0.1 if number < good else 0.3
+            views.append({**about, "status": "localized", "error_m": error, "error_deg": 1.0})
+    return pd.DataFrame(paths), pd.DataFrame(views)
+
+
+def test_shares_by_hand() -> None:
+    paths, views = _labelled()
+    table = summarize_paths(paths, views, QUICK).set_index("method")
+    assert table.loc["forward", "localized"] == pytest.approx(3 / 10)
+    assert table.loc["set", "localized"] == pytest.approx(5 / 10)
+    assert table.loc["set", "times_forward"] == pytest.approx(5 / 3)
+    assert table.loc["set", "times_forward_length"] == pytest.approx(6 / 5)  # over the pairs that both planned
+    assert table.loc["set", "failures"] == 1 and table.loc["set", "turn_deg_per_m"] == pytest.approx(10)
+    assert table.loc["forward", "times_forward_low"] == table.loc["forward", "times_forward_high"] == 1
+    assert table.loc["set", "localized_low"] < 0.5 < table.loc["set", "localized_high"] <= 0.8
+    strict = summarize_paths(paths, views, replace(QUICK, max_error_deg=0.5)).set_index("method")
+    assert strict.loc["set", "localized"] == 0
+
+
+def test_the_figure_shows_every_share() -> None:
+    paths, views = _labelled()
+    both = [table if scene == "a" else table.assign(scene=scene) for table in (paths, views) for scene in "ab"]
+    summary = summarize_paths(pd.concat(both[:2]), pd.concat(both[2:]), QUICK)
+    (axes,) = paths_figure(summary).axes
+    heights = sorted(round(patch.get_height(), 3) for patch in axes.patches)
+    assert heights == sorted(round(100 * value, 3) for value in summary["localized"]) and len(heights) == 6
+    assert axes.get_ylabel().endswith("(%)") and [t.get_text() for t in axes.get_xticklabels()] == ["a", "b", "all"]
+
+
+def test_impossible_options_of_a_comparison() -> None:
+    for name, value in (("pairs", 0), ("height_m", (2.0, 1.0)), ("methods", ("set",)), ("max_error_m", -1.0)):
+        with pytest.raises(ConfigError, match=name):
+            replace(QUICK, **{name: value})

@@ -48,5 +48,8 @@ def paths_figure(summary: pd.DataFrame) -> Figure:
             axes.set_ylim(0, 100)
             axes.set_xticks(np.arange(len(scenes)), scenes)
             axes.grid(axis="x", visible=False)
-            axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=min(5, len(methods)), frameon=False)
+        named = {
+            label: handle for axes in panels for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
+        }
+        figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=3, frameon=False)
         return figure

@@ -19,7 +19,7 @@ from wheretolook.camera_models import ColmapCamera
 from wheretolook.cli import main
 from wheretolook.dataset import Dataset
 from wheretolook.errors import TableError
-from wheretolook.geometry import PinholeCamera
+from wheretolook.geometry import PinholeCamera, camera_centers
 from wheretolook.labelling import report
 from wheretolook.learning.weights import load_classifier
 from wheretolook.localization_map import LocalizationMap
@@ -343,3 +343,24 @@ def test_planned_paths_are_rendered_and_localized(copy: Path, capsys: pytest.Cap
     assert "reusing" in capsys.readouterr().out and (root / "paths" / "views.parquet").read_bytes() == before
     assert run("compare-paths", copy, "--paths.scenes", "[nowhere]") == 2
     assert "There are" in capsys.readouterr().err
+
+
+def test_a_path_is_planned_and_shown(copy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = Dataset.load(copy / "data" / "tiny").split("test")[0]
+    centers = camera_centers(poses(scene.read_table()))
+    options = ["--scene", scene.name, "--plan.grid", "[4, 4, 2]", "--plan.directions", "40", "--out", str(tmp_path / "way"),
+               "--plan.planner.time_s", "1", "--plan.planner.spacing_m", "0.5"]  # fmt: skip
+    ends = ["--start", str(centers[0].tolist()), "--goal", str(centers[-1].tolist())]
+    assert run("plan", copy, *options, *ends) == 0
+    assert "mean score" in capsys.readouterr().out
+    table = pd.read_csv(tmp_path / "way" / "path.csv")
+    np.testing.assert_allclose(table[["x_m", "y_m", "z_m"]].to_numpy()[[0, -1]], centers[[0, -1]], atol=1e-6)
+    axes = table[["axis_x", "axis_y", "axis_z"]].to_numpy()
+    np.testing.assert_allclose(poses(table)[:, 2, :3], axes, atol=1e-6)
+    assert table["score"].between(0, 1).all()
+    assert {path.name for path in (tmp_path / "way").iterdir()} == {"path.csv", "path.png", "path.gif"}
+    assert run("plan", copy, *options) == 2
+    assert "needs a start and a goal" in capsys.readouterr().err
+    wall = ["--start", "[-99, 0, 1]", "--goal", str(centers[-1].tolist()), "--film", "none", "--method", "forward"]
+    assert run("plan", copy, *options, *wall) == 2
+    assert "the start is not in free space" in capsys.readouterr().err

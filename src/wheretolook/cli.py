@@ -48,6 +48,11 @@ STAGES = {
         "Score every direction at every free voxel of a scene, for planners to look up. Needs no labels.",
         ("viewpoint_map", "occlusion", "scenes.free_space"),
     ),
+    "plan": (
+        "plan",
+        "Plan a path on which the camera sees what it needs to know where it is; a table, a picture and a film of it.",
+        ("plan", "occlusion", "scenes.free_space", "scenes.mapped_space", "map.photographs.assume_metric"),
+    ),
     "compare-paths": (
         "compare_paths",
         "Plan paths between random places by several methods, render what the camera sees, localize it. Resumes.",
@@ -244,6 +249,7 @@ _SHORT = {"--engine": "--label.engine", "--images": "--map.photographs.images"}
 
 _SHORT_OF = {
     "viewpoint-map": {f"--{name}": f"--viewpoint_map.{name}" for name in ("scene", "method", "weights", "out")},
+    "plan": {f"--{name}": f"--plan.{name}" for name in ("scene", "start", "goal", "method", "weights", "out", "film")},
 }
 """The same, of one sub-command alone, since others have flags of such names in their own groups."""
 

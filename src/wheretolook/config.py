@@ -14,7 +14,7 @@ from wheretolook.geometry import PinholeCamera
 from wheretolook.labelling.config import LabelConfig
 from wheretolook.learning.config import TrainConfig
 from wheretolook.mapping.config import MapConfig
-from wheretolook.planning.config import PathsConfig, ViewpointMapConfig
+from wheretolook.planning.config import PathsConfig, PlanConfig, ViewpointMapConfig
 from wheretolook.sampling import SampleConfig
 from wheretolook.scenes.free_space import FreeSpaceConfig
 from wheretolook.scenes.mapped_space import MappedSpaceConfig
@@ -106,6 +106,7 @@ class Experiment:
         train: stage 5, the network.
         evaluate: stage 6, scores of all methods.
         viewpoint_map: what planners query.
+        plan: one path to plan.
         paths: planned paths of several methods, to be compared.
         tracking: where MLflow keeps its runs.
     """
@@ -123,6 +124,7 @@ class Experiment:
     train: TrainConfig = field(default_factory=TrainConfig)
     evaluate: EvaluateConfig = field(default_factory=EvaluateConfig)
     viewpoint_map: ViewpointMapConfig = field(default_factory=ViewpointMapConfig)
+    plan: PlanConfig = field(default_factory=PlanConfig)
     paths: PathsConfig = field(default_factory=PathsConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
 

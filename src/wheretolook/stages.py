@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from wheretolook.learning.training import TrainedModel
     from wheretolook.mapping.extraction import ExtractorConfig
     from wheretolook.planning import ViewpointMap
+    from wheretolook.planning.path_planning import PlannedPath
 
 Say = Callable[[str], None]
 Tick = Callable[[float], None]
@@ -324,6 +325,21 @@ def viewpoint_map(experiment: Experiment, say: Say = print, tick: Tick = lambda 
             f"{found.origin.scorer} -> {folder}")  # fmt: skip
         tick(1)
     return built
+
+
+def plan(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> PlannedPath:
+    """A path through a scene on which the camera localizes, `<scene>/path/path.{csv,png,gif}`; needs the map stage.
+
+    Raises:
+        ConfigError: no such scene or method, no start or goal, no weights, or Rerun is asked for and not installed.
+        PlanningError: the start or the goal is not free, or no path was found. WeightsError: weights cannot be used.
+        SceneError, MapError: the scene has no free place, or no map with a scale.
+    """
+    from wheretolook.planning.plan_stage import plan_scene
+
+    path = plan_scene(_dataset(experiment, "map"), experiment, say)
+    tick(1)
+    return path
 
 
 def compare_paths(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> pd.DataFrame:

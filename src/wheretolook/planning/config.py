@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 from wheretolook.errors import ConfigError
 from wheretolook.grid import Lattice
@@ -129,3 +130,38 @@ class PathsConfig:
             raise ConfigError("height_m needs a range above 0", value=self.height_m)
         if "forward" not in self.methods or len(set(self.methods)) < len(self.methods):
             raise ConfigError('methods need "forward" to compare with, and every name once', value=self.methods)
+
+
+@dataclass(frozen=True)
+class PlanConfig:
+    """A path to plan, and what to write about it.
+
+    Args:
+        scene: name of the scene's folder.
+        start: x, y, z in metres.
+        goal: x, y, z in metres.
+        out: folder to write; empty for `<data>/<name>/<scene>/path`.
+        method: that scores the views; "forward" for the shortest path, looking ahead; empty as for the viewpoint map.
+        weights: file of weights, for a method that has learnt; by default the best there are.
+        film: "gif", "mp4" or "none".
+        rerun: whether to write a recording for the Rerun viewer (needs `pip install rerun-sdk`).
+        grid: voxels of the viewpoint map along x, y and z.
+        directions: directions at each voxel.
+        planner: costs and limits of the path, time to plan.
+    """
+
+    scene: str = ""
+    start: tuple[float, float, float] | None = None
+    goal: tuple[float, float, float] | None = None
+    out: Path | None = None
+    method: str = ""
+    weights: Path | None = None
+    film: Literal["gif", "mp4", "none"] = "gif"
+    rerun: bool = False
+    grid: tuple[int, int, int] = (8, 8, 8)
+    directions: int = 500
+    planner: PathConfig = field(default_factory=PathConfig)
+
+    def __post_init__(self) -> None:
+        if self.film not in ("gif", "mp4", "none"):
+            raise ConfigError("unknown kind of film", value=self.film, fix="Use gif, mp4 or none.")

@@ -21,6 +21,7 @@ from wheretolook.labelling.labeller import MANIFEST, LabelTask, label_scenes, st
 from wheretolook.labelling.shard import SceneJob
 from wheretolook.mapping.extraction import ExtractorConfig
 from wheretolook.photograph_scenes import is_photographed
+from wheretolook.planning.borrowing import with_borrowed_views
 from wheretolook.planning.config import PathsConfig, ViewpointMapConfig
 from wheretolook.planning.path_comparison import FORWARD, ComparedPaths, compare_paths, draw_pairs, shares_below
 from wheretolook.planning.path_report import summarize_paths
@@ -117,7 +118,7 @@ def _plan(scene: SceneFolder, dataset: Dataset, experiment: Experiment, say: Say
             directions=config.directions,
         )  # fmt: skip
         built = scene_viewpoint_map(scene, dataset.camera, of_map, space, occlusion, experiment.warp_device)
-        maps[method] = built if method in PROBABILITIES else shares_below(built)
+        maps[method] = with_borrowed_views(built if method in PROBABILITIES else shares_below(built), space)
     found = compare_paths(draw_pairs(space, config), space, maps, config, f"plan {scene.name}")
     made.unlink(missing_ok=True)
     with storing(folder):

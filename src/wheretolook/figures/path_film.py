@@ -1,0 +1,175 @@
+"""A planned path as a film: what the camera sees, where it is, and what its view is worth."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.style import context
+from numpy.typing import NDArray
+
+from wheretolook.errors import ConfigError
+from wheretolook.figures.style import INK, RC, new_figure
+from wheretolook.geometry import Float
+
+Pixels = NDArray[np.uint8]
+
+PATH, SEEN = "#CC3311", "#EE9900"
+FRAMES_PER_SECOND = 8
+STILLS = 5
+
+
+@dataclass(frozen=True, eq=False)
+class PathView:
+    """One view along a path.
+
+    Attributes:
+        position: (3,) world, metres.
+        axis: (3,) unit optical axis, world.
+        score: of the view in [0, 1]; NaN where it is not known.
+        pixels: (K, 2) of the landmarks in view.
+        size_px: width and height of the image.
+        rgb: (H, W, 3) uint8 what the camera sees; None where nothing can be rendered.
+    """
+
+    position: Float
+    axis: Float
+    score: float
+    pixels: Float
+    size_px: tuple[int, int]
+    rgb: Pixels | None
+
+
+def film_frames(views: Sequence[PathView], landmarks: Float) -> Iterator[Pixels]:
+    """Frames (H, W, 3) uint8, one a view: the image with its landmarks, the map from above, the score along the path.
+
+    Args:
+        views: along the path, one at least.
+        landmarks: (N, 3) of the map, metres.
+    """
+    with context(RC):
+        for number in range(len(views)):
+            figure = new_figure(9.6, 4.4)
+            grid = figure.add_gridspec(2, 2, width_ratios=(1.5, 1.0), height_ratios=(1.7, 1.0))
+            _draw_view(figure.add_subplot(grid[:, 0]), views[number])
+            _draw_map(figure.add_subplot(grid[0, 1]), views, landmarks, number)
+            _draw_scores(figure.add_subplot(grid[1, 1]), views, number)
+            yield _pixels(figure)
+
+
+def still_figure(views: Sequence[PathView], landmarks: Float, title: str = "") -> Figure:
+    """The path in one picture: map from above, score along it, and some views evenly spread over it.
+
+    Args:
+        views: along the path, one at least.
+        landmarks: (N, 3) of the map, metres.
+        title: over the map.
+    """
+    shown = np.unique(np.linspace(0, len(views) - 1, STILLS).round().astype(int))
+    with context(RC):
+        figure = new_figure(2.5 * max(4, len(shown)), 5.8)
+        grid = figure.add_gridspec(2, 1, height_ratios=(1.6, 1.0))
+        above = grid[0].subgridspec(1, 2, width_ratios=(1.1, 1.0))
+        axes = figure.add_subplot(above[0])
+        _draw_map(axes, views, landmarks, None, shown)
+        axes.set_title(title)
+        _draw_scores(figure.add_subplot(above[1]), views, None, shown)
+        for column, number in enumerate(shown):
+            axes = figure.add_subplot(grid[1].subgridspec(1, len(shown))[column])
+            _draw_view(axes, views[number], f"{column + 1}: ")
+        return figure
+
+
+def save_film(frames: Iterator[Pixels], path: Path, frames_per_second: float = FRAMES_PER_SECOND) -> None:
+    """Write frames, all of one size, as an animated GIF or an MP4, by the file's ending; atomically.
+
+    Raises:
+        ConfigError: another ending, or MP4 cannot be written here.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".partial-{path.name}")
+    if path.suffix == ".gif":
+        from PIL import Image
+
+        first, *rest = (Image.fromarray(frame).quantize(128) for frame in frames)
+        first.save(partial, save_all=True, append_images=rest, duration=round(1000 / frames_per_second), loop=0)
+    elif path.suffix == ".mp4":
+        import cv2
+
+        writer = None
+        for frame in frames:
+            even = frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2]  # the codec's blocks
+            if writer is None:
+                codec = cv2.VideoWriter.fourcc(*"mp4v")
+                writer = cv2.VideoWriter(str(partial), codec, frames_per_second, even.shape[1::-1])
+                if not writer.isOpened():
+                    raise ConfigError("this OpenCV cannot write MP4", path=path, fix="Ask for a .gif.")
+            writer.write(np.ascontiguousarray(even[..., ::-1]))
+        if writer is not None:
+            writer.release()
+    else:
+        raise ConfigError("a film is a .gif or an .mp4", path=path, value=path.suffix, fix="Name it so.")
+    os.replace(partial, path)
+
+
+def _xy(point: Float) -> tuple[float, float]:
+    return float(point[0]), float(point[1])
+
+
+def _pixels(figure: Figure) -> Pixels:
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def _draw_view(axes: Axes, view: PathView, before: str = "") -> None:
+    width, height = view.size_px
+    if view.rgb is not None:
+        axes.imshow(view.rgb, extent=(0, width, height, 0))
+    axes.scatter(view.pixels[:, 0], view.pixels[:, 1], s=3, color=SEEN, linewidths=0)
+    score = "" if np.isnan(view.score) else f", score {view.score:.2f}"
+    axes.set(xlim=(0, width), ylim=(height, 0), xticks=[], yticks=[], aspect="equal", anchor="N")
+    axes.set_title(f"{before}{len(view.pixels):,} landmarks{score}", fontsize=9)
+    axes.grid(False)
+
+
+def _draw_map(
+    axes: Axes, views: Sequence[PathView], landmarks: Float, number: int | None, shown: NDArray[np.int64] | None = None
+) -> None:
+    positions = np.array([view.position for view in views])
+    low, high = np.percentile(landmarks[:, :2], (1, 99), axis=0)
+    low, high = np.minimum(low, positions[:, :2].min(0)), np.maximum(high, positions[:, :2].max(0))
+    axes.scatter(landmarks[:, 0], landmarks[:, 1], s=0.5, color="#9a9a9a", linewidths=0, rasterized=True)
+    axes.plot(*positions[:, :2].T, color=PATH, linewidth=1.6)
+    reach = 0.07 * float(np.max(high - low))
+    for at in [number] if number is not None else range(0, len(views), max(1, len(views) // 25)):
+        tip = views[at].axis[:2] * (2 if number is not None else 1) * reach
+        axes.annotate(
+            "", _xy(positions[at, :2] + tip), _xy(positions[at]),
+            arrowprops={"arrowstyle": "-|>", "color": INK, "linewidth": 1.0, "shrinkA": 0, "shrinkB": 0},
+        )  # fmt: skip
+    for column, at in enumerate(() if shown is None else shown, 1):
+        axes.annotate(str(column), _xy(positions[at]), fontsize=9, color="white", ha="center", va="center",
+                      bbox={"boxstyle": "circle,pad=0.15", "facecolor": PATH, "edgecolor": "white"})  # fmt: skip
+    axes.set(xlim=(low[0] - 0.3, high[0] + 0.3), ylim=(low[1] - 0.3, high[1] + 0.3), aspect="equal")
+    axes.set(xlabel="x (m)", ylabel="y (m)")
+
+
+def _draw_scores(
+    axes: Axes, views: Sequence[PathView], number: int | None, shown: NDArray[np.int64] | None = None
+) -> None:
+    positions = np.array([view.position for view in views])
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))])
+    scores = np.array([view.score for view in views])
+    axes.plot(along, scores, color=PATH, linewidth=1.4)
+    if number is not None:
+        axes.plot(along[number], scores[number], "o", color=INK, markersize=6)
+    for column, at in enumerate(() if shown is None else shown, 1):
+        axes.annotate(str(column), (along[at], scores[at]), textcoords="offset points", xytext=(0, 6), ha="center")
+    axes.set(xlim=(0, max(along[-1], 1e-6)), ylim=(0, 1.12), xlabel="along the path (m)", ylabel="score")

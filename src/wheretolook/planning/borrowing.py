@@ -1,0 +1,46 @@
+"""What a viewpoint map knows near places where it has no voxel of its own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from wheretolook.planning.path_planning import Space
+from wheretolook.planning.viewpoint_map import ViewpointMap
+
+REACH = 2
+"""Voxels that lend to one lie within so many along each axis."""
+
+INSIDE = np.stack(np.meshgrid(*[(-1 / 3, 0.0, 1 / 3)] * 3, indexing="ij"), -1).reshape(-1, 3)
+"""Points of a voxel that are looked at, from its centre in shares of its size."""
+
+
+def with_borrowed_views(viewpoint_map: ViewpointMap, space: Space) -> ViewpointMap:
+    """The map for planners: voxels with free space but an occupied centre have the views of the nearest one in reach.
+
+    In reach is a voxel whose centre a camera can go straight to, so that nothing is borrowed through walls.
+
+    Args:
+        viewpoint_map: of the space.
+        space: where a camera can be.
+    """
+    grid = viewpoint_map.grid
+    rows, centers = viewpoint_map.row_of_voxel.copy(), grid.centers()
+    size = grid.voxel_m
+    known = np.flatnonzero(rows >= 0)
+    unknown = np.flatnonzero(rows < 0)
+    points = centers[unknown][:, None] + INSIDE * size
+    free = space.is_free(points.reshape(-1, 3)).reshape(len(unknown), len(INSIDE))
+    order = np.argsort((INSIDE**2).sum(1), kind="stable")
+    for voxel, own, is_free in zip(unknown, points, free, strict=True):
+        if not is_free.any():
+            continue
+        start = own[order[is_free[order]][0]]
+        near = known[(np.abs(centers[known] - centers[voxel]) <= (REACH + 1e-6) * size).all(1)]
+        near = near[np.argsort(np.linalg.norm(centers[near] - start, axis=1), kind="stable")]
+        if len(near):
+            clear = space.segments_are_free(np.tile(start, (len(near), 1)), centers[near])
+            if clear.any():
+                rows[voxel] = viewpoint_map.row_of_voxel[near[int(np.argmax(clear))]]
+    return replace(viewpoint_map, row_of_voxel=rows)

@@ -1,0 +1,151 @@
+"""One planned path of a scene: its views as a table, a picture, a film and a recording."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from wheretolook.config import Experiment
+from wheretolook.dataset import Dataset, SceneFolder
+from wheretolook.errors import ConfigError
+from wheretolook.evaluation.scores import PROBABILITIES
+from wheretolook.figures.path_film import PathView, film_frames, save_film, still_figure
+from wheretolook.figures.style import save_figure
+from wheretolook.geometry import PinholeCamera, poses_looking_along
+from wheretolook.localization_map import LocalizationMap
+from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.photograph_scenes import is_photographed, occlusion_without_mesh
+from wheretolook.planning.borrowing import with_borrowed_views
+from wheretolook.planning.config import PlanConfig, ViewpointMapConfig
+from wheretolook.planning.path_comparison import FORWARD, shares_below
+from wheretolook.planning.path_planning import PlannedPath, plan_path
+from wheretolook.planning.scene_map import default_weights, scene_viewpoint_map
+from wheretolook.rendering import WarpRenderer
+from wheretolook.scene_space import space_and_occlusion
+from wheretolook.scenes.loading import load_mesh
+from wheretolook.scoring.registry import WEIGHTS_OF
+from wheretolook.table import pose_columns
+from wheretolook.visibility import OcclusionModel
+
+Say = Callable[[str], None]
+
+
+def plan_scene(dataset: Dataset, experiment: Experiment, say: Say = print) -> PlannedPath:
+    """Plan a path and write `path.csv`, `path.png`, the film and the recording; see `wheretolook.stages.plan`.
+
+    Raises:
+        ConfigError: no such scene or method, no start or goal, no weights, or Rerun is not installed.
+        PlanningError: no path can be found. SceneError, MapError: the scene cannot be used.
+    """
+    config = experiment.plan
+    scene = _scene(dataset, config)
+    if config.start is None or config.goal is None:
+        fix = "Give plan.start and plan.goal, such as --plan.start '[1, 1, 1.4]'."
+        raise ConfigError("a path needs a start and a goal", value=(config.start, config.goal), fix=fix)
+    recorder = _rerun() if config.rerun else None
+    photographed = is_photographed(scene)
+    hides = occlusion_without_mesh(experiment.occlusion) if photographed else experiment.occlusion
+    space, occlusion = space_and_occlusion(scene, dataset.camera, experiment, hides)
+    weights = config.weights or (default_weights(dataset, say) if config.method != FORWARD else None)
+    method = config.method or ("" if weights is not None else "bins")
+    views = None
+    if method != FORWARD:
+        if method in WEIGHTS_OF and weights is None:
+            raise ConfigError(f"{method} needs weights", path=dataset.root, fix="Train it, or name plan.weights.")
+        of_map = ViewpointMapConfig(
+            method=method, weights=weights if not method or method in WEIGHTS_OF else None, grid=config.grid,
+            directions=config.directions,
+        )  # fmt: skip
+        views = scene_viewpoint_map(scene, dataset.camera, of_map, space, occlusion, experiment.warp_device)
+        if views.origin.scorer.split()[0] not in PROBABILITIES:
+            views = shares_below(views)
+        views = with_borrowed_views(views, space)
+    path = plan_path(config.start, config.goal, space, space.bounds, views, config.planner)
+    folder = config.out or scene.folder / "path"
+    seen = path_views(path, scene, dataset.camera, occlusion, experiment.warp_device)
+    landmarks = Landmarks.load(scene.landmarks).points
+    folder.mkdir(parents=True, exist_ok=True)
+    _table(path).to_csv(folder / "path.csv", index=False, lineterminator="\n")
+    name = views.origin.scorer if views is not None else FORWARD
+    save_figure(still_figure(seen, landmarks, f"{scene.name}, {name}"), folder / "path.png")
+    written = ["path.csv", "path.png"]
+    if config.film != "none":
+        save_film(film_frames(seen, landmarks), folder / f"path.{config.film}")
+        written.append(f"path.{config.film}")
+    if recorder is not None:
+        _record(recorder, seen, landmarks, dataset.camera, folder / "path.rrd")
+        written.append("path.rrd")
+    say(f"{scene.name}: {path.length_m:.2f} m, {path.turn_deg:.0f} degrees of turning, {len(seen)} views, mean score "
+        f"{np.mean(path.scores):.2f} -> {folder}: {', '.join(written)}")  # fmt: skip
+    return path
+
+
+def _scene(dataset: Dataset, config: PlanConfig) -> SceneFolder:
+    by_name = {scene.name: scene for scene in dataset.scenes}
+    if not config.scene and len(by_name) == 1:
+        return dataset.scenes[0]
+    if config.scene not in by_name:
+        fix = f"There are {', '.join(by_name)}."
+        raise ConfigError("there is no such scene", path=dataset.root, value=config.scene, fix=fix)
+    return by_name[config.scene]
+
+
+def path_views(
+    path: PlannedPath, scene: SceneFolder, camera: PinholeCamera, occlusion: OcclusionModel, device: str = "cpu"
+) -> list[PathView]:
+    """What the camera sees along a path: landmarks in view, and where there is a mesh, the image."""
+    cam_from_world = poses_looking_along(path.positions, path.axes)
+    one = LocalizationMap(Landmarks.load(scene.landmarks), camera, occlusion, device)
+    visible = one.visible_landmarks(cam_from_world)
+    images = None
+    if scene.mesh.is_file():
+        images = WarpRenderer(load_mesh(scene.mesh), device).render(camera, cam_from_world).rgb
+    views = []
+    for number, pose in enumerate(cam_from_world):
+        local = one.landmarks.points[visible[number]] @ pose[:, :3].T + pose[:, 3]
+        pixels = local[:, :2] / local[:, 2:] * camera.focal_px + (camera.cx, camera.cy)
+        views.append(
+            PathView(path.positions[number], path.axes[number], float(path.scores[number]), pixels,
+                     (camera.width, camera.height), None if images is None else images[number])
+        )  # fmt: skip
+    return views
+
+
+def _table(path: PlannedPath) -> pd.DataFrame:
+    """A row a view: position, axis, score, and the pose cam_from_world."""
+    positions, axes = (dict(zip(names, values.T, strict=True)) for names, values in (
+        (("x_m", "y_m", "z_m"), path.positions), (("axis_x", "axis_y", "axis_z"), path.axes)))  # fmt: skip
+    poses = pose_columns(poses_looking_along(path.positions, path.axes))
+    return pd.DataFrame({**positions, **axes, "score": path.scores, **poses})
+
+
+def _rerun():  # type: ignore[no-untyped-def]  # the package is no dependency
+    try:
+        import rerun
+    except ImportError as error:
+        raise ConfigError("Rerun is not installed", fix="pip install rerun-sdk, or leave plan.rerun out.") from error
+    return rerun
+
+
+def _record(rerun, seen: list[PathView], landmarks: np.ndarray, camera: PinholeCamera, file: Path) -> None:  # type: ignore[no-untyped-def]
+    """A recording for the Rerun viewer: landmarks, path, the camera moving along it, its image, its score."""
+    stream = rerun.RecordingStream("wheretolook")
+    stream.save(str(file))
+    stream.log("world", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    stream.log("world/landmarks", rerun.Points3D(landmarks, radii=0.008), static=True)
+    stream.log("world/path", rerun.LineStrips3D([np.array([view.position for view in seen])]), static=True)
+    for number, view in enumerate(seen):
+        stream.set_time("view", sequence=number)
+        pose = poses_looking_along(view.position, view.axis)
+        stream.log("world/camera", rerun.Transform3D(translation=view.position, mat3x3=pose[:, :3].T))
+        stream.log("world/camera/image", rerun.Pinhole(
+            focal_length=camera.focal_px, width=camera.width, height=camera.height, camera_xyz=rerun.ViewCoordinates.RDF
+        ))  # fmt: skip
+        if view.rgb is not None:
+            stream.log("world/camera/image", rerun.Image(view.rgb).compress(jpeg_quality=85))
+        stream.log("world/camera/image/landmarks", rerun.Points2D(view.pixels))
+        stream.log("score", rerun.Scalars(view.score))
+    stream.flush()

@@ -1,0 +1,69 @@
+"""A path as a film and as one picture."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from wheretolook.errors import ConfigError
+from wheretolook.figures.path_film import PathView, film_frames, save_film, still_figure
+
+
+def some_views(n: int, images: bool = True) -> list[PathView]:
+    rng = np.random.default_rng(0)
+    return [
+        PathView(
+            np.array([0.5 * number, 1.0, 1.4]),
+            np.array([1.0, 0, 0]),
+            number / n,
+            rng.uniform(0, 60, (7 + number, 2)),
+            (80, 60),
+            np.full((60, 80, 3), 20 * number, np.uint8) if images else None,
+        )
+        for number in range(n)
+    ]
+
+
+LANDMARKS = np.random.default_rng(1).uniform((0, 0, 0), (4, 3, 2), (300, 3))
+
+
+@pytest.mark.parametrize("images", [True, False])
+def test_frames_show_each_view(images: bool) -> None:
+    frames = list(film_frames(some_views(4, images), LANDMARKS))
+    assert len(frames) == 4 and len({frame.shape for frame in frames}) == 1
+    assert all(not np.array_equal(a, b) for a, b in itertools.pairwise(frames))
+
+
+def test_films_can_be_played(tmp_path: Path) -> None:
+    views = some_views(5)
+    save_film(film_frames(views, LANDMARKS), tmp_path / "a.gif")
+    with Image.open(tmp_path / "a.gif") as film:
+        assert film.n_frames == 5 and film.info["duration"] == 120
+    save_film(film_frames(views, LANDMARKS), tmp_path / "a.mp4")
+    video = cv2.VideoCapture(str(tmp_path / "a.mp4"))
+    count = 0
+    while video.read()[0]:
+        count += 1
+    assert count == 5
+    with pytest.raises(ConfigError, match=r"a\.avi"):
+        save_film(iter(()), tmp_path / "a.avi")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.gif", "a.mp4"]
+
+
+def test_the_picture_tells_scores_and_landmarks() -> None:
+    views = some_views(9)
+    figure = still_figure(views, LANDMARKS, "room")
+    titles = [axes.get_title() for axes in figure.axes]
+    assert titles[0] == "room"
+    assert [title for title in titles if "landmarks" in title] == [
+        f"{column}: {len(views[at].pixels)} landmarks, score {at / 9:.2f}"
+        for column, at in enumerate((0, 2, 4, 6, 8), 1)
+    ]
+    line = next(axes for axes in figure.axes if axes.get_ylabel() == "score").lines[0]
+    np.testing.assert_allclose(line.get_xdata(), 0.5 * np.arange(9))
+    np.testing.assert_allclose(line.get_ydata(), np.arange(9) / 9)

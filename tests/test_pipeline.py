@@ -348,8 +348,9 @@ def test_planned_paths_are_rendered_and_localized(copy: Path, capsys: pytest.Cap
 def test_a_path_is_planned_and_shown(copy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene = Dataset.load(copy / "data" / "tiny").split("test")[0]
     centers = camera_centers(poses(scene.read_table()))
-    options = ["--scene", scene.name, "--plan.grid", "[4, 4, 2]", "--plan.directions", "40", "--out", str(tmp_path / "way"),
+    options = ["--scene", scene.name, "--plan.grid", "[4, 4, 2]", "--plan.directions", "40",
                "--plan.planner.time_s", "1", "--plan.planner.spacing_m", "0.5"]  # fmt: skip
+    options += ["--out", str(tmp_path / "way")]
     ends = ["--start", str(centers[0].tolist()), "--goal", str(centers[-1].tolist())]
     assert run("plan", copy, *options, *ends) == 0
     assert "mean score" in capsys.readouterr().out

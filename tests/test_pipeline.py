@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import sys
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
@@ -324,7 +325,7 @@ def test_stages_are_plain_functions(demo: Path) -> None:
 
 def test_planned_paths_are_rendered_and_localized(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = ["--paths.pairs", "2", "--paths.methods", "[forward,visible]", "--paths.grid", "[4, 4, 2]",
-               "--paths.directions", "40", "--paths.min_distance_m", "1", "--paths.planner.time_s", "0.5",
+               "--paths.directions", "40", "--paths.min_distance_m", "1", "--paths.planner.time_s", "2",
                "--paths.planner.spacing_m", "0.5", "--paths.max_turn_deg", "60"]  # fmt: skip
     assert run("compare-paths", copy, *options) == 0
     root = copy / "data" / "tiny" / "results"
@@ -345,23 +346,32 @@ def test_planned_paths_are_rendered_and_localized(copy: Path, capsys: pytest.Cap
     assert "There are" in capsys.readouterr().err
 
 
-def test_a_path_is_planned_and_shown(copy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_path_is_planned_and_shown(
+    copy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     scene = Dataset.load(copy / "data" / "tiny").split("test")[0]
     centers = camera_centers(poses(scene.read_table()))
     options = ["--scene", scene.name, "--plan.grid", "[4, 4, 2]", "--plan.directions", "40",
-               "--plan.planner.time_s", "1", "--plan.planner.spacing_m", "0.5"]  # fmt: skip
+               "--plan.planner.time_s", "3", "--plan.planner.spacing_m", "0.5"]  # fmt: skip
     options += ["--out", str(tmp_path / "way")]
-    ends = ["--start", str(centers[0].tolist()), "--goal", str(centers[-1].tolist())]
-    assert run("plan", copy, *options, *ends) == 0
+    away = np.linalg.norm(centers - centers[0], axis=1)
+    goal = centers[np.where(away > 0.5, away, np.inf).argmin()]  # not far: there is little time
+    ends = ["--start", str(centers[0].tolist()), "--goal", str(goal.tolist())]
+    assert run("plan", copy, *options, *ends, "--plan.against", "[forward]") == 0
     assert "mean score" in capsys.readouterr().out
     table = pd.read_csv(tmp_path / "way" / "path.csv")
-    np.testing.assert_allclose(table[["x_m", "y_m", "z_m"]].to_numpy()[[0, -1]], centers[[0, -1]], atol=1e-6)
+    np.testing.assert_allclose(table[["x_m", "y_m", "z_m"]].to_numpy()[[0, -1]], [centers[0], goal], atol=1e-6)
     axes = table[["axis_x", "axis_y", "axis_z"]].to_numpy()
     np.testing.assert_allclose(poses(table)[:, 2, :3], axes, atol=1e-6)
     assert table["score"].between(0, 1).all()
-    assert {path.name for path in (tmp_path / "way").iterdir()} == {"path.csv", "path.png", "path.gif"}
+    assert {path.name for path in (tmp_path / "way").iterdir()} == {
+        "path.csv", "path.png", "path.gif", "methods.png",
+    }  # fmt: skip
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    assert run("plan", copy, *options, *ends, "--plan.rerun", "true") == 2
+    assert "pip install rerun-sdk" in capsys.readouterr().err
     assert run("plan", copy, *options) == 2
     assert "needs a start and a goal" in capsys.readouterr().err
-    wall = ["--start", "[-99, 0, 1]", "--goal", str(centers[-1].tolist()), "--film", "none", "--method", "forward"]
+    wall = ["--start", "[-99, 0, 1]", "--goal", str(goal.tolist()), "--film", "none", "--method", "forward"]
     assert run("plan", copy, *options, *wall) == 2
     assert "the start is not in free space" in capsys.readouterr().err

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from wheretolook.errors import ConfigError
-from wheretolook.figures.path_film import PathView, film_frames, save_film, still_figure
+from wheretolook.figures.path_film import PathView, film_frames, methods_figure, save_film, still_figure
 
 
 def some_views(n: int, images: bool = True) -> list[PathView]:
@@ -67,3 +67,12 @@ def test_the_picture_tells_scores_and_landmarks() -> None:
     line = next(axes for axes in figure.axes if axes.get_ylabel() == "score").lines[0]
     np.testing.assert_allclose(line.get_xdata(), 0.5 * np.arange(9))
     np.testing.assert_allclose(line.get_ydata(), np.arange(9) / 9)
+
+
+def test_methods_stand_side_by_side() -> None:
+    views = some_views(6)
+    figure = methods_figure({"forward": views[:3], "set": views}, LANDMARKS)
+    assert [axes.get_title().split(":")[0] for axes in figure.axes] == ["forward", "set"]
+    for axes, shown in zip(figure.axes, (views[:3], views), strict=True):
+        np.testing.assert_allclose(axes.lines[0].get_xydata(), [view.position[:2] for view in shown])
+        assert f"{np.mean([len(view.pixels) for view in shown]):,.0f} landmarks" in axes.get_title()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -86,6 +86,22 @@ def still_figure(views: Sequence[PathView], landmarks: Float, title: str = "") -
         return figure
 
 
+def methods_figure(paths: Mapping[str, Sequence[PathView]], landmarks: Float) -> Figure:
+    """The paths of several methods side by side, from above, with where the camera looks (paper, Sec. 4.3).
+
+    Args:
+        paths: views along the path of each method, by the title of its panel.
+        landmarks: (N, 3) of the map, metres.
+    """
+    with context(RC):
+        figure = new_figure(3.9 * len(paths), 4.2)
+        for axes, (title, views) in zip(figure.subplots(1, len(paths), squeeze=False)[0], paths.items(), strict=True):
+            _draw_map(axes, views, landmarks, None)
+            n_seen = np.mean([len(view.pixels) for view in views])
+            axes.set_title(f"{title}: {n_seen:,.0f} landmarks in view on average", fontsize=10)
+        return figure
+
+
 def save_film(frames: Iterator[Pixels], path: Path, frames_per_second: float = FRAMES_PER_SECOND) -> None:
     """Write frames, all of one size, as an animated GIF or an MP4, by the file's ending; atomically.
 
@@ -137,6 +153,7 @@ def _draw_view(axes: Axes, view: PathView, before: str = "") -> None:
     axes.set(xlim=(0, width), ylim=(height, 0), xticks=[], yticks=[], aspect="equal", anchor="N")
     axes.set_title(f"{before}{len(view.pixels):,} landmarks{score}", fontsize=9)
     axes.grid(False)
+    axes.spines[:].set_visible(True)
 
 
 def _draw_map(
@@ -171,5 +188,6 @@ def _draw_scores(
     if number is not None:
         axes.plot(along[number], scores[number], "o", color=INK, markersize=6)
     for column, at in enumerate(() if shown is None else shown, 1):
-        axes.annotate(str(column), (along[at], scores[at]), textcoords="offset points", xytext=(0, 6), ha="center")
+        side = "left" if at == 0 else "right" if at == len(views) - 1 else "center"
+        axes.annotate(str(column), (along[at], scores[at]), textcoords="offset points", xytext=(0, 6), ha=side)
     axes.set(xlim=(0, max(along[-1], 1e-6)), ylim=(0, 1.12), xlabel="along the path (m)", ylabel="score")

@@ -143,6 +143,8 @@ class PlanConfig:
         out: folder to write; empty for `<data>/<name>/<scene>/path`.
         method: that scores the views; "forward" for the shortest path, looking ahead; empty as for the viewpoint map.
         weights: file of weights, for a method that has learnt; by default the best there are.
+        against: further methods to plan by, to be drawn side by side as `methods.png`, such as "forward" and
+            "fisher-trace-gp".
         film: "gif", "mp4" or "none".
         rerun: whether to write a recording for the Rerun viewer (needs `pip install rerun-sdk`).
         grid: voxels of the viewpoint map along x, y and z.
@@ -156,6 +158,7 @@ class PlanConfig:
     out: Path | None = None
     method: str = ""
     weights: Path | None = None
+    against: tuple[str, ...] = ()
     film: Literal["gif", "mp4", "none"] = "gif"
     rerun: bool = False
     grid: tuple[int, int, int] = (8, 8, 8)

@@ -12,7 +12,7 @@ from wheretolook.config import Experiment
 from wheretolook.dataset import Dataset, SceneFolder
 from wheretolook.errors import ConfigError
 from wheretolook.evaluation.scores import PROBABILITIES
-from wheretolook.figures.path_film import PathView, film_frames, save_film, still_figure
+from wheretolook.figures.path_film import PathView, film_frames, methods_figure, save_film, still_figure
 from wheretolook.figures.style import save_figure
 from wheretolook.geometry import PinholeCamera, poses_looking_along
 from wheretolook.localization_map import LocalizationMap
@@ -23,9 +23,12 @@ from wheretolook.planning.config import PlanConfig, ViewpointMapConfig
 from wheretolook.planning.path_comparison import FORWARD, shares_below
 from wheretolook.planning.path_planning import PlannedPath, plan_path
 from wheretolook.planning.scene_map import default_weights, scene_viewpoint_map
+from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.rendering import WarpRenderer
 from wheretolook.scene_space import space_and_occlusion
+from wheretolook.scenes.free_space import FreeSpace
 from wheretolook.scenes.loading import load_mesh
+from wheretolook.scenes.mapped_space import MappedSpace
 from wheretolook.scoring.registry import WEIGHTS_OF
 from wheretolook.table import pose_columns
 from wheretolook.visibility import OcclusionModel
@@ -49,38 +52,57 @@ def plan_scene(dataset: Dataset, experiment: Experiment, say: Say = print) -> Pl
     photographed = is_photographed(scene)
     hides = occlusion_without_mesh(experiment.occlusion) if photographed else experiment.occlusion
     space, occlusion = space_and_occlusion(scene, dataset.camera, experiment, hides)
-    weights = config.weights or (default_weights(dataset, say) if config.method != FORWARD else None)
-    method = config.method or ("" if weights is not None else "bins")
-    views = None
-    if method != FORWARD:
-        if method in WEIGHTS_OF and weights is None:
-            raise ConfigError(f"{method} needs weights", path=dataset.root, fix="Train it, or name plan.weights.")
-        of_map = ViewpointMapConfig(
-            method=method, weights=weights if not method or method in WEIGHTS_OF else None, grid=config.grid,
-            directions=config.directions,
-        )  # fmt: skip
-        views = scene_viewpoint_map(scene, dataset.camera, of_map, space, occlusion, experiment.warp_device)
-        if views.origin.scorer.split()[0] not in PROBABILITIES:
-            views = shares_below(views)
-        views = with_borrowed_views(views, space)
-    path = plan_path(config.start, config.goal, space, space.bounds, views, config.planner)
+    methods = list(dict.fromkeys((config.method, *config.against)))
+    weights = config.weights or (default_weights(dataset, say) if {*methods} != {FORWARD} else None)
+
+    def planned(method: str) -> tuple[str, PlannedPath]:
+        views = None if method == FORWARD else _views_by(method, weights, scene, dataset, experiment, space, occlusion)
+        name = method or (FORWARD if views is None else views.origin.scorer)
+        return name, plan_path(config.start, config.goal, space, space.bounds, views, config.planner)  # type: ignore[arg-type]
+
+    name, path = planned(config.method)
     folder = config.out or scene.folder / "path"
     seen = path_views(path, scene, dataset.camera, occlusion, experiment.warp_device)
     landmarks = Landmarks.load(scene.landmarks).points
     folder.mkdir(parents=True, exist_ok=True)
     _table(path).to_csv(folder / "path.csv", index=False, lineterminator="\n")
-    name = views.origin.scorer if views is not None else FORWARD
     save_figure(still_figure(seen, landmarks, f"{scene.name}, {name}"), folder / "path.png")
     written = ["path.csv", "path.png"]
+    if len(methods) > 1:
+        side_by_side = {name: seen}
+        for other, its_path in map(planned, methods[1:]):
+            side_by_side[other] = path_views(its_path, scene, dataset.camera, occlusion, experiment.warp_device, False)
+        save_figure(methods_figure(side_by_side, landmarks), folder / "methods.png")
+        written.append("methods.png")
     if config.film != "none":
         save_film(film_frames(seen, landmarks), folder / f"path.{config.film}")
         written.append(f"path.{config.film}")
     if recorder is not None:
         _record(recorder, seen, landmarks, dataset.camera, folder / "path.rrd")
         written.append("path.rrd")
-    say(f"{scene.name}: {path.length_m:.2f} m, {path.turn_deg:.0f} degrees of turning, {len(seen)} views, mean score "
-        f"{np.mean(path.scores):.2f} -> {folder}: {', '.join(written)}")  # fmt: skip
+    score = "" if np.isnan(path.scores).any() else f", mean score {np.mean(path.scores):.2f}"
+    say(f"{scene.name}: {path.length_m:.2f} m, {path.turn_deg:.0f} degrees of turning, {len(seen)} views{score} -> "
+        f"{folder}: {', '.join(written)}")  # fmt: skip
     return path
+
+
+def _views_by(
+    method: str, weights: Path | None, scene: SceneFolder, dataset: Dataset, experiment: Experiment,
+    space: FreeSpace | MappedSpace, occlusion: OcclusionModel,
+) -> ViewpointMap:  # fmt: skip
+    """What a method makes of a scene's views, for the planner: scores in [0, 1], borrowed where voxels are occupied."""
+    config = experiment.plan
+    method = method or ("" if weights is not None else "bins")
+    if method in WEIGHTS_OF and weights is None:
+        raise ConfigError(f"{method} needs weights", path=dataset.root, fix="Train it, or name plan.weights.")
+    of_map = ViewpointMapConfig(
+        method=method, weights=weights if not method or method in WEIGHTS_OF else None, grid=config.grid,
+        directions=config.directions,
+    )  # fmt: skip
+    views = scene_viewpoint_map(scene, dataset.camera, of_map, space, occlusion, experiment.warp_device)
+    if views.origin.scorer.split()[0] not in PROBABILITIES:
+        views = shares_below(views)
+    return with_borrowed_views(views, space)
 
 
 def _scene(dataset: Dataset, config: PlanConfig) -> SceneFolder:
@@ -94,22 +116,23 @@ def _scene(dataset: Dataset, config: PlanConfig) -> SceneFolder:
 
 
 def path_views(
-    path: PlannedPath, scene: SceneFolder, camera: PinholeCamera, occlusion: OcclusionModel, device: str = "cpu"
-) -> list[PathView]:
-    """What the camera sees along a path: landmarks in view, and where there is a mesh, the image."""
+    path: PlannedPath, scene: SceneFolder, camera: PinholeCamera, occlusion: OcclusionModel, device: str = "cpu",
+    images: bool = True,
+) -> list[PathView]:  # fmt: skip
+    """What the camera sees along a path: landmarks in view, and on request where there is a mesh, the image."""
     cam_from_world = poses_looking_along(path.positions, path.axes)
     one = LocalizationMap(Landmarks.load(scene.landmarks), camera, occlusion, device)
     visible = one.visible_landmarks(cam_from_world)
-    images = None
-    if scene.mesh.is_file():
-        images = WarpRenderer(load_mesh(scene.mesh), device).render(camera, cam_from_world).rgb
+    rgb = None
+    if images and scene.mesh.is_file():
+        rgb = WarpRenderer(load_mesh(scene.mesh), device).render(camera, cam_from_world).rgb
     views = []
     for number, pose in enumerate(cam_from_world):
         local = one.landmarks.points[visible[number]] @ pose[:, :3].T + pose[:, 3]
         pixels = local[:, :2] / local[:, 2:] * camera.focal_px + (camera.cx, camera.cy)
         views.append(
             PathView(path.positions[number], path.axes[number], float(path.scores[number]), pixels,
-                     (camera.width, camera.height), None if images is None else images[number])
+                     (camera.width, camera.height), None if rgb is None else rgb[number])
         )  # fmt: skip
     return views
 

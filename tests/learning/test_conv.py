@@ -138,7 +138,7 @@ def test_only_who_looks_at_landmark_channels_has_them_loaded(tmp_path: Path, sto
 
 
 def test_the_paper_trains_as_before() -> None:
-    assert TrainConfig().variants == ("2d", "2d+z", "2d+3d")
+    assert TrainConfig().variants == ("2d", "2d+z", "2d+3d", "set")  # what beats it learns beside it
 
 
 def test_a_map_without_descriptors_trains_and_scores(tmp_path: Path, store: str) -> None:

@@ -24,7 +24,7 @@ from wheretolook.learning.config import MatchabilityConfig, SetConfig, TrainConf
 from wheretolook.learning.data import labelled_rows, training_scenes
 from wheretolook.learning.landmark_views import AttributeStatistics, LandmarkLoader, load_landmark_views
 from wheretolook.learning.matchability import LandmarkBatches, Matchability
-from wheretolook.learning.set import SetModel
+from wheretolook.learning.set import SetModel, of_size
 from wheretolook.learning.set_network import (
     EXPECTED,
     MatchabilityNetwork,
@@ -437,6 +437,14 @@ def test_all_are_evaluated(dataset: Dataset, trained: dict[str, Path], tracking:
     )
     assert rows.loc[("set", ""), "roc_auc"] > 0.8 and np.isfinite(rows.loc[("set", ""), "ece"])
     assert rows.loc[("set", ""), "reference"] == "set"
+
+
+def test_few_views_are_gone_through_more_often() -> None:
+    config = TrainConfig(variants=("set",)).of_variant("set")
+    assert of_size(config, 200_000) is config and of_size(config, 16 * 1024) is config
+    few = of_size(config, 1350)
+    assert few.batch_size == 84 and few.epochs * 17 >= 600 > (few.epochs - 1) * 17
+    assert of_size(config, 100).batch_size == 64 and of_size(config, 100).epochs == 300
 
 
 def test_impossible_options() -> None:

@@ -155,6 +155,8 @@ class MatchabilityConfig(FittingConfig):
 class SetConfig(FittingConfig):
     """Options of the network over the set of landmarks in view.
 
+    With few training views, batches get smaller and epochs more (`wheretolook.learning.set.of_size`).
+
     Args:
         landmarks: landmarks of a view that a training step looks at, at most, chosen at random.
         width: units of the layers that look at single landmarks.

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from math import ceil
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
 from wheretolook.attributes import ViewLandmarks
-from wheretolook.learning.config import MATCHABILITY, SET, weights_name
+from wheretolook.learning.config import MATCHABILITY, SET, TrainConfig, weights_name
 from wheretolook.learning.data import check_classes
 from wheretolook.learning.landmark_model import LandmarkModel
 from wheretolook.learning.landmark_views import LandmarkDataModule, LandmarkLoader
@@ -66,6 +68,19 @@ MOST_OF_WINDOW = 2
 """Landmarks kept of a view, over those that a training step looks at."""
 
 
+LEAST_BATCHES, LEAST_BATCH, LEAST_STEPS = 16, 64, 600
+"""Batches that the training views are cut into at least, views of a batch at least, steps in all at least."""
+
+
+def of_size(config: TrainConfig, n_train: int) -> TrainConfig:
+    """Options for so many training views: few are gone through in smaller batches, and more often."""
+    batch_size = min(config.batch_size, max(LEAST_BATCH, n_train // LEAST_BATCHES))
+    enough = ceil(LEAST_STEPS / ceil(n_train / batch_size))
+    if n_train // LEAST_BATCHES >= config.batch_size:
+        return config
+    return replace(config, batch_size=batch_size, epochs=max(config.epochs, enough))
+
+
 def learn_set(task: Task, data: SetData | None = None) -> Learnt:
     """A set network from a dataset's labels.
 
@@ -81,6 +96,8 @@ def learn_set(task: Task, data: SetData | None = None) -> Learnt:
         WeightsError: the matchability model is damaged.
     """
     data, options = data or SetData(task), task.config.set
+    task = replace(task, config=of_size(task.config, len(data.train_rows)))
+    data.config = task.config
     path = task.dataset.root / "weights" / weights_name(MATCHABILITY)
     start = Matchability.load(path).network if options.from_matchability and path.is_file() else None
     statistics = data.statistics if start is None else start.statistics

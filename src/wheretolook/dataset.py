@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 
-from wheretolook.errors import TableError
+from wheretolook.errors import ConfigError, TableError
 from wheretolook.geometry import Float, PinholeCamera
 from wheretolook.localization_map import LocalizationMap
 from wheretolook.mapping.cameras import CAMERAS_FILE, colmap_poses, holds_model, load_mapping_poses
@@ -122,6 +122,18 @@ class Dataset:
     def split(self, split: Split) -> tuple[SceneFolder, ...]:
         """Scenes of one split."""
         return tuple(scene for scene in self.scenes if scene.split == split)
+
+    def scene(self, name: str) -> SceneFolder:
+        """The scene of a name.
+
+        Raises:
+            ConfigError: there is none.
+        """
+        for scene in self.scenes:
+            if scene.name == name:
+                return scene
+        fix = f"There are {', '.join(scene.name for scene in self.scenes)}."
+        raise ConfigError("there is no such scene", path=self.root, value=name, fix=fix)
 
     def fingerprint(self) -> str:
         """16 hexadecimal digits that change with any scene's table, landmarks or occlusion."""

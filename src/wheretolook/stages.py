@@ -6,28 +6,33 @@ from. Called again, it reuses what is there if its settings and inputs are the s
 
 from __future__ import annotations
 
-import json
 import shutil
 import time
 import zlib
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import asdict, replace
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from wheretolook.config import Experiment
 from wheretolook.dataset import Dataset, SceneFolder, Split, write_json
-from wheretolook.errors import ConfigError, MapError, SceneError, TableError
+from wheretolook.errors import MapError, SceneError
+from wheretolook.stage_inputs import (
+    dataset_after,
+    existing,
+    extractor_of,
+    mesh_fingerprint,
+    naming_scene,
+    refuse_release,
+)
 from wheretolook.stamps import forget_stamp, is_done, read_stamp, stage_key, write_stamp
-from wheretolook.table import fingerprint, write_table
+from wheretolook.table import write_table
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from wheretolook.learning.training import TrainedModel
-    from wheretolook.mapping.extraction import ExtractorConfig
     from wheretolook.planning import ViewpointMap
     from wheretolook.planning.path_planning import PlannedPath
 
@@ -46,7 +51,7 @@ def make_scenes(experiment: Experiment, say: Say = print, tick: Tick = lambda wo
     from wheretolook.scenes.procedural import generate_apartment
 
     config, root = experiment.scenes, experiment.root
-    _refuse_release(root)
+    refuse_release(root)
     numbers: dict[Split, int] = {"train": config.train, "val": config.val, "test": config.test}
     splits = [split for split, number in numbers.items() for _ in range(number)]
     sources: dict[SceneFolder, Callable[[], Any]] = {}
@@ -61,7 +66,7 @@ def make_scenes(experiment: Experiment, say: Say = print, tick: Tick = lambda wo
         if scene.name in {other.name for other in sources}:
             raise SceneError("two scenes have the same name", path=source.path, value=scene.name, fix="Give it a name.")
         sources[scene] = partial(load_mesh, source.path, up=source.up)
-        keys[scene] = [_mesh_fingerprint(source.path), source.up]
+        keys[scene] = [mesh_fingerprint(source.path), source.up]
 
     for scene, make in sources.items():
         key = stage_key("scenes", keys[scene])
@@ -93,24 +98,24 @@ def make_maps(experiment: Experiment, say: Say = print, tick: Tick = lambda work
     if experiment.map.photographs.images is not None:
         from wheretolook.photograph_scenes import map_photograph_scene
 
-        _refuse_release(experiment.root)
+        refuse_release(experiment.root)
         return map_photograph_scene(experiment, say, tick)
     from wheretolook.mapping.building import build_map
     from wheretolook.rendering import MeshRaycaster, WarpRenderer
     from wheretolook.scenes.free_space import FreeSpace
     from wheretolook.scenes.loading import load_mesh
 
-    dataset, device = _dataset(experiment, "scenes"), experiment.warp_device
+    dataset, device = dataset_after(experiment, "scenes"), experiment.warp_device
     settings = {name: value for name, value in asdict(experiment.map).items() if name != "photographs"}
     for scene in dataset.scenes:
         seed = zlib.crc32(scene.name.encode()) % 2**31  # the scene's own, whichever scenes are beside it
         key = stage_key("map", [settings, asdict(experiment.scenes.free_space), asdict(dataset.camera), seed,
-                           _existing(scene.mesh, SceneError, "scenes")])  # fmt: skip
+                           existing(scene.mesh, SceneError, "scenes")])  # fmt: skip
         model = [scene.map / name for name in ("cameras.bin", "images.bin", "points3D.bin")]
         if not is_done(scene, "map", key, scene.landmarks, *model):
             mesh = load_mesh(scene.mesh)
             raycaster = MeshRaycaster(mesh, device)
-            with _naming(scene.mesh):
+            with naming_scene(scene.mesh):
                 report = build_map(
                     mesh,
                     WarpRenderer(mesh, device),
@@ -148,7 +153,7 @@ def sample(experiment: Experiment, say: Say = print, tick: Tick = lambda work: N
     from wheretolook.sampling import free_locations, sample_viewpoints
     from wheretolook.scene_space import space_and_occlusion
 
-    dataset, device = _dataset(experiment, "map"), experiment.warp_device
+    dataset, device = dataset_after(experiment, "map"), experiment.warp_device
     for scene in dataset.scenes:
         chosen = {name: value for name, value in asdict(experiment.sample).items() if name != "memory_gb"}
         chosen["max_directions"] = experiment.sample.directions_of(scene.split)
@@ -158,11 +163,11 @@ def sample(experiment: Experiment, say: Say = print, tick: Tick = lambda work: N
             occlusion_config, source = occlusion_without_mesh(experiment.occlusion), scene.mapping_cameras
             space_config = asdict(experiment.scenes.mapped_space)
         key = stage_key("sample", [chosen, occlusion_config.settings(), space_config, asdict(dataset.camera),
-                                   _existing(source, SceneError, "map" if photographed else "scenes"),
-                                   _existing(scene.landmarks, MapError, "map")])  # fmt: skip
+                                   existing(source, SceneError, "map" if photographed else "scenes"),
+                                   existing(scene.landmarks, MapError, "map")])  # fmt: skip
         if not is_done(scene, "sample", key, scene.table, scene.occlusion):
             landmarks = Landmarks.load(scene.landmarks)
-            with _naming(source):
+            with naming_scene(source):
                 space, occlusion = space_and_occlusion(scene, dataset.camera, experiment, occlusion_config)
                 grid = VoxelGrid.over(space.bounds, experiment.sample.grid)
                 free = free_locations(grid, space)
@@ -206,16 +211,16 @@ def label(experiment: Experiment, say: Say = print, tick: Tick = lambda work: No
             f"degrees -> {scene.table}")  # fmt: skip
         tick(1)
 
-    dataset, config = _dataset(experiment, "sample"), experiment.label
+    dataset, config = dataset_after(experiment, "sample"), experiment.label
     scenes: dict[str, tuple[SceneFolder, str]] = {}
     tasks: list[LabelTask] = []
     for scene in dataset.scenes:
         refuse_labelling(scene)
     for scene in sorted(dataset.scenes, key=lambda scene: scene.split == "train"):  # those to evaluate on come first
-        table, extractor = scene.read_table(), _extractor_of(scene)
+        table, extractor = scene.read_table(), extractor_of(scene)
         key = stage_key("label", [asdict(config.localizer), asdict(extractor), asdict(dataset.camera),
-                             _existing(scene.mesh, SceneError, "scenes"),
-                             _existing(scene.landmarks, MapError, "map"), read_stamp(scene, "sample"),
+                             existing(scene.mesh, SceneError, "scenes"),
+                             existing(scene.landmarks, MapError, "map"), read_stamp(scene, "sample"),
                              *(["store_matches"] if config.store_matches else [])])  # fmt: skip
         shards = scene.folder / "shards"
         if is_done(scene, "label", key, scene.table):
@@ -266,7 +271,7 @@ def train(experiment: Experiment, say: Say = print, tick: Tick = lambda work: No
     config = experiment.train
     if experiment.warp_device == "cpu":
         config = replace(config, accelerator="cpu")
-    models = train_variants(_dataset(experiment, "label"), config, experiment.tracking)
+    models = train_variants(dataset_after(experiment, "label"), config, experiment.tracking)
     for model in models:
         say(f"{model.variant}: reusing {model.path}" if model.reused else f"{model.variant}: -> {model.path}")
     tick(1)
@@ -277,7 +282,7 @@ def evaluate(experiment: Experiment, say: Say = print, tick: Tick = lambda work:
     """Stage 6: the score table of all methods on the test scenes, `<dataset>/results/`, and nested MLflow runs."""
     from wheretolook.evaluation import evaluate as evaluate_methods
 
-    dataset = _dataset(experiment, "label")
+    dataset = dataset_after(experiment, "label")
     scores = evaluate_methods(
         dataset, experiment.evaluate, experiment.tracking, device=experiment.warp_device, occlusion=experiment.occlusion
     )
@@ -301,20 +306,16 @@ def viewpoint_map(experiment: Experiment, say: Say = print, tick: Tick = lambda 
     from wheretolook.planning.scene_map import default_weights, scene_viewpoint_map
     from wheretolook.scene_space import space_and_occlusion
 
-    dataset, config = _dataset(experiment, "map"), experiment.viewpoint_map
-    scenes = {scene.name: scene for scene in dataset.scenes}
-    if config.scene and config.scene not in scenes:
-        fix = f"There are {', '.join(scenes)}."
-        raise ConfigError("there is no such scene", path=dataset.root, value=config.scene, fix=fix)
+    dataset, config = dataset_after(experiment, "map"), experiment.viewpoint_map
     if not config.method and config.weights is None and (weights := default_weights(dataset, say)) is not None:
         say(f"scored by {weights}")
         config = replace(config, weights=weights)
     built: dict[str, ViewpointMap] = {}
-    for name in [config.scene] if config.scene else scenes:
-        scene = scenes[name]
+    for scene in [dataset.scene(config.scene)] if config.scene else dataset.scenes:
+        name = scene.name
         photographed = is_photographed(scene)
         hides = occlusion_without_mesh(experiment.occlusion) if photographed else experiment.occlusion
-        with _naming(scene.map if photographed else scene.mesh):
+        with naming_scene(scene.map if photographed else scene.mesh):
             space, occlusion = space_and_occlusion(scene, dataset.camera, experiment, hides)
             found = scene_viewpoint_map(scene, dataset.camera, config, space, occlusion, experiment.warp_device)
         folder = config.out or scene.folder / "viewpoint-map"
@@ -337,7 +338,7 @@ def plan(experiment: Experiment, say: Say = print, tick: Tick = lambda work: Non
     """
     from wheretolook.planning.plan_stage import plan_scene
 
-    path = plan_scene(_dataset(experiment, "map"), experiment, say)
+    path = plan_scene(dataset_after(experiment, "map"), experiment, say)
     tick(1)
     return path
 
@@ -356,7 +357,7 @@ def compare_paths(experiment: Experiment, say: Say = print, tick: Tick = lambda 
     """
     from wheretolook.planning.path_stage import compare_scenes
 
-    summary = compare_scenes(_dataset(experiment, "map"), experiment, _extractor_of, say)
+    summary = compare_scenes(dataset_after(experiment, "map"), experiment, extractor_of, say)
     tick(1)
     return summary
 
@@ -385,7 +386,7 @@ def release(experiment: Experiment, say: Say = print, tick: Tick = lambda work: 
     )
     from wheretolook.release_card import write_card
 
-    dataset = _dataset(experiment, "label")
+    dataset = dataset_after(experiment, "label")
     if not is_release(dataset):
         copy = copy_dataset(dataset, experiment)
         for scene, source in zip(copy.scenes, dataset.scenes, strict=True):
@@ -411,73 +412,3 @@ def release(experiment: Experiment, say: Say = print, tick: Tick = lambda work: 
     say(f"the card -> {write_card(dataset)}")
     say(size_text(sizes(dataset.root)))
     return dataset
-
-
-def _dataset(experiment: Experiment, needs: str) -> Dataset:
-    """The dataset, once the stage that is needed has been through all of its scenes with what they now hold."""
-    dataset = Dataset.load(experiment.root)
-    if needs != "label":
-        _refuse_release(experiment.root)
-    if dataset.camera != experiment.camera:
-        raise ConfigError(
-            "the dataset was made with another camera", path=experiment.root, value=dataset.camera,
-            fix="Run the scenes stage with this configuration, or give the experiment another name.",
-        )  # fmt: skip
-    for scene in dataset.scenes:
-        if read_stamp(scene, needs) is None:
-            raise TableError(
-                f"the {needs} stage has not been run for this scene, or not since an earlier stage remade its input",
-                path=scene.folder, fix=f"Run `wheretolook {needs}`.",
-            )  # fmt: skip
-    return dataset
-
-
-def _refuse_release(root: Path) -> None:
-    from wheretolook.release import ABOUT
-
-    if (root / ABOUT).is_file():
-        raise ConfigError(
-            "a release has no meshes and maps, and would be lost if they were made anew", path=root,
-            fix="Use it with train, evaluate and release alone, or give the experiment another name.",
-        )  # fmt: skip
-
-
-@contextmanager
-def _naming(path: Path) -> Iterator[None]:
-    """Add the scene's file to errors of those who know only its content."""
-    try:
-        yield
-    except (SceneError, MapError) as error:
-        if error.path is not None:
-            raise
-        raise type(error)(error.problem, path=path, value=error.value, fix=error.fix) from error
-
-
-def _extractor_of(scene: SceneFolder) -> ExtractorConfig:
-    """The keypoint extractor the map was made with: queries must use the same."""
-    from wheretolook.mapping.extraction import ExtractorConfig
-
-    path = scene.map / "report.json"
-    try:
-        return ExtractorConfig(**json.loads(path.read_text())["config"]["extractor"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise MapError("the map's report is missing or damaged", path=path, fix="Run the map stage again.") from error
-
-
-def _existing(path: Path, error: type[SceneError] | type[MapError], stage: str) -> str:
-    """Fingerprint of a file that an earlier stage makes."""
-    if not path.is_file():
-        raise error("this file is missing", path=path, fix=f"Run the {stage} stage first.")
-    return fingerprint(path)
-
-
-def _mesh_fingerprint(path: Path) -> str:
-    """A mesh file changes when its size or date does; it may be gigabytes."""
-    if not path.exists():
-        raise SceneError("there is no such mesh", path=path, fix="Check the path.")
-    files = [path]
-    if path.is_dir():
-        files = sorted(file for file in path.iterdir() if file.is_file())
-    elif path.suffix.lower() != ".glb":  # materials and textures lie beside it
-        files = sorted(file for file in path.parent.iterdir() if file.is_file())
-    return " ".join(f"{file.resolve()}:{file.stat().st_size}:{file.stat().st_mtime_ns}" for file in files)

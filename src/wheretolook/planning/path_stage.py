@@ -15,20 +15,17 @@ from wheretolook.config import Experiment
 from wheretolook.dataset import Dataset, SceneFolder, write_json, write_text
 from wheretolook.errors import ConfigError, SceneError
 from wheretolook.evaluation.report import markdown_table
-from wheretolook.evaluation.scores import PROBABILITIES
 from wheretolook.figures.style import save_figure
 from wheretolook.labelling.labeller import MANIFEST, LabelTask, label_scenes, storing
 from wheretolook.labelling.shard import SceneJob
 from wheretolook.mapping.extraction import ExtractorConfig
 from wheretolook.photograph_scenes import is_photographed
-from wheretolook.planning.borrowing import with_borrowed_views
-from wheretolook.planning.config import PathsConfig, ViewpointMapConfig
-from wheretolook.planning.path_comparison import FORWARD, ComparedPaths, compare_paths, draw_pairs, shares_below
+from wheretolook.planning.config import PathsConfig
+from wheretolook.planning.path_comparison import FORWARD, ComparedPaths, compare_paths, draw_pairs
 from wheretolook.planning.path_report import summarize_paths
-from wheretolook.planning.scene_map import default_weights, scene_viewpoint_map
-from wheretolook.planning.viewpoint_map import ViewpointMap
+from wheretolook.planning.planner_map import planner_map
+from wheretolook.planning.scene_map import default_weights
 from wheretolook.scene_space import space_and_occlusion
-from wheretolook.scoring.registry import WEIGHTS_OF
 from wheretolook.stamps import stage_key
 from wheretolook.table import SCHEMA, UNLABELLED, fingerprint
 from wheretolook.tracking import TrackingConfig, log, start_run
@@ -78,13 +75,7 @@ def compare_scenes(
 
 
 def _chosen(dataset: Dataset, config: PathsConfig) -> list[SceneFolder]:
-    by_name = {scene.name: scene for scene in dataset.scenes}
-    for name in config.scenes:
-        if name not in by_name:
-            raise ConfigError(
-                "there is no such scene", path=dataset.root, value=name, fix=f"There are {', '.join(by_name)}."
-            )
-    scenes = [by_name[name] for name in config.scenes] or list(dataset.split("test"))
+    scenes = [dataset.scene(name) for name in config.scenes] or list(dataset.split("test"))
     if not scenes:
         raise ConfigError("the dataset has no test scene", path=dataset.root, fix="Name scenes in paths.scenes.")
     for scene in scenes:
@@ -107,18 +98,12 @@ def _plan(scene: SceneFolder, dataset: Dataset, experiment: Experiment, say: Say
         say(f"{scene.name}: reusing {folder}")
         return ComparedPaths(**{name: pd.read_parquet(file) for name, file in files.items()})
     space, occlusion = space_and_occlusion(scene, dataset.camera, experiment, experiment.occlusion)
-    maps: dict[str, ViewpointMap] = {}
-    for method in config.methods:
-        if method == FORWARD:
-            continue
-        if method in WEIGHTS_OF and weights is None:
-            raise ConfigError(f"{method} needs weights", path=dataset.root, fix="Train it, or name paths.weights.")
-        of_map = ViewpointMapConfig(
-            method=method, weights=weights if method in WEIGHTS_OF else None, grid=config.grid,
-            directions=config.directions,
-        )  # fmt: skip
-        built = scene_viewpoint_map(scene, dataset.camera, of_map, space, occlusion, experiment.warp_device)
-        maps[method] = with_borrowed_views(built if method in PROBABILITIES else shares_below(built), space)
+    maps = {
+        method: planner_map(method, weights, config.grid, config.directions, scene, dataset, space, occlusion,
+                            experiment.warp_device)
+        for method in config.methods
+        if method != FORWARD
+    }  # fmt: skip
     found = compare_paths(draw_pairs(space, config), space, maps, config, f"plan {scene.name}")
     made.unlink(missing_ok=True)
     with storing(folder):

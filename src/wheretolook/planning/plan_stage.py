@@ -11,25 +11,19 @@ import pandas as pd
 from wheretolook.config import Experiment
 from wheretolook.dataset import Dataset, SceneFolder
 from wheretolook.errors import ConfigError
-from wheretolook.evaluation.scores import PROBABILITIES
 from wheretolook.figures.path_film import PathView, film_frames, methods_figure, save_film, still_figure
 from wheretolook.figures.style import save_figure
 from wheretolook.geometry import PinholeCamera, poses_looking_along
 from wheretolook.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.photograph_scenes import is_photographed, occlusion_without_mesh
-from wheretolook.planning.borrowing import with_borrowed_views
-from wheretolook.planning.config import PlanConfig, ViewpointMapConfig
-from wheretolook.planning.path_comparison import FORWARD, shares_below
+from wheretolook.planning.path_comparison import FORWARD
 from wheretolook.planning.path_planning import PlannedPath, plan_path
-from wheretolook.planning.scene_map import default_weights, scene_viewpoint_map
-from wheretolook.planning.viewpoint_map import ViewpointMap
+from wheretolook.planning.planner_map import planner_map
+from wheretolook.planning.scene_map import default_weights
 from wheretolook.rendering import WarpRenderer
 from wheretolook.scene_space import space_and_occlusion
-from wheretolook.scenes.free_space import FreeSpace
 from wheretolook.scenes.loading import load_mesh
-from wheretolook.scenes.mapped_space import MappedSpace
-from wheretolook.scoring.registry import WEIGHTS_OF
 from wheretolook.table import pose_columns
 from wheretolook.visibility import OcclusionModel
 
@@ -44,7 +38,7 @@ def plan_scene(dataset: Dataset, experiment: Experiment, say: Say = print) -> Pl
         PlanningError: no path can be found. SceneError, MapError: the scene cannot be used.
     """
     config = experiment.plan
-    scene = _scene(dataset, config)
+    scene = dataset.scenes[0] if not config.scene and len(dataset.scenes) == 1 else dataset.scene(config.scene)
     if config.start is None or config.goal is None:
         fix = "Give plan.start and plan.goal, such as --plan.start '[1, 1, 1.4]'."
         raise ConfigError("a path needs a start and a goal", value=(config.start, config.goal), fix=fix)
@@ -56,7 +50,19 @@ def plan_scene(dataset: Dataset, experiment: Experiment, say: Say = print) -> Pl
     weights = config.weights or (default_weights(dataset, say) if {*methods} != {FORWARD} else None)
 
     def planned(method: str) -> tuple[str, PlannedPath]:
-        views = None if method == FORWARD else _views_by(method, weights, scene, dataset, experiment, space, occlusion)
+        views = None
+        if method != FORWARD:
+            views = planner_map(
+                method,
+                weights,
+                config.grid,
+                config.directions,
+                scene,
+                dataset,
+                space,
+                occlusion,
+                experiment.warp_device,
+            )
         name = method or (FORWARD if views is None else views.origin.scorer)
         return name, plan_path(config.start, config.goal, space, space.bounds, views, config.planner)  # type: ignore[arg-type]
 
@@ -84,35 +90,6 @@ def plan_scene(dataset: Dataset, experiment: Experiment, say: Say = print) -> Pl
     say(f"{scene.name}: {path.length_m:.2f} m, {path.turn_deg:.0f} degrees of turning, {len(seen)} views{score} -> "
         f"{folder}: {', '.join(written)}")  # fmt: skip
     return path
-
-
-def _views_by(
-    method: str, weights: Path | None, scene: SceneFolder, dataset: Dataset, experiment: Experiment,
-    space: FreeSpace | MappedSpace, occlusion: OcclusionModel,
-) -> ViewpointMap:  # fmt: skip
-    """What a method makes of a scene's views, for the planner: scores in [0, 1], borrowed where voxels are occupied."""
-    config = experiment.plan
-    method = method or ("" if weights is not None else "bins")
-    if method in WEIGHTS_OF and weights is None:
-        raise ConfigError(f"{method} needs weights", path=dataset.root, fix="Train it, or name plan.weights.")
-    of_map = ViewpointMapConfig(
-        method=method, weights=weights if not method or method in WEIGHTS_OF else None, grid=config.grid,
-        directions=config.directions,
-    )  # fmt: skip
-    views = scene_viewpoint_map(scene, dataset.camera, of_map, space, occlusion, experiment.warp_device)
-    if views.origin.scorer.split()[0] not in PROBABILITIES:
-        views = shares_below(views)
-    return with_borrowed_views(views, space)
-
-
-def _scene(dataset: Dataset, config: PlanConfig) -> SceneFolder:
-    by_name = {scene.name: scene for scene in dataset.scenes}
-    if not config.scene and len(by_name) == 1:
-        return dataset.scenes[0]
-    if config.scene not in by_name:
-        fix = f"There are {', '.join(by_name)}."
-        raise ConfigError("there is no such scene", path=dataset.root, value=config.scene, fix=fix)
-    return by_name[config.scene]
 
 
 def path_views(

@@ -1,0 +1,48 @@
+"""The viewpoint map that a planner is given: scores in [0, 1], and something to go by wherever a camera can be."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from wheretolook.dataset import Dataset, SceneFolder
+from wheretolook.errors import ConfigError
+from wheretolook.evaluation.scores import PROBABILITIES
+from wheretolook.planning.borrowing import with_borrowed_views
+from wheretolook.planning.config import ViewpointMapConfig
+from wheretolook.planning.path_comparison import shares_below
+from wheretolook.planning.scene_map import scene_viewpoint_map
+from wheretolook.planning.viewpoint_map import ViewpointMap
+from wheretolook.scenes.free_space import FreeSpace
+from wheretolook.scenes.mapped_space import MappedSpace
+from wheretolook.scoring.registry import WEIGHTS_OF
+from wheretolook.visibility import OcclusionModel
+
+
+def planner_map(
+    method: str, weights: Path | None, grid: tuple[int, int, int], directions: int, scene: SceneFolder,
+    dataset: Dataset, space: FreeSpace | MappedSpace, occlusion: OcclusionModel, device: str = "cpu",
+) -> ViewpointMap:  # fmt: skip
+    """What a method makes of a scene's views: probabilities, or ranks of scores that are none, borrowed where needed.
+
+    Args:
+        method: that scores; empty for that of the weights, or bins without.
+        weights: for methods that have learnt; others leave them alone.
+        grid: voxels along x, y and z.
+        directions: at each voxel.
+        scene: its files.
+        dataset: gives the camera.
+        space: where a camera can be.
+        occlusion: which landmarks nothing stands in front of.
+        device: where kernels run.
+
+    Raises:
+        ConfigError: the method needs weights. Else as `wheretolook.planning.scene_map.scene_viewpoint_map`.
+    """
+    if method in WEIGHTS_OF and weights is None:
+        raise ConfigError(f"{method} needs weights", path=dataset.root, fix="Train it, or name weights.")
+    used = weights if not method or method in WEIGHTS_OF else None
+    config = ViewpointMapConfig(method=method, weights=used, grid=grid, directions=directions)
+    views = scene_viewpoint_map(scene, dataset.camera, config, space, occlusion, device)
+    if views.origin.scorer.split()[0] not in PROBABILITIES:
+        views = shares_below(views)
+    return with_borrowed_views(views, space)

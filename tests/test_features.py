@@ -21,6 +21,7 @@ from wheretolook.features import (
     arrange,
     bin_views,
     bin_views_plain,
+    count_bins,
 )
 from wheretolook.geometry import PinholeCamera, transform
 from wheretolook.localization_map import LocalizationMap
@@ -63,6 +64,19 @@ def test_kernel_bins_as_its_plain_twin(random_views: RandomViews, device: str) -
     np.testing.assert_array_equal(kernel.counts, plain.counts)
     np.testing.assert_allclose(kernel.means, plain.means, rtol=1e-5, atol=2e-5)
     assert plain.counts.sum() > 500
+
+
+def test_counted_bins_are_those_that_the_plain_twin_fills(random_views: RandomViews, device: str) -> None:
+    v = random_views
+    arguments = v.camera, v.cam_from_world, v.points, v.visible, v.location_rows
+    plain = bin_views_plain(*arguments, bins=12)
+    for block_bytes in (1 << 30, 3 * 12 * 12 * 4):  # all at once, and three views at a time
+        n_visible, n_filled = count_bins(*arguments, bins=12, device=device, block_bytes=block_bytes)
+        np.testing.assert_array_equal(n_visible, plain.n_visible)
+        np.testing.assert_array_equal(n_filled, plain.n_filled)
+    distorted = ColmapCamera("RADIAL", 320, 240, (150.0, 165.0, 118.0, -0.15, 0.02))
+    binned = bin_views(distorted, *arguments[1:], bins=6)
+    np.testing.assert_array_equal(count_bins(distorted, *arguments[1:], bins=6), (binned.n_visible, binned.n_filled))
 
 
 def test_a_distorted_camera_bins_what_it_projects(random_views: RandomViews) -> None:

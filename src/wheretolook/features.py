@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from wheretolook.camera_models import Camera, ColmapCamera
 from wheretolook.errors import ConfigError
-from wheretolook.features_kernel import bin_kernel
+from wheretolook.features_kernel import bin_kernel, count_bins_kernel
 from wheretolook.geometry import Float, split_poses
 from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 from wheretolook.visibility.frustum import (
@@ -53,6 +53,9 @@ INPUT_VARIANTS: dict[str, tuple[str, ...]] = {**PAPER_VARIANTS, "2d+3d+landmark"
 """All inputs of the paper's network by name: the paper's own, and with what landmarks are like."""
 
 Layout = Literal["in_place", "compact"]
+
+GPU_LANES = 32
+"""Threads that share a view on a GPU where bins are only counted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,6 +184,57 @@ def bin_views(
         means[rows] = block_means.numpy().reshape(-1, n_channels, bins, bins)
         counts[rows] = block_counts.numpy().reshape(-1, bins, bins)
     return BinnedViews(means, counts, channels)
+
+
+def count_bins(
+    camera: Camera,
+    cam_from_world: Float,
+    points: Float,
+    visible: VisibleSets,
+    location_rows: NDArray[np.integer[Any]],
+    bins: int = 30,
+    device: str = "cpu",
+    block_bytes: int = 1 << 30,
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """`BinnedViews.n_visible` and `BinnedViews.n_filled` of views, (B,) each, without binning anything else.
+
+    Args:
+        camera, cam_from_world, points, visible, location_rows, bins: as for `bin_views`, the plain twin of this.
+        device: "cpu" or a CUDA device.
+        block_bytes: views are worked through in blocks of about this many bytes.
+    """
+    if isinstance(camera, ColmapCamera):
+        binned = bin_views_plain(camera, cam_from_world, points, visible, location_rows, bins)
+        return binned.n_visible, binned.n_filled
+    device = start_warp(device)
+    lanes = GPU_LANES if device != "cpu" else 1
+    n_visible, n_filled = (np.empty(len(cam_from_world), dtype=np.int32) for _ in range(2))
+    block = max(1, block_bytes // (bins * bins * 4))
+    points_on_device: Any = wp.array(np.asarray(points, dtype=np.float64), dtype=wp.vec3d, device=device)
+    starts: Any = wp.array(visible.starts, dtype=wp.int32, device=device)
+    indices: Any = wp.array(visible.indices, dtype=wp.int32, device=device)
+    for begin in range(0, len(cam_from_world), block):
+        rows = slice(begin, min(begin + block, len(cam_from_world)))
+        rotations, centers = split_poses(cam_from_world[rows])
+        counted = [wp.zeros(len(centers), dtype=wp.int32, device=device) for _ in range(2)]
+        wp.launch(
+            count_bins_kernel,
+            dim=(len(centers), lanes),
+            inputs=[
+                wp.array(frustum_sides(camera, rotations), dtype=wp.vec3, device=device),
+                wp.array(rotations.astype(np.float32), dtype=wp.mat33, device=device),
+                wp.array(centers, dtype=wp.vec3d, device=device),
+                wp.array(np.asarray(location_rows[rows], dtype=np.int32), dtype=wp.int32, device=device),
+                points_on_device, starts, indices,
+                wp.float64(camera.focal_px), wp.float64(camera.cx), wp.float64(camera.cy),
+                wp.float64(bins / camera.width), wp.float64(bins / camera.height), wp.float64(MIN_DEPTH_M), bins, lanes,
+                wp.zeros((len(centers), bins * bins), dtype=wp.int32, device=device),
+            ],
+            outputs=counted,
+            device=device,
+        )  # fmt: skip
+        n_visible[rows], n_filled[rows] = (one.numpy() for one in counted)
+    return n_visible, n_filled
 
 
 def bin_views_plain(

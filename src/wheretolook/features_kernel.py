@@ -1,4 +1,4 @@
-"""Warp kernel of `bin_views`."""
+"""Warp kernels of `bin_views` and `count_bins`."""
 
 # mypy: ignore-errors
 # Warp's kernel language is not Python's type system.
@@ -68,3 +68,44 @@ def bin_kernel(
             scale = 1.0 / wp.float32(counts[view, cell])
             for channel in range(means.shape[1]):
                 means[view, channel, cell] = means[view, channel, cell] * scale
+
+
+@wp.kernel
+def count_bins_kernel(
+    sides: wp.array2d[wp.vec3],
+    rotations: wp.array[wp.mat33],
+    centers: wp.array[wp.vec3d],
+    location_rows: wp.array[wp.int32],
+    points: wp.array[wp.vec3d],
+    starts: wp.array[wp.int32],
+    indices: wp.array[wp.int32],
+    focal: wp.float64,
+    cx: wp.float64,
+    cy: wp.float64,
+    columns_per_pixel: wp.float64,
+    rows_per_pixel: wp.float64,
+    min_depth: wp.float64,
+    bins: wp.int32,
+    lanes: wp.int32,
+    taken: wp.array2d[wp.int32],  # 0 where no landmark has been seen in a bin yet
+    n_visible: wp.array[wp.int32],
+    n_filled: wp.array[wp.int32],
+):
+    view, lane = wp.tid()
+    rotation = rotations[view]
+    center = centers[view]
+    location = location_rows[view]
+    visible = wp.int32(0)
+    filled = wp.int32(0)
+    for entry in range(starts[location] + lane, starts[location + 1], lanes):
+        offset = offset_from(center, points[indices[entry]])
+        if in_view(sides, view, offset, min_depth):
+            pixel = pixel_of(rotation, offset, focal, cx, cy)
+            column = wp.clamp(wp.int32(pixel[0] * columns_per_pixel), 0, bins - 1)
+            row = wp.clamp(wp.int32(pixel[1] * rows_per_pixel), 0, bins - 1)
+            visible += 1
+            # whichever lane comes first fills the bin: the numbers do not depend on their order
+            if wp.atomic_max(taken, view, row * bins + column, 1) == 0:
+                filled += 1
+    wp.atomic_add(n_visible, view, visible)
+    wp.atomic_add(n_filled, view, filled)

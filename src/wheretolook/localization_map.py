@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wheretolook.camera_models import Camera, ColmapCamera
-from wheretolook.features import BinnedViews, bin_views
+from wheretolook.features import BinnedViews, bin_views, count_bins
 from wheretolook.geometry import Float, PinholeCamera, camera_centers
 from wheretolook.mapping.cameras import colmap_poses
 from wheretolook.mapping.colmap_model import read_model
@@ -103,6 +103,18 @@ class LocalizationMap:
             self.camera, cam_from_world, self.landmarks.points, unoccluded, rows, bins=bins, device=self.device,
             landmarks=self.landmarks if landmark_channels else None,
         )  # fmt: skip
+
+    def count_bins(self, cam_from_world: Float, bins: int = 30) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        """How many landmarks the views (B, 3, 4) see, and how many bins have one in them, (B,) each.
+
+        Raises:
+            ValueError: the poses have another shape, or entries that are not finite.
+        """
+        cam_from_world = check_poses(cam_from_world)
+        unoccluded, rows = self._unoccluded(cam_from_world)
+        return count_bins(
+            self.camera, cam_from_world, self.landmarks.points, unoccluded, rows, bins=bins, device=self.device
+        )
 
     def visible_landmarks(self, cam_from_world: Float) -> VisibleSets:
         """The landmarks that each of the views (B, 3, 4) sees. Views that share a location share its occlusion test.

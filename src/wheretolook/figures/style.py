@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import html
 import os
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +12,12 @@ from typing import Any
 
 from matplotlib.figure import Figure
 from matplotlib.style import context
+
+from wheretolook.errors import ConfigError
+
+ONE_COLUMN_IN, TWO_COLUMNS_IN = 3.5, 7.2
+"""Widths of figures for one and for two columns of a paper, inches. Their letters are as large as they will be in
+print: `PRINT`. Figures for the screen are wider, with the letters of `RC`."""
 
 INK = "#333333"
 GRID = "#d9d9d9"
@@ -37,7 +45,24 @@ RC: dict[str, Any] = {
     "savefig.dpi": 160,
     "savefig.bbox": "tight",
     "svg.hashsalt": "wheretolook",
+    "svg.fonttype": "none",
+    "pdf.fonttype": 42,
 }
+
+PRINT: dict[str, Any] = {
+    **RC,
+    "font.size": 8,
+    "axes.titlesize": 8.5,
+    "axes.labelsize": 8,
+    "xtick.labelsize": 7,
+    "ytick.labelsize": 7,
+    "legend.fontsize": 7,
+    "axes.linewidth": 0.6,
+    "lines.linewidth": 1.2,
+    "lines.markersize": 4,
+    "hatch.linewidth": 0.5,
+}
+"""`RC` with the letters and lines of a printed column."""
 
 
 @dataclass(frozen=True)
@@ -160,10 +185,53 @@ def new_figure(width_in: float, height_in: float) -> Figure:
         return Figure(figsize=(width_in, height_in), layout="constrained")
 
 
-def save_figure(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG, atomically; its folder is made when needed."""
+KINDS = ("png", "pdf", "svg")
+"""Kinds of files that figures are written as."""
+
+_NOTE = {"png": "Description", "pdf": "Subject", "svg": "Description"}
+
+
+def save_figure(figure: Figure, path: Path, note: str = "") -> None:
+    """Write a figure, atomically, the same figure as the same bytes; its folder is made when needed.
+
+    Args:
+        figure: what to write.
+        path: file, whose suffix says what kind: .png, .pdf or .svg, the latter two as vectors.
+        note: what to keep in the file's metadata, such as the runs that the figure was made from.
+
+    Raises:
+        ConfigError: another kind of file.
+    """
+    kind = path.suffix[1:].lower()
+    if kind not in KINDS:
+        raise ConfigError("figures are not written as such files", path=path, fix=f"Use {', '.join(KINDS)}.")
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".partial")
+    # without dates and versions
+    metadata: dict[str, Any] = {"pdf": {"CreationDate": None, "Creator": None}, "svg": {"Date": None}}.get(kind, {})
+    if note:
+        metadata[_NOTE[kind]] = note
     with context(RC):
-        figure.savefig(partial, format="png")
+        figure.savefig(partial, format=kind, metadata={**metadata, **({"Software": None} if kind == "png" else {})})
     os.replace(partial, path)
+
+
+def note_of(path: Path) -> str:
+    """What `save_figure` kept in a figure's metadata; empty if nothing.
+
+    Raises:
+        ConfigError: another kind of file than PNG, PDF or SVG.
+    """
+    kind = path.suffix[1:].lower()
+    if kind == "png":
+        from PIL import Image
+
+        with Image.open(path) as image:
+            return str(image.info.get(_NOTE[kind], ""))
+    if kind == "svg":
+        found = re.search(r"<dc:description>(.*?)</dc:description>", path.read_text(encoding="utf-8"), re.DOTALL)
+        return html.unescape(found[1]).strip() if found else ""
+    if kind == "pdf":
+        subject = re.search(rb"/Subject \((.*?)(?<!\\)\)", path.read_bytes(), re.DOTALL)
+        return re.sub(rb"\\(.)", rb"\1", subject[1]).decode("latin-1") if subject else ""
+    raise ConfigError("figures are not written as such files", path=path, fix=f"Use {', '.join(KINDS)}.")

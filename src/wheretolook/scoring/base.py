@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from wheretolook.features import ALL_CHANNELS, CHANNELS, BinnedViews
 from wheretolook.geometry import Float
@@ -91,3 +92,19 @@ class BinnedScorer(Scorer):
     @abstractmethod
     def score_bins(self, binned: BinnedViews) -> Float:
         """Score binned views with all channels that it asks for. Returns (B,) float64, finite."""
+
+
+class CountingScorer(BinnedScorer):
+    """A method that scores a view by how many landmarks and filled bins there are."""
+
+    def score(self, cam_from_world: Float) -> Float:
+        """Score poses (B, 3, 4). Returns (B,) float64."""
+        return self.score_counts(*self.localization_map.count_bins(cam_from_world, self.bins))
+
+    def score_bins(self, binned: BinnedViews) -> Float:
+        """Score binned views (B,)."""
+        return self.score_counts(binned.n_visible, binned.n_filled)
+
+    @abstractmethod
+    def score_counts(self, n_visible: NDArray[np.int32], n_filled: NDArray[np.int32]) -> Float:
+        """Score views by their landmarks and filled bins, (B,) each. Returns (B,) float64, finite."""

@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
-from wheretolook.features import BinnedViews
 from wheretolook.geometry import Float
-from wheretolook.scoring.base import BinnedScorer
+from wheretolook.scoring.base import CountingScorer
 
 
-class BinsScorer(BinnedScorer):
+class BinsScorer(CountingScorer):
     """Share of the image's bins with a visible landmark in them (paper, Sec. 4.1, "reprojection with bins").
 
     Among views with as many filled bins, the one that sees more landmarks scores higher, by less than one bin is worth.
@@ -20,7 +20,7 @@ class BinsScorer(BinnedScorer):
     name: ClassVar[str] = "bins"
     local = True
 
-    def score_bins(self, binned: BinnedViews) -> Float:
+    def score_counts(self, n_visible: NDArray[np.int32], n_filled: NDArray[np.int32]) -> Float:
         """(B,) in [0, 1)."""
-        visible = binned.n_visible.astype(np.float64)
-        return (binned.n_filled + visible / (1 + visible)) / (self.bins**2 + 1)
+        visible = n_visible.astype(np.float64)
+        return (n_filled + visible / (1 + visible)) / (self.bins**2 + 1)

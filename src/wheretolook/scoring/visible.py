@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from wheretolook.features import BinnedViews
+import numpy as np
+from numpy.typing import NDArray
+
 from wheretolook.geometry import Float
-from wheretolook.scoring.base import BinnedScorer
+from wheretolook.scoring.base import CountingScorer
 
 
-class VisibleScorer(BinnedScorer):
+class VisibleScorer(CountingScorer):
     """Share of the map's landmarks that a view sees (paper, Sec. 3.2)."""
 
     name: ClassVar[str] = "visible"
 
-    def score_bins(self, binned: BinnedViews) -> Float:
+    def score_counts(self, n_visible: NDArray[np.int32], n_filled: NDArray[np.int32]) -> Float:
         """(B,) in [0, 1]."""
-        return binned.n_visible / max(1, len(self.localization_map.landmarks.points))
+        return n_visible / max(1, len(self.localization_map.landmarks.points))

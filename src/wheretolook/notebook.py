@@ -1,0 +1,36 @@
+"""Where notebooks find the release and the tracking store, from whichever folder they are opened in."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from wheretolook.dataset import RELEASE, Dataset
+from wheretolook.errors import ConfigError
+from wheretolook.tracking import TrackingConfig
+
+RELEASE_VARIABLE, STORE_VARIABLE = "WHERETOLOOK_RELEASE", "WHERETOLOOK_MLRUNS"
+"""Environment variables that name the folders of a release and of a store, instead of the ones that are found."""
+
+
+def open_release() -> Dataset:
+    """The dataset that ships: the folder that `WHERETOLOOK_RELEASE` names, or the nearest `data/release` upwards.
+
+    Raises:
+        ConfigError: there is none. TableError: it is damaged.
+    """
+    here, named = Path.cwd(), os.environ.get(RELEASE_VARIABLE)
+    places = [Path(named)] if named else [folder / "data" / RELEASE for folder in (here, *here.parents)]
+    for place in places:
+        if (place / "dataset.json").is_file():
+            return Dataset.load(place)
+    fix = f"Open the notebook inside a checkout, or name its folder in {RELEASE_VARIABLE}."
+    raise ConfigError("there is no release here or in a folder above", path=places[0], fix=fix)
+
+
+def find_store() -> TrackingConfig:
+    """The store that `WHERETOLOOK_MLRUNS` names, or the nearest `mlruns` upwards, be it empty."""
+    here, named = Path.cwd(), os.environ.get(STORE_VARIABLE)
+    folders = [folder / "mlruns" for folder in (here, *here.parents)]
+    nearest = next((folder for folder in folders if folder.is_dir()), folders[0])
+    return TrackingConfig(named or str(nearest))

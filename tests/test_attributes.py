@@ -20,7 +20,7 @@ from wheretolook.attributes import (
 from wheretolook.camera_models import ColmapCamera
 from wheretolook.geometry import Float, poses_looking_along, transform
 from wheretolook.labelling.labeller import LABELS
-from wheretolook.localization_map import LocalizationMap
+from wheretolook.localization_map import LocalizationMap, shared_locations
 from wheretolook.visibility import StoredOcclusion
 
 COLMAP = ColmapCamera("OPENCV", 160, 120, (80.0, 80.0, 80.0, 60.0, -0.1, 0.01, 1e-3, -1e-3))
@@ -167,3 +167,25 @@ def test_blocks_of_views_hold_all_or_evenly_spread_landmarks(
 
 def test_no_views_are_no_blocks(localization_map: LocalizationMap) -> None:
     assert list(LandmarkDescriber(localization_map).in_blocks(some_views()[:0], 5)) == []
+
+
+def test_views_share_locations_in_whatever_order_they_come() -> None:
+    rng = np.random.default_rng(5)
+    places = rng.uniform(0, 4, (4, 3))
+    for order in ([0, 0, 0], [0, 0, 1, 1, 2], [2, 0, 2, 1, 0, 3, 3, 0], []):
+        poses = poses_looking_along(places[order], rng.normal(size=(len(order), 3)))
+        locations, rows = shared_locations(poses)
+        assert len(locations) == len(set(order))
+        np.testing.assert_allclose(locations[rows], places[order], atol=1e-6)
+
+
+def test_one_view_is_described_and_thinned_as_it_is_among_others(localization_map: LocalizationMap) -> None:
+    poses, describer = some_views(), LandmarkDescriber(localization_map)
+    ((_, together, seen),) = describer.in_blocks(poses, 20)
+    assert int(seen.max()) > 20 == int(together.counts.max())
+    for view, pose in enumerate(poses):
+        ((_, alone, alone_seen),) = describer.in_blocks(pose[None], 20)
+        mine = together.views == view
+        assert alone.rows.tolist() == together.rows[mine].tolist()
+        torch.testing.assert_close(alone.values, together.values[mine], rtol=1e-5, atol=1e-5, equal_nan=True)
+        assert int(alone_seen[0]) == int(seen[view])

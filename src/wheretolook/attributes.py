@@ -91,12 +91,14 @@ class LandmarkDescriber:
     def _describe(self, cam_from_world: Float, starts: Tensor, indices: Tensor) -> ViewLandmarks:
         device = self._points.device
         starts, rows = starts.to(device), indices.to(device, torch.int64)
-        views = torch.arange(len(starts) - 1, device=device).repeat_interleave(starts.diff())
         rotations, centers = split_poses(np.asarray(cam_from_world, dtype=np.float64))
-        offsets = (self._points[rows] - torch.from_numpy(centers).to(device)[views]).float()
+        from_centers, axes = torch.from_numpy(centers).to(device), torch.from_numpy(rotations).to(device, torch.float32)
+        if len(starts) > 2:  # what the only view sees need not be told whose it is
+            views = torch.arange(len(starts) - 1, device=device).repeat_interleave(starts.diff())
+            from_centers, axes = from_centers[views], axes[views]
+        offsets = (self._points[rows] - from_centers).float()
         distance = offsets.norm(dim=1)
-        axes = torch.from_numpy(rotations).to(device, torch.float32)
-        x, y, z = torch.einsum("eij,ej->ei", axes[views], offsets).unbind(1)
+        x, y, z = (offsets[:, None] @ axes.mT)[:, 0].unbind(1)
         of_map = self._attributes[rows]
         log_distance = distance.log()
         of_pose = torch.stack(
@@ -141,6 +143,8 @@ class LandmarkDescriber:
 
 def _thinned(starts: Tensor, indices: Tensor, most: int) -> tuple[NDArray[np.int64], Tensor]:
     """At most so many entries of each set, evenly spread over it."""
+    if len(starts) == 2:
+        return np.array([0, most]), indices[torch.arange(most, device=indices.device) * int(starts[1]) // most]
     lengths = starts.diff()
     kept = lengths.clamp(max=most)
     ends = kept.cumsum(0)

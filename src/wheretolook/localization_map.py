@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ from wheretolook.mapping.colmap_model import read_model
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
 from wheretolook.rendering.types import check_poses
 from wheretolook.visibility import NoOcclusion, OcclusionModel, VisibleSets, visible_landmarks
-from wheretolook.visibility.frustum import visible_on_device
+from wheretolook.visibility.frustum import points_on_device, visible_on_device
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -145,9 +146,13 @@ class LocalizationMap:
             visible = visible_landmarks(self.camera, cam_from_world, self.landmarks.points, unoccluded, rows)
             return visible.starts.astype(np.int64), torch.from_numpy(visible.indices).to(self.device)
         starts, indices = visible_on_device(
-            self.camera, cam_from_world, self.landmarks.points, unoccluded, rows, self.device
+            self.camera, cam_from_world, self._points_on_device, unoccluded, rows, self.device
         )
         return starts.astype(np.int64), wp.to_torch(indices)
+
+    @cached_property
+    def _points_on_device(self) -> Any:
+        return points_on_device(self.landmarks.points, self.device)
 
     def _unoccluded(self, cam_from_world: Float) -> tuple[VisibleSets, NDArray[np.int64]]:
         """Landmarks with a free line of sight from each location of poses, and each pose's row among these."""
@@ -158,5 +163,11 @@ class LocalizationMap:
 def shared_locations(cam_from_world: Float) -> tuple[Float, NDArray[np.int64]]:
     """Locations (L, 3) m that poses (B, 3, 4) look from, and each pose's row among these, (B,)."""
     centers = np.round(camera_centers(cam_from_world), SAME_LOCATION_DECIMALS)
-    locations, rows = np.unique(centers, axis=0, return_inverse=True)
-    return locations, rows.reshape(-1)
+    if len(centers) == 0:
+        return centers, np.empty(0, dtype=np.int64)
+    # views of a location mostly follow one another: the first of each run stands for it
+    first = np.concatenate([[True], (centers[1:] != centers[:-1]).any(axis=1)])
+    if first.sum() == 1:
+        return centers[:1], np.zeros(len(centers), dtype=np.int64)
+    locations, rows = np.unique(centers[first], axis=0, return_inverse=True)
+    return locations, rows.reshape(-1)[np.cumsum(first) - 1]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import batch_norm
@@ -16,7 +18,23 @@ for a bearing's noise of one radian)."""
 LIKELY = -2.0
 """Log-odds of being found that an untrained network gives a landmark: about one in eight, as in real views."""
 
-_UPPER = torch.triu_indices(3, 3)
+_PLACES = torch.tensor([
+    [0, 1, 2, 0, 8, 7],
+    [1, 3, 4, 8, 0, 6],
+    [2, 4, 5, 7, 6, 0],
+    [0, 8, 7, 9, 10, 11],
+    [8, 0, 6, 10, 12, 13],
+    [7, 6, 0, 11, 13, 14],
+])  # fmt: skip
+_SIGNS = torch.tensor([
+    [1, 1, 1, 0, 1, -1],
+    [1, 1, 1, -1, 0, 1],
+    [1, 1, 1, 1, -1, 0],
+    [0, -1, 1, 1, 1, 1],
+    [1, 0, -1, 1, 1, 1],
+    [-1, 1, 0, 1, 1, 1],
+])  # fmt: skip
+"""Which of the 15 numbers stands where in an information matrix, and its sign, 0 where none does."""
 
 
 def bearing_numbers(values: Tensor) -> Tensor:
@@ -39,15 +57,14 @@ def bearing_numbers(values: Tensor) -> Tensor:
 
 def information_matrices(numbers: Tensor) -> Tensor:
     """`wheretolook.fisher.information.information_matrices` of sums (..., 15), shift first, turn second."""
-    matrices = numbers.new_zeros((*numbers.shape[:-1], 6, 6))
-    for first, part in ((0, numbers[..., :6]), (3, numbers[..., 9:])):
-        matrices[..., first + _UPPER[0], first + _UPPER[1]] = part
-        matrices[..., first + _UPPER[1], first + _UPPER[0]] = part
-    x, y, z = numbers[..., 6:9].unbind(-1)
-    for row, column, value in ((3, 1, -z), (3, 2, y), (4, 0, z), (4, 2, -x), (5, 0, -y), (5, 1, x)):
-        matrices[..., row, column] = value
-        matrices[..., column, row] = value
-    return matrices
+    places, signs = _layout(numbers.device)
+    return numbers[..., places] * signs
+
+
+@cache
+def _layout(device: torch.device) -> tuple[Tensor, Tensor]:
+    with torch.inference_mode(False):  # what is made in that mode cannot be trained with later
+        return _PLACES.to(device), _SIGNS.to(device)
 
 
 class StandardAttributes(nn.Module):

@@ -52,7 +52,9 @@ class VisibleSets:
         Raises:
             ConfigError: there are more entries than an int32 counts.
         """
-        return cls(_starts(mask.sum(1)), np.nonzero(mask)[1].astype(np.int32))
+        lengths = mask.sum(1)
+        columns = np.flatnonzero(mask) - np.repeat(np.arange(len(mask)) * mask.shape[1], lengths)
+        return cls(_starts(lengths), columns.astype(np.int32))
 
 
 def _starts(lengths: NDArray[np.integer[Any]]) -> NDArray[np.int32]:
@@ -159,26 +161,35 @@ def visible_landmarks(
     """
     if isinstance(camera, ColmapCamera):
         return visible_landmarks_plain(camera, cam_from_world, points, unoccluded, location_rows)
-    starts, indices = visible_on_device(camera, cam_from_world, points, unoccluded, location_rows, device)
+    there = points_on_device(points, device)
+    starts, indices = visible_on_device(camera, cam_from_world, there, unoccluded, location_rows, device)
     return VisibleSets(starts, indices.numpy())
+
+
+def points_on_device(points: Float, device: str = "cpu") -> Any:
+    """Points (N, 3) m as the Warp array that `visible_on_device` takes, to be used again."""
+    return wp.array(np.asarray(points, dtype=np.float64), dtype=wp.vec3d, device=start_warp(device))
 
 
 def visible_on_device(
     camera: PinholeCamera,
     cam_from_world: Float,
-    points: Float,
+    points: Any,
     unoccluded: VisibleSets,
     location_rows: NDArray[np.integer[Any]],
     device: str = "cpu",
 ) -> tuple[NDArray[np.int32], Any]:
-    """What `visible_landmarks` gives for a pinhole: the starts (B + 1,), and the indices as a Warp array of int32."""
+    """What `visible_landmarks` gives for a pinhole: the starts (B + 1,), and the indices as a Warp array of int32.
+
+    The points are those of `points_on_device`.
+    """
     device = start_warp(device)
     rotations, centers = split_poses(cam_from_world)
     inputs: list[Any] = [
         wp.array(frustum_sides(camera, rotations), dtype=wp.vec3, device=device),
         wp.array(centers, dtype=wp.vec3d, device=device),
         wp.array(np.asarray(location_rows, dtype=np.int32), dtype=wp.int32, device=device),
-        wp.array(np.asarray(points, dtype=np.float64), dtype=wp.vec3d, device=device),
+        points,
         wp.array(unoccluded.starts, dtype=wp.int32, device=device),
         wp.array(unoccluded.indices, dtype=wp.int32, device=device),
         wp.float64(MIN_DEPTH_M),

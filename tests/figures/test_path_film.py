@@ -72,7 +72,7 @@ def test_the_picture_tells_scores_and_landmarks() -> None:
 def test_methods_stand_side_by_side() -> None:
     views = some_views(6)
     figure = methods_figure({"forward": views[:3], "set": views}, LANDMARKS)
-    assert [axes.get_title().split(":")[0] for axes in figure.axes] == ["forward", "set"]
+    assert [axes.get_title().split("\n")[0] for axes in figure.axes] == ["forward", "set of landmarks"]
     for axes, shown in zip(figure.axes, (views[:3], views), strict=True):
         np.testing.assert_allclose(axes.lines[0].get_xydata(), [view.position[:2] for view in shown])
         assert f"{np.mean([len(view.pixels) for view in shown]):,.0f} landmarks" in axes.get_title()

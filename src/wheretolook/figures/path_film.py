@@ -15,7 +15,7 @@ from matplotlib.style import context
 from numpy.typing import NDArray
 
 from wheretolook.errors import ConfigError
-from wheretolook.figures.style import INK, RC, new_figure
+from wheretolook.figures.style import INK, RC, new_figure, scorer_style
 from wheretolook.geometry import Float
 
 Pixels = NDArray[np.uint8]
@@ -90,15 +90,15 @@ def methods_figure(paths: Mapping[str, Sequence[PathView]], landmarks: Float) ->
     """The paths of several methods side by side, from above, with where the camera looks (paper, Sec. 4.3).
 
     Args:
-        paths: views along the path of each method, by the title of its panel.
+        paths: views along the path of each method, by its name on the command line.
         landmarks: (N, 3) of the map, metres.
     """
     with context(RC):
         figure = new_figure(3.9 * len(paths), 4.2)
-        for axes, (title, views) in zip(figure.subplots(1, len(paths), squeeze=False)[0], paths.items(), strict=True):
+        for axes, (name, views) in zip(figure.subplots(1, len(paths), squeeze=False)[0], paths.items(), strict=True):
             _draw_map(axes, views, landmarks, None)
             n_seen = np.mean([len(view.pixels) for view in views])
-            axes.set_title(f"{title}: {n_seen:,.0f} landmarks in view on average", fontsize=10)
+            axes.set_title(f"{scorer_style(name).label}\n{n_seen:,.0f} landmarks in view on average", fontsize=10)
         return figure
 
 

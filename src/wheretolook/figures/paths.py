@@ -7,7 +7,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.style import context
 
-from wheretolook.figures.style import INK, RC, method_style, new_figure
+from wheretolook.figures.style import INK, RC, new_figure, scorer_style
 
 TITLES = {"planned": "places and views planned", "given": "views along a given path"}
 
@@ -35,8 +35,7 @@ def paths_figure(summary: pd.DataFrame) -> Figure:
                 of_method = rows[rows["method"] == method].set_index("scene").reindex(scenes)
                 at = np.arange(len(scenes)) + (number - (len(methods) - 1) / 2) * width
                 name, _, rule = method.partition(" ")
-                kind, _, inputs = name.partition("-")
-                style = method_style(kind, inputs.replace("-", " "))
+                style = scorer_style(name)
                 value, low, high = (100 * of_method[f"localized{end}"].to_numpy() for end in ("", "_low", "_high"))
                 axes.bar(
                     at, value, 0.92 * width, color=style.color, hatch="////" if rule else "", edgecolor="white",
@@ -46,7 +45,7 @@ def paths_figure(summary: pd.DataFrame) -> Figure:
             axes.set_title(TITLES.get(task, task))
             axes.set_ylabel("views that localize (%)")
             axes.set_ylim(0, 100)
-            axes.set_xticks(np.arange(len(scenes)), scenes)
+            axes.set_xticks(np.arange(len(scenes)), [name.replace("_", "\n", 1) for name in scenes])
             axes.grid(axis="x", visible=False)
         named = {
             label: handle for axes in panels for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)

@@ -179,6 +179,14 @@ def method_style(method: str, inputs: str = "") -> MethodStyle:
     return MethodStyle(label, *_SPARE[sum(label.encode()) % len(_SPARE)])
 
 
+def scorer_style(name: str) -> MethodStyle:
+    """Style of a method by its name on the command line, such as "fisher-trace-gp" or "mlp-2d+z"."""
+    if (name, "") in _STYLES:
+        return _STYLES[name, ""]
+    method, _, inputs = name.partition("-")
+    return method_style(method, inputs.replace("-", " "))
+
+
 def new_figure(width_in: float, height_in: float) -> Figure:
     """An empty figure in this style, independent of pyplot and its global state. Draw in `with context(RC):`."""
     with context(RC):

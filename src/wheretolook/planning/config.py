@@ -143,7 +143,7 @@ class PlanConfig:
         out: folder to write; empty for `<data>/<name>/<scene>/path`.
         method: that scores the views; "forward" for the shortest path, looking ahead; empty as for the viewpoint map.
         weights: file of weights, for a method that has learnt; by default the best there are.
-        against: further methods to plan by, to be drawn side by side as `methods.png`, such as "forward" and
+        against: further methods to plan by, to be drawn to the left of it as `methods.png`, such as "forward" and
             "fisher-trace-gp".
         film: "gif", "mp4" or "none".
         rerun: whether to write a recording for the Rerun viewer (needs `pip install rerun-sdk`).

@@ -75,10 +75,11 @@ def plan_scene(dataset: Dataset, experiment: Experiment, say: Say = print) -> Pl
     save_figure(still_figure(seen, landmarks, f"{scene.name}, {name}"), folder / "path.png")
     written = ["path.csv", "path.png"]
     if len(methods) > 1:
-        side_by_side = {name: seen}
-        for other, its_path in map(planned, methods[1:]):
-            side_by_side[other] = path_views(its_path, scene, dataset.camera, occlusion, experiment.warp_device, False)
-        save_figure(methods_figure(side_by_side, landmarks), folder / "methods.png")
+        side_by_side = {
+            other: path_views(its_path, scene, dataset.camera, occlusion, experiment.warp_device, False)
+            for other, its_path in map(planned, methods[1:])
+        }
+        save_figure(methods_figure({**side_by_side, name: seen}, landmarks), folder / "methods.png")
         written.append("methods.png")
     if config.film != "none":
         save_film(film_frames(seen, landmarks), folder / f"path.{config.film}")

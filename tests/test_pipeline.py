@@ -26,7 +26,7 @@ from wheretolook.learning.weights import load_classifier
 from wheretolook.localization_map import LocalizationMap
 from wheretolook.scoring import load_scorer
 from wheretolook.table import fingerprint, is_good, poses, read_table, write_table
-from wheretolook.tracking import TrackingConfig, client, newest_run
+from wheretolook.tracking import TrackingConfig, artifact, client, newest_run
 from wheretolook.visibility import HiddenPointRemoval, StoredOcclusion
 from wheretolook.visibility.agreement import MaskAgreement
 
@@ -367,6 +367,9 @@ def test_a_path_is_planned_and_shown(
     assert {path.name for path in (tmp_path / "way").iterdir()} == {
         "path.csv", "path.png", "path.gif", "methods.png",
     }  # fmt: skip
+    logged = newest_run(TrackingConfig(str(copy / "mlruns")), "plan")
+    assert logged is not None and logged.data.metrics["score"] == pytest.approx(table["score"].mean(), abs=1e-4)
+    assert artifact(TrackingConfig(str(copy / "mlruns")), logged.info.run_id, "methods.png").is_file()
     monkeypatch.setitem(sys.modules, "rerun", None)
     assert run("plan", copy, *options, *ends, "--plan.rerun", "true") == 2
     assert "pip install rerun-sdk" in capsys.readouterr().err

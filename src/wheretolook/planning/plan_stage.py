@@ -17,15 +17,15 @@ from wheretolook.geometry import PinholeCamera, poses_looking_along
 from wheretolook.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.photograph_scenes import is_photographed, occlusion_without_mesh
+from wheretolook.planning.method_paths import path_views, plan_by_methods
 from wheretolook.planning.path_comparison import FORWARD
-from wheretolook.planning.path_planning import PlannedPath, plan_path
-from wheretolook.planning.planner_map import planner_map
+from wheretolook.planning.path_planning import PlannedPath
 from wheretolook.planning.scene_map import default_weights
 from wheretolook.rendering import WarpRenderer
 from wheretolook.scene_space import space_and_occlusion
 from wheretolook.scenes.loading import load_mesh
 from wheretolook.table import pose_columns
-from wheretolook.visibility import OcclusionModel
+from wheretolook.tracking import log, start_run
 
 Say = Callable[[str], None]
 
@@ -46,40 +46,26 @@ def plan_scene(dataset: Dataset, experiment: Experiment, say: Say = print) -> Pl
     photographed = is_photographed(scene)
     hides = occlusion_without_mesh(experiment.occlusion) if photographed else experiment.occlusion
     space, occlusion = space_and_occlusion(scene, dataset.camera, experiment, hides)
-    methods = list(dict.fromkeys((config.method, *config.against)))
+    methods, device = (
+        (*(name for name in config.against if name != config.method), config.method),
+        experiment.warp_device,
+    )
     weights = config.weights or (default_weights(dataset, say) if {*methods} != {FORWARD} else None)
-
-    def planned(method: str) -> tuple[str, PlannedPath]:
-        views = None
-        if method != FORWARD:
-            views = planner_map(
-                method,
-                weights,
-                config.grid,
-                config.directions,
-                scene,
-                dataset,
-                space,
-                occlusion,
-                experiment.warp_device,
-            )
-        name = method or (FORWARD if views is None else views.origin.scorer)
-        return name, plan_path(config.start, config.goal, space, space.bounds, views, config.planner)  # type: ignore[arg-type]
-
-    name, path = planned(config.method)
+    paths = plan_by_methods(
+        methods, config.start, config.goal, scene, dataset, space, occlusion, weights, config, device
+    )
+    name, path = list(paths.items())[-1]
     folder = config.out or scene.folder / "path"
-    seen = path_views(path, scene, dataset.camera, occlusion, experiment.warp_device)
-    landmarks = Landmarks.load(scene.landmarks).points
+    one = LocalizationMap(Landmarks.load(scene.landmarks), dataset.camera, occlusion, device)
+    renderer = None if photographed else WarpRenderer(load_mesh(scene.mesh), device)
+    seen, landmarks = path_views(path, one, renderer), one.landmarks.points
     folder.mkdir(parents=True, exist_ok=True)
     _table(path).to_csv(folder / "path.csv", index=False, lineterminator="\n")
     save_figure(still_figure(seen, landmarks, f"{scene.name}, {name}"), folder / "path.png")
     written = ["path.csv", "path.png"]
-    if len(methods) > 1:
-        side_by_side = {
-            other: path_views(its_path, scene, dataset.camera, occlusion, experiment.warp_device, False)
-            for other, its_path in map(planned, methods[1:])
-        }
-        save_figure(methods_figure({**side_by_side, name: seen}, landmarks), folder / "methods.png")
+    if len(paths) > 1:
+        side_by_side = {other: path_views(its_path, one) for other, its_path in paths.items()}
+        save_figure(methods_figure(side_by_side, landmarks), folder / "methods.png")
         written.append("methods.png")
     if config.film != "none":
         save_film(film_frames(seen, landmarks), folder / f"path.{config.film}")
@@ -87,32 +73,26 @@ def plan_scene(dataset: Dataset, experiment: Experiment, say: Say = print) -> Pl
     if recorder is not None:
         _record(recorder, seen, landmarks, dataset.camera, folder / "path.rrd")
         written.append("path.rrd")
+    _log(dataset, scene, name, list(paths), path, [folder / file for file in written], experiment)
     score = "" if np.isnan(path.scores).any() else f", mean score {np.mean(path.scores):.2f}"
     say(f"{scene.name}: {path.length_m:.2f} m, {path.turn_deg:.0f} degrees of turning, {len(seen)} views{score} -> "
         f"{folder}: {', '.join(written)}")  # fmt: skip
     return path
 
 
-def path_views(
-    path: PlannedPath, scene: SceneFolder, camera: PinholeCamera, occlusion: OcclusionModel, device: str = "cpu",
-    images: bool = True,
-) -> list[PathView]:  # fmt: skip
-    """What the camera sees along a path: landmarks in view, and on request where there is a mesh, the image."""
-    cam_from_world = poses_looking_along(path.positions, path.axes)
-    one = LocalizationMap(Landmarks.load(scene.landmarks), camera, occlusion, device)
-    visible = one.visible_landmarks(cam_from_world)
-    rgb = None
-    if images and scene.mesh.is_file():
-        rgb = WarpRenderer(load_mesh(scene.mesh), device).render(camera, cam_from_world).rgb
-    views = []
-    for number, pose in enumerate(cam_from_world):
-        local = one.landmarks.points[visible[number]] @ pose[:, :3].T + pose[:, 3]
-        pixels = local[:, :2] / local[:, 2:] * camera.focal_px + (camera.cx, camera.cy)
-        views.append(
-            PathView(path.positions[number], path.axes[number], float(path.scores[number]), pixels,
-                     (camera.width, camera.height), None if rgb is None else rgb[number])
-        )  # fmt: skip
-    return views
+def _log(
+    dataset: Dataset, scene: SceneFolder, method: str, methods: list[str], path: PlannedPath, files: list[Path],
+    experiment: Experiment,
+) -> None:  # fmt: skip
+    config = experiment.plan
+    params = {"dataset": dataset.name, "scene": scene.name, "method": method, "methods": " ".join(methods),
+              "start": config.start, "goal": config.goal, "score_weight": config.planner.score_weight}  # fmt: skip
+    metrics = {"length_m": path.length_m, "turn_deg": path.turn_deg, "score": float(path.scores.mean())}
+    tags = {"dataset": dataset.name}
+    with start_run(experiment.tracking, f"plan {scene.name}", "plan", params, tags=tags) as (client, run):
+        log(client, run, metrics=metrics)
+        for file in files:
+            client.log_artifact(run, str(file))
 
 
 def _table(path: PlannedPath) -> pd.DataFrame:

@@ -1,0 +1,83 @@
+"""Paths of several methods from a start to a goal, and what the camera sees along them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from numpy.typing import ArrayLike
+
+from wheretolook.dataset import Dataset, SceneFolder
+from wheretolook.figures.path_film import PathView
+from wheretolook.geometry import PinholeCamera, poses_looking_along
+from wheretolook.localization_map import LocalizationMap
+from wheretolook.planning.config import PlanConfig
+from wheretolook.planning.path_comparison import FORWARD
+from wheretolook.planning.path_planning import PlannedPath, plan_path
+from wheretolook.planning.planner_map import planner_map
+from wheretolook.rendering import WarpRenderer
+from wheretolook.scenes.free_space import FreeSpace
+from wheretolook.scenes.mapped_space import MappedSpace
+from wheretolook.visibility import OcclusionModel
+
+
+def plan_by_methods(
+    methods: Iterable[str], start: ArrayLike, goal: ArrayLike, scene: SceneFolder, dataset: Dataset,
+    space: FreeSpace | MappedSpace, occlusion: OcclusionModel, weights: Path | None = None,
+    config: PlanConfig = PlanConfig(), device: str = "cpu",
+) -> dict[str, PlannedPath]:  # fmt: skip
+    """Plan a path by each method, with progress bars; what a method thinks of the views is its own map's scores.
+
+    Args:
+        methods: "forward", or names of scorers; empty for that of the weights, or bins without.
+        start, goal: (3,) world, metres.
+        scene: its landmarks.
+        dataset: gives the camera.
+        space: where a camera can be.
+        occlusion: which landmarks nothing stands in front of.
+        weights: for methods that have learnt.
+        config: grid and directions of the viewpoint maps, costs and limits of paths.
+        device: where kernels run.
+
+    Returns:
+        Paths by the names of their methods, in the order given.
+
+    Raises:
+        ConfigError: a method needs weights, or there is none of that name. PlanningError: no path can be found.
+    """
+    paths: dict[str, PlannedPath] = {}
+    for method in methods:
+        views, name = None, method
+        if method != FORWARD:
+            views = planner_map(
+                method, weights, config.grid, config.directions, scene, dataset, space, occlusion, device
+            )
+            name = method or views.origin.scorer
+        paths.pop(name, None)  # named twice, it is what was asked for last
+        paths[name] = plan_path(start, goal, space, space.bounds, views, config.planner)
+    return paths
+
+
+def path_views(
+    path: PlannedPath, localization_map: LocalizationMap, renderer: WarpRenderer | None = None
+) -> list[PathView]:
+    """What the camera sees along a path: the landmarks in view, and the image if there is a renderer.
+
+    Args:
+        path: W views.
+        localization_map: with a pinhole camera.
+        renderer: of the scene's mesh.
+    """
+    camera, points = localization_map.camera, localization_map.landmarks.points
+    assert isinstance(camera, PinholeCamera)
+    cam_from_world = poses_looking_along(path.positions, path.axes)
+    visible = localization_map.visible_landmarks(cam_from_world)
+    rgb = None if renderer is None else renderer.render(camera, cam_from_world).rgb
+    views = []
+    for number, pose in enumerate(cam_from_world):
+        local = points[visible[number]] @ pose[:, :3].T + pose[:, 3]
+        views.append(
+            PathView(path.positions[number], path.axes[number], float(path.scores[number]), camera.project(local),
+                     (camera.width, camera.height), None if rgb is None else rgb[number])
+        )  # fmt: skip
+    return views

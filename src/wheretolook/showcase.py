@@ -109,6 +109,22 @@ class Showcase:
         """(3,) metres, of a location."""
         return self.grid.centers()[location_id]
 
+    def nearest_location(self, point: ArrayLike) -> int:
+        """The location with viewpoints that is nearest to a world point (3,) m."""
+        ids = np.unique(self.table["location_id"].to_numpy(np.int64))
+        apart = np.linalg.norm(self.grid.centers()[ids] - np.asarray(point, dtype=np.float64), axis=1)
+        return int(ids[np.argmin(apart)])
+
+    def summary(self) -> str:
+        """How much of everything there is, as a sentence."""
+        one, n_locations = self.localization_map, self.table["location_id"].nunique()
+        cameras = "" if one.mapping_poses is None else f" of {len(one.mapping_poses)} images"
+        return (
+            f"**{self.scene.name}**: {len(self.mesh.triangles):,} triangles; a map{cameras} with "
+            f"{len(one.landmarks):,} landmarks; {len(self.table):,} labelled viewpoints at {n_locations} locations, of "
+            f"which {is_good(self.table).mean():.0%} localize."
+        )
+
     def viewpoints(self, location_id: int) -> pd.DataFrame:
         """Rows of the table at a location.
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from wheretolook.errors import ConfigError
 from wheretolook.features import CHANNELS
 from wheretolook.figures.inputs import BinnedImage
 from wheretolook.figures.overview import View
@@ -114,17 +115,31 @@ def binned_image_of(showcase: Showcase, cam_from_world: ArrayLike, bins: int = 3
     return BinnedImage(showcase.render(pose)[0], pixels, means, binned.counts[0])
 
 
-def learning_of(showcase: Showcase, scorer: LearnedScorer, location_id: int) -> Learning:
-    """What the paper's network makes of its best labelled view of a location."""
+def learning_of(showcase: Showcase, scorer: LearnedScorer, location_id: int, best: bool = True) -> Learning:
+    """What the paper's network makes of the labelled view of a location that it scores highest, or else lowest."""
     from wheretolook.learning.architecture import activations
 
     candidates = showcase.viewpoints(location_id)
-    row = int(np.argmax(scorer.score(poses(candidates))))
+    row = int((np.argmax if best else np.argmin)(scorer.score(poses(candidates))))
     pose = poses(candidates.iloc[[row]])
     spec = scorer.network.spec
     found = activations(scorer.network, showcase.localization_map.bin_views(pose, spec.bins))
     image = binned_image_of(showcase, pose[0], spec.bins)
     return Learning(image, tuple(found), spec.channels, outcome_in_brief(candidates.iloc[row]))
+
+
+def mistaken_location(showcase: Showcase, scorer: Scorer, height_m: float = EYE_M) -> int:
+    """The location of a layer whose predicted probabilities are farthest from the labels, on average.
+
+    Raises:
+        ConfigError: the layer has no viewpoint.
+    """
+    rows = showcase.table[showcase.table["location_id"].isin(showcase.layer(height_m))]
+    if len(rows) == 0:
+        raise ConfigError("no viewpoint was sampled at this height", value=height_m, fix="Take another.")
+    off = np.abs(scorer.score(poses(rows)) - is_good(rows))
+    ids, group = np.unique(rows["location_id"].to_numpy(np.int64), return_inverse=True)
+    return int(ids[np.argmax(np.bincount(group, weights=off) / np.bincount(group))])
 
 
 def peaks_of(showcase: Showcase, scorer: Scorer, location_id: int, n: int = 3, apart_deg: float = 40.0) -> Peaks:

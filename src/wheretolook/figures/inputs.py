@@ -57,7 +57,7 @@ def inputs_figure(image: BinnedImage, variants: Mapping[str, tuple[str, ...]] = 
         left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(0.42, 0.8))[0]
         picture, bins = left.subplots(2, 1)
         draw_landmarks(picture, image)
-        picture.set_title(f"image, {len(image.pixels):,} landmarks in view")
+        picture.set_title(f"image, {n_landmarks(image)} in view")
         draw_counts(bins, image)
         bins.set_title(f"{int((image.counts > 0).sum())} of {image.counts.size} bins filled")
         grid = right.add_gridspec(len(variants), len(channels))
@@ -87,12 +87,17 @@ def draw_landmarks(axes: Axes, image: BinnedImage) -> None:
     _bare(axes)
 
 
+def n_landmarks(image: BinnedImage) -> str:
+    """How many landmarks are in view, in words."""
+    return f"{len(image.pixels):,} landmark{'s' * (len(image.pixels) != 1)}"
+
+
 def draw_counts(axes: Axes, image: BinnedImage) -> None:
     """Landmarks in each bin, on a logarithmic scale of colours, over the pale image."""
     height, width = image.rgb.shape[:2]
     axes.imshow(255 - (255 - image.rgb) // 3, extent=(0, width, height, 0))
     counts = np.ma.masked_equal(image.counts, 0)
-    axes.imshow(np.log(counts), extent=(0, width, height, 0), cmap="cividis", interpolation="nearest", aspect="auto")
+    axes.imshow(np.ma.log(counts), extent=(0, width, height, 0), cmap="cividis", interpolation="nearest", aspect="auto")
     bins = len(image.counts)
     axes.vlines(np.linspace(0, width, bins + 1), 0, height, color="white", linewidth=0.25)
     axes.hlines(np.linspace(0, height, bins + 1), 0, width, color="white", linewidth=0.25)
@@ -110,7 +115,7 @@ def draw_channel(axes: Axes, image: BinnedImage, name: str) -> None:
     else:
         axes.imshow(values, cmap="cividis", interpolation="nearest")
     digits = 0 if UNITS.get(name) == "px" else 1
-    ends = f"{low:.{digits}f} to {high:.{digits}f}".replace("-", "−")
+    ends = " to ".join(dict.fromkeys(f"{end:.{digits}f}" for end in (low, high))).replace("-", "−")
     axes.set_xlabel(ends if values.count() else "no landmark", fontsize=6.5, labelpad=1)
     _bare(axes)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from itertools import pairwise
 
@@ -12,11 +13,12 @@ from matplotlib.patches import ConnectionPatch
 from matplotlib.style import context
 
 from wheretolook.figures.dollhouse import BLUE, VERMILION
-from wheretolook.figures.inputs import BinnedImage, draw_counts, draw_landmarks
+from wheretolook.figures.inputs import BinnedImage, draw_counts, draw_landmarks, n_landmarks
 from wheretolook.figures.style import INK, PRINT, TWO_COLUMNS_IN, new_figure
 from wheretolook.geometry import Float
 
 _COLUMNS = 12  # of a hidden layer's values
+_WIDE = 10  # letters below the score
 
 
 def learning_figure(image: BinnedImage, activations: Sequence[Float], channels: Sequence[str], outcome: str) -> Figure:
@@ -40,10 +42,10 @@ def learning_figure(image: BinnedImage, activations: Sequence[Float], channels: 
         picture, bins = figure.add_subplot(stages[0]), figure.add_subplot(stages[1])
         draw_landmarks(picture, image)
         picture.set_title("a  pose and\nvisible landmarks", loc="left")
-        picture.set_xlabel(f"{len(image.pixels):,} landmarks")
+        picture.set_xlabel(n_landmarks(image))
         draw_counts(bins, image)
         bins.set_title(f"b  image binning\n{len(image.counts)} × {len(image.counts)}", loc="left")
-        bins.set_xlabel(f"{int((image.counts > 0).sum())} bins filled")
+        bins.set_xlabel(f"{int((image.counts > 0).sum())} of {image.counts.size} filled")
         inner = stages[2].subgridspec(len(means), 1)
         inputs = [figure.add_subplot(inner[row]) for row in range(len(means))]
         for axes, values, name in zip(inputs, means, channels, strict=True):
@@ -93,4 +95,4 @@ def _draw_score(axes: Axes, score: float, outcome: str) -> None:
     axes.spines[:].set_visible(True)
     axes.text(0, score - 0.03 if score >= 0.2 else score + 0.03, f"{score:.2f}", ha="center",
               va="top" if score >= 0.2 else "bottom", color="white" if score >= 0.2 else INK, fontsize=7)  # fmt: skip
-    axes.set_xlabel(outcome.replace(", ", ",\n"))
+    axes.set_xlabel("\n".join(textwrap.wrap(outcome, _WIDE)))

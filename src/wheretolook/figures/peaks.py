@@ -93,15 +93,12 @@ def _draw_sphere(
     dots = axes.scatter(*_angles(directions), s=size, c=scores, cmap="cividis", vmin=0, vmax=1, linewidths=0)
     if tried is not None:
         looked, good = tried
+        halo = [withStroke(linewidth=1.8, foreground="white")]
         axes.scatter(*_angles(looked[good]), s=1.1 * size, facecolors="none", edgecolors=INK, linewidths=0.7,
-                     label="localizes")  # fmt: skip
-        axes.scatter(*_angles(looked[~good]), s=0.6 * size, marker="x", color="white", linewidths=0.7,
-                     label="does not")  # fmt: skip
-        legend = axes.legend(loc="upper center", bbox_to_anchor=(0.5, 1.2), ncols=2, labelcolor=INK, columnspacing=1.2,
-                             handletextpad=0.2)  # fmt: skip
-        for handle in legend.legend_handles[1:]:
-            assert handle is not None
-            handle.set_path_effects([withStroke(linewidth=2.0, foreground=INK)])
+                     label="localizes", path_effects=halo)  # fmt: skip
+        axes.scatter(*_angles(looked[~good]), s=0.6 * size, marker="x", color=INK, linewidths=0.7, label="does not",
+                     path_effects=halo)  # fmt: skip
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, 1.2), ncols=2, columnspacing=1.2, handletextpad=0.2)
     axes.set(xticklabels=[], yticklabels=[])
     bar = figure.colorbar(dots, ax=axes, orientation="horizontal", shrink=0.7, pad=0.08, aspect=25)
     bar.set_label("predicted probability to localize")

@@ -22,7 +22,7 @@ from wheretolook.figures.dollhouse import (
     frustum_corners,
     frustum_segments,
 )
-from wheretolook.figures.style import INK, PRINT, TWO_COLUMNS_IN, new_figure
+from wheretolook.figures.style import INK, ONE_COLUMN_IN, PRINT, TWO_COLUMNS_IN, new_figure
 from wheretolook.geometry import Float, PinholeCamera
 from wheretolook.grid import fibonacci_sphere
 from wheretolook.rendering.dollhouse import Dollhouse
@@ -84,7 +84,8 @@ def pipeline_figure(pipeline: Pipeline) -> Figure:
             panel.set_ylim(bottom, top)
         _draw_map(panels[0], pipeline)
         _draw_samples(panels[1], pipeline)
-        _draw_ranks(figure, panels[2], pipeline)
+        _draw_ranks(figure, panels[2], pipeline.house, pipeline.locations, pipeline.best_axes, pipeline.best_scores)
+        panels[2].set_title("c  Ranked: the best view of each location", loc="left")
         _draw_choice(panels[3], pipeline)
         return figure
 
@@ -107,20 +108,38 @@ def _draw_samples(axes: Axes, pipeline: Pipeline) -> None:
     axes.set_title(f"b  Sampled: {part} locations × {pipeline.n_directions} directions", loc="left")
 
 
-def _draw_ranks(figure: Figure, axes: Axes, pipeline: Pipeline) -> None:
-    order = np.argsort(pipeline.best_scores, kind="stable")
-    at, scores = pipeline.locations[order], pipeline.best_scores[order]
-    length = 0.8 * _spacing(pipeline.locations)
-    segments = np.stack([at, at + length * pipeline.best_axes[order]], axis=1)
+def ranked_figure(house: Dollhouse, locations: Float, best_axes: Float, best_scores: Float) -> Figure:
+    """The best view of each location alone, one column and a half wide.
+
+    Args:
+        house: the scene from above.
+        locations: (L, 3) metres.
+        best_axes: (L, 3) unit optical axes.
+        best_scores: (L,) probabilities.
+    """
+    with context(PRINT):
+        top, bottom = _rows_drawn(house)
+        figure = new_figure(1.5 * ONE_COLUMN_IN, 1.5 * ONE_COLUMN_IN * (bottom - top) / house.rgb.shape[1])
+        axes = figure.subplots()
+        draw_house(axes, house, 0.5)
+        axes.set_ylim(bottom, top)
+        _draw_ranks(figure, axes, house, locations, best_axes, best_scores)
+        return figure
+
+
+def _draw_ranks(
+    figure: Figure, axes: Axes, house: Dollhouse, locations: Float, best_axes: Float, best_scores: Float
+) -> None:
+    order = np.argsort(best_scores, kind="stable")
+    at, scores = locations[order], best_scores[order]
+    segments = np.stack([at, at + 0.8 * _spacing(locations) * best_axes[order]], axis=1)
     norm = Normalize(0, 1)
-    draw_segments(axes, pipeline.house, segments, color=INK, linewidth=2.2)
-    lines = draw_segments(axes, pipeline.house, segments, array=scores, cmap="cividis", norm=norm, linewidth=1.5)
-    draw_points(axes, pipeline.house, at, s=15, c=scores, cmap="cividis", norm=norm, edgecolors=INK, linewidths=0.4,
-                zorder=3)  # fmt: skip
+    draw_segments(axes, house, segments, color=INK, linewidth=2.2)
+    lines = draw_segments(axes, house, segments, array=scores, cmap="cividis", norm=norm, linewidth=1.5)
+    draw_points(axes, house, at, s=15, c=scores, cmap="cividis", norm=norm, edgecolors=INK, linewidths=0.4, zorder=3)
     bar = figure.colorbar(lines, cax=axes.inset_axes((0.66, 0.04, 0.3, 0.025)), orientation="horizontal")
     bar.set_label("predicted probability", labelpad=1)
     bar.set_ticks([0, 0.5, 1], labels=["0", "0.5", "1"])
-    axes.set_title("c  Ranked: the best view of each location", loc="left")
 
 
 def _draw_choice(axes: Axes, pipeline: Pipeline) -> None:

@@ -106,8 +106,7 @@ def _draw_directions(figure: Figure, axes: Axes, sampling: Sampling) -> None:
                         edgecolors=INK, linewidths=0.3)  # fmt: skip
     axes.set(xticklabels=[], yticklabels=[], anchor="N")
     axes.set_title(f"b  Directions: {kept.sum()} of {len(kept)} kept", loc="left")
-    bar = figure.colorbar(dots, ax=axes, orientation="horizontal", shrink=0.75, pad=0.06, aspect=25,
-                          panchor=(0.5, 1.0))  # fmt: skip
+    bar = figure.colorbar(dots, cax=axes.inset_axes((0.12, -0.14, 0.76, 0.06)), orientation="horizontal")
     bar.set_label("landmarks in view (open: dropped)")
 
 

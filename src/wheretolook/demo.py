@@ -20,7 +20,7 @@ from wheretolook.rendering import WarpRenderer
 from wheretolook.scenes.loading import load_mesh
 from wheretolook.scoring import load_scorer
 from wheretolook.stamps import STAGES
-from wheretolook.table import LOCALIZED, is_good, poses
+from wheretolook.table import is_good, outcome_in_words, poses
 from wheretolook.tracking import ui_command
 
 SECONDS = {"scenes": 5.0, "map": 15.0, "sample": 1.0, "label": 75.0, "train": 25.0, "evaluate": 6.0}
@@ -106,13 +106,8 @@ def draw_overview(experiment: Experiment, weights: Path) -> Path:
     def view(row: int) -> View:
         pose = poses(candidates.iloc[[row]])
         label = candidates.iloc[row]
-        outcome = str(label["status"]).replace("_", " ")
-        if label["status"] == LOCALIZED and label["error_m"] < 1:
-            outcome = f"pose found, {100 * label['error_m']:.1f} cm and {label['error_deg']:.2f}° off"
-        elif label["status"] == LOCALIZED:
-            outcome = f"wrong pose found, {label['error_m']:.1f} m and {label['error_deg']:.0f}° off"
         rgb = renderer.render(dataset.camera, pose).rgb[0]
-        return View(rgb, pose[0, 2, :3], float(candidate_scores[row]), outcome)
+        return View(rgb, pose[0, 2, :3], float(candidate_scores[row]), outcome_in_words(label))
 
     directions = direction_lattice(experiment.sample.directions, experiment.sample.lattice)
     figure = overview_figure(

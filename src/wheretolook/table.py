@@ -96,6 +96,27 @@ def is_good(table: pd.DataFrame, max_error_m: float = 0.05, max_error_deg: float
     return good.to_numpy()
 
 
+def outcome_in_words(label: pd.Series) -> str:
+    """What came of localizing a row of a table; empty if it was not tried."""
+    status = str(label["status"])
+    if status == UNLABELLED:
+        return ""
+    if status != LOCALIZED:
+        return status.replace("_", " ")
+    if label["error_m"] < 1:
+        return f"pose found, {100 * label['error_m']:.1f} cm and {label['error_deg']:.2f}° off"
+    return f"wrong pose found, {label['error_m']:.1f} m and {label['error_deg']:.0f}° off"
+
+
+def outcome_in_brief(label: pd.Series) -> str:
+    """The same for narrow pictures: the error of the pose that was found, if one was."""
+    if str(label["status"]) != LOCALIZED:
+        return outcome_in_words(label)
+    if label["error_m"] < 1:
+        return f"{100 * label['error_m']:.1f} cm, {label['error_deg']:.2f}° off"
+    return f"{label['error_m']:.1f} m, {label['error_deg']:.0f}° off"
+
+
 def write_table(table: pd.DataFrame, path: Path, compact: bool = False) -> None:
     """Write a table atomically as zstd Parquet with checksums. The same rows give the same bytes.
 

@@ -1,0 +1,126 @@
+"""From an image to the network's input: visible landmarks, bins, channels."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import TwoSlopeNorm
+from matplotlib.figure import Figure
+from matplotlib.style import context
+from numpy.typing import NDArray
+
+from wheretolook.features import PAPER_VARIANTS
+from wheretolook.figures.dollhouse import ORANGE
+from wheretolook.figures.style import INK, PRINT, TWO_COLUMNS_IN, new_figure
+from wheretolook.geometry import Float
+
+UNITS = {"u": "px", "v": "px", "x": "m", "y": "m", "z": "m"}
+
+_EMPTY = "#e8e8e8"
+
+
+@dataclass(frozen=True, eq=False)
+class BinnedImage:
+    """One view and what a network is told of it.
+
+    Attributes:
+        rgb: (H, W, 3) uint8, what the camera sees.
+        pixels: (K, 2) of the landmarks in view.
+        means: (bins, bins) mean of each channel over a bin's landmarks, by the channel's name; NaN in empty bins. Rows
+            go down the image, columns right.
+        counts: (bins, bins) landmarks in each bin.
+    """
+
+    rgb: NDArray[np.uint8]
+    pixels: Float
+    means: Mapping[str, Float]
+    counts: NDArray[np.int32]
+
+
+def inputs_figure(image: BinnedImage, variants: Mapping[str, tuple[str, ...]] = PAPER_VARIANTS) -> Figure:
+    """The image with its landmarks, their bins, and the channels of each input variant.
+
+    Args:
+        image: with every channel that a variant asks for.
+        variants: channels by name; the paper's by default.
+
+    Returns:
+        As wide as two columns. Left: the image, then the number of landmarks in each bin. Right: a row for each
+        variant, a map of the bins for each of its channels; empty bins are grey, and zero to the network.
+    """
+    channels = [*dict.fromkeys(name for names in variants.values() for name in names)]
+    with context(PRINT):
+        figure = new_figure(TWO_COLUMNS_IN, 0.55 + 1.05 * max(3, len(variants)))
+        left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(0.42, 0.8))[0]
+        picture, bins = left.subplots(2, 1)
+        draw_landmarks(picture, image)
+        picture.set_title(f"image, {n_landmarks(image)} in view")
+        draw_counts(bins, image)
+        bins.set_title(f"{int((image.counts > 0).sum())} of {image.counts.size} bins filled")
+        grid = right.add_gridspec(len(variants), len(channels))
+        for row, (variant, names) in enumerate(variants.items()):
+            for column, name in enumerate(channels):
+                axes = right.add_subplot(grid[row, column])
+                if name in names:
+                    draw_channel(axes, image, name)
+                    if row == min(r for r, other in enumerate(variants.values()) if name in other):
+                        axes.set_title(f"${name}$ ({UNITS.get(name, '')})")
+                else:
+                    axes.axis("off")
+                if column == 0:
+                    size = len(names) * image.counts.size
+                    axes.set_ylabel(f"{variant.replace('+', ' + ')}\n{size:,} values")
+        note = "Each bin holds the mean over its landmarks.\nEmpty bins, grey here, are zero to the network."
+        right.text(0.99, 0.9, note, ha="right", va="top", fontsize=7)
+        return figure
+
+
+def draw_landmarks(axes: Axes, image: BinnedImage) -> None:
+    """The image with its landmarks."""
+    height, width = image.rgb.shape[:2]
+    axes.imshow(image.rgb, extent=(0, width, height, 0))
+    axes.scatter(image.pixels[:, 0], image.pixels[:, 1], s=1.5, color=ORANGE, linewidths=0, rasterized=True)
+    axes.set(xlim=(0, width), ylim=(height, 0))
+    _bare(axes)
+
+
+def n_landmarks(image: BinnedImage) -> str:
+    """How many landmarks are in view, in words."""
+    return f"{len(image.pixels):,} landmark{'s' * (len(image.pixels) != 1)}"
+
+
+def draw_counts(axes: Axes, image: BinnedImage) -> None:
+    """Landmarks in each bin, on a logarithmic scale of colours, over the pale image."""
+    height, width = image.rgb.shape[:2]
+    axes.imshow(255 - (255 - image.rgb) // 3, extent=(0, width, height, 0))
+    counts = np.ma.masked_equal(image.counts, 0)
+    axes.imshow(np.ma.log(counts), extent=(0, width, height, 0), cmap="cividis", interpolation="nearest", aspect="auto")
+    bins = len(image.counts)
+    axes.vlines(np.linspace(0, width, bins + 1), 0, height, color="white", linewidth=0.25)
+    axes.hlines(np.linspace(0, height, bins + 1), 0, width, color="white", linewidth=0.25)
+    axes.set(xlim=(0, width), ylim=(height, 0), aspect="equal")
+    _bare(axes)
+
+
+def draw_channel(axes: Axes, image: BinnedImage, name: str) -> None:
+    """One channel of the bins, from its least (dark) to its greatest value (light); the range stands below."""
+    values = np.ma.masked_invalid(np.asarray(image.means[name], dtype=np.float64))
+    axes.set_facecolor(_EMPTY)
+    low, high = (float(values.min()), float(values.max())) if values.count() else (0.0, 0.0)
+    if name in ("x", "y") and low < 0 < high:  # right and left, down and up: white is straight ahead
+        axes.imshow(values, cmap="PuOr", norm=TwoSlopeNorm(0, low, high), interpolation="nearest")
+    else:
+        axes.imshow(values, cmap="cividis", interpolation="nearest")
+    digits = 0 if UNITS.get(name) == "px" else 1
+    ends = " to ".join(dict.fromkeys(f"{end:.{digits}f}" for end in (low, high))).replace("-", "−")
+    axes.set_xlabel(ends if values.count() else "no landmark", fontsize=6.5, labelpad=1)
+    _bare(axes)
+
+
+def _bare(axes: Axes) -> None:
+    axes.set(xticks=[], yticks=[])
+    axes.grid(False)
+    axes.spines[:].set(visible=True, linewidth=0.5, color=INK)

@@ -1,0 +1,178 @@
+"""The paper's first figure: from a map over sampled and ranked viewpoints to the camera that is chosen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
+from matplotlib.style import context
+from numpy.typing import NDArray
+
+from wheretolook.figures.dollhouse import (
+    BLUE,
+    ORANGE,
+    VERMILION,
+    draw_house,
+    draw_points,
+    draw_segments,
+    frustum_corners,
+    frustum_segments,
+)
+from wheretolook.figures.style import INK, ONE_COLUMN_IN, PRINT, TWO_COLUMNS_IN, new_figure
+from wheretolook.geometry import Float, PinholeCamera
+from wheretolook.grid import fibonacci_sphere
+from wheretolook.rendering.dollhouse import Dollhouse
+
+_GLYPH = 32  # directions drawn of a location
+_MARGIN_M = 0.1  # landmarks lie a little behind surfaces, too
+
+
+@dataclass(frozen=True, eq=False)
+class Pipeline:
+    """What the figure draws.
+
+    Attributes:
+        house: the scene from above.
+        landmarks: (N, 3) of the map, metres.
+        mapping_poses: cam_from_world (M, 3, 4) of the images that the map was made from.
+        camera: of all images.
+        locations: (L, 3) metres, where viewpoints are sampled.
+        n_locations: how many there are in the scene; those of `locations` may be some of them.
+        n_directions: of each location.
+        best_axes: (L, 3) unit optical axis of the best view of each location.
+        best_scores: (L,) its score, a probability.
+        chosen: cam_from_world (3, 4) of the camera that is chosen.
+        chosen_score: its score.
+        seen: (N,) landmarks that it sees.
+        rgb: (H, W, 3) uint8, the image that it takes.
+        outcome: what came of localizing it, in words; empty where it is not known.
+    """
+
+    house: Dollhouse
+    landmarks: Float
+    mapping_poses: Float
+    camera: PinholeCamera
+    locations: Float
+    n_locations: int
+    n_directions: int
+    best_axes: Float
+    best_scores: Float
+    chosen: Float
+    chosen_score: float
+    seen: NDArray[np.bool_]
+    rgb: NDArray[np.uint8]
+    outcome: str = ""
+
+
+def pipeline_figure(pipeline: Pipeline) -> Figure:
+    """Map, sampled viewpoints, ranked viewpoints and the chosen camera, all drawn on the same picture of the scene.
+
+    Returns:
+        Four panels, two by two, as wide as two columns. Landmarks that something stands in front of are left out.
+    """
+    with context(PRINT):
+        top, bottom = _rows_drawn(pipeline.house)
+        width = pipeline.house.rgb.shape[1]
+        figure = new_figure(TWO_COLUMNS_IN, TWO_COLUMNS_IN * (bottom - top) / width + 0.6)
+        panels = figure.subplots(2, 2).ravel()
+        for panel, fade in zip(panels, (0.45, 0.6, 0.6, 0.35), strict=True):
+            draw_house(panel, pipeline.house, fade)
+            panel.set_ylim(bottom, top)
+        _draw_map(panels[0], pipeline)
+        _draw_samples(panels[1], pipeline)
+        _draw_ranks(figure, panels[2], pipeline.house, pipeline.locations, pipeline.best_axes, pipeline.best_scores)
+        panels[2].set_title("c  Ranked: the best view of each location", loc="left")
+        _draw_choice(panels[3], pipeline)
+        return figure
+
+
+def _draw_map(axes: Axes, pipeline: Pipeline) -> None:
+    shown = pipeline.landmarks[pipeline.house.shows(pipeline.landmarks, _MARGIN_M)]
+    draw_points(axes, pipeline.house, shown, s=0.9, color=ORANGE, rasterized=True)
+    frusta = frustum_segments(pipeline.camera, pipeline.mapping_poses, 0.16)
+    draw_segments(axes, pipeline.house, frusta, color=BLUE, linewidth=0.5)
+    axes.set_title(f"a  Map: {len(pipeline.landmarks):,} landmarks, {len(pipeline.mapping_poses)} cameras", loc="left")
+
+
+def _draw_samples(axes: Axes, pipeline: Pipeline) -> None:
+    spacing = _spacing(pipeline.locations)
+    ends = pipeline.locations[:, None] + 0.42 * spacing * fibonacci_sphere(_GLYPH)
+    segments = np.stack([np.broadcast_to(pipeline.locations[:, None], ends.shape), ends], axis=-2)
+    draw_segments(axes, pipeline.house, segments, color=BLUE, linewidth=0.35, alpha=0.8)
+    draw_points(axes, pipeline.house, pipeline.locations, s=4, color=INK)
+    part = f"{len(pipeline.locations)} of {pipeline.n_locations}"
+    axes.set_title(f"b  Sampled: {part} locations × {pipeline.n_directions} directions", loc="left")
+
+
+def ranked_figure(house: Dollhouse, locations: Float, best_axes: Float, best_scores: Float) -> Figure:
+    """The best view of each location alone, one column and a half wide.
+
+    Args:
+        house: the scene from above.
+        locations: (L, 3) metres.
+        best_axes: (L, 3) unit optical axes.
+        best_scores: (L,) probabilities.
+    """
+    with context(PRINT):
+        top, bottom = _rows_drawn(house)
+        figure = new_figure(1.5 * ONE_COLUMN_IN, 1.5 * ONE_COLUMN_IN * (bottom - top) / house.rgb.shape[1])
+        axes = figure.subplots()
+        draw_house(axes, house, 0.5)
+        axes.set_ylim(bottom, top)
+        _draw_ranks(figure, axes, house, locations, best_axes, best_scores)
+        return figure
+
+
+def _draw_ranks(
+    figure: Figure, axes: Axes, house: Dollhouse, locations: Float, best_axes: Float, best_scores: Float
+) -> None:
+    order = np.argsort(best_scores, kind="stable")
+    at, scores = locations[order], best_scores[order]
+    segments = np.stack([at, at + 0.8 * _spacing(locations) * best_axes[order]], axis=1)
+    norm = Normalize(0, 1)
+    draw_segments(axes, house, segments, color=INK, linewidth=2.2)
+    lines = draw_segments(axes, house, segments, array=scores, cmap="cividis", norm=norm, linewidth=1.5)
+    draw_points(axes, house, at, s=15, c=scores, cmap="cividis", norm=norm, edgecolors=INK, linewidths=0.4, zorder=3)
+    bar = figure.colorbar(lines, cax=axes.inset_axes((0.66, 0.04, 0.3, 0.025)), orientation="horizontal")
+    bar.set_label("predicted probability", labelpad=1)
+    bar.set_ticks([0, 0.5, 1], labels=["0", "0.5", "1"])
+
+
+def _draw_choice(axes: Axes, pipeline: Pipeline) -> None:
+    seen = pipeline.landmarks[pipeline.seen]
+    draw_points(axes, pipeline.house, seen, s=1.2, color=ORANGE, rasterized=True)
+    (corners,) = frustum_corners(pipeline.camera, pipeline.chosen, 0.7)
+    pixels = pipeline.house.pixels(corners)
+    axes.add_patch(Polygon(pixels[1:], facecolor=VERMILION, edgecolor="none", alpha=0.35))
+    frustum = frustum_segments(pipeline.camera, pipeline.chosen, 0.7)
+    draw_segments(axes, pipeline.house, frustum, color="white", linewidth=2.4)
+    draw_segments(axes, pipeline.house, frustum, color=VERMILION, linewidth=1.2)
+    draw_points(axes, pipeline.house, corners[:1], s=14, color=VERMILION, zorder=4)
+    image = axes.inset_axes((0.6, 0.06, 0.4, 0.36))
+    image.imshow(pipeline.rgb)
+    image.set(xticks=[], yticks=[], anchor="SE")
+    image.grid(False)
+    image.spines[:].set(visible=True, color=VERMILION, linewidth=1.2)
+    title = f"d  Chosen: {int(pipeline.seen.sum()):,} landmarks in view, score {pipeline.chosen_score:.2f}"
+    axes.set_title(title, loc="left")
+    axes.text(1.0, 0.04, pipeline.outcome, transform=axes.transAxes, fontsize=7, ha="right", va="top")
+
+
+def _rows_drawn(house: Dollhouse) -> tuple[float, float]:
+    """First and last row of the picture that something is seen in, with room for what is drawn above walls."""
+    rows = np.flatnonzero((house.depth_m > 0).any(1))
+    height = len(house.depth_m)
+    return max(0.0, float(rows[0]) - 0.07 * height), min(float(height), float(rows[-1]) + 0.02 * height)
+
+
+def _spacing(locations: Float) -> float:
+    """Median distance from a location to its nearest neighbour, metres."""
+    from scipy.spatial import cKDTree
+
+    if len(locations) < 2:
+        return 0.5
+    return float(np.median(cKDTree(locations).query(locations, k=2)[0][:, 1]))

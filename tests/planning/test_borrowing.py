@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+import pytest
 
 from planning.test_path_planning import BOUNDS, Room, looking_north
+from wheretolook.errors import MapFormatError
 from wheretolook.planning.borrowing import with_borrowed_views
+from wheretolook.planning.path_comparison import shares_below
 from wheretolook.planning.path_planning import PathConfig, plan_path
 
 
@@ -56,3 +60,16 @@ def test_a_planner_has_scores_where_it_had_none() -> None:
     assert (plan_path(*ends, BoundedRoom(), BOUNDS, one, config, progress=False).scores == 0).all()
     lent = with_borrowed_views(one, BoundedRoom())
     np.testing.assert_allclose(plan_path(*ends, BoundedRoom(), BOUNDS, lent, config, progress=False).scores, 0.25)
+
+
+def test_a_map_with_borrowed_views_is_told_from_the_original(tmp_path: Path) -> None:
+    _, one = known_west_and_east()
+    lent = with_borrowed_views(one, BoundedRoom())
+    assert one.origin.derived == "" and lent.origin.derived == "views borrowed by neighbours"
+    ranks = with_borrowed_views(shares_below(one), BoundedRoom())
+    assert ranks.origin.derived == "scores replaced by ranks; views borrowed by neighbours"
+    with pytest.raises(MapFormatError, match="views borrowed by neighbours"):
+        lent.save(tmp_path / "map")
+    for name in ("voxel_of_row", "locations"):
+        with pytest.raises(ValueError, match="voxels share rows"):
+            getattr(lent, name)

@@ -6,6 +6,7 @@ import json
 import shutil
 import struct
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from planning.rooms import GRID, build, joined, room_landmarks, room_map
 from wheretolook.errors import MapFormatError
 from wheretolook.planning import ViewpointMap
 from wheretolook.planning.map_file import ARRAYS, DESCRIPTION, LAYOUT
+from wheretolook.planning.path_comparison import shares_below
 from wheretolook.scoring import make_scorer
 
 
@@ -51,7 +53,7 @@ def test_what_was_saved_comes_back(viewpoint_map: ViewpointMap, folder: Path, mm
     np.testing.assert_array_equal(best.axis, expected.axis)
     loaded.save(folder.with_name("again"))
     assert content_of(folder.with_name("again")) == content_of(folder)
-    assert [path.name for path in folder.parent.iterdir() if "partial" in path.name] == []
+    assert {path.name for path in folder.parent.iterdir()} == {"room", "again"}
 
 
 def test_a_loaded_map_can_be_updated_and_saved_over_itself(folder: Path) -> None:
@@ -177,4 +179,84 @@ def test_what_is_no_map_is_neither_read_nor_replaced(viewpoint_map: ViewpointMap
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(MapFormatError, match="something else is here"):
         viewpoint_map.save(tmp_path)
+    with pytest.raises(MapFormatError, match="something else is here"):
+        viewpoint_map.save(tmp_path / "notes.txt")
     assert (tmp_path / "notes.txt").read_text() == "mine"
+
+
+@pytest.mark.parametrize("content", ['{"mine": 1}', "[]", "null", "{", '{"format": "else"}'])
+def test_a_file_of_the_maps_name_does_not_make_a_map(viewpoint_map: ViewpointMap, tmp_path: Path, content: str) -> None:
+    (tmp_path / DESCRIPTION).write_text(content)
+    (tmp_path / "thesis.tex").write_text("mine")
+    with pytest.raises(MapFormatError, match="something else is here"):
+        viewpoint_map.save(tmp_path)
+    assert content_of(tmp_path) == {DESCRIPTION: content.encode(), "thesis.tex": b"mine"}
+
+
+def test_a_map_with_notes_beside_it_is_not_replaced(viewpoint_map: ViewpointMap, folder: Path) -> None:
+    (folder / "notes.txt").write_text("mine")
+    before = content_of(folder)
+    with pytest.raises(MapFormatError, match=r"notes\.txt: this is no file of the viewpoint map"):
+        viewpoint_map.save(folder)
+    assert content_of(folder) == before
+
+
+def test_folders_beside_a_map_are_left_alone(viewpoint_map: ViewpointMap, folder: Path) -> None:
+    others = [folder.with_name(name) for name in ("room.before", "room.partial", ".room.mine")]
+    for other in others:
+        other.mkdir()
+        (other / "mine").write_text("mine")
+    viewpoint_map.save(folder)
+    assert all((other / "mine").read_text() == "mine" for other in others)
+    assert {path.name for path in folder.parent.iterdir()} == {"room", *(other.name for other in others)}
+
+
+@pytest.mark.parametrize("killed", [False, True])
+def test_the_old_map_outlives_a_save_that_ends_between_the_two_moves(
+    viewpoint_map: ViewpointMap, folder: Path, monkeypatch: pytest.MonkeyPatch, killed: bool
+) -> None:
+    """An error puts it back; who is killed leaves it where `load` says it is, and the next save leaves it alone."""
+    before = content_of(folder)
+    rename, moves = Path.rename, []
+
+    def interrupted(path: Path, target: Path) -> Path:
+        moves.append(target)
+        if len(moves) == 2 or (killed and len(moves) > 2):
+            raise OSError("interrupted")
+        return rename(path, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "rename", interrupted)
+        if killed:
+            patch.setattr(shutil, "rmtree", lambda *_, **__: None)
+        with pytest.raises(OSError, match="interrupted"):
+            viewpoint_map.save(folder)
+    if not killed:
+        assert content_of(folder) == before and len(list(folder.parent.iterdir())) == 1
+        return
+    with pytest.raises(MapFormatError, match="A save was interrupted: the map from before is") as error:
+        ViewpointMap.load(folder)
+    old = Path(str(error.value.fix).split(" is ")[1].removesuffix(", move it here."))
+    assert content_of(old) == before
+    viewpoint_map.save(folder)
+    assert content_of(old) == content_of(folder) == before
+
+
+def test_rows_that_are_not_each_of_one_voxel_are_refused(viewpoint_map: ViewpointMap, folder: Path) -> None:
+    rows = viewpoint_map.row_of_voxel.copy()
+    first, second = viewpoint_map.voxel_of_row[:2]
+    for changed in ({first: 1, second: 0}, {first: 1}, {first: -2}):
+        wrong = rows.copy()
+        for voxel, row in changed.items():
+            wrong[voxel] = row
+        with pytest.raises(ValueError, match="row_of_voxel"):
+            replace(viewpoint_map, row_of_voxel=wrong)
+        np.save(folder / "row_of_voxel.npy", wrong)
+        with pytest.raises(MapFormatError, match="do not fit together: row_of_voxel"):
+            ViewpointMap.load(folder, mmap=True)
+
+
+def test_derived_maps_are_not_saved(viewpoint_map: ViewpointMap, tmp_path: Path) -> None:
+    with pytest.raises(MapFormatError, match=r"derived from another.*scores replaced by ranks"):
+        shares_below(viewpoint_map).save(tmp_path / "room")
+    assert list(tmp_path.iterdir()) == []

@@ -18,6 +18,7 @@ from wheretolook.learning.set_network import MatchabilityNetwork, SetNetwork
 from wheretolook.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.planning import ViewpointMap, build_viewpoint_map, update_viewpoint_map
+from wheretolook.planning.path_comparison import shares_below
 from wheretolook.scoring import SCORERS, make_scorer
 from wheretolook.scoring.registry import WEIGHTS_OF
 from wheretolook.visibility import HiddenPointRemoval, NoOcclusion, OcclusionModel, StoredOcclusion
@@ -131,6 +132,12 @@ def test_another_method_camera_or_geometry_is_refused() -> None:
     old = replace(old, scores=old.scores + np.float32(0.01))  # as of other weights
     with pytest.raises(ConfigError, match="voxel that sees none of the added"):
         old.updated(make_scorer("bins", room_map(landmarks)))
+
+
+def test_derived_maps_are_not_updated() -> None:
+    scorer = make_scorer("bins", room_map(joined(OLD, seen_by_some())))
+    with pytest.raises(ConfigError, match=r"derived from another cannot be updated.*scores replaced by ranks"):
+        shares_below(build(OLD)).updated(scorer)
 
 
 @pytest.mark.parametrize("method", [name for name in SCORERS if name not in WEIGHTS_OF])

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from planning.rooms import CAMERA, DIRECTIONS, GRID, build, free_voxels, room_landmarks, room_map
-from wheretolook.errors import ConfigError, SceneError
+from wheretolook.errors import ConfigError, MapError, SceneError
 from wheretolook.geometry import poses_looking_along, rotation_angle_deg, rotation_looking_along
 from wheretolook.planning import ViewChoice, ViewpointMap, build_viewpoint_map
 from wheretolook.scoring import make_scorer
@@ -151,6 +153,48 @@ def test_questions_without_sense_are_refused(viewpoint_map: ViewpointMap) -> Non
         viewpoint_map.best_reachable((1, 1, 1), 2 * np.eye(3), 10)
     with pytest.raises(ValueError, match="shape"):
         viewpoint_map.best_many((1, 1, 1))
+
+
+@pytest.mark.parametrize("n", [2.5, 2.0, np.nan, "2", None])
+def test_only_a_whole_number_of_views_can_be_asked_for(viewpoint_map: ViewpointMap, n: object) -> None:
+    point = viewpoint_map.locations[0]
+    with pytest.raises(ValueError, match=f"whole number of at least 1, got {n!r}"):
+        viewpoint_map.best_n(point, n)  # type: ignore[arg-type]
+    assert len(viewpoint_map.best_n(point, np.int64(2)) or ()) == 2
+
+
+def test_a_matrix_that_mirrors_is_no_rotation(viewpoint_map: ViewpointMap) -> None:
+    with pytest.raises(ValueError, match="a determinant of 1"):
+        viewpoint_map.best_reachable(viewpoint_map.locations[0], np.diag([1.0, 1.0, -1.0]), 180.0)
+    with pytest.raises(ValueError, match="a determinant of 1"):
+        viewpoint_map.best_reachable(viewpoint_map.locations[0], -rotation_looking_along(DIRECTIONS[3]), 180.0)
+
+
+def test_a_mask_and_ids_of_free_voxels_give_the_same_map() -> None:
+    scorer = make_scorer("bins", room_map(room_landmarks(200)))
+    mask = np.zeros(len(GRID), dtype=bool)
+    mask[list(free_voxels())] = True
+    a, b = (build_viewpoint_map(scorer, GRID, free, DIRECTIONS) for free in (mask, free_voxels()[::-1]))
+    np.testing.assert_array_equal(a.voxel_of_row, free_voxels())
+    np.testing.assert_array_equal(a.row_of_voxel, b.row_of_voxel)
+    np.testing.assert_array_equal(a.scores, b.scores)
+
+
+@pytest.mark.parametrize("free", [np.ones(7, bool), np.ones((len(GRID), 1), bool), [0.5, 3.0], np.full(len(GRID), "a")])
+def test_free_voxels_are_ids_or_a_mask_of_the_grid(free: object) -> None:
+    scorer = make_scorer("bins", room_map(room_landmarks(20)))
+    with pytest.raises(ConfigError, match="free voxels"):
+        build_viewpoint_map(scorer, GRID, free, DIRECTIONS)  # type: ignore[arg-type]
+
+
+def test_a_landmark_without_a_position_is_refused_by_its_id() -> None:
+    landmarks = room_landmarks(20, first_id=100)
+    points = landmarks.points.copy()
+    points[7, 1] = np.nan
+    with pytest.raises(MapError, match="position of landmark 107 is not finite"):
+        build(replace(landmarks, points=points))
+    with pytest.raises(MapError, match="position of landmark 107 is not finite"):
+        build(landmarks).updated(make_scorer("bins", room_map(replace(landmarks, points=points))))
 
 
 def test_interpolation_meets_the_voxels_at_their_centres(viewpoint_map: ViewpointMap) -> None:

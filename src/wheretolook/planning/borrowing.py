@@ -24,6 +24,9 @@ def with_borrowed_views(viewpoint_map: ViewpointMap, space: Space) -> ViewpointM
     Args:
         viewpoint_map: of the space.
         space: where a camera can be.
+
+    Returns:
+        A derived map (`MapOrigin.derived`): voxels share rows in it, so it is neither saved nor updated.
     """
     grid = viewpoint_map.grid
     rows, centers = viewpoint_map.row_of_voxel.copy(), grid.centers()
@@ -43,4 +46,4 @@ def with_borrowed_views(viewpoint_map: ViewpointMap, space: Space) -> ViewpointM
             clear = space.segments_are_free(np.tile(start, (len(near), 1)), centers[near])
             if clear.any():
                 rows[voxel] = viewpoint_map.row_of_voxel[near[int(np.argmax(clear))]]
-    return replace(viewpoint_map, row_of_voxel=rows)
+    return replace(viewpoint_map, row_of_voxel=rows, origin=viewpoint_map.origin.derive("views borrowed by neighbours"))

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
 from wheretolook.camera_models import Camera, ColmapCamera
-from wheretolook.errors import ConfigError, SceneError
+from wheretolook.errors import ConfigError, MapError, SceneError
 from wheretolook.geometry import Float, rotation_looking_along
 from wheretolook.grid import VoxelGrid
 from wheretolook.localization_map import LocalizationMap
@@ -47,23 +47,25 @@ def build_viewpoint_map(
     Args:
         scorer: any method; it knows its map, and so landmarks, camera, occlusion and device.
         grid: voxels of the world.
-        free: ids of the voxels where a camera can be, (L,), such as `wheretolook.sampling.free_locations` finds.
+        free: where a camera can be: ids of voxels, (L,), such as `wheretolook.sampling.free_locations` finds, or a mask
+            of all voxels, (V,) bool.
         directions: (D, 3) optical axes in the world, of any length, such as `direction_lattice` gives.
         lattice: their name, to be told to readers.
         progress: text of progress bars; None shows none.
 
     Raises:
         SceneError: no voxel is free, or the centre of one lies inside geometry.
-        MapError: the map has no landmarks.
-        ConfigError: more than 65,536 directions, or ids outside the grid.
+        MapError: the map has no landmarks, or one whose position is not finite.
+        ConfigError: more than 65,536 directions, ids outside the grid, or neither ids nor a mask of its voxels.
         ValueError: directions of another shape, or such that have no direction.
     """
     axes = _unit(directions)
-    rows = np.unique(np.asarray(free, dtype=np.int64))
+    rows = _ids(free, len(grid))
     if len(rows) == 0:
         raise SceneError("no voxel is free", value=len(grid), fix="Refine the grid, or check where it lies.")
     if rows[0] < 0 or rows[-1] >= len(grid):
         raise ConfigError("ids of free voxels lie outside the grid", value=(int(rows[0]), int(rows[-1])))
+    _check_landmarks(scorer.localization_map.landmarks)
     row_of_voxel = np.full(len(grid), -1, dtype=np.int32)
     row_of_voxel[rows] = np.arange(len(rows))
     ranked, scores, n_visible = _score_and_count(scorer, grid.centers()[rows], axes, progress)
@@ -95,11 +97,17 @@ def update_viewpoint_map(
         the numbers equal those of a new build up to rounding.
 
     Raises:
-        ConfigError: another method, camera or occlusion model; or the scores or counts of a voxel that should not have
-            changed did, so that weights or geometry must be others.
+        ConfigError: the map was derived from another; the method, camera or occlusion model is another; or the scores
+            or counts of a voxel that should not have changed did, so that weights or geometry must be others.
         SceneError, MapError: as in `build_viewpoint_map`.
     """
     one = scorer.localization_map
+    if old.origin.derived:
+        raise ConfigError(
+            "a viewpoint map derived from another cannot be updated", value=old.origin.derived,
+            fix="Update the one it was derived from, and derive it again.",
+        )  # fmt: skip
+    _check_landmarks(one.landmarks)
     digests = landmark_digests(one.landmarks)
     origin = _origin(scorer, old.origin.lattice, digests)
     for name in ("scorer", "inputs", "camera", "occlusion"):
@@ -162,6 +170,29 @@ def _score_and_count(
             scores[rows] = values
             bar.update(len(values))
     return ranked, scores, counted.counts.astype(np.uint32)
+
+
+def _ids(free: ArrayLike, n_voxels: int) -> NDArray[np.int64]:
+    """Ids of free voxels, ascending, each once, of ids or a mask."""
+    given = np.asarray(free)
+    if given.dtype == bool:
+        if given.shape != (n_voxels,):
+            raise ConfigError("a mask of free voxels has a value for each voxel", value=given.shape,
+                              fix=f"Give one of shape ({n_voxels},), in the order of VoxelGrid.centers.")  # fmt: skip
+        return np.flatnonzero(given)
+    if given.size and not np.issubdtype(given.dtype, np.integer):
+        raise ConfigError("free voxels are given by ids or a mask", value=str(given.dtype),
+                          fix="Give integers, or a boolean for each voxel.")  # fmt: skip
+    return np.unique(given.astype(np.int64))
+
+
+def _check_landmarks(landmarks: Landmarks) -> None:
+    bad = np.flatnonzero(~np.isfinite(landmarks.points).all(axis=1))
+    if len(bad):
+        raise MapError(
+            f"the position of landmark {landmarks.ids[bad[0]]} is not finite",
+            value=tuple(landmarks.points[bad[0]].tolist()), fix="Remove it, or run the map stage again.",
+        )  # fmt: skip
 
 
 def _unit(directions: ArrayLike) -> Float:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import glob
 import json
 import shutil
+import tempfile
 from dataclasses import asdict
 from hashlib import sha256
 from pathlib import Path
@@ -31,6 +33,9 @@ ARRAYS = {
     "landmark_digests": ("<u8", "N, 2"),
 }
 """Type, little-endian, and shape of each array; each is a file `<name>.npy`."""
+
+_OLD = "old"
+"""Where a map that is being replaced lies in the hidden folder of the one who saves."""
 
 _REBUILD = "Build it anew with `wheretolook viewpoint-map`, or get the folder again."
 
@@ -99,46 +104,81 @@ _MEANINGS = {
 
 
 def save_viewpoint_map(viewpoint_map: ViewpointMap, folder: str | Path) -> None:
-    """Write a folder; one that holds a viewpoint map already is replaced once the new one is complete.
+    """Write a folder; one that holds a viewpoint map and nothing else is replaced once the new one is complete.
 
-    The same map gives the same bytes. The layout is described in the folder's own `LAYOUT.txt`.
+    The same map gives the same bytes. The layout is described in the folder's own `LAYOUT.txt`. The new map is made in
+    a hidden folder beside it, `.<name>.<some letters>`, where the old one is put until the new one has its place.
+    Whoever is killed at that moment leaves both there, and `load_viewpoint_map` says where.
 
     Raises:
-        MapFormatError: the folder holds something else.
+        MapFormatError: the folder holds something else, or something beside a map; or the map was derived from another
+            (`MapOrigin.derived`).
     """
     folder = Path(folder).resolve()  # which has a name, also for "."
-    if folder.exists() and not (folder.is_dir() and ((folder / DESCRIPTION).is_file() or not any(folder.iterdir()))):
+    if viewpoint_map.origin.derived:
+        raise MapFormatError(
+            "a map derived from another is for planners and not to be saved", path=folder,
+            value=viewpoint_map.origin.derived, fix="Save the map it was derived from.",
+        )  # fmt: skip
+    _refuse_something_else(folder)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    work = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    new, old = work / "new", work / _OLD
+    try:
+        new.mkdir()
+        _write(viewpoint_map, new)
+        if folder.exists():
+            folder.rename(old)
+        new.rename(folder)
+    finally:
+        if old.exists() and not folder.exists():
+            old.rename(folder)
+        shutil.rmtree(work, ignore_errors=True)  # who has mapped the old files keeps them
+
+
+def _refuse_something_else(folder: Path) -> None:
+    """Raise MapFormatError unless a folder is missing, empty, or holds a viewpoint map of any version and only that."""
+    if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
+        return
+    try:
+        is_map = json.loads((folder / DESCRIPTION).read_text(encoding="utf-8"))["format"] == FORMAT
+    except (OSError, ValueError, LookupError, TypeError):
+        is_map = False
+    if not is_map:
         raise MapFormatError("something else is here", path=folder, fix="Name a new folder, or remove this.")
-    partial = folder.with_name(folder.name + ".partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
+    known = {DESCRIPTION, LAYOUT, *(f"{name}.npy" for name in ARRAYS)}
+    others = sorted(path.name for path in folder.iterdir() if path.name not in known)
+    if others:
+        raise MapFormatError(
+            "this is no file of the viewpoint map that is to be replaced", path=folder / others[0],
+            fix="Move it elsewhere, or name a new folder for the map.",
+        )  # fmt: skip
+
+
+def _write(viewpoint_map: ViewpointMap, folder: Path) -> None:
     checksums = {}
     for name, (kind, _) in ARRAYS.items():
-        np.save(partial / f"{name}.npy", np.ascontiguousarray(getattr(viewpoint_map, name), dtype=kind))
-        checksums[f"{name}.npy"] = _sha256(partial / f"{name}.npy")
+        np.save(folder / f"{name}.npy", np.ascontiguousarray(getattr(viewpoint_map, name), dtype=kind))
+        checksums[f"{name}.npy"] = _sha256(folder / f"{name}.npy")
     grid = viewpoint_map.grid
     n_rows, n_directions = viewpoint_map.scores.shape
     files = "\n".join(
         f"  {name + '.npy':<20}{np.dtype(kind).name:<9}({shape + ')':<7}{_MEANINGS[name]}"
         for name, (kind, shape) in ARRAYS.items()
     )
-    write_text(partial / LAYOUT, _TEXT.format(version=VERSION, files=files))
+    write_text(folder / LAYOUT, _TEXT.format(version=VERSION, files=files))
+    origin = asdict(viewpoint_map.origin)
+    del origin["derived"]  # of what is saved, nothing is
     content = {
         "format": FORMAT,
         "version": VERSION,
         "grid": {name: [*map(float, getattr(grid, name))] for name in ("lower", "upper")}
         | {"shape": [*map(int, grid.shape)]},
         "sizes": {"V": len(grid), "L": n_rows, "D": n_directions, "N": len(viewpoint_map.landmark_ids)},
-        "origin": asdict(viewpoint_map.origin),
+        "origin": origin,
         "sha256": checksums,
     }
-    write_json(partial / DESCRIPTION, content)
-    before = folder.with_name(folder.name + ".before")
-    shutil.rmtree(before, ignore_errors=True)
-    if folder.exists():
-        folder.rename(before)  # so that one of the two is whole at any moment
-    partial.rename(folder)
-    shutil.rmtree(before, ignore_errors=True)  # who has mapped its files keeps them
+    write_json(folder / DESCRIPTION, content)
 
 
 def load_viewpoint_map(folder: str | Path, mmap: bool = False) -> ViewpointMap:
@@ -155,7 +195,9 @@ def load_viewpoint_map(folder: str | Path, mmap: bool = False) -> ViewpointMap:
     folder = Path(folder)
     path = folder / DESCRIPTION
     if not path.is_file():
-        raise MapFormatError("there is no viewpoint map in this folder", path=folder, fix=_REBUILD)
+        raise MapFormatError(
+            "there is no viewpoint map in this folder", path=folder, fix=_left_behind(folder) or _REBUILD
+        )
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         found = content.get("format"), content.get("version")
@@ -181,6 +223,13 @@ def load_viewpoint_map(folder: str | Path, mmap: bool = False) -> ViewpointMap:
         return ViewpointMap(grid=grid, origin=origin, **arrays)
     except ValueError as error:
         raise MapFormatError(f"the arrays do not fit together: {error}", path=folder, fix=_REBUILD) from error
+
+
+def _left_behind(folder: Path) -> str:
+    """Where the map lies that a save took away and, killed, did not replace; empty if there is none."""
+    folder = folder.resolve()
+    found = sorted(folder.parent.glob(f".{glob.escape(folder.name)}.*/{_OLD}/{DESCRIPTION}"))
+    return f"A save was interrupted: the map from before is {found[-1].parent}, move it here." if found else ""
 
 
 def _read(path: Path, kind: str, shape: tuple[int, ...], mmap: bool) -> NDArray[Any]:

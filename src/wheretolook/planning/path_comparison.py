@@ -102,7 +102,8 @@ def shares_below(viewpoint_map: ViewpointMap) -> ViewpointMap:
     """
     ordered = np.sort(viewpoint_map.scores, axis=None)
     shares = np.searchsorted(ordered, viewpoint_map.scores, side="left") / max(1, ordered.size - 1)
-    return replace(viewpoint_map, scores=shares.astype(np.float32))
+    origin = viewpoint_map.origin.derive("scores replaced by ranks")
+    return replace(viewpoint_map, scores=shares.astype(np.float32), origin=origin)
 
 
 def compare_paths(

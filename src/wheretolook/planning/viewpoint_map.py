@@ -6,7 +6,7 @@ A query does the arithmetic of a perfect hash and reads a few numbers, so it tak
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from math import isfinite
 from pathlib import Path
@@ -70,6 +70,8 @@ class MapOrigin:
             in COLMAP's order.
         occlusion: name of the occlusion model.
         landmarks: 16 hexadecimal digits that change with any landmark.
+        derived: what was done to a map since it was built, such as scores replaced by ranks; "" for the map as it was
+            built. A derived map answers queries; it is neither saved nor updated.
     """
 
     scorer: str
@@ -78,6 +80,11 @@ class MapOrigin:
     camera: dict[str, Any]
     occlusion: str
     landmarks: str
+    derived: str = ""
+
+    def derive(self, what: str) -> MapOrigin:
+        """The origin of a map to which this was done as well."""
+        return replace(self, derived=f"{self.derived}; {what}" if self.derived else what)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +99,8 @@ class ViewpointMap:
 
     Attributes:
         grid: V voxels of the world, metres, z up.
-        row_of_voxel: (V,) int32, row of each free voxel in the arrays below, -1 for others; rows count up with voxels.
+        row_of_voxel: (V,) int32, row of each free voxel in the arrays below, -1 for others; rows count up with voxels,
+            each used once. In derived maps voxels may share rows.
         directions: (D, 3) float64 unit optical axes in the world.
         ranked: (L, D) uint16, ids of the directions at each of L free voxels: by falling score before it was rounded
             to single precision, then by rising id.
@@ -123,6 +131,11 @@ class ViewpointMap:
                 raise ValueError(f"{name} must be of shape {cells}, got {getattr(self, name).shape}")
         if len(self.row_of_voxel) != len(self.grid):
             raise ValueError(f"row_of_voxel must be of length {len(self.grid)}, got {len(self.row_of_voxel)}")
+        used = self.row_of_voxel[self.row_of_voxel >= 0]
+        if self.row_of_voxel.min(initial=-1) < -1 or not (
+            self.origin.derived or np.array_equal(used, np.arange(len(used)))
+        ):
+            raise ValueError("row_of_voxel must be -1 or count up with voxels, using every row once")
 
     @classmethod
     def load(cls, folder: str | Path, mmap: bool = False) -> ViewpointMap:
@@ -145,12 +158,19 @@ class ViewpointMap:
 
     @property
     def voxel_of_row(self) -> NDArray[np.int64]:
-        """Ids of the free voxels, (L,), ascending."""
-        return np.flatnonzero(self.row_of_voxel >= 0)
+        """Ids of the free voxels, (L,), ascending.
+
+        Raises:
+            ValueError: voxels share rows in this derived map.
+        """
+        voxels = np.flatnonzero(self.row_of_voxel >= 0)
+        if len(voxels) != len(self.scores):
+            raise ValueError(f"voxels share rows in this map ({self.origin.derived}); ask the one it was derived from")
+        return voxels
 
     @property
     def locations(self) -> Float:
-        """Centres of the free voxels, (L, 3) metres."""
+        """Centres of the free voxels, (L, 3) metres; raises as `voxel_of_row`."""
         return self.grid.centers()[self.voxel_of_row]
 
     def row(self, point: Point) -> int:
@@ -177,9 +197,13 @@ class ViewpointMap:
         return None if row < 0 else self._choice(row, self.ranked.item(row, 0))
 
     def best_n(self, point: Point, n: int) -> list[ViewChoice] | None:
-        """The n best orientations at a world point (3,) m, or all if there are fewer, the best first."""
-        if n < 1:
-            raise ValueError(f"n must be at least 1, got {n}")
+        """The n best orientations at a world point (3,) m, or all if there are fewer, the best first.
+
+        Raises:
+            ValueError: n is no whole number of at least 1, or a coordinate is not finite.
+        """
+        if not isinstance(n, int | np.integer) or n < 1:
+            raise ValueError(f"n must be a whole number of at least 1, got {n!r}")
         row = self.row(point)
         return None if row < 0 else [self._choice(row, choice) for choice in self.ranked[row, :n].tolist()]
 
@@ -209,9 +233,12 @@ class ViewpointMap:
         Returns None also if no direction of the lattice is so near.
 
         Raises:
-            ValueError: the point or `current` is not finite, or an axis has no length.
+            ValueError: the point or `current` is not finite, an axis has no length, or a matrix is no rotation (one
+                that mirrors is none).
         """
         row = self.row(point)
+        if np.shape(current) == (3, 3) and not np.linalg.det(np.asarray(current, dtype=np.float64)) > 0:
+            raise ValueError(f"a rotation (3, 3) has a determinant of 1, got {np.asarray(current)}")
         return self._best_of(row, within(turns_from_deg(current, self._rotations), max_turn_deg))
 
     def best_many(self, points: ArrayLike) -> ViewChoices:

@@ -10,7 +10,7 @@ import pytest
 from mapping.marker_rooms import CAMERA, MARKERS, hand_held_poses, marker_room
 from wheretolook.errors import ConfigError, MapError
 from wheretolook.geometry import poses_looking_along, transform
-from wheretolook.mapping.markers import MarkerView, detect_markers, place_marker
+from wheretolook.mapping.markers import MAX_ERROR_PX, MAX_ERROR_SHARE, MarkerView, detect_markers, place_marker
 from wheretolook.rendering import WarpRenderer
 
 COLMAP_CAMERA = pycolmap.Camera(
@@ -54,6 +54,36 @@ def test_one_bad_view_moves_little() -> None:
     off = MarkerView("off.jpg", COLMAP_CAMERA, views[2].cam_from_world, views[2].corners_px + np.array([8.0, 0.0]))
     marker = place_marker(7, [*views, off])
     np.testing.assert_allclose(marker.corners, MARKER.corners, atol=0.01)
+
+
+def test_a_marker_in_two_places_is_refused() -> None:
+    """One id printed twice, 0.4 m apart, seen in three photographs."""
+    views = [view(f"{index}.jpg", pose) for index, pose in enumerate(hand_held_poses()[[4, 6, 8]])]
+    elsewhere = MARKER.corners + np.array([0.4, 0.0, 0.0])
+    pixels = np.asarray(COLMAP_CAMERA.img_from_cam(transform(views[1].cam_from_world, elsewhere)))
+    moved = MarkerView("1.jpg", COLMAP_CAMERA, views[1].cam_from_world, pixels)
+    assert place_marker(7, views).error_px < 1e-4
+    with pytest.raises(MapError, match=r"no single place fits .*marker 7.*miss by \d+\.\d px, more than 4\.0.*1\.jpg"):
+        place_marker(7, [views[0], moved, views[2]])
+
+
+def test_a_larger_photograph_may_miss_by_more_pixels() -> None:
+    """The same share of the image: what is refused at 480 pixels is 1/400 at eight times as many, and less."""
+    rng = np.random.default_rng(0)
+    noise = [rng.normal(scale=0.6, size=(4, 2)) for _ in range(5)]
+    poses = hand_held_poses()[4:9]
+
+    def placed(times: float) -> float:
+        large = pycolmap.Camera(model="PINHOLE", width=int(480 * times), height=int(360 * times), params=[
+            CAMERA.focal_px * times, CAMERA.focal_px * times, CAMERA.cx * times, CAMERA.cy * times])  # fmt: skip
+        views = [
+            MarkerView(f"{row}.jpg", large, pose, np.asarray(large.img_from_cam(transform(pose, MARKER.corners)))
+                       + times * noise[row])
+            for row, pose in enumerate(poses)
+        ]  # fmt: skip
+        return place_marker(7, views).error_px
+
+    assert MAX_ERROR_PX < placed(8.0) < MAX_ERROR_SHARE * 8 * 480
 
 
 def test_a_marker_seen_once_is_refused_by_name() -> None:

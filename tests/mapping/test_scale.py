@@ -101,6 +101,32 @@ def test_positions_fix_the_frame_and_leave_residuals() -> None:
     assert max(worst, key=lambda name: worst[name]) == "2.jpg"
 
 
+@pytest.mark.parametrize("off_m", [2.0, 100.0])
+def test_a_position_that_is_far_off_is_refused_by_name(off_m: float) -> None:
+    centers = {f"{index}.jpg": center for index, center in enumerate(np.random.default_rng(3).normal(size=(14, 3)))}
+    positions = {name: 2 * center for name, center in centers.items()}
+    positions["2.jpg"] = positions["2.jpg"] + (0, off_m, 0)
+    with pytest.raises(MapError, match=r"do not agree with the map.* 5 % of .*got '2\.jpg: "):
+        scale_from_positions(centers, positions)
+    assert scale_from_positions(centers, positions, 95.0)[0].residuals["2.jpg"] > off_m / 2
+
+
+def test_positions_in_another_order_are_refused() -> None:
+    centers = {f"{index}.jpg": center for index, center in enumerate(np.random.default_rng(3).normal(size=(8, 3)))}
+    swapped = dict(zip(centers, reversed(centers.values()), strict=True))
+    with pytest.raises(MapError, match="do not agree with the map"):
+        scale_from_positions(centers, swapped)
+
+
+def test_the_report_tells_how_well_markers_are_placed() -> None:
+    often = Marker(2, SQUARE, ("a.jpg", "b.jpg", "c.jpg"), 0.3)
+    scale = scale_from_markers([square(1, 1.0), often], 0.2)
+    assert scale.marker_error_px == {"marker 1": 0.1, "marker 2": 0.3}
+    assert scale.marker_views == {"marker 1": 2, "marker 2": 3}
+    assert "corners missed by 0.3 px at most" in scale.describe() and "NOT CHECKED" not in scale.describe()
+    assert "NOT CHECKED: no marker is seen in more" in scale_from_markers([square(1, 1.0)], 0.2).describe()
+
+
 def test_tables_are_read_and_contradictions_refused(tmp_path: Path) -> None:
     table = tmp_path / "markers.csv"
     table.write_text("id, size_m\n3, 0.4\n7, 0.2\n7, 0.2\n")

@@ -22,6 +22,12 @@ if TYPE_CHECKING:
 _LEAST_ANGLE_DEG = 1.5  # between two rays to a marker, as for landmarks
 _SOFT_PX = 1.0
 
+MAX_ERROR_PX = 4.0
+MAX_ERROR_SHARE = 1 / 400
+"""A marker is refused whose corners miss those seen by more pixels than this (root mean square), or by more than this
+share of the photographs' longer side, whichever is larger. Corners are found to a fraction of a pixel; a marker that
+was moved, or printed twice, misses by tens."""
+
 
 @dataclass(frozen=True, eq=False)
 class MarkerView:
@@ -103,7 +109,8 @@ def place_marker(marker_id: int, views: Sequence[MarkerView]) -> Marker:
     """Place a marker's corners where the rays to them meet, by least reprojection error (robust: Huber-like).
 
     Raises:
-        MapError: fewer than two photographs see it, or all from one direction.
+        MapError: fewer than two photographs see it, or all from one direction; or no place fits what they see, as of
+            a marker that was moved or printed twice.
     """
     from scipy.optimize import least_squares
 
@@ -129,6 +136,13 @@ def place_marker(marker_id: int, views: Sequence[MarkerView]) -> Marker:
 
     found = least_squares(residuals, start.ravel(), loss="soft_l1", f_scale=_SOFT_PX, x_scale="jac")
     error_px = float(np.sqrt(2 * np.mean(residuals(found.x) ** 2)))
+    limit_px = max(MAX_ERROR_PX, MAX_ERROR_SHARE * max(max(view.camera.width, view.camera.height) for view in views))
+    if not error_px <= limit_px:
+        raise MapError(
+            f"no single place fits the photographs of marker {marker_id}, its corners miss by {error_px:.1f} px, more "
+            f"than {limit_px:.1f}", value=" ".join(images),
+            fix="Print every marker once, and leave out photographs from before it was moved.",
+        )  # fmt: skip
     return Marker(marker_id, found.x.reshape(4, 3), images, error_px)
 
 

@@ -52,7 +52,8 @@ class ScaleConfig:
         marker_size_m: side of the black square of every marker, in metres; 0 for no markers.
         marker_table: CSV file of markers of different sizes, with the columns `id` and `size_m`. Other markers are
             passed over.
-        tolerance_percent: a marker's side that differs by more from its size is refused.
+        tolerance_percent: a marker's side that differs by more from its size is refused, and a position that is off
+            by more of the extent of all positions.
         distance: one known distance.
         positions: CSV file with the columns `image`, `x`, `y`, `z`, or JSON file `{"image": [x, y, z]}`: where
             photographs were taken, in metres, z up. They fix the whole frame, not only its scale.

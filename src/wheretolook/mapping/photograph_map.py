@@ -207,7 +207,7 @@ def _scale(
     model, names, config = mapped.model, _registered(mapped), known.config
     centers = {name: model.images[number].projection_center() for number, name in names.items()}
     if known.positions:
-        return scale_from_positions(centers, known.positions)
+        return scale_from_positions(centers, known.positions, config.tolerance_percent)
     scale = MapScale()
     if config.has_marker_sizes:
         views = _marker_views(mapped, folder, config.dictionary, full_sizes, progress)

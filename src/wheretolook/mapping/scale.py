@@ -32,6 +32,9 @@ class MapScale:
             single distance, which cannot contradict itself.
         unit: of the residuals: "percent", "m", or "" where there are none.
         unused: what was seen but could not be used, and why.
+        marker_error_px: root mean square reprojection error of each marker's corners.
+        marker_views: number of photographs that see each marker. Two alone do not tell whether they see one marker in
+            one place: most wrong places fit as well.
     """
 
     source: Source = "unknown"
@@ -39,6 +42,8 @@ class MapScale:
     residuals: dict[str, float] = field(default_factory=dict)
     unit: Literal["percent", "m", ""] = ""
     unused: dict[str, str] = field(default_factory=dict)
+    marker_error_px: dict[str, float] = field(default_factory=dict)
+    marker_views: dict[str, int] = field(default_factory=dict)
 
     @property
     def is_metric(self) -> bool:
@@ -53,6 +58,10 @@ class MapScale:
         if self.residuals:
             off = np.abs(list(self.residuals.values()))
             text += f", off by {np.median(off):.3g} {self.unit} (median), {off.max():.3g} {self.unit} (most)"
+        if self.marker_error_px:
+            text += f", corners missed by {max(self.marker_error_px.values()):.2g} px at most"
+        if self.marker_views and max(self.marker_views.values()) <= 2:
+            text += "; NOT CHECKED: no marker is seen in more than two photographs"
         return text + (f"; not used: {', '.join(self.unused)}" if self.unused else "")
 
 
@@ -98,7 +107,11 @@ def scale_from_markers(
             f"the markers do not agree on a scale: sides off by more than {tolerance_percent:g} %", value=worst,
             fix="Measure the black squares; give markers of different sizes in a marker_table.",
         )  # fmt: skip
-    return MapScale("markers", factor, residuals, "percent", dict(unused or {}))
+    return MapScale(
+        "markers", factor, residuals, "percent", dict(unused or {}),
+        {f"marker {marker.marker_id}": marker.error_px for marker in markers},
+        {f"marker {marker.marker_id}": len(set(marker.images)) for marker in markers},
+    )  # fmt: skip
 
 
 def scale_from_distance(first: ArrayLike, second: ArrayLike, distance_m: float) -> MapScale:
@@ -113,15 +126,18 @@ def scale_from_distance(first: ArrayLike, second: ArrayLike, distance_m: float) 
     return MapScale("distance", distance_m / length)
 
 
-def scale_from_positions(centers: Mapping[str, Float], positions: Mapping[str, Float]) -> tuple[MapScale, Similarity]:
+def scale_from_positions(
+    centers: Mapping[str, Float], positions: Mapping[str, Float], tolerance_percent: float = 5.0
+) -> tuple[MapScale, Similarity]:
     """The scale, and the similarity that takes the map to the frame of known camera positions.
 
     Args:
         centers: where the map has the photographs, by name.
         positions: where they were taken, metres, z up. Photographs that the map lacks are not used.
+        tolerance_percent: how far a position may be off, of the diagonal of the box around those that are used.
 
     Raises:
-        MapError: fewer than three of them are in the map, or all are on a line.
+        MapError: fewer than three of them are in the map, all are on a line, or one is off by more.
     """
     names = [name for name in positions if name in centers]
     source = np.array([centers[name] for name in names]).reshape(-1, 3)
@@ -130,6 +146,14 @@ def scale_from_positions(centers: Mapping[str, Float], positions: Mapping[str, F
     off = np.linalg.norm(similarity.apply(source) - target, axis=1)
     unused = {name: "not in the map" for name in positions if name not in centers}
     residuals = dict(zip(names, off.tolist(), strict=True))
+    limit_m = tolerance_percent / 100 * float(np.linalg.norm(np.ptp(target, axis=0)))
+    if off.max() > limit_m:
+        worst = sorted((name for name in names if residuals[name] > limit_m), key=lambda name: -residuals[name])
+        raise MapError(
+            f"the positions do not agree with the map: off by more than {limit_m:.3g} m, {tolerance_percent:g} % of "
+            "their extent", value=", ".join(f"{name}: {residuals[name]:.3g} m" for name in worst[:5]),
+            fix="The first is the worst: check its position, their units and names, or raise tolerance_percent.",
+        )  # fmt: skip
     return MapScale("positions", similarity.scale, residuals, "m", unused), similarity
 
 

@@ -51,10 +51,24 @@ def scene_occlusion(
                              fix="Run the scenes stage, or use hidden-points or none.")  # fmt: skip
         mesh = load_mesh(scene.mesh)
     if config.model == "tsdf":
-        images = RenderedDepth(WarpRenderer(mesh, device), camera, colmap_poses(scene.map))
-        tsdf = TsdfConfig(voxel_size_m=config.voxel_m, max_depth_m=config.max_depth_m)
-        return TsdfOcclusion(TsdfVolume.from_images(images, tsdf, progress), config.margin_m, device)
+        volume, _ = scene_tsdf(scene, camera, config, mesh, device, progress)
+        return TsdfOcclusion(volume, config.margin_m, device)
     return MeshOcclusion(MeshRaycaster(mesh, device), config.margin_m, two_sided)
+
+
+def scene_tsdf(
+    scene: SceneFolder, camera: PinholeCamera, config: OcclusionConfig, mesh: TexturedMesh, device: str = "cpu",
+    progress: bool = True,
+) -> tuple[TsdfVolume, RenderedDepth]:  # fmt: skip
+    """Depth images of a scene, rendered where the map's images were taken, and the volume they fuse to.
+
+    Raises:
+        MapError: there is no COLMAP model. SceneError: no depth image has a reading.
+        ConfigError: the voxels do not fit into memory.
+    """
+    images = RenderedDepth(WarpRenderer(mesh, device), camera, colmap_poses(scene.map))
+    tsdf = TsdfConfig(voxel_size_m=config.voxel_m, max_depth_m=config.max_depth_m)
+    return TsdfVolume.from_images(images, tsdf, progress), images
 
 
 class RenderedDepth(Sequence[DepthImage]):

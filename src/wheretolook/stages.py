@@ -168,7 +168,9 @@ def sample(experiment: Experiment, say: Say = print, tick: Tick = lambda work: N
         if not is_done(scene, "sample", key, scene.table, scene.occlusion):
             landmarks = Landmarks.load(scene.landmarks)
             with naming_scene(source):
-                space, occlusion = space_and_occlusion(scene, dataset.camera, experiment, occlusion_config)
+                space, occlusion = space_and_occlusion(
+                    scene, dataset.camera, experiment, occlusion_config, free_by_tsdf=False
+                )
                 grid = VoxelGrid.over(space.bounds, experiment.sample.grid)
                 free = free_locations(grid, space)
                 # depth images that have not seen all of the scene may put free space behind surfaces

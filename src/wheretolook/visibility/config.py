@@ -20,7 +20,8 @@ class OcclusionConfig:
     Args:
         model: "mesh" casts one ray for each landmark; "tsdf" does so against the surface that depth images fuse to,
             here rendered where the map's images were taken; "hidden-points" needs nothing but the landmarks; "none"
-            sees through walls, as the paper's released code.
+            sees through walls, as the paper's released code. With "tsdf", collisions of viewpoint maps and paths are
+            with that surface too, not with the mesh, and what no depth image saw is not free.
         margin_m: a surface this close in front of a landmark is the landmark's own.
         radius: of hidden-point removal, in distances of the farthest landmark.
         voxel_m: voxel size of the TSDF.

@@ -31,3 +31,37 @@ def test_methods_are_listed_without_a_dataset(
 def test_only_evaluate_lists_methods(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["map", "--list-methods"]) == 2
     assert "list-methods" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("stage", "says"),
+    [
+        (
+            "viewpoint-map",
+            ["--scenes.mapped_space.clearance_m", "--map.photographs.assume_metric", "photographs has no"],
+        ),
+        (
+            "plan",
+            ["--scene, --start, --goal,", "--film", "wheretolook plan --config", "--tracking.folder", "model tsdf"],
+        ),
+    ],
+)
+def test_help_names_what_a_stage_reads(stage: str, says: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([stage, "--help"]) == 0
+    said = capsys.readouterr().out
+    assert [text for text in says if text not in said] == [] and "--evaluate" not in said
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "message"),
+    [
+        ("--start", "[.nan, 1, 1]", "plan.start must be finite"),
+        ("--goal", "[1, 1, .inf]", "plan.goal must be finite"),
+        ("--plan.planner.time_s", ".inf", "time_s must be positive and finite"),
+    ],
+)
+def test_a_plan_with_numbers_that_are_not_finite_is_refused(
+    option: str, value: str, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["plan", option, value]) == 2
+    assert message in capsys.readouterr().err

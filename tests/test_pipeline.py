@@ -17,13 +17,17 @@ import pytest
 
 from wheretolook import labelling, stages
 from wheretolook.camera_models import ColmapCamera
-from wheretolook.cli import main
+from wheretolook.cli import main, parse_experiment
 from wheretolook.dataset import Dataset
 from wheretolook.errors import TableError
 from wheretolook.geometry import PinholeCamera, camera_centers
 from wheretolook.labelling import report
 from wheretolook.learning.weights import load_classifier
 from wheretolook.localization_map import LocalizationMap
+from wheretolook.planning.path_comparison import draw_pairs
+from wheretolook.scene_space import space_and_occlusion
+from wheretolook.scenes.free_space import FreeSpace
+from wheretolook.scenes.tsdf_space import TsdfSpace
 from wheretolook.scoring import load_scorer
 from wheretolook.table import fingerprint, is_good, poses, read_table, write_table
 from wheretolook.tracking import TrackingConfig, artifact, client, newest_run
@@ -378,3 +382,25 @@ def test_a_path_is_planned_and_shown(
     wall = ["--start", "[-99, 0, 1]", "--goal", str(goal.tolist()), "--film", "none", "--method", "forward"]
     assert run("plan", copy, *options, *wall) == 2
     assert "the start is not in free space" in capsys.readouterr().err
+
+
+def test_paths_keep_clear_of_what_depth_images_saw(copy: Path, tmp_path: Path) -> None:
+    """With the occlusion model tsdf; locations are sampled by the mesh all the same."""
+    options = ["--config", str(copy / "tiny.yaml"), "--data", str(copy / "data"), "--device", "cpu"]
+    experiment = parse_experiment("plan", [*options, "--occlusion.model", "tsdf"])
+    assert experiment is not None
+    dataset = Dataset.load(experiment.root)
+    scene = dataset.split("test")[0]
+    by_mesh, _ = space_and_occlusion(scene, dataset.camera, experiment, experiment.occlusion, free_by_tsdf=False)
+    space, hides = space_and_occlusion(scene, dataset.camera, experiment, experiment.occlusion)
+    assert type(by_mesh) is FreeSpace and isinstance(space, TsdfSpace) and hides.name == "tsdf"
+    points = np.random.default_rng(0).uniform(*by_mesh.bounds, (4000, 3))
+    free, expected = space.is_free(points), by_mesh.is_free(points)
+    assert free.sum() > 100 and expected[free].mean() > 0.95 and free[expected].mean() < 1
+    assert not free[by_mesh._raycaster.distance_to_surface(points, 1.0) < 0.25 - 2 * experiment.occlusion.voxel_m].any()
+    way = draw_pairs(space, replace(experiment.paths, pairs=1, min_distance_m=0.5))[0]
+    ends = ["--start", str(way[0].tolist()), "--goal", str(way[1].tolist()), "--out", str(tmp_path / "way")]
+    rest = ["--scene", scene.name, "--method", "forward", "--film", "none", "--plan.planner.time_s", "1"]
+    assert run("plan", copy, "--occlusion.model", "tsdf", *ends, *rest) == 0
+    path = pd.read_csv(tmp_path / "way" / "path.csv")[["x_m", "y_m", "z_m"]].to_numpy()
+    assert len(path) > 1 and space.is_free(path).all()

@@ -46,12 +46,12 @@ STAGES = {
     "viewpoint-map": (
         "viewpoint_map",
         "Score every direction at every free voxel of a scene, for planners to look up. Needs no labels.",
-        ("viewpoint_map", "occlusion", "scenes.free_space"),
+        ("viewpoint_map", "occlusion", "scenes.free_space", "scenes.mapped_space", "map.photographs.assume_metric"),
     ),
     "plan": (
         "plan",
         "Plan a path on which the camera sees what it needs to know where it is; a table, a picture and a film of it.",
-        ("plan", "occlusion", "scenes.free_space", "scenes.mapped_space", "map.photographs.assume_metric"),
+        ("plan", "occlusion", "scenes.free_space", "scenes.mapped_space", "map.photographs.assume_metric", "tracking"),
     ),
     "compare-paths": (
         "compare_paths",
@@ -256,9 +256,10 @@ _SHORT_OF = {
 _MORE_HELP = {
     "evaluate": "\nWhat evaluate.methods may name: wheretolook evaluate --list-methods\n",
     "viewpoint-map": """
-Reads a scene's mesh and map, as the scenes and map stages leave them; --scene, --method, --weights and --out stand for
-the settings of viewpoint_map. Without weights or a method, the best weights of the dataset, or else those that ship,
-score the views. For example, with the paper's network:
+Reads a scene's map and its mesh, as the scenes and map stages leave them; a scene of photographs has no mesh, and is
+free where scenes.mapped_space says. --scene, --method, --weights and --out stand for the settings of viewpoint_map.
+Without weights or a method, the best weights of the dataset, or else those that ship, score the views. For example,
+with the paper's network:
 
   wheretolook viewpoint-map --config configs/demo.yaml --scene apartment-000 \\
       --weights data/release/weights/mlp-2d+z.safetensors --out apartment.map
@@ -268,6 +269,15 @@ The folder holds plain arrays and LAYOUT.txt, which says how C++ or any language
   from wheretolook.planning import ViewpointMap
   viewpoint_map = ViewpointMap.load("apartment.map", mmap=True)
   choice = viewpoint_map.best((1.0, 2.0, 1.5))    # None where no camera can be, else axis, score, n_visible
+""",
+    "plan": """
+Reads a scene's map and its mesh, if it has one, as the scenes and map stages leave them. --scene, --start, --goal,
+--method, --weights, --out and --film stand for the settings of plan. For example, beside the shortest path:
+
+  wheretolook plan --config configs/demo.yaml --scene apartment-000 --start '[-4, -3, 1.4]' --goal '[4, 3, 1.4]' \\
+      --plan.against '[forward]' --film mp4 --out way
+
+Without a mesh to keep clear of, by what depth images saw: --occlusion.model tsdf
 """,
 }
 

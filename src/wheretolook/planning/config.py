@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from math import inf, isfinite
 from pathlib import Path
 from typing import Literal
 
@@ -69,11 +70,11 @@ class PathConfig:
         if not -90 < low <= high < 90:
             raise ConfigError("pitch_deg needs a range inside -90 to 90", value=self.pitch_deg)
         for name in ("max_turn_deg_per_m", "spacing_m", "step_m", "time_s"):
-            if not getattr(self, name) > 0:
-                raise ConfigError(f"{name} must be positive", value=getattr(self, name))
+            if not 0 < getattr(self, name) < inf:
+                raise ConfigError(f"{name} must be positive and finite", value=getattr(self, name))
         for name in ("score_weight", "turn_weight_m"):
-            if not getattr(self, name) >= 0:
-                raise ConfigError(f"{name} must not be negative", value=getattr(self, name))
+            if not 0 <= getattr(self, name) < inf:
+                raise ConfigError(f"{name} must be finite and not negative", value=getattr(self, name))
 
 
 @dataclass(frozen=True)
@@ -168,3 +169,7 @@ class PlanConfig:
     def __post_init__(self) -> None:
         if self.film not in ("gif", "mp4", "none"):
             raise ConfigError("unknown kind of film", value=self.film, fix="Use gif, mp4 or none.")
+        for name in ("start", "goal"):
+            point = getattr(self, name)
+            if point is not None and not all(map(isfinite, point)):
+                raise ConfigError(f"plan.{name} must be finite", value=point, fix="Give x, y, z in metres.")

@@ -386,8 +386,9 @@ def test_a_path_is_planned_and_shown(
 
 def test_paths_keep_clear_of_what_depth_images_saw(copy: Path, tmp_path: Path) -> None:
     """With the occlusion model tsdf; locations are sampled by the mesh all the same."""
-    options = ["--config", str(copy / "tiny.yaml"), "--data", str(copy / "data"), "--device", "cpu"]
-    experiment = parse_experiment("plan", [*options, "--occlusion.model", "tsdf"])
+    tsdf = ["--occlusion.model", "tsdf", "--occlusion.voxel_m", "0.04"]
+    options = ["--config", str(copy / "tiny.yaml"), "--data", str(copy / "data"), "--device", "cpu", *tsdf]
+    experiment = parse_experiment("plan", options)
     assert experiment is not None
     dataset = Dataset.load(experiment.root)
     scene = dataset.split("test")[0]
@@ -401,6 +402,6 @@ def test_paths_keep_clear_of_what_depth_images_saw(copy: Path, tmp_path: Path) -
     way = draw_pairs(space, replace(experiment.paths, pairs=1, min_distance_m=0.5))[0]
     ends = ["--start", str(way[0].tolist()), "--goal", str(way[1].tolist()), "--out", str(tmp_path / "way")]
     rest = ["--scene", scene.name, "--method", "forward", "--film", "none", "--plan.planner.time_s", "1"]
-    assert run("plan", copy, "--occlusion.model", "tsdf", *ends, *rest) == 0
+    assert run("plan", copy, *tsdf, *ends, *rest) == 0
     path = pd.read_csv(tmp_path / "way" / "path.csv")[["x_m", "y_m", "z_m"]].to_numpy()
     assert len(path) > 1 and space.is_free(path).all()

@@ -25,9 +25,10 @@ def summarize_paths(paths: pd.DataFrame, views: pd.DataFrame, config: PathsConfi
         config: limits of the errors, resamples, seed.
 
     Returns:
-        `localized`, the share of all views that localize, and `times_forward`, that share over the one of "forward",
-        both with the ends of 95 % intervals by resampling pairs within scenes; over the pairs that both planned,
-        `times_forward_length`; `failures` to plan, `turn_deg_per_m`, `promised`.
+        `localized`, the share of all views that localize; over the pairs that both planned, `times_forward`, that share
+        over the one of "forward", and `times_forward_length`; the former two with the ends of 95 % intervals by
+        resampling pairs within scenes; `failures` to plan, `turn_deg_per_m`, `promised`. What there is nothing to tell
+        of is NaN.
     """
     good = (
         (views["status"] == LOCALIZED)
@@ -78,22 +79,33 @@ def _row(of_method: pd.DataFrame, forward: pd.DataFrame, draws: NDArray[np.int64
         good, n = (weights @ counts[name]).T
         return np.divide(good, n, out=np.full(len(weights), np.nan), where=n > 0)
 
+    def ratio(weights: NDArray[Any]) -> NDArray[Any]:
+        ours, theirs = (share(name, weights * both) for name in ("one", "base"))
+        return np.divide(ours, theirs, out=np.full(len(weights), np.nan), where=theirs > 0)
+
     whole = np.ones((1, len(index)))
-    shares, ratios = share("one", draws), share("one", draws) / share("base", draws)
-    localized = float(share("one", whole)[0])
+    shares, ratios = _interval(share("one", draws)), _interval(ratio(draws))
+    metres = float(of_method["length_m"].sum())
     lengths = one["length_m"].to_numpy()[both].sum(), base["length_m"].to_numpy()[both].sum()
     return {
         "pairs": len(of_method),
         "failures": int((~of_method["planned"]).sum()),
         "views": int(counts["one"][:, 1].sum()),
-        "localized": localized,
-        "localized_low": float(np.nanpercentile(shares, 2.5)),
-        "localized_high": float(np.nanpercentile(shares, 97.5)),
-        "times_forward": float(localized / share("base", whole)[0]),
-        "times_forward_low": float(np.nanpercentile(ratios, 2.5)),
-        "times_forward_high": float(np.nanpercentile(ratios, 97.5)),
+        "localized": float(share("one", whole)[0]),
+        "localized_low": shares[0],
+        "localized_high": shares[1],
+        "times_forward": float(ratio(whole)[0]),
+        "times_forward_low": ratios[0],
+        "times_forward_high": ratios[1],
         "times_forward_length": float(lengths[0] / lengths[1]) if lengths[1] else float("nan"),
         "length_m": float(of_method["length_m"].mean()),
-        "turn_deg_per_m": float(of_method["turn_deg"].sum() / max(of_method["length_m"].sum(), 1e-9)),
+        "turn_deg_per_m": float(of_method["turn_deg"].sum() / metres) if metres else float("nan"),
         "promised": float(of_method["promised"].mean()),
     }
+
+
+def _interval(draws: NDArray[Any]) -> tuple[float, float]:
+    """Ends of the 95 % interval of what is known."""
+    known = draws[np.isfinite(draws)]
+    low, high = np.percentile(known, (2.5, 97.5)) if len(known) else (np.nan, np.nan)
+    return float(low), float(high)

@@ -23,8 +23,8 @@ from wheretolook.photograph_scenes import is_photographed
 from wheretolook.planning.config import PathsConfig
 from wheretolook.planning.path_comparison import FORWARD, ComparedPaths, compare_paths, draw_pairs
 from wheretolook.planning.path_report import summarize_paths
-from wheretolook.planning.planner_map import planner_map
-from wheretolook.planning.scene_map import default_weights
+from wheretolook.planning.planner_map import check_methods, planner_map
+from wheretolook.planning.scene_map import weights_for
 from wheretolook.scene_space import space_and_occlusion
 from wheretolook.stamps import stage_key
 from wheretolook.table import SCHEMA, UNLABELLED, fingerprint
@@ -54,6 +54,7 @@ def compare_scenes(
         ConfigError: no such scene or method, or no weights. SceneError: a scene has no mesh, or too little room.
     """
     config = experiment.paths
+    check_methods(config.methods)
     scenes = _chosen(dataset, config)
     planned = {scene.name: _plan(scene, dataset, experiment, say) for scene in scenes}
     labelled = _localize(scenes, planned, dataset, experiment, extractor_of)
@@ -87,11 +88,11 @@ def _chosen(dataset: Dataset, config: PathsConfig) -> list[SceneFolder]:
 def _plan(scene: SceneFolder, dataset: Dataset, experiment: Experiment, say: Say) -> ComparedPaths:
     """The paths of a scene: those that are there if they were planned with the same settings."""
     config, folder = experiment.paths, dataset.root / "results" / FOLDER / scene.name
-    weights = config.weights or default_weights(dataset, say)
+    weights = {method: weights_for(method, dataset, config.weights, say) for method in config.methods}
     settings = {name: value for name, value in asdict(config).items() if name not in _OF_THE_REPORT}
     key = stage_key("paths", [settings, asdict(experiment.scenes.free_space), asdict(experiment.occlusion),
                               fingerprint(scene.mesh), fingerprint(scene.landmarks),
-                              None if weights is None else fingerprint(weights)])  # fmt: skip
+                              [path and fingerprint(path) for path in weights.values()]])  # fmt: skip
     files = {name: folder / f"{name}.parquet" for name in ("paths", "views")}
     made = folder / "made.json"
     if made.is_file() and all(file.is_file() for file in files.values()) and json.loads(made.read_text()) == key:
@@ -99,8 +100,8 @@ def _plan(scene: SceneFolder, dataset: Dataset, experiment: Experiment, say: Say
         return ComparedPaths(**{name: pd.read_parquet(file) for name, file in files.items()})
     space, occlusion = space_and_occlusion(scene, dataset.camera, experiment, experiment.occlusion)
     maps = {
-        method: planner_map(method, weights, config.grid, config.directions, scene, dataset, space, occlusion,
-                            experiment.warp_device)
+        method: planner_map(method, weights[method], config.grid, config.directions, config.lattice, scene, dataset,
+                            space, occlusion, experiment.warp_device)
         for method in config.methods
         if method != FORWARD
     }  # fmt: skip

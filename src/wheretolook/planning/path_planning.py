@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from dataclasses import replace
 from typing import Any, Protocol
 
@@ -24,9 +25,12 @@ __all__ = ["PathConfig", "PlannedPath", "Space", "plan_path"]
 TABLE_STEP_DEG = 2.0
 """Step of yaw and pitch of the table that finds the map's direction nearest to an axis."""
 
-SHORTEST_SHARE, SHORTEN_SHARE, SEARCH_SHARE = 0.25, 0.05, 0.3
-"""Shares of the time in which a short path is looked for, in which it is made shorter, and in which places and views
-are looked for together. In the rest what costs least is improved."""
+SHORT_SHARE, SEARCH_SHARE, SHORTEN_SHARE = 0.25, 0.3, 0.05
+"""Shares of the time in which a short path is looked for, in which places and views are looked for together, and in
+which the short path is made shorter. In the rest what costs least is improved."""
+
+AHEAD_SHARE = 0.5
+"""Share of the time in which a short path is looked for where there is nothing else to look for."""
 
 SAME_M = 1e-6
 """Points nearer to each other are the same."""
@@ -94,19 +98,21 @@ def plan_path(
     rng = np.random.default_rng(0)
     box = np.array([low, high])
     with tqdm(total=round(config.time_s, 1), desc="plan", unit="s", disable=not progress) as bar:
+        end, ahead = time.monotonic() + config.time_s, viewpoint_map is None
         shortest = _Problem(ends, low, high, space, None, config)
         route: Float | None = None
         try:
-            route = shortest.solve([(0.0, 0.0)], SHORTEST_SHARE * config.time_s, bar)[:, :3]
+            share = (AHEAD_SHARE, 1.0) if ahead else (SHORT_SHARE, 1 - SEARCH_SHARE)
+            route = shortest.solve([(0.0, 0.0)], share[0] * config.time_s, share[1] * config.time_s, bar)[:, :3]
         except PlanningError:
-            if viewpoint_map is None:
+            if ahead:
                 raise
         if route is not None:
-            seconds = (1 - SHORTEST_SHARE if viewpoint_map is None else SHORTEN_SHARE) * config.time_s
+            seconds = end - time.monotonic() if ahead else SHORTEN_SHARE * config.time_s
             route = improve(route, _shorter, _length(route), space, box, seconds, rng)
-            bar.update(seconds)
         if viewpoint_map is None:
             assert route is not None
+            _finish(bar)
             samples = RouteSamples.of(route, config.spacing_m)
             looking = _forward(samples.positions, np.radians(config.pitch_deg))
             unknown = np.full(len(samples.positions), np.nan)
@@ -122,13 +128,13 @@ def plan_path(
         if route is not None:
             add(views.best(route), route, "short route")
         try:
-            states = problem.solve(orientations, SEARCH_SHARE * config.time_s, bar)
+            most = SEARCH_SHARE * config.time_s if found else end - time.monotonic()
+            states = problem.solve(orientations, SEARCH_SHARE * config.time_s, most, bar)
             add(problem.path(states, views), states[:, :3], "search")
             add(views.best(states[:, :3]), states[:, :3], "search")
         except PlanningError:
             if not found:
                 raise
-        seconds = max(0.0, (1 - SHORTEST_SHARE - SHORTEN_SHARE - SEARCH_SHARE) * config.time_s)
         cheapest, places = found[min(found)]
 
         def cost_below(candidate: Float, limit: float) -> float | None:
@@ -137,11 +143,15 @@ def plan_path(
             path = views.best(candidate)
             return None if path is None or path.cost >= limit else path.cost
 
-        better = improve(places, cost_below, cheapest.cost, space, box, seconds, rng)
-        bar.update(seconds)
+        better = improve(places, cost_below, cheapest.cost, space, box, end - time.monotonic(), rng)
         if better is not places:
             add(views.best(better), better, "improvement")
+        _finish(bar)
     return found[min(found)][0]
+
+
+def _finish(bar: Any) -> None:
+    bar.update(max(0.0, bar.total - bar.n))
 
 
 def check_ends(ends: Float, space: Space, bounds: Float) -> None:
@@ -234,8 +244,8 @@ class _Problem:
                 return False
         return bool(self.space.segments_are_free([a[:3]], [b[:3]])[0])
 
-    def solve(self, orientations: list[tuple[float, float]], time_s: float, bar: Any) -> Float:
-        """States (S, 5) of the best path that is found in a time.
+    def solve(self, orientations: list[tuple[float, float]], time_s: float, most_s: float, bar: Any) -> Float:
+        """States (S, 5) of the best path that is found in a time, or of the first that is found until another.
 
         Raises:
             PlanningError: there is none.
@@ -286,13 +296,14 @@ class _Problem:
         planner.setProblemDefinition(definition)
         planner.setRange(self.config.step_m)
         planner.setup()
-        slices = max(1, round(time_s / 0.25))
-        for _ in range(slices):
-            planner.solve(time_s / slices)
-            bar.update(time_s / slices)
+        step, spent = max(1e-3, min(0.25, time_s)), 0.0
+        while spent < time_s - 1e-9 or (spent < most_s - 1e-9 and not definition.hasExactSolution()):
+            planner.solve(step)
+            spent += step
+            bar.update(min(step, max(0.0, bar.total - bar.n)))
         if not definition.hasExactSolution():
             raise PlanningError(
-                "no path was found in time", value=f"{time_s:g} s",
+                "no path was found in time", value=f"{spent:.2g} s",
                 fix="Give it more time, or loosen the camera's limits.",
             )  # fmt: skip
         found = definition.getSolutionPath()

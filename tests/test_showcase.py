@@ -13,18 +13,27 @@ import pytest
 from synthetic_dataset import make_landmarks, make_mapping_poses
 from wheretolook.dataset import Dataset, SceneFolder
 from wheretolook.errors import ConfigError, SceneError
-from wheretolook.geometry import Float, PinholeCamera, camera_centers
+from wheretolook.geometry import Float, PinholeCamera, camera_centers, poses_looking_along
 from wheretolook.grid import VoxelGrid
+from wheretolook.learning.network import InputStatistics, NetworkSpec, ViewpointNetwork
 from wheretolook.mapping.cameras import save_mapping_poses
 from wheretolook.rendering import MeshRaycaster
 from wheretolook.sampling import SampleConfig, free_locations, sample_viewpoints
 from wheretolook.scenes.free_space import FreeSpace, FreeSpaceConfig
 from wheretolook.scenes.procedural import ApartmentConfig, generate_apartment
 from wheretolook.scoring.base import Scorer
+from wheretolook.scoring.learned import LearnedScorer
 from wheretolook.scoring.visible import VisibleScorer
 from wheretolook.showcase import Showcase, open_showcase, shares_good
-from wheretolook.showcase_figures import binned_image_of, mistaken_location, peaks_of, pipeline_of, sampling_of
-from wheretolook.table import LOCALIZED, NO_POSE, outcome_in_brief, outcome_in_words, poses, write_table
+from wheretolook.showcase_figures import (
+    binned_image_of,
+    learning_of,
+    mistaken_location,
+    peaks_of,
+    pipeline_of,
+    sampling_of,
+)
+from wheretolook.table import LOCALIZED, NO_POSE, UNLABELLED, outcome_in_brief, outcome_in_words, poses, write_table
 from wheretolook.visibility import MeshOcclusion
 from wheretolook.visibility.config import OcclusionConfig
 
@@ -195,24 +204,33 @@ def test_the_mistaken_location_is_where_scores_are_farthest_from_labels(showcase
     assert mistaken == off.idxmax()
 
 
-def test_outcomes_are_told_in_words() -> None:
-    found = pd.Series({"status": LOCALIZED, "error_m": 0.0123, "error_deg": 0.456})
-    assert (
-        outcome_in_words(found) == "pose found, 1.2 cm and 0.46° off" and outcome_in_brief(found) == "1.2 cm, 0.46° off"
-    )
-    wrong = pd.Series({"status": LOCALIZED, "error_m": 2.34, "error_deg": 56.7})
-    assert (
-        outcome_in_words(wrong) == "wrong pose found, 2.3 m and 57° off" and outcome_in_brief(wrong) == "2.3 m, 57° off"
-    )
-    assert (
-        outcome_in_words(pd.Series({"status": NO_POSE}))
-        == outcome_in_brief(pd.Series({"status": NO_POSE}))
-        == "no pose"
-    )
-    assert outcome_in_words(pd.Series({"status": "unlabelled"})) == ""
+def test_learning_follows_the_best_and_the_worst_view(showcase: Showcase) -> None:
+    statistics = InputStatistics(("u", "v"), (48.0, 36.0), (20.0, 20.0))
+    network = ViewpointNetwork(NetworkSpec("2d", CAMERA, statistics, bins=6))
+    scorer = LearnedScorer(showcase.localization_map, network)
+    location = showcase.instructive_location()
+    rows = showcase.viewpoints(location)
+    scores = scorer.score(poses(rows))
+    for best, score in ((True, scores.max()), (False, scores.min())):
+        learning = learning_of(showcase, scorer, location, best)
+        assert learning.activations[-1] == pytest.approx(score)
+        assert learning.channels == ("u", "v") and learning.image.counts.shape == (6, 6)
+        assert learning.outcome == outcome_in_brief(rows.iloc[int(np.argmin(np.abs(scores - score)))])
+
+
+@pytest.mark.parametrize(
+    ("status", "error_m", "error_deg", "words", "brief"),
+    [
+        (LOCALIZED, 0.0123, 0.456, "pose found, 1.2 cm and 0.46° off", "1.2 cm, 0.46° off"),
+        (LOCALIZED, 2.34, 56.7, "wrong pose found, 2.3 m and 57° off", "2.3 m, 57° off"),
+        (NO_POSE, np.nan, np.nan, "no pose", "no pose"),
+        (UNLABELLED, np.nan, np.nan, "", ""),
+    ],
+)
+def test_outcomes_are_told_in_words(status: str, error_m: float, error_deg: float, words: str, brief: str) -> None:
+    label = pd.Series({"status": status, "error_m": error_m, "error_deg": error_deg})
+    assert (outcome_in_words(label), outcome_in_brief(label)) == (words, brief)
 
 
 def _poses_at(showcase: Showcase, location: int) -> Float:
-    from wheretolook.geometry import poses_looking_along
-
     return poses_looking_along(np.tile(showcase.center(location), (len(showcase.directions), 1)), showcase.directions)

@@ -15,7 +15,21 @@ from synthetic_dataset import make_dataset
 from wheretolook.evaluation import EvaluateConfig, evaluate
 from wheretolook.tracking import TrackingConfig
 
+SCORES = "01_score_table_and_lattices"
+
+OF_THE_RELEASE = {
+    "01_pipeline": 2,
+    "02_sampling": 3,
+    "03_inputs": 4,
+    "04b_what_the_network_sees": 4,
+    "09_your_own_map": 2,
+}
+"""Notebooks that need nothing but the release that ships, and how many pictures each shows."""
+
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
+
+
+NOTEBOOK = {path.stem: path for path in NOTEBOOKS}
 
 
 def execute(path: Path, monkeypatch: pytest.MonkeyPatch, store: Path) -> nbformat.NotebookNode:
@@ -33,7 +47,7 @@ def outputs(notebook: nbformat.NotebookNode, mime: str) -> list[str]:
 
 
 def test_there_are_notebooks() -> None:
-    assert [path.stem for path in NOTEBOOKS] == ["01_score_table_and_lattices"]
+    assert [path.stem for path in NOTEBOOKS] == sorted([SCORES, *OF_THE_RELEASE])
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
@@ -49,15 +63,31 @@ def test_score_notebook_draws_the_newest_evaluation(tmp_path: Path, monkeypatch:
     store = tmp_path / "mlruns"
     config = EvaluateConfig(methods=("random", "bins"), resamples=50)
     evaluate(dataset, config, TrackingConfig(str(store)), progress=False)
-    notebook = execute(NOTEBOOKS[0], monkeypatch, store)
+    notebook = execute(NOTEBOOK[SCORES], monkeypatch, store)
     assert len(outputs(notebook, "image/png")) == 2
     (table,) = outputs(notebook, "text/markdown")
     assert (dataset.root / "results" / "scores.md").read_text().split("\n")[2:] == table.split("\n")[2:]
 
 
 def test_score_notebook_says_what_to_run_without_a_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    notebook = execute(NOTEBOOKS[0], monkeypatch, tmp_path / "nothing")
+    notebook = execute(NOTEBOOK[SCORES], monkeypatch, tmp_path / "nothing")
     assert len(outputs(notebook, "image/png")) == 1
     (message,) = outputs(notebook, "text/markdown")
     assert "make demo" in message
     assert not (tmp_path / "nothing").exists()
+
+
+@pytest.mark.parametrize("name", OF_THE_RELEASE)
+def test_notebooks_of_the_release_run_from_top_to_bottom(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    notebook = execute(NOTEBOOK[name], monkeypatch, tmp_path / "nothing")
+    assert len(outputs(notebook, "image/png")) == OF_THE_RELEASE[name]
+    printed = [output for cell in notebook.cells for output in cell.get("outputs", []) if "name" in output]
+    assert [output["text"] for output in printed if output["name"] == "stderr"] == []
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_cells_are_short(path: Path) -> None:
+    cells = [cell.source.splitlines() for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code"]
+    assert path.stem == SCORES or max(len(lines) for lines in cells[1:]) <= 6  # behind the imports

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,6 +13,10 @@ from numpy.typing import NDArray
 from wheretolook.planning.config import PathsConfig
 from wheretolook.planning.path_comparison import FORWARD
 from wheretolook.table import LOCALIZED
+from wheretolook.tracking import NestedRun, TrackingConfig, log_nested, start_run
+
+PATHS_CSV, PATHS_MD, PATHS_PNG = "paths.csv", "paths.md", "paths.png"
+"""Files of a comparison, in `<dataset>/results/` and as artifacts of its run."""
 
 ALL = "all"
 """Name of the rows over all scenes."""
@@ -97,3 +103,36 @@ def _row(of_method: pd.DataFrame, forward: pd.DataFrame, draws: NDArray[np.int64
         "turn_deg_per_m": float(of_method["turn_deg"].sum() / max(of_method["length_m"].sum(), 1e-9)),
         "promised": float(of_method["promised"].mean()),
     }
+
+
+def log_paths(
+    params: Mapping[str, Any],
+    summary: pd.DataFrame,
+    results: Path,
+    tracking: TrackingConfig,
+    tags: Mapping[str, str] | None = None,
+) -> str:
+    """Log a comparison: a run with its files, and in it one for each task and method over all scenes.
+
+    Args:
+        params: of the comparison, such as the dataset.
+        summary: of `summarize_paths`.
+        results: folder of the files; those that are missing are left out.
+        tracking: where to log.
+        tags: further tags.
+
+    Returns:
+        Id of the run.
+    """
+    pooled = summary[summary["scene"] == summary["scene"].iloc[-1]]
+    with start_run(tracking, f"paths {params['dataset']}", "paths", params, tags=tags) as (client, run):
+        for name in (PATHS_CSV, PATHS_MD, PATHS_PNG):
+            if (results / name).is_file():
+                client.log_artifact(run, str(results / name))
+        nested = []
+        for row in pooled.to_dict("records"):
+            about = {**params, "task": row["task"], "method": row["method"]}
+            numbers = {str(key): float(value) for key, value in row.items() if key not in ("scene", "task", "method")}
+            nested.append(NestedRun(f"paths {row['task']} {row['method']}", about, numbers))
+        log_nested(tracking, run, "paths", nested, tags)
+    return run

@@ -71,16 +71,19 @@ def records(folder: Path) -> dict[Path, dict[str, Any]]:
 def keep_histories(release: Dataset, tracking: TrackingConfig) -> pd.DataFrame:
     """Write `results/training.csv` of a release: histories of what was trained on it, as far as the store has them.
 
-    Variants trained in another store keep the rows that they have there already.
+    A history is that of the run that trained the weights, or else of the newest with the same parameters. Variants
+    without any keep the rows that the file has already.
     """
     path = release.root / "results" / TRAINING_CSV
     known = pd.read_csv(path) if path.is_file() else pd.DataFrame({"variant": []})
     kept = []
     for record in records(release.root / "weights").values():
         variant, history = record["about"]["variant"], None
-        for run in finished_runs(tracking, "train", file=HISTORY_CSV):
-            if run.info.run_id == record["run_id"]:
-                history = pd.read_csv(artifact(tracking, run.info.run_id, HISTORY_CSV))
+        same = {name: str(value) for name, value in params_of(record["about"]).items()}
+        alike = list(finished_runs(tracking, "train", params=same, file=HISTORY_CSV))
+        own = [run for run in alike if run.info.run_id == record["run_id"]]
+        for run in (own or alike)[:1]:
+            history = pd.read_csv(artifact(tracking, run.info.run_id, HISTORY_CSV))
         rows = known[known["variant"] == variant] if history is None else history.assign(variant=variant)
         kept.append(rows[["variant", *rows.columns.drop("variant")]])
     table = pd.concat([rows for rows in kept if len(rows)], ignore_index=True) if any(map(len, kept)) else known

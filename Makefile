@@ -12,7 +12,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --progre
 CONSTRAINTS := configs/constraints.txt
 READY := $(VENV)/ready-$(TORCH)
 
-.PHONY: demo test setup ui notebooks clean help
+.PHONY: demo test setup ui lab html clean help
 
 help:
 	@sed -n '1,3s/^# //p' Makefile
@@ -26,10 +26,15 @@ test: $(READY)
 	OMP_WAIT_POLICY=PASSIVE OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
 
 ui: $(READY)
+	@$(BIN)/wheretolook log-release
 	$(BIN)/mlflow ui --backend-store-uri sqlite:///mlruns/mlflow.db
 
-notebooks: $(READY)
+lab: $(READY)
+	@test -x $(BIN)/jupyter-lab || $(PIP) -c $(CONSTRAINTS) -e '.[notebooks]'
 	$(BIN)/jupyter lab notebooks
+
+html: $(READY)
+	OMP_WAIT_POLICY=PASSIVE $(BIN)/python -m wheretolook.notebook_html notebooks notebooks/html
 
 setup: $(READY)
 

@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import wheretolook
+from wheretolook.errors import MissingRunError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -244,6 +245,25 @@ def finished_runs(
         run = mlflow_client.get_run(run_id)
         if not file or (Path(run.info.artifact_uri) / file).is_file():
             yield run
+
+
+def newest_artifact(tracking: TrackingConfig, stage: str, file: str, dataset: str = "") -> Path:
+    """An artifact of the newest finished top-level run that has it.
+
+    Args:
+        tracking: the store.
+        stage: of the run.
+        file: the artifact.
+        dataset: that the run is about; "" for any.
+
+    Raises:
+        MissingRunError: there is no such run.
+    """
+    run = newest_run(tracking, stage, params={"dataset": dataset} if dataset else None, file=file)
+    if run is None:
+        fix = "`wheretolook figures` tells which command makes it, `wheretolook log-release` logs what ships."
+        raise MissingRunError(f"there is no run of {stage} with {file}", path=tracking.root, fix=fix)
+    return Path(run.info.artifact_uri) / file
 
 
 def artifact(tracking: TrackingConfig, run_id: str, path: str) -> Path:

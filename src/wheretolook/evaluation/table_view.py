@@ -9,12 +9,27 @@ import pandas as pd
 from wheretolook.evaluation.config import threshold_label
 from wheretolook.evaluation.paper_tables import KEYS
 from wheretolook.evaluation.scores import RELEASED_DIVISOR
+from wheretolook.tracking import TrackingConfig, newest_artifact
 
 if TYPE_CHECKING:
     from pandas.io.formats.style import Styler
 
 DIVIDED = f"/{RELEASED_DIVISOR}"
 """Name of the column of shares divided by the released code's constant."""
+
+
+def latest_paper_table(tracking: TrackingConfig, name: str, dataset: str = "") -> pd.DataFrame:
+    """A table of `wheretolook.evaluation.paper_tables.paper_tables` from the newest evaluation in a store.
+
+    Args:
+        tracking: the store.
+        name: "vs_others" or "input_variants".
+        dataset: that was evaluated; "" for any.
+
+    Raises:
+        MissingRunError: there is none.
+    """
+    return pd.read_csv(newest_artifact(tracking, "evaluate", f"table_{name}.csv", dataset))
 
 
 def paper_cells(table: pd.DataFrame) -> pd.DataFrame:

@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 from wheretolook.benchmark_runs import RUNTIMES_CSV, SCALING_CSV
 from wheretolook.dataset import Dataset, write_text
 from wheretolook.errors import ConfigError, MissingRunError, WhereToLookError
+from wheretolook.evaluation.calibration import read_calibration
 from wheretolook.evaluation.report import markdown_table, score_markdown
 from wheretolook.evaluation.results import CALIBRATION_CSV, SCORES_CSV
 from wheretolook.evaluation.scores import read_scores
@@ -131,8 +132,7 @@ def _top_n(source: Source) -> Figure:
 def _calibration(source: Source) -> Figure:
     from wheretolook.figures.calibration import calibration_figure
 
-    table = pd.read_csv(source.file(CALIBRATION_CSV), keep_default_na=False, na_values=[""])
-    return calibration_figure(table.assign(inputs=table["inputs"].fillna("")))
+    return calibration_figure(read_calibration(source.file(CALIBRATION_CSV)))
 
 
 def _training(source: Source) -> Figure:

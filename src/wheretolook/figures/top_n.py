@@ -68,6 +68,22 @@ def top_n_figure(scores: pd.DataFrame, methods: Sequence[Method] = ()) -> Figure
         return figure
 
 
+def top_n_table(scores: pd.DataFrame, methods: Sequence[Method] = ()) -> pd.DataFrame:
+    """What `top_n_figure` draws at the finest threshold, in %, and the oracle's: a row a method, columns by N."""
+    scores = main_rows(scores)
+    pooled, key = scores[scores["scene"] == ALL], threshold_keys(scores)[0]
+    names = {"normalized": "good ones, % of the oracle's", "any": "locations with one, %"}
+    columns = {}
+    for column, name in names.items():
+        for n in pooled["top_n"].unique():
+            rows = pooled[pooled["top_n"] == n].set_index(["method", "inputs"])
+            columns[name, f"N = {n}"] = 100 * rows[f"{column}_{key}"]
+    shown = [*_present(pooled, methods or SHOWN), ORACLE]
+    table = pd.DataFrame(columns).loc[shown]
+    table.index = pd.Index([method_style(*method).label for method in shown])
+    return table
+
+
 def _present(pooled: pd.DataFrame, methods: Sequence[Method]) -> list[Method]:
     """Those of the methods that a table has; the network without inputs stands for the first with any."""
     there = methods_of(pooled)

@@ -42,6 +42,26 @@ def histories(tracking: TrackingConfig, dataset: str) -> dict[str, pd.DataFrame]
     return dict(sorted(found.items()))
 
 
+def trained(tracking: TrackingConfig, dataset: str) -> pd.DataFrame:
+    """What the newest run of each variant trained on a dataset kept.
+
+    Returns:
+        A row a variant, the best first: `variant`, `epoch` whose weights were kept, and on the validation views
+        `average_precision`, `roc_auc` and `calibration_error`, NaN where the learner does not measure it.
+    """
+    found: dict[str, dict[str, Any]] = {}
+    for run in finished_runs(tracking, "train", params={"dataset": dataset}):
+        kept, variant = run.data.metrics, run.data.params["variant"]
+        measures = {name: kept.get(f"kept_val_{name}", float("nan")) for name in _MEASURES}
+        found.setdefault(variant, {"variant": variant, "epoch": kept.get("kept_epoch", float("nan")), **measures})
+    table = pd.DataFrame(list(found.values()), columns=["variant", "epoch", *_MEASURES])
+    table["epoch"] = table["epoch"].astype("Int64")
+    return table.sort_values("average_precision", ascending=False, ignore_index=True)
+
+
+_MEASURES = ("average_precision", "roc_auc", "calibration_error")
+
+
 def log_history(tracking: TrackingConfig, run_id: str, history: pd.DataFrame) -> None:
     """Log a history as training itself does: each epoch a step of the metrics; those that are not finite are left out.
 

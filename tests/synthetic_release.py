@@ -14,7 +14,13 @@ from wheretolook.evaluation.paper_tables import write_paper_tables
 from wheretolook.evaluation.scores import Method
 from wheretolook.release import ABOUT
 
-METHODS: tuple[Method, ...] = (("random", ""), ("bins", ""), ("fisher", "trace exact"), ("mlp", "2d+z"), ("mlp", "2d+3d"))
+METHODS: tuple[Method, ...] = (
+    ("random", ""),
+    ("bins", ""),
+    ("fisher", "trace exact"),
+    ("mlp", "2d+z"),
+    ("mlp", "2d+3d"),
+)
 
 
 def make_release(root: Path) -> Dataset:
@@ -57,9 +63,24 @@ def calibration() -> pd.DataFrame:
 
 
 def runtimes() -> pd.DataFrame:
-    about = {"locations": 648, "directions": 500, "landmarks": 24919, "device": "cpu", "name": "A Processor", "cores": 2}
+    about = {
+        "locations": 648,
+        "directions": 500,
+        "landmarks": 24919,
+        "device": "cpu",
+        "name": "A Processor",
+        "cores": 2,
+    }
     rows = [
-        {"what": what, "threads": 1, "median_s": 2.0, "min_s": 1.5, "max_s": 3.0, "repeats": 5, "projections_per_s": 4e9}
+        {
+            "what": what,
+            "threads": 1,
+            "median_s": 2.0,
+            "min_s": 1.5,
+            "max_s": 3.0,
+            "repeats": 5,
+            "projections_per_s": 4e9,
+        }
         for what in ("counts alone", "occlusion, counts, best 100", "NumPy twin, counts alone, scaled")
     ]
     return pd.DataFrame(rows).assign(**about)
@@ -80,7 +101,7 @@ def paths() -> pd.DataFrame:
                "times_forward_low", "times_forward_high", "times_forward_length", "length_m", "turn_deg_per_m",
                "promised")  # fmt: skip
     rows = [
-        {"scene": scene, "task": task, "method": method, **{name: 0.5 for name in columns}}
+        {"scene": scene, "task": task, "method": method, **dict.fromkeys(columns, 0.5)}
         for scene in ("scene-0", "all")
         for task in ("planned", "given")
         for method in ("forward", "bins")

@@ -57,9 +57,10 @@ def test_every_kind_of_result_becomes_a_run_once(logged: tuple[Dataset, Tracking
     pd.testing.assert_frame_equal(
         latest_scores(tracking, "release"), read_scores(release.root / "results" / "scores.csv")
     )
-    assert newest_artifact(tracking, "paths", "paths.csv").read_bytes() == (
-        release.root / "results" / "paths.csv"
-    ).read_bytes()
+    assert (
+        newest_artifact(tracking, "paths", "paths.csv").read_bytes()
+        == (release.root / "results" / "paths.csv").read_bytes()
+    )
 
 
 def test_rows_over_all_scenes_are_nested(logged: tuple[Dataset, TrackingConfig, ReleaseRuns]) -> None:

@@ -1,5 +1,7 @@
 # make demo   sets everything up and runs the whole line on the embedded default
 # make test   sets everything up and runs linter, type checker and tests
+# make ui     opens MLflow on the runs, those of the release included; make lab opens Jupyter on the notebooks
+# make html   runs all notebooks and writes them as pages, notebooks/html
 # Options: TORCH=cuda for the CUDA build of PyTorch, PYTHON=python3.12 for a certain interpreter. See environment.md.
 
 TORCH ?= cpu
@@ -15,7 +17,7 @@ READY := $(VENV)/ready-$(TORCH)
 .PHONY: demo test setup ui lab html clean help
 
 help:
-	@sed -n '1,3s/^# //p' Makefile
+	@sed -n '1,5s/^# //p' Makefile
 
 demo: $(READY)
 	@$(BIN)/wheretolook demo

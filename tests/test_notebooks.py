@@ -6,6 +6,7 @@ import base64
 import io
 import os
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import jupytext
@@ -66,7 +67,7 @@ def test_notebooks_say_what_they_show(path: Path) -> None:
     """Each opens with words, and no cell of code stands without some before it; none holds a pipeline."""
     cells = nbformat.read(path, as_version=4).cells
     assert cells[0].cell_type == "markdown" and cells[0].source.startswith("# ")
-    for before, cell in zip(cells, cells[1:], strict=False):
+    for before, cell in pairwise(cells):
         if cell.cell_type == "code":
             assert before.cell_type == "markdown", cell.source
             lines = [line for line in cell.source.splitlines() if line and not line.startswith(("import", "from", "%"))]

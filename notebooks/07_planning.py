@@ -22,6 +22,7 @@
 # %%
 # %matplotlib inline
 # %config InlineBackend.figure_formats = ["retina"]
+import pandas as pd
 from IPython.display import Markdown, display
 
 from wheretolook.figures.path_film import methods_figure, still_figure
@@ -29,36 +30,37 @@ from wheretolook.figures.paths import paths_figure
 from wheretolook.notebook import open_release, open_store
 from wheretolook.planning.config import PathConfig, PathsConfig, PlanConfig
 from wheretolook.planning.method_paths import path_views, plan_by_methods
-from wheretolook.planning.path_report import latest_paths, path_markdown
+from wheretolook.planning.path_report import path_markdown
 from wheretolook.showcase import open_showcase
+from wheretolook.tracking import newest_artifact
 
 # %% [markdown]
 # ## Three ways to look
 #
-# A path costs its length, its turns and, for every metre, what its views lack in score. RRT* looks for places and views
-# together; each method has its own map of scores, eight by eight by four voxels with 200 directions each (the network
-# on two cores takes most of this notebook's time).
+# A start and a goal in an apartment that the network has never seen. A path costs its length, its turns and, for every
+# metre, what its views lack in score.
 
 # %%
 release = open_release()
 showcase = open_showcase(release, "apartment-210")
 start, goal = [-1.83, 1.20, 1.55], [2.24, -2.12, 1.53]
 config = PlanConfig(grid=(8, 8, 4), directions=200, planner=PathConfig(time_s=6.0))
-paths = plan_by_methods(
-    ["forward", "fisher-trace-gp", "set"], start, goal, showcase.scene, release, showcase.space,
-    showcase.localization_map.occlusion, release.root / "weights" / "set.safetensors", config,
-)  # fmt: skip
 
 # %% [markdown]
-# From above, with an arrow for where the camera looks. Looking ahead it passes bare walls; the other two turn to where
-# there is something to recognize.
+# Each method has its own map of scores, eight by eight by four voxels with 200 directions each; the network's takes half
+# a minute on two cores. RRT* looks for a short path, and for places and views together; what costs least is improved.
 
 # %%
-views = {
-    method: path_views(path, showcase.localization_map, showcase.renderer if method == "set" else None)
-    for method, path in paths.items()
-}
-display(methods_figure(views, showcase.localization_map.landmarks.points))
+one, methods = showcase.localization_map, ["forward", "fisher-trace-gp", "set"]
+paths = plan_by_methods(methods, start, goal, showcase.scene, release, showcase.space, one.occlusion, config=config)
+
+# %% [markdown]
+# From above, with an arrow for where the camera looks. All three go nearly the same way. Looking ahead, the camera ends
+# facing a corner that was hardly mapped; the other two keep turning to where the landmarks are.
+
+# %%
+views = {name: path_views(path, one, showcase.renderer if name == "set" else None) for name, path in paths.items()}
+display(methods_figure(views, one.landmarks.points))
 
 # %% [markdown]
 # ## What the camera sees on its way
@@ -67,7 +69,7 @@ display(methods_figure(views, showcase.localization_map.landmarks.points))
 # `wheretolook plan --film gif`.
 
 # %%
-display(still_figure(views["set"], showcase.localization_map.landmarks.points, "apartment-210, set of landmarks"))
+display(still_figure(views["set"], one.landmarks.points, "apartment-210, set of landmarks"))
 
 # %% [markdown]
 # ## Does it help?
@@ -77,6 +79,6 @@ display(still_figure(views["set"], showcase.localization_map.landmarks.points, "
 # exactly and by the greedy rule of the Active Localization Benchmark (hatched).
 
 # %%
-summary = latest_paths(open_store(), release.name)
+summary = pd.read_csv(newest_artifact(open_store(release), "paths", "paths.csv", release.name))
 display(paths_figure(summary))
 display(Markdown(path_markdown(summary, PathsConfig())))

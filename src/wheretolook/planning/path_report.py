@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from wheretolook.evaluation.report import markdown_table
 from wheretolook.planning.config import PathsConfig
 from wheretolook.planning.path_comparison import FORWARD
 from wheretolook.table import LOCALIZED
+from wheretolook.tracking import NestedRun, TrackingConfig, log_nested, start_run
+
+PATHS_CSV, PATHS_MD, PATHS_PNG = "paths.csv", "paths.md", "paths.png"
+"""Files of a comparison, in `<dataset>/results/` and as artifacts of its run."""
 
 ALL = "all"
 """Name of the rows over all scenes."""
@@ -109,3 +116,56 @@ def _interval(draws: NDArray[Any]) -> tuple[float, float]:
     known = draws[np.isfinite(draws)]
     low, high = np.percentile(known, (2.5, 97.5)) if len(known) else (np.nan, np.nan)
     return float(low), float(high)
+
+
+def path_markdown(summary: pd.DataFrame, config: PathsConfig) -> str:
+    """The summary as Markdown, a table for each task."""
+    text = [f"Share of the views along paths that localize within {config.max_error_m:g} m and "
+            f"{config.max_error_deg:g}°, in % [95 % interval over pairs]."]  # fmt: skip
+    titles = {"planned": "Places and views planned", "given": "Views along a given path"}
+    for task, rows in summary.groupby("task", sort=False):
+        header = ["scene", "method", "localized", "times forward", "length / forward's", "turn, °/m", "not found"]
+        lines = [
+            [
+                str(row["scene"]), str(row["method"]),
+                f"{100 * row['localized']:.1f} [{100 * row['localized_low']:.1f}, {100 * row['localized_high']:.1f}]",
+                f"{row['times_forward']:.2f} [{row['times_forward_low']:.2f}, {row['times_forward_high']:.2f}]",
+                f"{row['times_forward_length']:.2f}", f"{row['turn_deg_per_m']:.0f}", f"{row['failures']}",
+            ]
+            for _, row in rows.iterrows()
+        ]  # fmt: skip
+        text += [f"{titles[str(task)]}:", markdown_table(header, lines)]
+    return "\n\n".join(text) + "\n"
+
+
+def log_paths(
+    params: Mapping[str, Any],
+    summary: pd.DataFrame,
+    results: Path,
+    tracking: TrackingConfig,
+    tags: Mapping[str, str] | None = None,
+) -> str:
+    """Log a comparison: a run with its files, and in it one for each task and method over all scenes.
+
+    Args:
+        params: of the comparison, such as the dataset.
+        summary: of `summarize_paths`.
+        results: folder of the files; those that are missing are left out.
+        tracking: where to log.
+        tags: further tags.
+
+    Returns:
+        Id of the run.
+    """
+    pooled = summary[summary["scene"] == summary["scene"].iloc[-1]]
+    with start_run(tracking, f"paths {params['dataset']}", "paths", params, tags=tags) as (client, run):
+        for name in (PATHS_CSV, PATHS_MD, PATHS_PNG):
+            if (results / name).is_file():
+                client.log_artifact(run, str(results / name))
+        nested = []
+        for row in pooled.to_dict("records"):
+            about = {**params, "task": row["task"], "method": row["method"]}
+            numbers = {str(key): float(value) for key, value in row.items() if key not in ("scene", "task", "method")}
+            nested.append(NestedRun(f"paths {row['task']} {row['method']}", about, numbers))
+        log_nested(tracking, run, "paths", nested, tags)
+    return run

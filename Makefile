@@ -1,5 +1,7 @@
 # make demo   sets everything up and runs the whole line on the embedded default
 # make test   sets everything up and runs linter, type checker and tests
+# make ui     opens MLflow on the runs, those of the release included; make lab opens Jupyter on the notebooks
+# make html   runs all notebooks and writes them as pages, notebooks/html
 # Options: TORCH=cuda for the CUDA build of PyTorch, PYTHON=python3.12 for a certain interpreter. See environment.md.
 
 TORCH ?= cpu
@@ -12,10 +14,10 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --progre
 CONSTRAINTS := configs/constraints.txt
 READY := $(VENV)/ready-$(TORCH)
 
-.PHONY: demo test setup ui notebooks clean help
+.PHONY: demo test setup ui lab html clean help
 
 help:
-	@sed -n '1,3s/^# //p' Makefile
+	@sed -n '1,5s/^# //p' Makefile
 
 demo: $(READY)
 	@$(BIN)/wheretolook demo
@@ -26,10 +28,15 @@ test: $(READY)
 	OMP_WAIT_POLICY=PASSIVE OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
 
 ui: $(READY)
+	@$(BIN)/wheretolook log-release
 	$(BIN)/mlflow ui --backend-store-uri sqlite:///mlruns/mlflow.db
 
-notebooks: $(READY)
+lab: $(READY)
+	@test -x $(BIN)/jupyter-lab || $(PIP) -c $(CONSTRAINTS) -e '.[notebooks]'
 	$(BIN)/jupyter lab notebooks
+
+html: $(READY)
+	OMP_WAIT_POLICY=PASSIVE $(BIN)/python -m wheretolook.notebook_html notebooks notebooks/html
 
 setup: $(READY)
 

@@ -76,11 +76,11 @@ grid = VoxelGrid.over(space.bounds, (10, 8, 4))
 views = build_viewpoint_map(scorer, grid, free_locations(grid, space), fibonacci_sphere(200), "fibonacci")
 
 # %% [markdown]
-# The best view of every free voxel of a layer, seen from above. Light ones localize. Where all are dark, no turn of the
-# camera helps: the walk of the mapping camera has never been there.
+# The best view of every free voxel of a layer, seen from above. Light ones will localize. Where all are dark, no turn
+# of the camera helps: the walk of the mapping camera has never been there.
 
 # %%
-layer = views.locations[abs(views.locations[:, 2] - 1.5) < 0.5]
+layer = views.locations[abs(views.locations[:, 2] - 1.5) < 0.33]
 best = views.best_many(layer)
 display(ranked_figure(dollhouse(mesh, cut_m=1.5), layer, views.directions[best.direction_id], best.score))
 

@@ -1,30 +1,55 @@
-"""The notebooks run as they are, on a store that a tiny evaluation has filled, and say so if there is none."""
+"""Notebooks are pairs without outputs, run as they are on a tiny release, and become small pages."""
 
 from __future__ import annotations
 
+import base64
+import io
 import os
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import jupytext
 import nbformat
+import numpy as np
 import pytest
 from nbclient import NotebookClient
+from PIL import Image
 
-from synthetic_dataset import make_dataset
-from wheretolook.evaluation import EvaluateConfig, evaluate
-from wheretolook.tracking import TrackingConfig
+from synthetic_release import make_release
+from wheretolook.notebook_html import main, notebook_page, with_palette
+from wheretolook.tracking import TrackingConfig, newest_run
 
-NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
+FOLDER = Path(__file__).parents[1] / "notebooks"
+NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
+OF_THE_RELEASE = {
+    "01_pipeline": 2,
+    "02_sampling": 3,
+    "03_inputs": 4,
+    "04_training": 6,
+    "07_planning": 3,
+    "09_your_own_map": 2,
+}
+"""Notebooks that need the release that ships, and how many pictures each draws."""
+
+FROM_RUNS = {"05_tables": 4, "06_top_n": 2, "08_runtimes": 1}
+"""Notebooks that need nothing but logged runs, and how many pictures they draw."""
 
 
-def execute(path: Path, monkeypatch: pytest.MonkeyPatch, store: Path) -> nbformat.NotebookNode:
-    """Run a notebook in its own folder with the interpreter and the import path of the tests."""
+@pytest.fixture(scope="module")
+def release(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a tiny release beside an empty store."""
+    return make_release(tmp_path_factory.mktemp("notebooks") / "data" / "release").root
+
+
+@pytest.fixture
+def environment(release: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """What kernels need to find that release and the import path of the tests; the store."""
+    store = release.parents[1] / "mlruns"
+    monkeypatch.setenv("WHERETOLOOK_RELEASE", str(release))
     monkeypatch.setenv("WHERETOLOOK_MLRUNS", str(store))
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(entry for entry in sys.path if entry))
-    notebook = nbformat.read(path, as_version=4)
-    NotebookClient(notebook, timeout=120, resources={"metadata": {"path": str(path.parent)}}).execute()
-    return notebook
+    return store
 
 
 def outputs(notebook: nbformat.NotebookNode, mime: str) -> list[str]:
@@ -32,8 +57,9 @@ def outputs(notebook: nbformat.NotebookNode, mime: str) -> list[str]:
     return [entry[mime] for entry in data if mime in entry]
 
 
-def test_there_are_notebooks() -> None:
-    assert [path.stem for path in NOTEBOOKS] == ["01_score_table_and_lattices"]
+def test_each_script_has_its_notebook() -> None:
+    assert {*FROM_RUNS, *OF_THE_RELEASE} == {path.stem for path in NOTEBOOKS}
+    assert {path.stem for path in FOLDER.glob("*.py")} == {path.stem for path in NOTEBOOKS}
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
@@ -41,23 +67,85 @@ def test_notebooks_are_stripped_and_paired(path: Path) -> None:
     notebook = nbformat.read(path, as_version=4)
     assert not any(cell.get("outputs") or cell.get("execution_count") for cell in notebook.cells)
     text = jupytext.read(path.with_suffix(".py"))
-    assert [cell.source for cell in notebook.cells] == [cell.source for cell in text.cells]
+    assert [(cell.cell_type, cell.source) for cell in notebook.cells] == [
+        (cell.cell_type, cell.source) for cell in text.cells
+    ]
 
 
-def test_score_notebook_draws_the_newest_evaluation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    dataset = make_dataset(tmp_path / "tiny", ("test",), n_locations=6, n_directions=10)
-    store = tmp_path / "mlruns"
-    config = EvaluateConfig(methods=("random", "bins"), resamples=50)
-    evaluate(dataset, config, TrackingConfig(str(store)), progress=False)
-    notebook = execute(NOTEBOOKS[0], monkeypatch, store)
-    assert len(outputs(notebook, "image/png")) == 2
-    (table,) = outputs(notebook, "text/markdown")
-    assert (dataset.root / "results" / "scores.md").read_text().split("\n")[2:] == table.split("\n")[2:]
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_notebooks_say_what_they_show(path: Path) -> None:
+    """Each opens with words, and no cell of code stands without some before it; none holds a pipeline."""
+    cells = nbformat.read(path, as_version=4).cells
+    assert cells[0].cell_type == "markdown" and cells[0].source.startswith("# ")
+    for before, cell in pairwise(cells):
+        if cell.cell_type == "code":
+            assert before.cell_type == "markdown", cell.source
+            lines = [line for line in cell.source.splitlines() if line and not line.startswith(("import", "from", "%"))]
+            assert len(lines) <= 6, cell.source
 
 
-def test_score_notebook_says_what_to_run_without_a_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    notebook = execute(NOTEBOOKS[0], monkeypatch, tmp_path / "nothing")
-    assert len(outputs(notebook, "image/png")) == 1
-    (message,) = outputs(notebook, "text/markdown")
-    assert "make demo" in message
-    assert not (tmp_path / "nothing").exists()
+@pytest.mark.parametrize("name", FROM_RUNS)
+def test_notebooks_of_runs_draw_them(name: str, environment: Path) -> None:
+    notebook = nbformat.read(FOLDER / f"{name}.ipynb", as_version=4)
+    NotebookClient(notebook, timeout=120, resources={"metadata": {"path": str(FOLDER)}}).execute()
+    assert len(outputs(notebook, "image/png")) == FROM_RUNS[name]
+    assert newest_run(TrackingConfig(str(environment)), "evaluate", params={"dataset": "release"}) is not None
+    if name == "05_tables":
+        assert sum("68.7" in text for text in outputs(notebook, "text/html")) == 1
+        assert any("Localization score" in text for text in outputs(notebook, "text/markdown"))
+
+
+@pytest.mark.parametrize("name", OF_THE_RELEASE)
+def test_notebooks_of_the_release_run_from_top_to_bottom(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("WHERETOLOOK_MLRUNS", str(tmp_path / "mlruns"))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(entry for entry in sys.path if entry))
+    notebook = nbformat.read(FOLDER / f"{name}.ipynb", as_version=4)
+    NotebookClient(notebook, timeout=180, resources={"metadata": {"path": str(FOLDER)}}).execute()
+    assert len(outputs(notebook, "image/png")) == OF_THE_RELEASE[name]
+    if name == "04_training":
+        assert any("fully connected 4500 × 300" in text for text in outputs(notebook, "text/html"))
+
+
+def test_pages_are_small_and_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(entry for entry in sys.path if entry))
+    folder = tmp_path / "notebooks"
+    folder.mkdir()
+    (folder / "01_one.py").write_text(
+        "# %% [markdown]\n# # One & all\n# ![a picture](images/one.png), [elsewhere](https://example.org)\n\n"
+        "# %%\n# %matplotlib inline\nimport sys\nfrom IPython.display import display\n"
+        "from matplotlib.figure import Figure\nprint('1 < 2')\nprint('std' + 'error', file=sys.stderr)\n"
+        "figure = Figure()\nfigure.subplots().plot([0, 1])\ndisplay(figure)\n"
+    )
+    (folder / "02_broken.py").write_text("# %%\nraise ValueError('no such thing')\n")
+    assert main([str(folder), str(tmp_path / "html")]) == 1
+    assert "02_broken: ValueError: no such thing" in capsys.readouterr().err
+    (page,) = (tmp_path / "html").iterdir()
+    text = page.read_text()
+    assert "<h1>One &amp; all</h1>" in text and "1 &lt; 2" in text and "stderror" not in text
+    assert 'src="../images/one.png"' in text and 'href="https://example.org"' in text
+    assert text.count("data:image/png;base64,") == 1 and len(text) < 40_000
+    assert 'href="02_broken.html"' in text
+
+
+def test_pictures_keep_their_colours_in_less_space() -> None:
+    pixels = np.full((200, 300, 4), 255, np.uint8)
+    pixels[50:100, 50:200] = (0, 114, 178, 255)
+    pixels[:10] = 0  # transparent
+    stream = io.BytesIO()
+    Image.fromarray(pixels).save(stream, "PNG", compress_level=0)
+    small = base64.b64decode(with_palette(base64.b64encode(stream.getvalue()).decode()))
+    assert len(small) < len(stream.getvalue()) / 20
+    with Image.open(io.BytesIO(small)) as image:
+        assert image.convert("RGB").getpixel((60, 60)) == (0, 114, 178)
+        assert image.convert("RGB").getpixel((60, 5)) == (255, 255, 255)
+
+
+def test_a_page_shows_tables_once() -> None:
+    table = nbformat.v4.new_output("display_data", {"text/html": "<b>told</b>", "text/plain": "told"})
+    cells = [nbformat.v4.new_code_cell("x", outputs=[table])]
+    page = notebook_page(nbformat.v4.new_notebook(cells=cells), "a page")
+    assert page.count("<b>told</b>") == page.count("told") == 1 and "<title>a page</title>" in page

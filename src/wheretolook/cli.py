@@ -63,8 +63,18 @@ STAGES = {
         "Make a compact copy, data/release; given that copy and weights trained on it, evaluate and write its card.",
         ("evaluate", "occlusion", "tracking"),
     ),
+    "log-release": (
+        "log_release",
+        "Log what a release ships as MLflow runs, as if it had been made here; once.",
+        ("tracking",),
+    ),
+    "figures": (
+        "figures",
+        "Draw every figure and table of the paper, and others, from logged runs.",
+        ("figures", "tracking"),
+    ),
 }
-"""Sub-command: function in `wheretolook.stages`, what it does, groups of settings it reads."""
+"""Sub-command: function in `wheretolook.stages` or `store_stages`, what it does, groups of settings it reads."""
 
 DEMO = "Run all stages on the embedded default and draw the score figure."
 
@@ -83,6 +93,7 @@ stages, in order; each reads what the one before it left in <data>/<name>/
   wheretolook label --config configs/paper.yaml --engine ray     on a Ray cluster; the default is local
   wheretolook evaluate --list-methods    what can be compared
   wheretolook viewpoint-map --config configs/demo.yaml --scene apartment-000 --out room.map
+  wheretolook figures --list             figures and tables of the paper; `wheretolook figures` draws them
   wheretolook --version
 """
 
@@ -140,10 +151,15 @@ def _run(command: str, arguments: list[str]) -> int:
     if command == "evaluate" and "--list-methods" in arguments:
         print(_method_list())
         return 0
+    if command == "figures" and "--list" in arguments:
+        from wheretolook.figures.catalog import catalog_text
+
+        print(catalog_text())
+        return 0
     experiment = parse_experiment(command, arguments)
     if experiment is None:
         return 0
-    from wheretolook import stages
+    from wheretolook import stages, store_stages
 
     if command == "demo":
         from wheretolook.demo import run_demo
@@ -151,7 +167,8 @@ def _run(command: str, arguments: list[str]) -> int:
         run_demo(experiment)
     else:
         start = time.monotonic()
-        getattr(stages, STAGES[command][0])(experiment)
+        name = STAGES[command][0]
+        getattr(store_stages if hasattr(store_stages, name) else stages, name)(experiment)
         print(f"done in {time.monotonic() - start:.0f} s: {experiment.root}")
     return 0
 
@@ -167,8 +184,9 @@ def parse_experiment(command: str, arguments: list[str]) -> Experiment | None:
     short = {**_SHORT, **_SHORT_OF.get(command, {})}
     arguments = [short.get(name, name) + equals + value for name, equals, value in
                  (argument.partition("=") for argument in arguments)]  # fmt: skip
-    if command == "demo" and not any(argument.startswith("--config") for argument in arguments):
-        arguments = ["--config", str(_default_config()), *arguments]
+    chosen = any(argument.startswith("--config") for argument in arguments)
+    if command in _DEFAULT_CONFIG and not chosen and not {"-h", "--help"} & {*arguments}:
+        arguments = ["--config", str(_default_config(command)), *arguments]
     parser = _parser(command)
     if "-h" in arguments or "--help" in arguments:
         print(_help(parser, command))
@@ -249,12 +267,35 @@ _SHORT = {"--engine": "--label.engine", "--images": "--map.photographs.images"}
 
 _SHORT_OF = {
     "viewpoint-map": {f"--{name}": f"--viewpoint_map.{name}" for name in ("scene", "method", "weights", "out")},
+    "figures": {f"--{name}": f"--figures.{name}" for name in ("out", "only", "kinds")},
     "plan": {f"--{name}": f"--plan.{name}" for name in ("scene", "start", "goal", "method", "weights", "out", "film")},
 }
 """The same, of one sub-command alone, since others have flags of such names in their own groups."""
 
+_DEFAULT_CONFIG = {"demo": "demo", "log-release": "release", "figures": "release"}
+"""Sub-commands that need no --config: names of files in configs/."""
+
 _MORE_HELP = {
     "evaluate": "\nWhat evaluate.methods may name: wheretolook evaluate --list-methods\n",
+    "log-release": """
+A release ships its tables, not an MLflow store. This logs them into one, in seconds: an evaluation with a nested run
+for each method x inputs x N x occlusion x candidates, a train run for each weights record, the comparison of learners,
+planned paths and measured times. Done again, it adds only what is new; `make ui` does it first. Without --config it is
+configs/release.yaml.
+
+  wheretolook log-release                               into mlruns/
+  wheretolook log-release --tracking.folder elsewhere
+""",
+    "figures": """
+Each file says which runs it was drawn from, and is attached to them as an artifact under figures/. Where a run is
+missing, the command that makes it is named, the others are drawn, and the exit code is 2. --out, --only and --kinds
+stand for the settings of figures. Without --config it is configs/release.yaml, whose runs are logged first.
+
+  wheretolook figures --list                            what there is, of the paper and beyond
+  wheretolook figures --out figures                     everything, as PNG and PDF, tables as CSV, Markdown and TeX
+  wheretolook figures --only '[top_n, runtimes]' --kinds '[svg]'
+  wheretolook figures --config configs/demo.yaml        from the runs of the demo
+""",
     "viewpoint-map": """
 Reads a scene's map and its mesh, as the scenes and map stages leave them; a scene of photographs has no mesh, and is
 free where scenes.mapped_space says. --scene, --method, --weights and --out stand for the settings of viewpoint_map.
@@ -291,11 +332,11 @@ def _causes(error: BaseException) -> Iterator[BaseException]:
         cause = cause.__cause__ or cause.__context__
 
 
-def _default_config() -> Path:
-    path = Path("configs/demo.yaml")
+def _default_config(command: str) -> Path:
+    path = Path(f"configs/{_DEFAULT_CONFIG[command]}.yaml")
     if not path.is_file():
         raise ConfigError(
-            "the demo's configuration is not here", path=path, fix="Run in the project's folder, or give --config."
+            "the default configuration is not here", path=path, fix="Run in the project's folder, or give --config."
         )
     return path
 

@@ -10,6 +10,7 @@ from typing import Literal
 
 from wheretolook.errors import ConfigError
 from wheretolook.evaluation.config import EvaluateConfig
+from wheretolook.figures.config import FiguresConfig
 from wheretolook.geometry import PinholeCamera
 from wheretolook.labelling.config import LabelConfig
 from wheretolook.learning.config import TrainConfig
@@ -108,6 +109,7 @@ class Experiment:
         viewpoint_map: what planners query.
         plan: one path to plan.
         paths: planned paths of several methods, to be compared.
+        figures: of the paper and others, drawn from runs.
         tracking: where MLflow keeps its runs.
     """
 
@@ -126,6 +128,7 @@ class Experiment:
     viewpoint_map: ViewpointMapConfig = field(default_factory=ViewpointMapConfig)
     plan: PlanConfig = field(default_factory=PlanConfig)
     paths: PathsConfig = field(default_factory=PathsConfig)
+    figures: FiguresConfig = field(default_factory=FiguresConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
 
     def __post_init__(self) -> None:

@@ -59,5 +59,9 @@ class MapFormatError(WhereToLookError):
     """A saved viewpoint map is missing, damaged or of another version."""
 
 
+class MissingRunError(WhereToLookError):
+    """A figure needs a run that the tracking store does not have."""
+
+
 class PlanningError(WhereToLookError):
     """A path leaves the viewpoint map, or cannot be looked along within the limits."""

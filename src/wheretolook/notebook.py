@@ -34,3 +34,19 @@ def find_store() -> TrackingConfig:
     folders = [folder / "mlruns" for folder in (here, *here.parents)]
     nearest = next((folder for folder in folders if folder.is_dir()), folders[0])
     return TrackingConfig(named or str(nearest))
+
+
+def open_store(release: Dataset | None = None) -> TrackingConfig:
+    """The store of `find_store` with the runs of a release in it: logged now if it lacks them, which takes seconds.
+
+    Args:
+        release: that of `open_release` if not given.
+
+    Raises:
+        ConfigError: there is no release. TableError: it is damaged.
+    """
+    from wheretolook.release_runs import log_release
+
+    tracking = find_store()
+    log_release(open_release() if release is None else release, tracking, print)
+    return tracking

@@ -191,7 +191,8 @@ def sizes(root: Path, weights: bool = True) -> dict[str, int]:
     parts = dict.fromkeys((*kinds.values(), "weights", "text"), 0)
     for path in root.rglob("*"):
         shelved = path.suffix == ".safetensors" and (path.parent.name == SHELF or not weights)
-        if path.is_file() and not shelved and path.suffix not in (".png", ".partial"):
+        drawn = path.suffix in (".png", ".partial") or path.parent == root / "results" / "figures"
+        if path.is_file() and not shelved and not drawn:
             parts["weights" if path.suffix == ".safetensors" else kinds.get(path.name, "text")] += path.stat().st_size
     if sum(parts.values()) >= MAX_BYTES:
         raise StorageError(

@@ -51,6 +51,7 @@ class Showcase:
     Attributes:
         scene: its files.
         mesh: metres, z up.
+        space: where a camera can be.
         localization_map: with the mesh's occlusion, so that it answers for any location.
         table: its viewpoints.
         grid: of its locations.
@@ -61,6 +62,7 @@ class Showcase:
 
     scene: SceneFolder
     mesh: TexturedMesh
+    space: FreeSpace
     localization_map: LocalizationMap
     table: pd.DataFrame
     grid: VoxelGrid
@@ -181,7 +183,7 @@ def open_showcase(dataset: Dataset, name: str | None = None, device: str = "cpu"
     directions = direction_lattice(sampling.directions, sampling.lattice)
     localization_map = LocalizationMap(landmarks, dataset.camera, occlusion, device, scene.mapping_poses())
     return Showcase(
-        scene, mesh, localization_map, scene.read_table(), grid, free_locations(grid, space), directions,
+        scene, mesh, space, localization_map, scene.read_table(), grid, free_locations(grid, space), directions,
         sampling.keep or SampleConfig().keep,
     )  # fmt: skip
 

@@ -376,6 +376,7 @@ def release(experiment: Experiment, say: Say = print, tick: Tick = lambda work: 
         ConfigError: another dataset lies where the copy belongs.
     """
     from wheretolook.evaluation.results import SCORES_CSV, VARIANTS_CSV
+    from wheretolook.learning.runs import keep_histories
     from wheretolook.learning.weights import weights_kind
     from wheretolook.release import (
         choose_weights_to_ship,
@@ -409,6 +410,7 @@ def release(experiment: Experiment, say: Say = print, tick: Tick = lambda work: 
     compared = ", ".join(f"{name} {value:.4f}" for name, value in choice.precision.items())
     say(f"validation average precision: {compared}")
     say(f"the paper's network that ships, in half precision: {choice.network}; the best of all: {choice.best}")
+    keep_histories(dataset, experiment.tracking)
     sizes(dataset.root)  # too large? then before the evaluation
     evaluate(on_cpu, say, tick)
     say(f"the card -> {write_card(dataset)}")

@@ -4,6 +4,7 @@
     python tests/benchmarks/bench_visibility.py --device cuda --out h200.json
     python tests/benchmarks/bench_visibility.py --scaling --out scaling.json
     python tests/benchmarks/bench_visibility.py --draw laptop.json h200.json --figures FOLDER --log
+    python tests/benchmarks/bench_visibility.py --draw FOLDER/runtimes.csv h200.json --figures FOLDER  # adds one
 
 The size is the paper's (Sec. "Runtimes"): 648 locations, 24,919 landmarks and the 500 directions of its released
 configuration, in a synthetic apartment whose mesh is cut into at least 250,000 triangles. Nothing here fails on time.
@@ -307,34 +308,33 @@ def bounded(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
     return [row]
 
 
+def rows_of(file: Path, part: str) -> list[dict[str, Any]]:
+    """Rows of results of an earlier run, or of a table made of such."""
+    if file.suffix == ".csv":
+        return pd.read_csv(file).to_dict("records") if part == "paper_size" else []
+    result = json.loads(file.read_text())
+    return [{**row, **result["machine"]} for row in result.get(part, [])]
+
+
 def draw(args: argparse.Namespace) -> None:
+    from wheretolook.benchmark_runs import RUNTIMES_CSV, SCALING_CSV, log_runtimes
     from wheretolook.figures.runtimes import runtime_figure, scaling_figure
     from wheretolook.figures.style import save_figure
+    from wheretolook.tracking import TrackingConfig
 
-    results = [json.loads(Path(file).read_text()) for file in args.draw]
-    sizes = pd.DataFrame([{**row, **result["machine"]} for result in results for row in result.get("paper_size", [])])
-    growth = pd.DataFrame([{**row, **result["machine"]} for result in results for row in result.get("scaling", [])])
+    sizes, growth = (
+        pd.DataFrame([row for file in args.draw for row in rows_of(Path(file), part)])
+        for part in ("paper_size", "scaling")
+    )
     folder = Path(args.figures)
     folder.mkdir(parents=True, exist_ok=True)
-    figures = {"runtimes.png": runtime_figure(sizes)}
+    save_figure(runtime_figure(sizes), folder / "runtimes.png")
+    sizes.to_csv(folder / RUNTIMES_CSV, index=False, float_format="%.6g", lineterminator="\n")
     if len(growth):
-        figures["visibility-scaling.png"] = scaling_figure(growth)
-    for name, figure in figures.items():
-        save_figure(figure, folder / name)
+        save_figure(scaling_figure(growth), folder / "visibility-scaling.png")
+        growth.to_csv(folder / SCALING_CSV, index=False, float_format="%.6g", lineterminator="\n")
     if args.log:
-        from wheretolook.tracking import TrackingConfig, log, start_run
-
-        tables = {"runtimes.csv": sizes, "scaling.csv": growth}
-        metrics = {}
-        for row in sizes.dropna(subset="median_s").to_dict("records"):
-            name = f"{row['what']} {row['device'].split(':')[0]} {row['threads']} threads s"
-            metrics["".join(letter for letter in name if letter.isalnum() or letter == " ")] = row["median_s"]
-        with start_run(TrackingConfig(), "visibility runtimes", "benchmark") as (client, run):
-            log(client, run, metrics=metrics)
-            for name, table in tables.items():
-                table.to_csv(folder / name, index=False)
-            for name in (*figures, *tables):
-                client.log_artifact(run, str(folder / name))
+        log_runtimes(TrackingConfig(), sizes, growth)
 
 
 def main() -> None:
@@ -353,8 +353,13 @@ def main() -> None:
     parser.add_argument("--bounded", action="store_true", help="2 million landmarks x 5,000 locations, too")
     parser.add_argument("--memory-gb", type=float, default=2.0, help="bound on the blocks in work")
     parser.add_argument("--out", help="write the results to this JSON file")
-    parser.add_argument("--draw", nargs="+", metavar="JSON", help="draw results of earlier runs instead of measuring")
-    parser.add_argument("--figures", default=".", help="folder for the figures")
+    parser.add_argument(
+        "--draw",
+        nargs="+",
+        metavar="JSON",
+        help="draw earlier results, or a table of such",
+    )
+    parser.add_argument("--figures", default=".", help="folder for figures and tables")
     parser.add_argument("--log", action="store_true", help="log tables and figures to MLflow")
     args = parser.parse_args()
     if args.draw:

@@ -56,6 +56,13 @@ def test_training_figure_marks_the_best_epoch(tmp_path: Path) -> None:
     _assert_draws(figure, tmp_path)
 
 
+def test_training_figure_names_learners_as_other_figures_do() -> None:
+    history = pd.DataFrame({name: [0.5, 0.6] for name in (
+        "train_bce", "val_bce", "train_average_precision", "val_average_precision")}).assign(epoch=[0, 1])  # fmt: skip
+    labels = training_figure({"set": history}).axes[1].get_legend_handles_labels()[1]
+    assert labels == ["set of landmarks: training", "set of landmarks: validation"]
+
+
 def test_sphere_figure_stars_the_best_direction(tmp_path: Path) -> None:
     directions, best = fibonacci_sphere(100), 37
     scores = {("bins", ""): -np.abs(np.arange(100) - best).astype(float), ("mlp", "2d"): np.arange(100.0)}

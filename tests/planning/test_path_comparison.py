@@ -16,6 +16,7 @@ from wheretolook.geometry import camera_centers
 from wheretolook.planning.config import PathConfig, PathsConfig
 from wheretolook.planning.path_comparison import ComparedPaths, compare_paths, draw_pairs, shares_below
 from wheretolook.planning.path_report import summarize_paths
+from wheretolook.planning.ways import Ways
 from wheretolook.scenes.free_space import FreeSpace
 from wheretolook.table import poses
 
@@ -51,6 +52,33 @@ def test_pairs_are_far_apart_and_free(space: FreeSpace) -> None:
     np.testing.assert_array_equal(draw_pairs(space, replace(QUICK, pairs=3)), pairs)
     with pytest.raises(SceneError, match=r"found only 0 .*min_distance_m"):
         draw_pairs(space, replace(QUICK, min_distance_m=50.0))
+
+
+def test_ways_lead_round_walls_but_not_through_them() -> None:
+    class Rooms:
+        """Two rooms, and a door between them or not."""
+
+        bounds = np.array([[0.0, 0.0, 0.0], [4.0, 2.0, 1.0]])
+
+        def __init__(self, door: bool) -> None:
+            self.door = door
+
+        def is_free(self, points):
+            x, y, z = np.atleast_2d(points).T
+            wall = (np.abs(x - 2) < 0.2) & ~(self.door & (y > 1))
+            return (x > 0) & (x < 4) & (y > 0) & (y < 2) & (z > 0) & (z < 1) & ~wall
+
+        def segments_are_free(self, a, b):
+            a, b = np.atleast_2d(a), np.atleast_2d(b)
+            t = np.linspace(0, 1, 50)[:, None, None]
+            points = a * (1 - t) + b * t
+            return self.is_free(points.reshape(-1, 3)).reshape(points.shape[:2]).all(0)
+
+    left, right = (0.5, 0.5, 0.5), (3.5, 0.5, 0.5)
+    assert Ways(Rooms(True), 0.25).joins(left, right)
+    closed = Ways(Rooms(False), 0.25)
+    assert closed.joins(left, (1.5, 1.5, 0.5)) and not closed.joins(left, right)
+    assert not closed.joins(left, (2.0, 0.5, 0.5))  # in the wall
 
 
 def test_scores_become_ranks() -> None:
@@ -105,13 +133,37 @@ def test_shares_by_hand() -> None:
     table = summarize_paths(paths, views, QUICK).set_index("method")
     assert table.loc["forward", "localized"] == pytest.approx(3 / 10)
     assert table.loc["set", "localized"] == pytest.approx(5 / 10)
-    assert table.loc["set", "times_forward"] == pytest.approx(5 / 3)
+    of_both = paths[paths["planned"]].groupby("pair")["method"].nunique() == 2
+    good = views[views["error_m"] < 0.25].groupby(["method", "pair"]).size().unstack(fill_value=0)
+    size = views.groupby(["method", "pair"]).size().unstack(fill_value=0)
+    shares = good.loc[:, of_both].sum(1) / size.loc[:, of_both].sum(1)  # pairs that both planned
+    assert table.loc["set", "times_forward"] == pytest.approx(shares["set"] / shares["forward"])
     assert table.loc["set", "times_forward_length"] == pytest.approx(6 / 5)  # over the pairs that both planned
     assert table.loc["set", "failures"] == 1 and table.loc["set", "turn_deg_per_m"] == pytest.approx(10)
     assert table.loc["forward", "times_forward_low"] == table.loc["forward", "times_forward_high"] == 1
     assert table.loc["set", "localized_low"] < 0.5 < table.loc["set", "localized_high"] <= 0.8
     strict = summarize_paths(paths, views, replace(QUICK, max_error_deg=0.5)).set_index("method")
     assert strict.loc["set", "localized"] == 0
+
+
+def test_what_failed_leaves_the_ratio_alone() -> None:
+    paths, views = _labelled()
+    some = {("forward", 0): (9, 10), ("forward", 1): (0, 10), ("forward", 2): (0, 10), ("set", 0): (9, 10)}
+    paths = pd.DataFrame([
+        {"scene": "a", "task": "planned", "method": method, "pair": pair, "planned": (method, pair) in some,
+         "length_m": 2.0 if (method, pair) in some else np.nan, "turn_deg": np.nan, "n_views": 10, "promised": np.nan}
+        for method in ("forward", "set") for pair in range(3)
+    ])  # fmt: skip
+    views = pd.DataFrame([
+        {"scene": "a", "task": "planned", "method": method, "pair": pair, "status": "localized",
+         "error_m": 0.1 if number < good else 9.0, "error_deg": 0.1}
+        for (method, pair), (good, n) in some.items() for number in range(n)
+    ])  # fmt: skip
+    table = summarize_paths(paths, views, QUICK).set_index("method")
+    assert table.loc["set", "failures"] == 2 and table.loc["set", "times_forward"] == pytest.approx(1)
+    assert table.loc["set", "times_forward_low"] == table.loc["set", "times_forward_high"] == pytest.approx(1)
+    nothing = summarize_paths(paths, views.assign(error_m=9.0), QUICK).set_index("method")
+    assert np.isnan(nothing.loc["set", "times_forward"]) and nothing.loc["set", "localized"] == 0
 
 
 def test_the_figure_shows_every_share() -> None:

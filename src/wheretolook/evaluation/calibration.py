@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -126,3 +127,9 @@ def calibration_rows(probability: Float, good: Good, temperature: float) -> pd.D
 
 def _mean_loss(logits: Float, good: Good) -> float:
     return float(np.mean(np.logaddexp(0, logits) - np.where(good, logits, 0.0)))
+
+
+def read_calibration(path: Path) -> pd.DataFrame:
+    """Reliability curves from the CSV file that the evaluate stage writes. Methods without inputs have ""."""
+    table = pd.read_csv(path, keep_default_na=False, na_values=[""])
+    return table.assign(inputs=table["inputs"].fillna(""))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -22,7 +22,7 @@ from wheretolook.evaluation.views import CandidateSet
 from wheretolook.fisher.soft_visibility import GaussianProcessVisibility, cone_half_angle
 from wheretolook.geometry import Float
 from wheretolook.table import fingerprint
-from wheretolook.tracking import TrackingConfig, artifact, log, newest_run, start_run
+from wheretolook.tracking import NestedRun, TrackingConfig, artifact, log, newest_run, start_run
 from wheretolook.visibility.config import OcclusionConfig
 
 SCORES_CSV, SCORES_MD, SCORES_PNG, OCCLUSION_PNG = "scores.csv", "scores.md", "scores.png", "occlusion.png"
@@ -125,17 +125,14 @@ def log_evaluation(
         occlusion: settings of occlusion models, logged if the configuration names any.
         results: folder of the files.
     """
-    params: dict[str, Any] = {
-        "dataset": dataset.name,
-        "dataset_fingerprint": Dataset(dataset.root, dataset.camera, tuple(scenes)).fingerprint(),
-        "scenes": " ".join(scene.name for scene in scenes),
+    params = {
+        **evaluation_params(dataset, scenes, weights),
         **{name: value for name, value in asdict(config).items() if name not in ("weights", "methods")},
         **(
             {f"occlusion_{name}": value for name, value in asdict(occlusion).items() if name != "model"}
             if config.occlusions
             else {}
         ),
-        "weights": " ".join(f"{path.stem}:{fingerprint(path)}" for path in weights),
     }
     if any(name.startswith("fisher") and "gp" in name for name in config.methods):
         process = GaussianProcessVisibility.fitted(cone_half_angle(dataset.camera))
@@ -143,35 +140,69 @@ def log_evaluation(
         params["gp_held_out_rmse"] = round(process.held_out_error(), 4)
     positives = float(views.good[:, 0].mean())
     metrics = {"n_locations": views.n_locations, "n_views": len(views.good), "positives": positives}
-    tags = {"dataset": dataset.name}
     with (
         TemporaryDirectory() as folder,
-        start_run(tracking, f"evaluate {dataset.name}", "evaluate", params, tags=tags) as (client, run),
-    ):
+        start_run(
+            tracking, f"evaluate {dataset.name}", "evaluate", params, tags={"dataset": dataset.name}
+        ) as (client, run),
+    ):  # fmt: skip
         log(client, run, metrics=metrics)
         for file in results.iterdir():
             if file.is_file():
                 client.log_artifact(run, str(file))
         for one in scored:
-            by_scene = one.table[one.table["scene"] != ALL]
-            for row in one.table[one.table["scene"] == ALL].to_dict("records"):
-                named = ("method", "inputs", "occlusion", "candidates", "top_n")
-                seen = (row["occlusion"], *([row["candidates"]] if row["candidates"] != ALL else []))
-                shown = (row["method"], row["inputs"], f"best {row['top_n']}", f"({', '.join(seen)})")
-                name = " ".join(part for part in shown if part)
-                child_params = {**params, **{key: row[key] for key in named}}
-                texts = (*named, "scene", "reference")
-                numbers = {str(key): float(value) for key, value in row.items() if key not in texts}
-                same = by_scene[["method", "inputs", "top_n"]] == [row[key] for key in ("method", "inputs", "top_n")]
-                for scene in by_scene[same.all(axis=1)].to_dict("records"):
-                    for key, value in scene.items():
-                        if str(key).startswith(("good_", "n_views", "normalized_", "regret_")):
-                            numbers[f"{key}/{scene['scene']}"] = float(value)
+            for row, nested in runs_of_rows(one.table, params):
                 chosen = _location_table(one, (row["method"], row["inputs"]), row["top_n"], scenes, config)
                 chosen.to_parquet(Path(folder) / LOCATIONS_PARQUET, index=False)
-                with start_run(tracking, name, "evaluate", child_params, parent=run) as (_, child):
-                    log(client, child, metrics=numbers)
+                with start_run(tracking, nested.name, "evaluate", nested.params, parent=run) as (_, child):
+                    log(client, child, metrics=nested.metrics)
                     client.log_artifact(child, str(Path(folder) / LOCATIONS_PARQUET))
+
+
+def evaluation_params(dataset: Dataset, scenes: Sequence[SceneFolder], weights: Iterable[Path]) -> dict[str, Any]:
+    """Parameters of an evaluation's run that tell what was evaluated.
+
+    Args:
+        dataset: evaluated.
+        scenes: those of the split.
+        weights: files of methods that have learnt.
+    """
+    return {
+        "dataset": dataset.name,
+        "dataset_fingerprint": Dataset(dataset.root, dataset.camera, tuple(scenes)).fingerprint(),
+        "scenes": " ".join(scene.name for scene in scenes),
+        "weights": " ".join(f"{path.stem}:{fingerprint(path)}" for path in weights),
+    }
+
+
+_NAMED = ("method", "inputs", "occlusion", "candidates", "top_n")
+"""What names a row of a score table, beside the scene."""
+
+_BY_SCENE = ("good_", "n_views", "normalized_", "regret_")
+"""Beginnings of the columns whose values in each scene are logged as well."""
+
+
+def runs_of_rows(table: pd.DataFrame, params: Mapping[str, Any]) -> Iterator[tuple[dict[str, Any], NestedRun]]:
+    """Each row over all scenes of score tables, with the run nested in the evaluation's that it is logged as.
+
+    Args:
+        table: score tables, one below the other, with columns `occlusion` and `candidates`.
+        params: of the evaluation; the row's own are added.
+    """
+    by_row: dict[tuple[Any, ...], list[dict[Any, Any]]] = {}
+    for record in table[table["scene"] != ALL].to_dict("records"):
+        by_row.setdefault(tuple(record[name] for name in _NAMED), []).append(record)
+    for record in table[table["scene"] == ALL].to_dict("records"):
+        row = {str(key): value for key, value in record.items()}
+        seen = (row["occlusion"], *([row["candidates"]] if row["candidates"] != ALL else []))
+        shown = (row["method"], row["inputs"], f"best {row['top_n']}", f"({', '.join(seen)})")
+        texts = (*_NAMED, "scene", "reference")
+        numbers = {key: float(value) for key, value in row.items() if key not in texts}
+        for scene in by_row.get(tuple(row[name] for name in _NAMED), []):
+            for key, value in scene.items():
+                if str(key).startswith(_BY_SCENE):
+                    numbers[f"{key}/{scene['scene']}"] = float(value)
+        yield row, NestedRun(" ".join(filter(None, shown)), {**params, **{key: row[key] for key in _NAMED}}, numbers)
 
 
 def _location_table(

@@ -52,7 +52,7 @@ def learning_figure(image: BinnedImage, activations: Sequence[Float], channels: 
             reach = float(np.abs(values).max()) or 1.0
             _grid(axes, values, "PuOr", -reach, reach)
             axes.set_ylabel(f"${name}$", rotation=0, ha="right", va="center", labelpad=2)
-        inputs[-1].set_xlabel("standardized")
+        inputs[-1].set_xlabel("standardized,\nempty: 0")
         inputs[0].set_title(f"c  input\n{means.size:,}", loc="left")
         layers = [figure.add_subplot(stages[3 + number]) for number in range(len(hidden))]
         for number, (axes, values) in enumerate(zip(layers, hidden, strict=True)):
@@ -75,7 +75,7 @@ def _connect(figure: Figure, before: list[Axes], inputs: list[Axes], after: list
     at = 0.5 if len(inputs) % 2 else 1.0  # an even number has its middle between two
     for one, other in pairwise([*before, middle, *after]):
         start = (1.0, at if one is middle else 0.5)
-        end = (-0.25, at) if other is middle else (0.0, 0.5)  # clear of the channel's name
+        end = (-0.45, at) if other is middle else (0.0, 0.5)  # clear of the channel's name
         arrow = ConnectionPatch(start, end, "axes fraction", "axes fraction", axesA=one, axesB=other, arrowstyle="-|>",
                                 mutation_scale=7, color=INK, shrinkA=2, shrinkB=2, linewidth=0.8)  # fmt: skip
         figure.add_artist(arrow)

@@ -41,7 +41,10 @@ def paths_figure(summary: pd.DataFrame) -> Figure:
                     at, value, 0.92 * width, color=style.color, hatch="////" if rule else "", edgecolor="white",
                     linewidth=0.4, label=f"{style.label}{', greedy' if rule else ''}",
                 )  # fmt: skip
-                axes.errorbar(at, value, [value - low, high - value], fmt="none", ecolor=INK, elinewidth=0.9)
+                # a share may lie outside its interval of few resamples
+                axes.errorbar(
+                    at, value, np.maximum(0, [value - low, high - value]), fmt="none", ecolor=INK, elinewidth=0.9
+                )
             axes.set_title(TITLES.get(task, task))
             axes.set_ylabel("views that localize (%)")
             axes.set_ylim(0, 100)

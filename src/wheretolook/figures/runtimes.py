@@ -96,6 +96,20 @@ def runtime_figure(sizes: pd.DataFrame) -> Figure:
         return figure
 
 
+def runtime_table(sizes: pd.DataFrame) -> pd.DataFrame:
+    """What `runtime_figure` draws of this project's times, in numbers: a row for each machine, work and threads."""
+    rows = sizes[sizes["what"].isin((TWIN, COUNTS, EVERYTHING))]
+    return pd.DataFrame({
+        "machine": rows["name"].map(machine_label),
+        "work": rows["what"],
+        "threads": rows["threads"],
+        "median (s)": rows["median_s"],
+        "least (s)": rows["min_s"],
+        "most (s)": rows["max_s"],
+        "projections (10⁹/s)": rows["projections_per_s"] / 1e9,
+    }).sort_values(["work", "median (s)"], ignore_index=True)  # fmt: skip
+
+
 def _draw_bars(axes: Axes, bars: list[_Bar], start: float) -> None:
     for y, bar in enumerate(bars):
         axes.barh(y, bar.seconds - start, 0.68, left=start, **_LOOK[bar.source])

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.style import context
 
 from wheretolook.errors import ConfigError
+from wheretolook.figures.config import KINDS
 
 ONE_COLUMN_IN, TWO_COLUMNS_IN = 3.5, 7.2
 """Widths of figures for one and for two columns of a paper, inches. Their letters are as large as they will be in
@@ -192,9 +193,6 @@ def new_figure(width_in: float, height_in: float) -> Figure:
     with context(RC):
         return Figure(figsize=(width_in, height_in), layout="constrained")
 
-
-KINDS = ("png", "pdf", "svg")
-"""Kinds of files that figures are written as."""
 
 _NOTE = {"png": "Description", "pdf": "Subject", "svg": "Description"}
 

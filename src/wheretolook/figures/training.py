@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.style import context
 
 from wheretolook.figures.style import RC, method_style, new_figure
+from wheretolook.learning.config import LEARNERS
 
 
 def training_figure(histories: Mapping[str, pd.DataFrame]) -> Figure:
@@ -25,7 +26,7 @@ def training_figure(histories: Mapping[str, pd.DataFrame]) -> Figure:
         figure = new_figure(9, 3.4)
         panels = figure.subplots(1, 2)
         for variant, history in histories.items():
-            style = method_style("mlp", variant)
+            style = method_style(variant) if variant in LEARNERS else method_style("mlp", variant)
             for panel, name in zip(panels, ("bce", "average_precision"), strict=True):
                 panel.plot(history["epoch"], history[f"train_{name}"], ":", color=style.color, linewidth=1.1,
                            label=f"{style.label}: training")  # fmt: skip

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.figures.dollhouse import BLUE, ORANGE, VERMILION, frustum_segments
 from wheretolook.geometry import Float, PinholeCamera
-from wheretolook.rendering.dollhouse import cut_above
+from wheretolook.scenes.cutting import cut_above
 from wheretolook.scenes.mesh import TexturedMesh
 
 FRUSTUM_M = 0.25

@@ -32,6 +32,7 @@ from wheretolook.learning.data import ViewpointDataModule, with_also
 from wheretolook.learning.fit import EpochRecord, RunLog, fit, home_device
 from wheretolook.learning.learner import Learner, Task
 from wheretolook.learning.network import NetworkSpec, ViewpointNetwork
+from wheretolook.learning.runs import HISTORY_CSV, params_of
 from wheretolook.learning.weights import save_classifier
 from wheretolook.table import fingerprint as file_fingerprint
 from wheretolook.table import sha256
@@ -197,8 +198,7 @@ def _train_variant(
     config = data.config
     labels = {side: data.views.labels[rows] for side, rows in (("train", data.train_rows), ("val", data.val_rows))}
     params = {
-        **{name: about[name] for name in ("variant", "dataset", "dataset_fingerprint")},
-        **about["config"],
+        **params_of(about),
         "devices": config.devices,
         **{f"n_{side}": len(values) for side, values in labels.items()},
         **{f"positives_{side}": round(float(values.mean()), 4) for side, values in labels.items()},
@@ -228,12 +228,7 @@ def _learn(
     dataset: Dataset, config: TrainConfig, variant: str, path: Path, about: dict[str, Any], tracking: TrackingConfig,
     progress: bool,
 ) -> TrainedModel:  # fmt: skip
-    params = {
-        **{name: about[name] for name in ("variant", "dataset", "dataset_fingerprint")},
-        **about["config"][variant],
-        **{name: value for name, value in about["config"].items() if name != variant},
-    }
-    with start_run(tracking, f"train {variant}", "train", params) as (client, run_id), isolate_rng():
+    with start_run(tracking, f"train {variant}", "train", params_of(about)) as (client, run_id), isolate_rng():
         seed_everything(config.seed, verbose=False)
         task = Task(dataset, config, f"train {variant}", progress, RunLog(tracking, run_id))
         learnt = learner_of(variant)(task)
@@ -256,6 +251,6 @@ def _log_artifacts(
     if history is None:
         return
     with TemporaryDirectory() as folder:
-        history.to_csv(Path(folder) / "history.csv", index=False)
+        history.to_csv(Path(folder) / HISTORY_CSV, index=False)
         save_figure(training_figure({variant: history}), Path(folder) / "curves.png")
         client.log_artifacts(run_id, folder)

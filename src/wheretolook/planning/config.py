@@ -89,9 +89,11 @@ class PathsConfig:
         height_m: range of the heights of starts and goals above the floor.
         methods: "forward", the shortest path looking ahead, and methods that score views, see `wheretolook evaluate
             --list-methods`. Scores that are no probabilities enter by their ranks.
-        weights: of the methods that have learnt; by default the best of the dataset, or else of the release.
+        weights: of the methods that have learnt, those that are of another kind; by default, and for the others, the
+            best of each method in the dataset, or else in the release.
         grid: voxels of the viewpoint maps along x, y and z.
         directions: directions at each voxel.
+        lattice: how they are spread: fibonacci is even; yaw-pitch are ActLoc's 6 x 18, whatever `directions` says.
         max_turn_deg: along a path that is given, the camera turns by no more from one waypoint to the next.
         max_error_m: a view is good if it localizes with a smaller error of its position.
         max_error_deg: and of its orientation.
@@ -108,6 +110,7 @@ class PathsConfig:
     weights: Path | None = None
     grid: tuple[int, int, int] = (8, 8, 8)
     directions: int = 500
+    lattice: Lattice = "fibonacci"
     max_turn_deg: float = 30.0
     max_error_m: float = 0.25
     max_error_deg: float = 2.0
@@ -150,6 +153,7 @@ class PlanConfig:
         rerun: whether to write a recording for the Rerun viewer (needs `pip install rerun-sdk`).
         grid: voxels of the viewpoint map along x, y and z.
         directions: directions at each voxel.
+        lattice: how they are spread, fibonacci or yaw-pitch.
         planner: costs and limits of the path, time to plan.
     """
 
@@ -164,6 +168,7 @@ class PlanConfig:
     rerun: bool = False
     grid: tuple[int, int, int] = (8, 8, 8)
     directions: int = 500
+    lattice: Lattice = "fibonacci"
     planner: PathConfig = field(default_factory=PathConfig)
 
     def __post_init__(self) -> None:

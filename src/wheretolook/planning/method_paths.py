@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from wheretolook.dataset import Dataset, SceneFolder
@@ -13,8 +14,9 @@ from wheretolook.geometry import PinholeCamera, poses_looking_along
 from wheretolook.localization_map import LocalizationMap
 from wheretolook.planning.config import PlanConfig
 from wheretolook.planning.path_comparison import FORWARD
-from wheretolook.planning.path_planning import PlannedPath, plan_path
-from wheretolook.planning.planner_map import planner_map
+from wheretolook.planning.path_planning import PlannedPath, check_ends, plan_path
+from wheretolook.planning.planner_map import check_methods, planner_map
+from wheretolook.planning.scene_map import weights_for
 from wheretolook.rendering import WarpRenderer
 from wheretolook.scenes.free_space import FreeSpace
 from wheretolook.scenes.mapped_space import MappedSpace
@@ -35,7 +37,7 @@ def plan_by_methods(
         dataset: gives the camera.
         space: where a camera can be.
         occlusion: which landmarks nothing stands in front of.
-        weights: for methods that have learnt.
+        weights: for methods that have learnt, if they are of their kind; see `weights_for`.
         config: grid and directions of the viewpoint maps, costs and limits of paths.
         device: where kernels run.
 
@@ -45,12 +47,16 @@ def plan_by_methods(
     Raises:
         ConfigError: a method needs weights, or there is none of that name. PlanningError: no path can be found.
     """
+    methods = tuple(methods)
+    check_methods(methods)
+    check_ends(np.asarray([start, goal], dtype=np.float64), space, space.bounds)  # before maps are built
     paths: dict[str, PlannedPath] = {}
     for method in methods:
         views, name = None, method
         if method != FORWARD:
+            used = weights_for(method, dataset, weights)
             views = planner_map(
-                method, weights, config.grid, config.directions, scene, dataset, space, occlusion, device
+                method, used, config.grid, config.directions, config.lattice, scene, dataset, space, occlusion, device
             )
             name = method or views.origin.scorer
         paths.pop(name, None)  # named twice, it is what was asked for last

@@ -16,6 +16,7 @@ from wheretolook.planning.config import PathsConfig
 from wheretolook.planning.path_planning import PathConfig, PlannedPath, plan_path
 from wheretolook.planning.sequences import TurnLimit, ViewSequence, best_sequence, greedy_sequence, resample_path
 from wheretolook.planning.viewpoint_map import ViewpointMap
+from wheretolook.planning.ways import Ways
 from wheretolook.scenes.free_space import FreeSpace
 from wheretolook.scenes.mapped_space import MappedSpace
 from wheretolook.table import pose_columns
@@ -34,8 +35,8 @@ RULES: dict[str, Rule] = {"": best_sequence, "greedy": greedy_sequence}
 DRAWS = 50
 """Pairs drawn for each one wanted, before a scene is said to have too little room."""
 
-REACH_S = 1.0
-"""Time to find out whether there is a way from a start to a goal."""
+WAYS_M = 0.25
+"""Grid of places by which to find out whether there is a way from a start to a goal."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,9 +45,9 @@ class ComparedPaths:
 
     Attributes:
         paths: a row for each pair, task (`PLANNED`, `GIVEN`) and method: `planned`, whether there is a path, its
-            `length_m`, `turn_deg`, `n_views`, and `promised`, the mean score of its views by the method's own map (NaN
-            for "forward").
-        views: a row for each view along them: pair, task, method, waypoint, score, and
+        `length_m`, `turn_deg`, `n_views`, `promised`, the mean score of its views by the method's own map (NaN for
+        "forward"), and `found_by` (`PlannedPath.found_by`).
+    views: a row for each view along them: pair, task, method, waypoint, score, and
             `wheretolook.table.POSE_COLUMNS`.
     """
 
@@ -66,19 +67,16 @@ def draw_pairs(space: FreeSpace | MappedSpace, config: PathsConfig) -> Float:
     """
     rng = np.random.default_rng(config.seed)
     low, high = space.bounds
+    ways = Ways(space, WAYS_M)
     found: list[Float] = []
-    reach = replace(config.planner, time_s=REACH_S)
     for _ in range(DRAWS * config.pairs):
         if len(found) == config.pairs:
             break
         ends = _free_points(space, rng.uniform(low, high, (400, 3)), config, rng)[:2]
         if len(ends) < 2 or np.linalg.norm(ends[1] - ends[0]) < config.min_distance_m:
             continue
-        try:
-            plan_path(ends[0], ends[1], space, space.bounds, None, reach, progress=False)
-        except PlanningError:
-            continue  # in parts of the scene that no way joins
-        found.append(ends)
+        if ways.joins(ends[0], ends[1]):  # not in parts of the scene between which there is no way
+            found.append(ends)
     if len(found) < config.pairs:
         raise SceneError(
             f"found only {len(found)} starts and goals {config.min_distance_m:g} m apart with a way between them",
@@ -118,6 +116,9 @@ def compare_paths(
         maps: viewpoint map of each method but "forward", scores in [0, 1].
         config: planner, and limit on turns along given paths.
         progress: title of a progress bar; None shows none.
+
+    Raises:
+        PlanningError: no path was found at all.
     """
     paths: list[dict[str, Any]] = []
     views: list[pd.DataFrame] = []
@@ -125,11 +126,13 @@ def compare_paths(
     def add(pair: int, task: str, method: str, path: PlannedPath | None) -> None:
         about = {"pair": pair, "task": task, "method": method, "planned": path is not None}
         if path is None:
-            paths.append({**about, "length_m": np.nan, "turn_deg": np.nan, "n_views": 0, "promised": np.nan})
+            paths.append(
+                {**about, "length_m": np.nan, "turn_deg": np.nan, "n_views": 0, "promised": np.nan, "found_by": ""}
+            )
             return
         promised = float(path.scores.mean())
         paths.append({**about, "length_m": path.length_m, "turn_deg": path.turn_deg, "n_views": len(path.positions),
-                      "promised": promised})  # fmt: skip
+                      "promised": promised, "found_by": path.found_by})  # fmt: skip
         of_view = {"waypoint": np.arange(len(path.positions)), "score": path.scores,
                    **pose_columns(poses_looking_along(path.positions, path.axes))}  # fmt: skip
         views.append(pd.DataFrame({"pair": pair, "task": task, "method": method, **of_view}))
@@ -149,6 +152,8 @@ def compare_paths(
                 for rule, choose in RULES.items():
                     path = None if along is None else _looking_about(along, one, limits[name], config, choose)
                     add(number, GIVEN, f"{name} {rule}".strip(), path)
+    if not views:
+        raise PlanningError("no path was found at all", value=f"{len(pairs)} pairs", fix="Raise paths.planner.time_s.")
     return ComparedPaths(pd.DataFrame(paths), pd.concat(views, ignore_index=True))
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+import time
+from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -14,7 +15,8 @@ from wheretolook.errors import PlanningError
 from wheretolook.geometry import Float
 from wheretolook.grid import axes_of_angles
 from wheretolook.planning.config import PathConfig
-from wheretolook.planning.sequences import TurnLimit, best_sequence
+from wheretolook.planning.path_improvement import improve
+from wheretolook.planning.route_views import PlannedPath, RouteSamples, RouteViews, between
 from wheretolook.planning.turns import check_axis
 from wheretolook.planning.viewpoint_map import ViewpointMap
 
@@ -23,8 +25,12 @@ __all__ = ["PathConfig", "PlannedPath", "Space", "plan_path"]
 TABLE_STEP_DEG = 2.0
 """Step of yaw and pitch of the table that finds the map's direction nearest to an axis."""
 
-SHORTEST_SHARE = 0.3
-"""Share of the time in which a short path is looked for, whose views are then chosen; it may cost least."""
+SHORT_SHARE, SEARCH_SHARE, SHORTEN_SHARE = 0.25, 0.3, 0.05
+"""Shares of the time in which a short path is looked for, in which places and views are looked for together, and in
+which the short path is made shorter. In the rest what costs least is improved."""
+
+AHEAD_SHARE = 0.5
+"""Share of the time in which a short path is looked for where there is nothing else to look for."""
 
 SAME_M = 1e-6
 """Points nearer to each other are the same."""
@@ -43,34 +49,6 @@ class Space(Protocol):
         """Whether it may go straight from points a to points b, (N, 3) m each; (N,)."""
 
 
-@dataclass(frozen=True, eq=False)
-class PlannedPath:
-    """A path of a camera, sampled at its corners and every `PathConfig.spacing_m` or a little less.
-
-    Attributes:
-        positions: (W, 3) world, metres.
-        axes: (W, 3) unit optical axes in the world.
-        scores: (W,) of the viewpoint map at the views, 0 where it knows nothing; NaN without a map.
-        cost: of the path (`PathConfig`), its scores taken from view to view.
-    """
-
-    positions: Float
-    axes: Float
-    scores: Float
-    cost: float
-
-    @property
-    def length_m(self) -> float:
-        """Length of the path."""
-        return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
-
-    @property
-    def turn_deg(self) -> float:
-        """By how much the camera turns on its way, in all."""
-        cosines = (self.axes[1:] * self.axes[:-1]).sum(1).clip(-1, 1)
-        return float(np.degrees(np.arccos(cosines)).sum())
-
-
 def plan_path(
     start: ArrayLike,
     goal: ArrayLike,
@@ -84,9 +62,10 @@ def plan_path(
     """Plan a path on which the camera sees what it needs to know where it is.
 
     RRT* (Karaman and Frazzoli 2011) looks for a short path, then for places and views together. Along either, the views
-    are chosen anew, exactly (`best_sequence`), and what costs least is kept.
+    are chosen anew, exactly (`best_sequence`); what costs least is then improved by moving its corners.
 
-    Without a viewpoint map the path is the shortest that is found, and the camera looks forward along it.
+    Without a viewpoint map the path is the shortest that is found, and the camera looks forward along it, as level as
+    `PathConfig.pitch_deg` allows; it is then the front of the robot, and no limit on turns holds.
 
     Args:
         start, goal: (3,) world, metres.
@@ -102,13 +81,86 @@ def plan_path(
 
     Raises:
         PlanningError: the start or the goal is not free or lies outside the bounds; they are the same; the axis is
-            beyond the camera's limits; or no path was found in time.
+            beyond the camera's limits, or given without a viewpoint map; or no path was found in time.
         ValueError: a point is not finite, or the axis has no direction.
     """
     ends = np.asarray([start, goal], dtype=np.float64)
     low, high = np.asarray(bounds, dtype=np.float64)
     if not np.isfinite(ends).all():
         raise ValueError(f"start and goal must be finite, got {ends.tolist()}")
+    check_ends(ends, space, np.array([low, high]))
+    if viewpoint_map is None and start_axis is not None:
+        raise PlanningError(
+            "without a viewpoint map the camera looks ahead", value=start_axis, fix="Give no start axis."
+        )
+    problem = _Problem(ends, low, high, space, viewpoint_map, config)
+    orientations = problem.start_orientations(start_axis)
+    rng = np.random.default_rng(0)
+    box = np.array([low, high])
+    with tqdm(total=round(config.time_s, 1), desc="plan", unit="s", disable=not progress) as bar:
+        end, ahead = time.monotonic() + config.time_s, viewpoint_map is None
+        shortest = _Problem(ends, low, high, space, None, config)
+        route: Float | None = None
+        try:
+            share = (AHEAD_SHARE, 1.0) if ahead else (SHORT_SHARE, 1 - SEARCH_SHARE)
+            route = shortest.solve([(0.0, 0.0)], share[0] * config.time_s, share[1] * config.time_s, bar)[:, :3]
+        except PlanningError:
+            if ahead:
+                raise
+        if route is not None:
+            seconds = end - time.monotonic() if ahead else SHORTEN_SHARE * config.time_s
+            route = improve(route, _shorter, _length(route), space, box, seconds, rng)
+        if viewpoint_map is None:
+            assert route is not None
+            _finish(bar)
+            samples = RouteSamples.of(route, config.spacing_m)
+            looking = _forward(samples.positions, np.radians(config.pitch_deg))
+            unknown = np.full(len(samples.positions), np.nan)
+            return PlannedPath(samples.positions, looking, unknown, float(samples.corners[-1]), "short route")
+        axis = None if start_axis is None else axes_of_angles(np.degrees(orientations[0]))
+        views = RouteViews(viewpoint_map, config, axis)
+        found: dict[float, tuple[PlannedPath, Float]] = {}
+
+        def add(path: PlannedPath | None, places: Float, found_by: str) -> None:
+            if path is not None:
+                found[path.cost] = replace(path, found_by=found_by), places
+
+        if route is not None:
+            add(views.best(route), route, "short route")
+        try:
+            most = SEARCH_SHARE * config.time_s if found else end - time.monotonic()
+            states = problem.solve(orientations, SEARCH_SHARE * config.time_s, most, bar)
+            add(problem.path(states, views), states[:, :3], "search")
+            add(views.best(states[:, :3]), states[:, :3], "search")
+        except PlanningError:
+            if not found:
+                raise
+        cheapest, places = found[min(found)]
+
+        def cost_below(candidate: Float, limit: float) -> float | None:
+            if views.least_cost(candidate) >= limit:
+                return None
+            path = views.best(candidate)
+            return None if path is None or path.cost >= limit else path.cost
+
+        better = improve(places, cost_below, cheapest.cost, space, box, end - time.monotonic(), rng)
+        if better is not places:
+            add(views.best(better), better, "improvement")
+        _finish(bar)
+    return found[min(found)][0]
+
+
+def _finish(bar: Any) -> None:
+    bar.update(max(0.0, bar.total - bar.n))
+
+
+def check_ends(ends: Float, space: Space, bounds: Float) -> None:
+    """Check that a start and a goal (2, 3) m are different places where a camera can be.
+
+    Raises:
+        PlanningError: they are not.
+    """
+    low, high = bounds
     for name, point in zip(("start", "goal"), ends, strict=True):
         if not ((point >= low) & (point <= high)).all() or not space.is_free(point[None])[0]:
             raise PlanningError(
@@ -118,26 +170,15 @@ def plan_path(
     if np.linalg.norm(ends[1] - ends[0]) < SAME_M:
         fix = "Ask the map for the best view there."
         raise PlanningError("the start is the goal", value=tuple(ends[0].tolist()), fix=fix)
-    problem = _Problem(ends, low, high, space, viewpoint_map, config)
-    orientations = problem.start_orientations(start_axis)
-    with tqdm(total=round(config.time_s, 1), desc="plan", unit="s", disable=not progress) as bar:
-        if viewpoint_map is None:
-            return problem.path(problem.solve([(0.0, 0.0)], config.time_s, bar))
-        shortest = _Problem(ends, low, high, space, None, config)
-        found = []
-        try:
-            route = shortest.solve([(0.0, 0.0)], SHORTEST_SHARE * config.time_s, bar)
-            found.append(
-                problem.best_views(route, None if start_axis is None else axes_of_angles(np.degrees(orientations[0])))
-            )
-        except PlanningError:
-            pass  # it may be found yet
-        try:
-            found.append(problem.path(problem.solve(orientations, (1 - SHORTEST_SHARE) * config.time_s, bar)))
-        except PlanningError:
-            if not any(path is not None for path in found):
-                raise
-    return min((path for path in found if path is not None), key=lambda path: path.cost)
+
+
+def _length(places: Float) -> float:
+    return float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
+
+
+def _shorter(places: Float, limit: float) -> float | None:
+    length = _length(places)
+    return length if length < limit - 1e-9 else None
 
 
 class _Problem:
@@ -203,8 +244,8 @@ class _Problem:
                 return False
         return bool(self.space.segments_are_free([a[:3]], [b[:3]])[0])
 
-    def solve(self, orientations: list[tuple[float, float]], time_s: float, bar: Any) -> Float:
-        """States (S, 5) of the best path that is found in a time.
+    def solve(self, orientations: list[tuple[float, float]], time_s: float, most_s: float, bar: Any) -> Float:
+        """States (S, 5) of the best path that is found in a time, or of the first that is found until another.
 
         Raises:
             PlanningError: there is none.
@@ -255,13 +296,14 @@ class _Problem:
         planner.setProblemDefinition(definition)
         planner.setRange(self.config.step_m)
         planner.setup()
-        slices = max(1, round(time_s / 0.25))
-        for _ in range(slices):
-            planner.solve(time_s / slices)
-            bar.update(time_s / slices)
+        step, spent = max(1e-3, min(0.25, time_s)), 0.0
+        while spent < time_s - 1e-9 or (spent < most_s - 1e-9 and not definition.hasExactSolution()):
+            planner.solve(step)
+            spent += step
+            bar.update(min(step, max(0.0, bar.total - bar.n)))
         if not definition.hasExactSolution():
             raise PlanningError(
-                "no path was found in time", value=f"{time_s:g} s",
+                "no path was found in time", value=f"{spent:.2g} s",
                 fix="Give it more time, or loosen the camera's limits.",
             )  # fmt: skip
         found = definition.getSolutionPath()
@@ -280,89 +322,18 @@ class _Problem:
         space.addSubspace(base.SO2StateSpace(), 1.0)
         return space
 
-    def path(self, states: Float) -> PlannedPath:
-        """The path through some states (S, 5), sampled; its views are the planner's or better ones."""
-        corners, _, along = self._samples(states)
-        positions = _between(corners, states[:, :3], along)
-        if self.map is None:
-            return PlannedPath(positions, _forward(positions), np.full(len(positions), np.nan), float(corners[-1]))
+    def path(self, states: Float, views: RouteViews) -> PlannedPath:
+        """The path through some states (S, 5), its views those of the states."""
+        samples = RouteSamples.of(states[:, :3], self.config.spacing_m)
         angles = np.column_stack([np.unwrap(states[:, 3]), states[:, 4]])
-        planned = self._costed(positions, axes_of_angles(np.degrees(_between(corners, angles, along))))
-        turned = self.best_views(states, planned.axes[0])
-        return planned if turned is None or planned.cost <= turned.cost else turned
-
-    def best_views(self, states: Float, start: Float | None) -> PlannedPath | None:
-        """The places of states (S, 5) with the best views that a camera can turn to one after the other.
-
-        Args:
-            states: of which only the places count.
-            start: (3,) axis to start with; None for any.
-
-        Returns:
-            None where the map's directions are too coarse for so small turns.
-        """
-        corners, even, along = self._samples(states)
-        places = _between(corners, states[:, :3], even)
-        views = self._turned(places if start is None else places[1:], start, float(even[-1]) / (len(even) - 1))
-        if views is None:
-            return None
-        axes = views if start is None else np.concatenate([start[None], views])
-        return self._costed(_between(corners, states[:, :3], along), _turning(even, axes, along))
-
-    def _samples(self, states: Float) -> tuple[Float, Float, Float]:
-        """Arc lengths along a path: of its corners (S,), of even steps, and of both together."""
-        pieces = np.linalg.norm(np.diff(states[:, :3], axis=0), axis=1)
-        corners = np.concatenate([[0.0], np.cumsum(pieces)])
-        even = np.linspace(0, corners[-1], max(1, math.ceil(corners[-1] / self.config.spacing_m - 1e-9)) + 1)
-        along = np.union1d(even, corners)  # without its corners a path would lead through those of the walls
-        return corners, even, along[np.append(True, np.diff(along) > 1e-9)]
-
-    def _turned(self, positions: Float, start: Float | None, step: float) -> Float | None:
-        """The best axes (W, 3) at places (W, 3) a step apart, that a camera can turn to one after the other."""
-        assert self.map is not None
-        limit = TurnLimit.of(self.map.directions, self.config.max_turn_deg_per_m * step)
-        low, high = np.sin(self.pitch)
-        inside = (limit.directions[:, 2] >= low) & (limit.directions[:, 2] <= high)
-        rows = self.map.rows(positions)
-        scores = np.where((rows >= 0)[:, None], self.map.scores[rows], 0.0)
-        try:
-            return limit.directions[best_sequence(np.where(inside, scores, -np.inf), limit, start).direction_ids]
-        except PlanningError:
-            return None  # the lattice is too coarse for so small turns
-
-    def _costed(self, positions: Float, axes: Float) -> PlannedPath:
-        """A path with its scores and what it costs."""
-        assert self.map is not None
-        rows, nearest = self.map.rows(positions), (axes @ self.map.directions.T).argmax(1)
-        scores = np.where(rows >= 0, self.map.scores[rows, nearest], 0.0).astype(np.float64)
-        path = PlannedPath(positions, axes, scores, 0.0)
-        steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
-        missed = float((steps * (1 - (scores[1:] + scores[:-1]) / 2)).sum())
-        turning = self.config.turn_weight_m * math.radians(path.turn_deg)
-        return replace(path, cost=path.length_m + turning + self.config.score_weight * missed)
+        return views.costed(
+            samples.positions, axes_of_angles(np.degrees(between(samples.corners, angles, samples.along)))
+        )
 
 
-def _between(knots: Float, values: Float, at: Float) -> Float:
-    """Values (S, C) at knots (S,), linearly between them."""
-    return np.column_stack([np.interp(at, knots, column) for column in values.T])
-
-
-def _turning(knots: Float, axes: Float, at: Float) -> Float:
-    """Unit axes (S, 3) at knots (S,), turning evenly between them (Shoemake 1985)."""
-    after = np.clip(np.searchsorted(knots, at, side="right"), 1, len(knots) - 1)
-    a, b = axes[after - 1], axes[after]
-    t = ((at - knots[after - 1]) / (knots[after] - knots[after - 1]))[:, None]
-    angle = np.arccos((a * b).sum(1, keepdims=True).clip(-1, 1))
-    # where there is next to nothing to turn, the mean is as good
-    some = angle > 1e-6
-    sine = np.where(some, np.sin(angle), 1.0)
-    weights = [np.where(some, np.sin(part * angle) / sine, part) for part in (1 - t, t)]
-    between = weights[0] * a + weights[1] * b
-    return np.asarray(between / np.linalg.norm(between, axis=1, keepdims=True))
-
-
-def _forward(positions: Float) -> Float:
-    """Unit axes (W, 3) that look along a path (W, 3), level; where it goes straight up or down, as before."""
+def _forward(positions: Float, pitch: Float) -> Float:
+    """Unit axes (W, 3) that look along a path (W, 3), as level as the pitch (2,) may be, in radians; where it goes
+    straight up or down, as before."""
     steps = np.gradient(positions, axis=0)[:, :2] if len(positions) > 1 else np.array([[1.0, 0.0]])
     length = np.linalg.norm(steps, axis=1)
     known = length > 1e-9
@@ -371,7 +342,8 @@ def _forward(positions: Float) -> Float:
         length = np.ones(len(steps))
     last = np.maximum.accumulate(np.where(known, np.arange(len(steps)), int(np.argmax(known))))
     level = (steps / np.maximum(length, 1e-9)[:, None])[last]
-    return np.column_stack([level, np.zeros(len(level))])
+    least = float(np.clip(0.0, *pitch))
+    return np.column_stack([level * math.cos(least), np.full(len(level), math.sin(least))])
 
 
 def _numbers(state: Any) -> tuple[float, float, float, float, float]:

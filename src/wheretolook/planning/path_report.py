@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from wheretolook.evaluation.report import markdown_table
 from wheretolook.planning.config import PathsConfig
 from wheretolook.planning.path_comparison import FORWARD
 from wheretolook.table import LOCALIZED
+from wheretolook.tracking import NestedRun, TrackingConfig, log_nested, start_run
+
+PATHS_CSV, PATHS_MD, PATHS_PNG = "paths.csv", "paths.md", "paths.png"
+"""Files of a comparison, in `<dataset>/results/` and as artifacts of its run."""
 
 ALL = "all"
 """Name of the rows over all scenes."""
@@ -25,9 +32,10 @@ def summarize_paths(paths: pd.DataFrame, views: pd.DataFrame, config: PathsConfi
         config: limits of the errors, resamples, seed.
 
     Returns:
-        `localized`, the share of all views that localize, and `times_forward`, that share over the one of "forward",
-        both with the ends of 95 % intervals by resampling pairs within scenes; over the pairs that both planned,
-        `times_forward_length`; `failures` to plan, `turn_deg_per_m`, `promised`.
+        `localized`, the share of all views that localize; over the pairs that both planned, `times_forward`, that share
+        over the one of "forward", and `times_forward_length`; the former two with the ends of 95 % intervals by
+        resampling pairs within scenes; `failures` to plan, `turn_deg_per_m`, `promised`. What there is nothing to tell
+        of is NaN.
     """
     good = (
         (views["status"] == LOCALIZED)
@@ -78,22 +86,86 @@ def _row(of_method: pd.DataFrame, forward: pd.DataFrame, draws: NDArray[np.int64
         good, n = (weights @ counts[name]).T
         return np.divide(good, n, out=np.full(len(weights), np.nan), where=n > 0)
 
+    def ratio(weights: NDArray[Any]) -> NDArray[Any]:
+        ours, theirs = (share(name, weights * both) for name in ("one", "base"))
+        return np.divide(ours, theirs, out=np.full(len(weights), np.nan), where=theirs > 0)
+
     whole = np.ones((1, len(index)))
-    shares, ratios = share("one", draws), share("one", draws) / share("base", draws)
-    localized = float(share("one", whole)[0])
+    shares, ratios = _interval(share("one", draws)), _interval(ratio(draws))
+    metres = float(of_method["length_m"].sum())
     lengths = one["length_m"].to_numpy()[both].sum(), base["length_m"].to_numpy()[both].sum()
     return {
         "pairs": len(of_method),
         "failures": int((~of_method["planned"]).sum()),
         "views": int(counts["one"][:, 1].sum()),
-        "localized": localized,
-        "localized_low": float(np.nanpercentile(shares, 2.5)),
-        "localized_high": float(np.nanpercentile(shares, 97.5)),
-        "times_forward": float(localized / share("base", whole)[0]),
-        "times_forward_low": float(np.nanpercentile(ratios, 2.5)),
-        "times_forward_high": float(np.nanpercentile(ratios, 97.5)),
+        "localized": float(share("one", whole)[0]),
+        "localized_low": shares[0],
+        "localized_high": shares[1],
+        "times_forward": float(ratio(whole)[0]),
+        "times_forward_low": ratios[0],
+        "times_forward_high": ratios[1],
         "times_forward_length": float(lengths[0] / lengths[1]) if lengths[1] else float("nan"),
         "length_m": float(of_method["length_m"].mean()),
-        "turn_deg_per_m": float(of_method["turn_deg"].sum() / max(of_method["length_m"].sum(), 1e-9)),
+        "turn_deg_per_m": float(of_method["turn_deg"].sum() / metres) if metres else float("nan"),
         "promised": float(of_method["promised"].mean()),
     }
+
+
+def _interval(draws: NDArray[Any]) -> tuple[float, float]:
+    """Ends of the 95 % interval of what is known."""
+    known = draws[np.isfinite(draws)]
+    low, high = np.percentile(known, (2.5, 97.5)) if len(known) else (np.nan, np.nan)
+    return float(low), float(high)
+
+
+def path_markdown(summary: pd.DataFrame, config: PathsConfig) -> str:
+    """The summary as Markdown, a table for each task."""
+    text = [f"Share of the views along paths that localize within {config.max_error_m:g} m and "
+            f"{config.max_error_deg:g}°, in % [95 % interval over pairs]."]  # fmt: skip
+    titles = {"planned": "Places and views planned", "given": "Views along a given path"}
+    for task, rows in summary.groupby("task", sort=False):
+        header = ["scene", "method", "localized", "times forward", "length / forward's", "turn, °/m", "not found"]
+        lines = [
+            [
+                str(row["scene"]), str(row["method"]),
+                f"{100 * row['localized']:.1f} [{100 * row['localized_low']:.1f}, {100 * row['localized_high']:.1f}]",
+                f"{row['times_forward']:.2f} [{row['times_forward_low']:.2f}, {row['times_forward_high']:.2f}]",
+                f"{row['times_forward_length']:.2f}", f"{row['turn_deg_per_m']:.0f}", f"{row['failures']}",
+            ]
+            for _, row in rows.iterrows()
+        ]  # fmt: skip
+        text += [f"{titles[str(task)]}:", markdown_table(header, lines)]
+    return "\n\n".join(text) + "\n"
+
+
+def log_paths(
+    params: Mapping[str, Any],
+    summary: pd.DataFrame,
+    results: Path,
+    tracking: TrackingConfig,
+    tags: Mapping[str, str] | None = None,
+) -> str:
+    """Log a comparison: a run with its files, and in it one for each task and method over all scenes.
+
+    Args:
+        params: of the comparison, such as the dataset.
+        summary: of `summarize_paths`.
+        results: folder of the files; those that are missing are left out.
+        tracking: where to log.
+        tags: further tags.
+
+    Returns:
+        Id of the run.
+    """
+    pooled = summary[summary["scene"] == summary["scene"].iloc[-1]]
+    with start_run(tracking, f"paths {params['dataset']}", "paths", params, tags=tags) as (client, run):
+        for name in (PATHS_CSV, PATHS_MD, PATHS_PNG):
+            if (results / name).is_file():
+                client.log_artifact(run, str(results / name))
+        nested = []
+        for row in pooled.to_dict("records"):
+            about = {**params, "task": row["task"], "method": row["method"]}
+            numbers = {str(key): float(value) for key, value in row.items() if key not in ("scene", "task", "method")}
+            nested.append(NestedRun(f"paths {row['task']} {row['method']}", about, numbers))
+        log_nested(tracking, run, "paths", nested, tags)
+    return run

@@ -14,7 +14,6 @@ import pandas as pd
 from wheretolook.config import Experiment
 from wheretolook.dataset import Dataset, SceneFolder, write_json, write_text
 from wheretolook.errors import ConfigError, SceneError
-from wheretolook.evaluation.report import markdown_table
 from wheretolook.figures.style import save_figure
 from wheretolook.labelling.labeller import MANIFEST, LabelTask, label_scenes, storing
 from wheretolook.labelling.shard import SceneJob
@@ -22,13 +21,19 @@ from wheretolook.mapping.extraction import ExtractorConfig
 from wheretolook.photograph_scenes import is_photographed
 from wheretolook.planning.config import PathsConfig
 from wheretolook.planning.path_comparison import FORWARD, ComparedPaths, compare_paths, draw_pairs
-from wheretolook.planning.path_report import summarize_paths
-from wheretolook.planning.planner_map import planner_map
-from wheretolook.planning.scene_map import default_weights
+from wheretolook.planning.path_report import (
+    PATHS_CSV,
+    PATHS_MD,
+    PATHS_PNG,
+    log_paths,
+    path_markdown,
+    summarize_paths,
+)
+from wheretolook.planning.planner_map import check_methods, planner_map
+from wheretolook.planning.scene_map import weights_for
 from wheretolook.scene_space import space_and_occlusion
 from wheretolook.stamps import stage_key
 from wheretolook.table import SCHEMA, UNLABELLED, fingerprint
-from wheretolook.tracking import TrackingConfig, log, start_run
 
 FOLDER = "paths"
 """In `results/`: a folder for each scene with `paths.parquet` and `views.parquet`, and what was made of all of them."""
@@ -54,6 +59,7 @@ def compare_scenes(
         ConfigError: no such scene or method, or no weights. SceneError: a scene has no mesh, or too little room.
     """
     config = experiment.paths
+    check_methods(config.methods)
     scenes = _chosen(dataset, config)
     planned = {scene.name: _plan(scene, dataset, experiment, say) for scene in scenes}
     labelled = _localize(scenes, planned, dataset, experiment, extractor_of)
@@ -61,14 +67,16 @@ def compare_scenes(
     views = pd.concat([table.assign(scene=name) for name, table in labelled.items()], ignore_index=True)
     summary = summarize_paths(paths, views, config)
     folder = dataset.root / "results"
-    with storing(folder / "paths.csv"):
-        summary.to_csv(folder / "paths.csv", index=False, float_format="%.6g", lineterminator="\n")
-        write_text(folder / "paths.md", path_markdown(summary, config))
+    with storing(folder / PATHS_CSV):
+        summary.to_csv(folder / PATHS_CSV, index=False, float_format="%.6g", lineterminator="\n")
+        write_text(folder / PATHS_MD, path_markdown(summary, config))
         views.to_parquet(folder / FOLDER / "views.parquet", index=False)
     from wheretolook.figures.paths import paths_figure
 
-    save_figure(paths_figure(summary), folder / "paths.png")
-    _log(dataset, config, summary, experiment.tracking)
+    save_figure(paths_figure(summary), folder / PATHS_PNG)
+    params = {"dataset": dataset.name, "pairs": config.pairs, "seed": config.seed, "time_s": config.planner.time_s,
+              "score_weight": config.planner.score_weight, "max_turn_deg": config.max_turn_deg}  # fmt: skip
+    log_paths(params, summary, folder, experiment.tracking)
     say(path_markdown(summary, config))
     say(f"-> {folder / 'paths.csv'}, paths.md, paths.png; every view in {folder / FOLDER}")
     return summary
@@ -87,11 +95,11 @@ def _chosen(dataset: Dataset, config: PathsConfig) -> list[SceneFolder]:
 def _plan(scene: SceneFolder, dataset: Dataset, experiment: Experiment, say: Say) -> ComparedPaths:
     """The paths of a scene: those that are there if they were planned with the same settings."""
     config, folder = experiment.paths, dataset.root / "results" / FOLDER / scene.name
-    weights = config.weights or default_weights(dataset, say)
+    weights = {method: weights_for(method, dataset, config.weights, say) for method in config.methods}
     settings = {name: value for name, value in asdict(config).items() if name not in _OF_THE_REPORT}
     key = stage_key("paths", [settings, asdict(experiment.scenes.free_space), asdict(experiment.occlusion),
                               fingerprint(scene.mesh), fingerprint(scene.landmarks),
-                              None if weights is None else fingerprint(weights)])  # fmt: skip
+                              [path and fingerprint(path) for path in weights.values()]])  # fmt: skip
     files = {name: folder / f"{name}.parquet" for name in ("paths", "views")}
     made = folder / "made.json"
     if made.is_file() and all(file.is_file() for file in files.values()) and json.loads(made.read_text()) == key:
@@ -99,8 +107,8 @@ def _plan(scene: SceneFolder, dataset: Dataset, experiment: Experiment, say: Say
         return ComparedPaths(**{name: pd.read_parquet(file) for name, file in files.items()})
     space, occlusion = space_and_occlusion(scene, dataset.camera, experiment, experiment.occlusion)
     maps = {
-        method: planner_map(method, weights, config.grid, config.directions, scene, dataset, space, occlusion,
-                            experiment.warp_device)
+        method: planner_map(method, weights[method], config.grid, config.directions, config.lattice, scene, dataset,
+                            space, occlusion, experiment.warp_device)
         for method in config.methods
         if method != FORWARD
     }  # fmt: skip
@@ -155,39 +163,3 @@ def _as_table(views: pd.DataFrame) -> pd.DataFrame:
     types = {field.name: field.type.to_pandas_dtype() for field in SCHEMA if field.name != "status"}
     columns = {name: values.get(name, views.get(name)) for name in SCHEMA.names}
     return pd.DataFrame(columns).astype(types)
-
-
-def path_markdown(summary: pd.DataFrame, config: PathsConfig) -> str:
-    """The summary as Markdown, a table for each task."""
-    text = [f"Share of the views along paths that localize within {config.max_error_m:g} m and "
-            f"{config.max_error_deg:g}°, in % [95 % interval over pairs]."]  # fmt: skip
-    titles = {"planned": "Places and views planned", "given": "Views along a given path"}
-    for task, rows in summary.groupby("task", sort=False):
-        header = ["scene", "method", "localized", "times forward", "length / forward's", "turn, °/m", "not found"]
-        lines = [
-            [
-                str(row["scene"]), str(row["method"]),
-                f"{100 * row['localized']:.1f} [{100 * row['localized_low']:.1f}, {100 * row['localized_high']:.1f}]",
-                f"{row['times_forward']:.2f} [{row['times_forward_low']:.2f}, {row['times_forward_high']:.2f}]",
-                f"{row['times_forward_length']:.2f}", f"{row['turn_deg_per_m']:.0f}", f"{row['failures']}",
-            ]
-            for _, row in rows.iterrows()
-        ]  # fmt: skip
-        text += [f"{titles[str(task)]}:", markdown_table(header, lines)]
-    return "\n\n".join(text) + "\n"
-
-
-def _log(dataset: Dataset, config: PathsConfig, summary: pd.DataFrame, tracking: TrackingConfig) -> None:
-    """One run, and one nested in it for each task and method, with the numbers over all scenes."""
-    params = {"dataset": dataset.name, "pairs": config.pairs, "seed": config.seed, "time_s": config.planner.time_s,
-              "score_weight": config.planner.score_weight, "max_turn_deg": config.max_turn_deg}  # fmt: skip
-    last = summary[summary["scene"] == summary["scene"].iloc[-1]]
-    results = dataset.root / "results"
-    with start_run(tracking, f"paths {dataset.name}", "paths", params) as (client, run):
-        for name in ("paths.csv", "paths.md", "paths.png"):
-            client.log_artifact(run, str(results / name))
-        for _, row in last.iterrows():
-            about = {**params, "task": row["task"], "method": row["method"]}
-            with start_run(tracking, f"paths {row['task']} {row['method']}", "paths", about, parent=run) as (_, child):
-                numbers = {name: float(value) for name, value in row.items() if name not in ("scene", "task", "method")}
-                log(client, child, metrics={name: value for name, value in numbers.items() if np.isfinite(value)})

@@ -18,9 +18,7 @@ from wheretolook.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.photograph_scenes import is_photographed, occlusion_without_mesh
 from wheretolook.planning.method_paths import path_views, plan_by_methods
-from wheretolook.planning.path_comparison import FORWARD
 from wheretolook.planning.path_planning import PlannedPath
-from wheretolook.planning.scene_map import default_weights
 from wheretolook.rendering import WarpRenderer
 from wheretolook.scene_space import space_and_occlusion
 from wheretolook.scenes.loading import load_mesh
@@ -50,9 +48,8 @@ def plan_scene(dataset: Dataset, experiment: Experiment, say: Say = print) -> Pl
         (*(name for name in config.against if name != config.method), config.method),
         experiment.warp_device,
     )
-    weights = config.weights or (default_weights(dataset, say) if {*methods} != {FORWARD} else None)
     paths = plan_by_methods(
-        methods, config.start, config.goal, scene, dataset, space, occlusion, weights, config, device
+        methods, config.start, config.goal, scene, dataset, space, occlusion, config.weights, config, device
     )
     name, path = list(paths.items())[-1]
     folder = config.out or scene.folder / "path"

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 from wheretolook.dataset import Dataset, SceneFolder
 from wheretolook.errors import ConfigError
 from wheretolook.evaluation.scores import PROBABILITIES
+from wheretolook.grid import Lattice
 from wheretolook.planning.borrowing import with_borrowed_views
 from wheretolook.planning.config import ViewpointMapConfig
 from wheretolook.planning.path_comparison import shares_below
@@ -14,13 +16,14 @@ from wheretolook.planning.scene_map import scene_viewpoint_map
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.scenes.free_space import FreeSpace
 from wheretolook.scenes.mapped_space import MappedSpace
-from wheretolook.scoring.registry import WEIGHTS_OF
+from wheretolook.scoring.registry import SCORERS, WEIGHTS_OF
 from wheretolook.visibility import OcclusionModel
 
 
 def planner_map(
-    method: str, weights: Path | None, grid: tuple[int, int, int], directions: int, scene: SceneFolder,
-    dataset: Dataset, space: FreeSpace | MappedSpace, occlusion: OcclusionModel, device: str = "cpu",
+    method: str, weights: Path | None, grid: tuple[int, int, int], directions: int, lattice: Lattice,
+    scene: SceneFolder, dataset: Dataset, space: FreeSpace | MappedSpace, occlusion: OcclusionModel,
+    device: str = "cpu",
 ) -> ViewpointMap:  # fmt: skip
     """What a method makes of a scene's views: probabilities, or ranks of scores that are none, borrowed where needed.
 
@@ -29,6 +32,7 @@ def planner_map(
         weights: for methods that have learnt; others leave them alone.
         grid: voxels along x, y and z.
         directions: at each voxel.
+        lattice: of the directions.
         scene: its files.
         dataset: gives the camera.
         space: where a camera can be.
@@ -41,8 +45,22 @@ def planner_map(
     if method in WEIGHTS_OF and weights is None:
         raise ConfigError(f"{method} needs weights", path=dataset.root, fix="Train it, or name weights.")
     used = weights if not method or method in WEIGHTS_OF else None
-    config = ViewpointMapConfig(method=method, weights=used, grid=grid, directions=directions)
+    config = ViewpointMapConfig(method=method, weights=used, grid=grid, directions=directions, lattice=lattice)
     views = scene_viewpoint_map(scene, dataset.camera, config, space, occlusion, device)
     if views.origin.scorer.split()[0] not in PROBABILITIES:
         views = shares_below(views)
     return with_borrowed_views(views, space)
+
+
+def check_methods(methods: Iterable[str]) -> None:
+    """Check names of methods before anything is built for them.
+
+    Args:
+        methods: "forward", or names of scorers; empty for that of the weights.
+
+    Raises:
+        ConfigError: there is none of a name.
+    """
+    for name in methods:
+        if name and name not in SCORERS:
+            raise ConfigError("unknown method", value=name, fix=f"There are {', '.join(SCORERS)}.")

@@ -11,7 +11,7 @@ from wheretolook.geometry import PinholeCamera
 from wheretolook.grid import VoxelGrid, direction_lattice
 from wheretolook.learning.config import MATCHABILITY
 from wheretolook.learning.training import was_trained_on
-from wheretolook.learning.weights import read_record, read_training, read_weights
+from wheretolook.learning.weights import read_record, read_training, read_weights, weights_kind
 from wheretolook.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.planning.config import ViewpointMapConfig
@@ -22,6 +22,7 @@ from wheretolook.scenes.free_space import FreeSpace
 from wheretolook.scenes.mapped_space import MappedSpace
 from wheretolook.scoring import Scorer, load_scorer, make_scorer
 from wheretolook.scoring.learned import same_field_of_view
+from wheretolook.scoring.registry import WEIGHTS_OF
 from wheretolook.visibility import OcclusionModel
 
 
@@ -57,20 +58,47 @@ def scene_viewpoint_map(
     )
 
 
-def default_weights(dataset: Dataset, say: Callable[[str], None] = print) -> Path | None:
+def weights_for(
+    method: str, dataset: Dataset, given: Path | None = None, say: Callable[[str], None] = print
+) -> Path | None:
+    """The weights that a method scores with: those given if they are of its kind, or else the best there are.
+
+    Args:
+        method: its name; empty for whatever the weights are of.
+        dataset: see `default_weights`.
+        given: a file of weights.
+        say: told of files that cannot be used, and why.
+
+    Returns:
+        None for a method that has learnt nothing, or if there are none.
+
+    Raises:
+        WeightsError: the file given is missing or damaged.
+    """
+    if method and method not in WEIGHTS_OF:
+        return None
+    if given is not None and (not method or weights_kind(given) == WEIGHTS_OF[method]):
+        return given
+    return default_weights(dataset, say, WEIGHTS_OF[method] if method else "")
+
+
+def default_weights(dataset: Dataset, say: Callable[[str], None] = print, kind: str = "") -> Path | None:
     """The best weights of a dataset, or else of the release beside it, that serve its camera's field of view.
 
     Args:
         dataset: whose `weights` folder is looked into first.
         say: told of files that cannot be used, and why.
+        kind: of method that they must serve; empty for any that scores views by itself.
     """
     for root in (dataset.root, dataset.root.parent / RELEASE):
         fitting: dict[Path, float] = {}
         for path in sorted((root / "weights").glob("*.safetensors")):
-            if path.stem == MATCHABILITY:
+            if path.stem == MATCHABILITY != kind:
                 continue
             try:
                 header, training = read_weights(path)[1], read_training(path)
+                if kind and weights_kind(path) != kind:
+                    continue
                 trained = PinholeCamera(**header["camera"])
                 precision = float(read_record(path)["metrics"]["val_average_precision"])
             except (WeightsError, ConfigError, KeyError, TypeError, ValueError) as error:

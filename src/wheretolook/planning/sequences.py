@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.errors import PlanningError
 from wheretolook.geometry import Float, rotation_looking_along
-from wheretolook.planning.turns import turns_deg, turns_from_deg, within
+from wheretolook.planning.turns import check_axis, pan_tilt_turns_deg, turns_deg, turns_from_deg, within
 from wheretolook.planning.viewpoint_map import ViewpointMap
 
 SPACING_M = 0.2
@@ -34,15 +34,22 @@ class TurnLimit:
         max_turn_deg: largest angle of the rotation between two waypoints, included.
         neighbours: (D, K) int64, ids reachable from each direction, itself among them, ascending; where there are
             fewer than K, D fills up.
+        pan_tilt: whether the angle is that of a pan-tilt head (`wheretolook.planning.turns.pan_tilt_turns_deg`).
     """
 
     directions: Float
     max_turn_deg: float
     neighbours: NDArray[np.int64]
+    pan_tilt: bool = False
 
     @classmethod
-    def of(cls, directions: ArrayLike, max_turn_deg: float = MAX_TURN_DEG) -> TurnLimit:
+    def of(cls, directions: ArrayLike, max_turn_deg: float = MAX_TURN_DEG, pan_tilt: bool = False) -> TurnLimit:
         """For a lattice (D, 3), such as `direction_lattice` gives: Fibonacci's, ActLoc's yaws and pitches, or another.
+
+        Args:
+            directions: (D, 3) unit vectors.
+            max_turn_deg: largest angle.
+            pan_tilt: whether it limits what a pan-tilt head turns evenly, which is a little more.
 
         Raises:
             ValueError: directions of another shape, not of unit length, or a limit that is none.
@@ -50,19 +57,22 @@ class TurnLimit:
         axes = np.asarray(directions, dtype=np.float64)
         if axes.ndim != 2 or axes.shape[1] != 3 or not np.allclose(np.linalg.norm(axes, axis=1), 1, atol=1e-6):
             raise ValueError(f"directions must be unit vectors (D, 3), got an array of shape {axes.shape}")
-        reachable = within(turns_deg(axes), max_turn_deg)
+        reachable = within(pan_tilt_turns_deg(axes, axes) if pan_tilt else turns_deg(axes), max_turn_deg)
         most = int(reachable.sum(axis=1).max(initial=0))
         ids = np.where(reachable, np.arange(len(axes)), len(axes))
-        return cls(axes, float(max_turn_deg), np.sort(ids, axis=1)[:, :most])
+        return cls(axes, float(max_turn_deg), np.sort(ids, axis=1)[:, :most], pan_tilt)
 
     def from_start(self, start: ArrayLike | None) -> NDArray[np.bool_]:
         """Which directions (D,) the first waypoint may have: all, or those within the limit of the camera's start.
 
         Args:
-            start: (3,) axis of a camera without roll, (3, 3) cam_from_world rotation, or None.
+            start: (3,) axis of a camera without roll, (3, 3) cam_from_world rotation, or None. For a pan-tilt head, an
+                axis.
         """
         if start is None:
             return np.ones(len(self.directions), dtype=bool)
+        if self.pan_tilt:
+            return within(pan_tilt_turns_deg(check_axis(start)[None], self.directions)[0], self.max_turn_deg)
         return within(turns_from_deg(start, rotation_looking_along(self.directions)), self.max_turn_deg)
 
 

@@ -37,6 +37,22 @@ def check_axis(axis: ArrayLike) -> Float:
     return np.asarray(given / length)
 
 
+def pan_tilt_angles(axes: Float) -> tuple[Float, Float]:
+    """Yaws and pitches of unit axes (D, 3), (D,) each, in radians."""
+    return np.arctan2(axes[:, 1], axes[:, 0]), np.arcsin(axes[:, 2].clip(-1, 1))
+
+
+def pan_tilt_turns_deg(a: Float, b: Float) -> Float:
+    """How far (A, B) in degrees a camera on a pan-tilt head turns that turns both evenly from axes (A, 3) to (B, 3).
+
+    Pan and tilt turn about axes at right angles, so it is the root of the sum of their squares, and never less than the
+    angle of the rotation from one to the other (`turns_deg`).
+    """
+    (yaw_a, pitch_a), (yaw_b, pitch_b) = pan_tilt_angles(a), pan_tilt_angles(b)
+    pan = np.abs(yaw_a[:, None] - yaw_b[None])
+    return np.degrees(np.hypot(np.minimum(pan, 2 * np.pi - pan), pitch_a[:, None] - pitch_b[None]))
+
+
 def angles_to_axis_deg(directions: Float, axis: Float) -> Float:
     """Angles (D,) in degrees between unit directions (D, 3) and a unit axis (3,), accurate at small angles too."""
     chord = np.linalg.norm(directions - axis, axis=-1)

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from wheretolook.errors import ConfigError, SceneError
 from wheretolook.geometry import Float, PinholeCamera, poses_looking_along, rotation_looking_along, transform
 from wheretolook.rendering.warp_renderer import WarpRenderer
+from wheretolook.scenes.cutting import cut_above
 from wheretolook.scenes.mesh import TexturedMesh
 
 FAR = 25.0
@@ -98,60 +99,6 @@ def dollhouse(
     rgb, depth_m = drawn.rgb[0], drawn.depth_m[0]
     rgb[depth_m == 0] = 255
     return Dollhouse(rgb, depth_m, camera, pose)
-
-
-def cut_above(mesh: TexturedMesh, height_m: float) -> TexturedMesh:
-    """The part of a mesh at or below a world height; triangles that reach above it are cut."""
-    corners = mesh.triangles
-    below = mesh.vertices[corners][..., 2] <= height_m
-    n_below = below.sum(1)
-    # the corner that is alone on its side of the cut comes first
-    rows = np.flatnonzero((n_below == 1) | (n_below == 2))
-    lone = np.where(n_below[rows] == 1, below[rows].argmax(1), (~below[rows]).argmax(1))
-    order = (lone[:, None] + np.arange(3)) % 3
-    first, second, third = np.take_along_axis(corners[rows], order, axis=1).T
-    uvs = np.take_along_axis(mesh.corner_uvs[rows], order[:, :, None], axis=1)
-
-    def between(a: NDArray[np.integer], b: NDArray[np.integer]) -> Float:
-        """How far from a to b the cut lies."""
-        z_a, z_b = mesh.vertices[a, 2].astype(np.float64), mesh.vertices[b, 2].astype(np.float64)
-        return ((height_m - z_a) / (z_b - z_a))[:, None]
-
-    def mixed(values: NDArray, a: NDArray, b: NDArray, at: Float) -> NDArray:  # type: ignore[type-arg]
-        return ((1 - at) * values[a] + at * values[b]).astype(values.dtype)
-
-    to_second, to_third = between(first, second), between(first, third)
-    n_vertices, n_cut = len(mesh.vertices), len(rows)
-    on_second, on_third = n_vertices + np.arange(n_cut), n_vertices + n_cut + np.arange(n_cut)
-
-    def extended(values: NDArray) -> NDArray:  # type: ignore[type-arg]
-        return np.concatenate([values, mixed(values, first, second, to_second), mixed(values, first, third, to_third)])
-
-    uv_second = (1 - to_second) * uvs[:, 0] + to_second * uvs[:, 1]
-    uv_third = (1 - to_third) * uvs[:, 0] + to_third * uvs[:, 2]
-    tip, trunk = n_below[rows] == 1, n_below[rows] == 2
-    whole = n_below == 3
-    pieces = [
-        (corners[whole], mesh.corner_uvs[whole], mesh.triangle_texture[whole]),
-        _piece(tip, (first, on_second, on_third), (uvs[:, 0], uv_second, uv_third), mesh, rows),
-        _piece(trunk, (second, third, on_third), (uvs[:, 1], uvs[:, 2], uv_third), mesh, rows),
-        _piece(trunk, (second, on_third, on_second), (uvs[:, 1], uv_third, uv_second), mesh, rows),
-    ]
-    triangles, corner_uvs, texture = (np.concatenate(parts) for parts in zip(*pieces, strict=True))
-    return replace(
-        mesh,
-        vertices=extended(mesh.vertices),
-        triangles=triangles.astype(np.int32),
-        corner_uvs=corner_uvs.astype(np.float32),
-        triangle_texture=texture,
-        vertex_colors=None if mesh.vertex_colors is None else extended(mesh.vertex_colors),
-    )
-
-
-def _piece(keep: NDArray, corners, uvs, mesh: TexturedMesh, rows: NDArray) -> tuple[NDArray, NDArray, NDArray]:  # type: ignore[no-untyped-def,type-arg]
-    """Triangles, their texture coordinates and their textures, of what is left of cut triangles."""
-    texture = mesh.triangle_texture[rows[keep]]
-    return np.stack(corners, axis=1)[keep], np.stack(uvs, axis=1)[keep], texture
 
 
 def _facing(mesh: TexturedMesh, to_eye: Float) -> TexturedMesh:

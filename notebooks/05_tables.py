@@ -1,0 +1,99 @@
+# ---
+# jupyter:
+#   jupytext:
+#     formats: ipynb,py:percent
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # The paper's tables
+#
+# How well does each method choose where to look, and how sure is that? Both tables of the paper's experiments, with
+# intervals, beside the numbers it prints; then all methods at once, what each loses, and what occlusion has to do with
+# it. All from the newest evaluation in the tracking store; on a fresh clone that of the release is logged first.
+
+# %%
+# %matplotlib inline
+from IPython.display import Markdown, display
+
+from wheretolook.evaluation.paper_tables import NOTE
+from wheretolook.evaluation.table_view import latest_paper_table, paper_styler
+from wheretolook.notebook import open_release, open_store
+
+release = open_release()
+tracking = open_store(release)
+
+# %% [markdown]
+# ## Table 2: all methods
+#
+# The best view of each location, at four limits of the error. *Ours* is the share of views that localize, in % of what
+# an oracle reaches, with its 95 % interval over locations; */0.527* the same share divided as the paper's released code
+# divides. Read down a column: the order of the methods is what can be compared, not the size of the numbers.
+
+# %%
+display(Markdown(NOTE))
+paper_styler(latest_paper_table(tracking, "vs_others", release.name))
+
+# %% [markdown]
+# ## Table 3: inputs of the network
+#
+# In the paper depth brings four points at the finest limit. Here the three variants are within each other's intervals.
+
+# %%
+paper_styler(latest_paper_table(tracking, "input_variants", release.name))
+
+# %% [markdown]
+# ## All methods
+#
+# Filled marks are the best view of each location, open ones the best 5 and 10; random is far to the left, beyond the
+# axis. The methods that know what landmarks are like lead at the finest limit; at coarser ones most are alike.
+
+# %%
+from wheretolook.evaluation import latest_scores
+from wheretolook.figures.scores import regret_figure, score_figure
+
+scores = latest_scores(tracking, release.name)
+display(score_figure(scores))
+
+# %% [markdown]
+# ## What each method loses
+#
+# Left, how far a method stays behind the oracle; right, the difference to the set of landmarks on the same locations:
+# where the whisker crosses the dashed line, the two cannot be told apart.
+
+# %%
+display(regret_figure(scores))
+
+# %% [markdown]
+# The same on six interiors made by others, never trained on: differences are larger, and the paper's network is ahead
+# of the bins.
+
+# %%
+display(regret_figure(latest_scores(tracking, "interiors")))
+
+# %% [markdown]
+# ## Seeing through walls
+#
+# Filled marks with true occlusion, open ones as if every method saw through walls, as the paper's released code does.
+# The order of the paper, network above bins above Fisher information, comes back with the walls gone.
+
+# %%
+from wheretolook.figures.occlusion import occlusion_figure
+
+display(occlusion_figure(scores))
+
+# %% [markdown]
+# ## Everything in numbers
+#
+# All that the evaluation tells; `results/scores.md` of the dataset holds the same.
+
+# %%
+from wheretolook.evaluation.report import score_markdown
+
+display(Markdown(score_markdown(scores)))

@@ -1,0 +1,30 @@
+"""Options of drawing figures and tables from logged runs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from wheretolook.errors import ConfigError
+
+KINDS = ("png", "pdf", "svg")
+"""Kinds of files that figures are written as."""
+
+
+@dataclass(frozen=True)
+class FiguresConfig:
+    """Options of drawing.
+
+    Args:
+        out: folder of the files; `<dataset>/results/figures` if not given.
+        only: names of the items to make, as `wheretolook figures --list` tells; empty for all.
+        kinds: kinds of files of a figure: png, pdf, svg.
+    """
+
+    out: Path | None = None
+    only: tuple[str, ...] = ()
+    kinds: tuple[str, ...] = ("png", "pdf")
+
+    def __post_init__(self) -> None:
+        if not self.kinds or not set(self.kinds) <= set(KINDS):
+            raise ConfigError("unknown kind of figure", value=self.kinds, fix=f"Use some of {', '.join(KINDS)}.")

@@ -1,0 +1,127 @@
+"""What several viewpoints of a location are worth: the paper's figure "Multiple viewpoints results"."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.style import context
+
+from wheretolook.evaluation.config import threshold_label
+from wheretolook.evaluation.paper_tables import PAPER
+from wheretolook.evaluation.report import main_rows, methods_of, threshold_keys
+from wheretolook.evaluation.scores import ALL, LEARNED, ORACLE, Method
+from wheretolook.figures.style import PRINT, TWO_COLUMNS_IN, method_style, new_figure
+
+SHOWN: tuple[Method, ...] = (("set", ""), (LEARNED, ""), ("fisher", "trace exact"), ("bins", ""), ("random", ""))
+"""Methods that are drawn where no others are asked for; the network is the first there is."""
+
+ROWS = {
+    "normalized": "good ones among the best N\n(% of the oracle's share)",
+    "any": "locations with a good one\namong N (%)",
+}
+"""The two meanings of a score of several viewpoints: columns of the score table, and what they tell."""
+
+_PRINTED = {row.name: row.printed for row in PAPER["vs_others"]}
+_PAPER_MARKS = {"proposed": ("D", "paper, proposed"), "random": ("s", "paper, random")}
+_GREY = "#7a7a7a"
+
+
+def top_n_figure(scores: pd.DataFrame, methods: Sequence[Method] = ()) -> Figure:
+    """Scores over the number N of best viewpoints, at each threshold.
+
+    Args:
+        scores: a table of `wheretolook.evaluation.scores.score_table`; its rows over all scenes are drawn, those of the
+            first occlusion model and the first set of candidates if there are several.
+        methods: those to draw; `SHOWN` if empty.
+
+    Returns:
+        A column for each threshold. Above the share of good viewpoints among the best N of all locations, in % of the
+        oracle's; below the share of locations with a good one among N, the oracle's as lines. Whiskers are 95 %
+        bootstrap intervals. Open grey marks: what the paper prints for N = 1, on other scenes and divided by the
+        constant of its released code; of other N it prints no numbers.
+    """
+    scores = main_rows(scores)
+    pooled, keys = scores[scores["scene"] == ALL], threshold_keys(scores)
+    shown = _present(pooled, methods or SHOWN)
+    top_n = [int(n) for n in pooled["top_n"].unique()]
+    with context(PRINT):
+        figure = new_figure(TWO_COLUMNS_IN, 4.6)
+        panels = figure.subplots(len(ROWS), len(keys), sharex=True, sharey="row", squeeze=False)
+        for line, (column, name) in zip(panels, ROWS.items(), strict=True):
+            for index, (axes, key) in enumerate(zip(line, keys, strict=True)):
+                _draw(axes, pooled, shown, top_n, f"{column}_{{}}{key}")
+                if column == "normalized":
+                    axes.set_title(f"within {threshold_label(key)}")
+                    _draw_printed(axes, index)
+                else:
+                    _draw_oracle(axes, pooled, top_n, f"{column}_{key}")
+            line[0].set_ylabel(name)
+        for axes in panels[-1]:
+            axes.set_xlabel("N")
+        handles = [*panels[1, 0].get_legend_handles_labels()[0], *_printed_handles()]
+        figure.legend(handles=handles, loc="outside upper center", ncols=4, columnspacing=1.6, handlelength=1.4)
+        return figure
+
+
+def top_n_table(scores: pd.DataFrame, methods: Sequence[Method] = ()) -> pd.DataFrame:
+    """What `top_n_figure` draws at the finest threshold, in %, and the oracle's: a row a method, columns by N."""
+    scores = main_rows(scores)
+    pooled, key = scores[scores["scene"] == ALL], threshold_keys(scores)[0]
+    names = {"normalized": "good ones, % of the oracle's", "any": "locations with one, %"}
+    columns = {}
+    for column, name in names.items():
+        for n in pooled["top_n"].unique():
+            rows = pooled[pooled["top_n"] == n].set_index(["method", "inputs"])
+            columns[name, f"N = {n}"] = 100 * rows[f"{column}_{key}"]
+    shown = [*_present(pooled, methods or SHOWN), ORACLE]
+    table = pd.DataFrame(columns).loc[shown]
+    table.index = pd.Index([method_style(*method).label for method in shown])
+    return table
+
+
+def _present(pooled: pd.DataFrame, methods: Sequence[Method]) -> list[Method]:
+    """Those of the methods that a table has; the network without inputs stands for the first with any."""
+    there = methods_of(pooled)
+    network = next((method for method in there if method[0] == LEARNED), None)
+    named = [network if method == (LEARNED, "") and network else method for method in methods]
+    return [method for method in dict.fromkeys(named) if method in there]
+
+
+def _draw(axes: Axes, pooled: pd.DataFrame, methods: Sequence[Method], top_n: Sequence[int], column: str) -> None:
+    """Marks of all methods over N; `column` with "low_", "high_" or nothing inserted names the table's columns."""
+    places = np.arange(len(top_n), dtype=float)
+    for number, method in enumerate(methods):
+        rows = pooled[(pooled["method"] == method[0]) & (pooled["inputs"] == method[1])].set_index("top_n")
+        rows = rows.reindex(list(top_n))
+        style = method_style(*method)
+        at = places + 0.14 * (number - (len(methods) - 1) / 2)  # side by side, or whiskers would hide one another
+        value, low, high = (100 * rows[column.format(end)].to_numpy(dtype=float) for end in ("", "low_", "high_"))
+        axes.vlines(at, low, high, color=style.color, linewidth=0.9)
+        axes.plot(at, value, style.marker, color=style.color, markersize=5, label=style.label)
+    axes.set_xticks(places, [f"{n}" for n in top_n])
+    axes.set_xlim(-0.65, len(top_n) - 0.5)
+    axes.set_ylim(top=101)
+    axes.grid(axis="x", visible=False)
+
+
+def _draw_oracle(axes: Axes, pooled: pd.DataFrame, top_n: Sequence[int], column: str) -> None:
+    style, best = method_style(*ORACLE), pooled[pooled["method"] == ORACLE[0]].set_index("top_n").reindex(list(top_n))
+    places = np.arange(len(top_n))
+    axes.hlines(100 * best[column], places - 0.42, places + 0.42, color=style.color, linewidth=1, label=style.label)
+
+
+def _draw_printed(axes: Axes, index: int) -> None:
+    for name, (marker, _) in _PAPER_MARKS.items():
+        axes.plot(-0.5, _PRINTED[name][index], marker, markersize=5, color=_GREY, markerfacecolor="white")
+
+
+def _printed_handles() -> list[Line2D]:
+    return [
+        Line2D([], [], linestyle="none", marker=marker, color=_GREY, markerfacecolor="white", label=label)
+        for marker, label in _PAPER_MARKS.values()
+    ]

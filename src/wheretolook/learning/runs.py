@@ -1,0 +1,112 @@
+"""What a train run in the tracking store holds: its parameters, and the metrics of every epoch, its history."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from wheretolook.dataset import Dataset, write_text
+from wheretolook.tracking import TrackingConfig, artifact, client, finished_runs
+
+HISTORY_CSV = "history.csv"
+"""Artifact of a train run: a row an epoch."""
+
+TRAINING_CSV = "training.csv"
+"""In a release's `results/`: the histories of all that was trained, one below the other, with a column `variant`."""
+
+LOG_AT_MOST = 1000
+"""Metrics MLflow takes at a time."""
+
+
+def params_of(about: Mapping[str, Any]) -> dict[str, Any]:
+    """Parameters of a train run, from what its weights' record tells about it."""
+    config, variant = about["config"], about["variant"]
+    return {
+        **{name: about[name] for name in ("variant", "dataset", "dataset_fingerprint")},
+        **config.get(variant, {}),  # a learner has its own
+        **{name: value for name, value in config.items() if name != variant},
+    }
+
+
+def histories(tracking: TrackingConfig, dataset: str) -> dict[str, pd.DataFrame]:
+    """The history of the newest run of each variant trained on a dataset, by the variant; empty without any."""
+    found: dict[str, pd.DataFrame] = {}
+    for run in finished_runs(tracking, "train", params={"dataset": dataset}, file=HISTORY_CSV):
+        variant = run.data.params["variant"]
+        if variant not in found:
+            found[variant] = pd.read_csv(artifact(tracking, run.info.run_id, HISTORY_CSV))
+    return dict(sorted(found.items()))
+
+
+def trained(tracking: TrackingConfig, dataset: str) -> pd.DataFrame:
+    """What the newest run of each variant trained on a dataset kept.
+
+    Returns:
+        A row a variant, the best first: `variant`, `epoch` whose weights were kept, and on the validation views
+        `average_precision`, `roc_auc` and `calibration_error`, NaN where the learner does not measure it.
+    """
+    found: dict[str, dict[str, Any]] = {}
+    for run in finished_runs(tracking, "train", params={"dataset": dataset}):
+        kept, variant = run.data.metrics, run.data.params["variant"]
+        measures = {name: kept.get(f"kept_val_{name}", float("nan")) for name in _MEASURES}
+        found.setdefault(variant, {"variant": variant, "epoch": kept.get("kept_epoch", float("nan")), **measures})
+    table = pd.DataFrame(list(found.values()), columns=["variant", "epoch", *_MEASURES])
+    table["epoch"] = table["epoch"].astype("Int64")
+    return table.sort_values("average_precision", ascending=False, ignore_index=True)
+
+
+_MEASURES = ("average_precision", "roc_auc", "calibration_error")
+
+
+def log_history(tracking: TrackingConfig, run_id: str, history: pd.DataFrame) -> None:
+    """Log a history as training itself does: each epoch a step of the metrics; those that are not finite are left out.
+
+    Args:
+        tracking: the store.
+        run_id: of the run.
+        history: a row an epoch, with its number as `epoch`.
+    """
+    from mlflow.entities import Metric
+
+    start = int(client(tracking).get_run(run_id).info.start_time)
+    metrics = [
+        Metric(str(name), float(value), start + int(row["epoch"]), int(row["epoch"]))
+        for row in history.to_dict("records")
+        for name, value in row.items()
+        if name != "epoch" and pd.notna(value)
+    ]
+    for begin in range(0, len(metrics), LOG_AT_MOST):
+        client(tracking).log_batch(run_id, metrics=metrics[begin : begin + LOG_AT_MOST])
+
+
+def records(folder: Path) -> dict[Path, dict[str, Any]]:
+    """Records of training in a folder of weights and the folders in it, by their files."""
+    return {path: json.loads(path.read_text()) for path in sorted(folder.rglob("*.json"))}
+
+
+def keep_histories(release: Dataset, tracking: TrackingConfig) -> pd.DataFrame:
+    """Write `results/training.csv` of a release: histories of what was trained on it, as far as the store has them.
+
+    A history is that of the run that trained the weights, or else of the newest with the same parameters. Variants
+    without any keep the rows that the file has already.
+    """
+    path = release.root / "results" / TRAINING_CSV
+    known = pd.read_csv(path) if path.is_file() else pd.DataFrame({"variant": []})
+    kept = []
+    for record in records(release.root / "weights").values():
+        variant, history = record["about"]["variant"], None
+        same = {name: str(value) for name, value in params_of(record["about"]).items()}
+        alike = list(finished_runs(tracking, "train", params=same, file=HISTORY_CSV))
+        own = [run for run in alike if run.info.run_id == record["run_id"]]
+        for run in (own or alike)[:1]:
+            history = pd.read_csv(artifact(tracking, run.info.run_id, HISTORY_CSV))
+        rows = known[known["variant"] == variant] if history is None else history.assign(variant=variant)
+        kept.append(rows[["variant", *rows.columns.drop("variant")]])
+    table = pd.concat([rows for rows in kept if len(rows)], ignore_index=True) if any(map(len, kept)) else known
+    if len(table):
+        write_text(path, table.to_csv(index=False, float_format="%.5g", lineterminator="\n"))
+    return table

@@ -29,6 +29,9 @@ from wheretolook.notebook import open_release
 from wheretolook.showcase import open_showcase
 from wheretolook.showcase_figures import sampling_of
 
+# %% [markdown]
+# An apartment of the release, generated anew from its seed; a place in it where half of all views fail.
+
 # %%
 showcase = open_showcase(open_release(), "apartment-210")
 location = showcase.instructive_location()

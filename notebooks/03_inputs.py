@@ -31,6 +31,9 @@ from wheretolook.notebook import open_release
 from wheretolook.showcase import open_showcase
 from wheretolook.showcase_figures import learning_of
 
+# %% [markdown]
+# An apartment of the release, generated anew from its seed, and the paper's network that ships.
+
 # %%
 release = open_release()
 showcase = open_showcase(release, "apartment-210")

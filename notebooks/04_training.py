@@ -14,9 +14,9 @@
 # %% [markdown]
 # # Training
 #
-# Does the network learn what it should, is there overfitting, do its probabilities mean what they say, and what does it
-# look at? What is shown comes from train runs in the tracking store: those of the release, logged now if they are not there yet, and
-# whatever you have trained yourself.
+# Does the network learn what it should, is there overfitting, do its probabilities mean what they say, and what does
+# it look at? What is shown comes from train runs in the tracking store: those of the release, logged now if they are
+# not there yet, and whatever you have trained yourself.
 
 # %%
 # %matplotlib inline
@@ -96,8 +96,8 @@ from wheretolook.showcase import open_showcase
 from wheretolook.showcase_figures import mistaken_location, peaks_of
 
 # %% [markdown]
-# The place is one of an apartment that none of them has learnt from, where half of all views fail. Its mesh is generated
-# anew from its seed to render what the camera sees.
+# The place is one of an apartment that none of them has learnt from, where half of all views fail. Its mesh is
+# generated anew from its seed to render what the camera sees.
 
 # %%
 showcase = open_showcase(release, "apartment-210")

@@ -47,8 +47,9 @@ start, goal = [-1.83, 1.20, 1.55], [2.24, -2.12, 1.53]
 config = PlanConfig(grid=(8, 8, 4), directions=200, planner=PathConfig(time_s=6.0))
 
 # %% [markdown]
-# Each method has its own map of scores, eight by eight by four voxels with 200 directions each; the network's takes half
-# a minute on two cores. RRT* looks for a short path, and for places and views together; what costs least is improved.
+# Each method has its own map of scores, eight by eight by four voxels with 200 directions each; the network's takes
+# half a minute on two cores. RRT* looks for a short path, and for places and views together; what costs least is
+# improved until time is up.
 
 # %%
 one, methods = showcase.localization_map, ["forward", "fisher-trace-gp", "set"]

@@ -39,6 +39,11 @@ from wheretolook.sampling import free_locations
 from wheretolook.scenes.free_space import FreeSpace
 from wheretolook.scenes.loading import load_mesh
 
+# %% [markdown]
+# ## A map
+#
+# Put your own folder here. This one is made on the spot: a small apartment, photographed and mapped.
+
 # %%
 folder = Path(mkdtemp())
 example = make_example_model(folder)

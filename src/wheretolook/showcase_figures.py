@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from wheretolook.dataset import Dataset
 from wheretolook.errors import ConfigError
 from wheretolook.features import CHANNELS
 from wheretolook.figures.inputs import BinnedImage
 from wheretolook.figures.overview import View
+from wheretolook.figures.path_film import PathView
 from wheretolook.figures.peaks import spread_extrema
 from wheretolook.figures.pipeline import Pipeline
 from wheretolook.figures.sampling import Sampling
 from wheretolook.geometry import Float, poses_looking_along, rotation_looking_along
+from wheretolook.planning.config import PathsConfig, PlanConfig
+from wheretolook.planning.method_paths import path_views, plan_by_methods
+from wheretolook.planning.path_comparison import draw_pairs
 from wheretolook.planning.refine import score_directions
 from wheretolook.scoring.base import Scorer
 from wheretolook.scoring.learned import LearnedScorer
@@ -165,6 +171,32 @@ def peaks_of(showcase: Showcase, scorer: Scorer, location_id: int, n: int = 3, a
     everywhere = score_directions(scorer, showcase.center(location_id), showcase.directions)[0]
     tried = axes[known], is_good(rows[known])
     return Peaks(showcase.directions, everywhere, views(True), views(False), tried)
+
+
+PLANNED_BY = ("forward", "fisher-trace-gp", "set")
+"""Methods of the paper's planning figure."""
+
+
+def planned_views(
+    showcase: Showcase,
+    dataset: Dataset,
+    methods: Sequence[str] = PLANNED_BY,
+    config: PlanConfig = PlanConfig(grid=(8, 8, 4), directions=200),
+) -> dict[str, list[PathView]]:
+    """What a camera sees along the paths of several methods, between a start and a goal drawn with seed 0.
+
+    Args:
+        showcase: the scene.
+        dataset: it is of; its weights are used.
+        methods: names on the command line.
+        config: grid and directions of the viewpoint maps, and of the paths.
+    """
+    one = showcase.localization_map
+    ((start, goal),) = draw_pairs(showcase.space, PathsConfig(pairs=1))
+    paths = plan_by_methods(
+        methods, start, goal, showcase.scene, dataset, showcase.space, one.occlusion, config=config, device=one.device
+    )
+    return {name: path_views(path, one) for name, path in paths.items()}
 
 
 def _survey(showcase: Showcase, locations: Float) -> Survey:

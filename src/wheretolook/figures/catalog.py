@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import pandas as pd
 from matplotlib.figure import Figure
@@ -24,6 +25,7 @@ from wheretolook.evaluation.scores import read_scores
 from wheretolook.features import PAPER_VARIANTS
 from wheretolook.figures.config import FiguresConfig
 from wheretolook.figures.style import save_figure
+from wheretolook.learning.config import weights_name
 from wheretolook.learning.runs import HISTORY_CSV, histories
 from wheretolook.planning.path_report import PATHS_CSV
 from wheretolook.release import is_release, read_about
@@ -31,6 +33,10 @@ from wheretolook.tracking import TrackingConfig, client, finished_runs
 
 if TYPE_CHECKING:
     from mlflow.entities import Run
+
+    from wheretolook.scoring.base import Scorer
+    from wheretolook.scoring.learned import LearnedScorer
+    from wheretolook.showcase import Showcase
 
 Texts = Mapping[str, str]
 """A table: its text by the ending of its file, such as "md"."""
@@ -184,16 +190,88 @@ def _lattices(source: Source) -> Figure:
     return fibonacci_figure()
 
 
+@lru_cache(maxsize=1)
+def _showcase(root: Path) -> Showcase:
+    from wheretolook.showcase import open_showcase
+
+    return open_showcase(Dataset.load(root))
+
+
+def _shown(source: Source, weights: str = "") -> tuple[Showcase, Scorer, int]:
+    """The first test scene of a release, a scorer of it, and a place where looking matters."""
+    from wheretolook.scoring import load_scorer
+
+    showcase = _showcase(source.dataset.root)
+    scorer = load_scorer(source.dataset.root / "weights" / weights, showcase.localization_map)
+    return showcase, scorer, showcase.instructive_location()
+
+
+def _pipeline(source: Source) -> Figure:
+    from wheretolook.figures.pipeline import pipeline_figure
+    from wheretolook.showcase_figures import pipeline_of
+
+    return pipeline_figure(pipeline_of(*_shown(source)))
+
+
+def _learning(source: Source) -> Figure:
+    from wheretolook.figures.learning import learning_figure
+    from wheretolook.showcase_figures import learning_of
+
+    showcase, scorer, location = _shown(source, weights_name("2d+z"))
+    return learning_figure(*learning_of(showcase, cast("LearnedScorer", scorer), location).drawn)
+
+
+def _sampling(source: Source) -> Figure:
+    from wheretolook.figures.sampling import sampling_figure
+    from wheretolook.showcase_figures import sampling_of
+
+    showcase = _showcase(source.dataset.root)
+    return sampling_figure(sampling_of(showcase, showcase.instructive_location()))
+
+
+def _inputs(source: Source) -> Figure:
+    from wheretolook.figures.inputs import inputs_figure
+    from wheretolook.showcase_figures import learning_of
+
+    showcase, scorer, location = _shown(source, weights_name("2d+z"))
+    return inputs_figure(learning_of(showcase, cast("LearnedScorer", scorer), location).image)
+
+
+def _peaks(source: Source) -> Figure:
+    from wheretolook.figures.peaks import peaks_figure
+    from wheretolook.showcase_figures import peaks_of
+
+    return peaks_figure(*peaks_of(*_shown(source)).drawn)
+
+
+def _planning(source: Source) -> Figure:
+    from wheretolook.figures.path_film import methods_figure
+    from wheretolook.showcase_figures import planned_views
+
+    showcase = _showcase(source.dataset.root)
+    return methods_figure(planned_views(showcase, source.dataset), showcase.localization_map.landmarks.points)
+
+
 _TRAIN = "wheretolook train --config {config}"
 _BENCH = "python tests/benchmarks/bench_visibility.py{} --out cpu.json && python tests/benchmarks/bench_visibility.py" \
     " --draw cpu.json --log"  # fmt: skip
+_RELEASE = "wheretolook release --config {config}"
 _OTHERS = (("dataset", "interiors"),)
 
+_SET, _PAPERS = ((("dataset", "{dataset}"), ("variant", variant)) for variant in ("set", "2d+z"))
+
 ITEMS: tuple[Item, ...] = (
+    Item("pipeline", "Fig. 1", "from a map to the camera that is turned", "01_pipeline", _pipeline, "train", "",
+         _TRAIN, _SET),
+    Item("learning", "Fig. 2", "a view on its way through the network", "03_inputs", _learning, "train", "", _TRAIN,
+         _PAPERS),
+    Item("viewpoint_generation", "Fig. 3", "voxels, directions, occlusion", "02_sampling", _sampling, "", "",
+         _RELEASE),
     Item("spherical_sampling", "Fig. 4", "lattices of directions", "02_sampling", _lattices, "", ""),
     Item("architecture", "Table 1", "layers of the network", "04_training", _architecture, "train", "", _TRAIN),
     Item("table_vs_others", "Table 2", "all methods", "05_tables", _paper_table("vs_others"),
          file="table_vs_others.md"),
+    Item("planning", "Fig. 5", "the same way by three methods", "07_planning", _planning, "train", "", _TRAIN, _SET),
     Item("paths", "Fig. 5", "planned paths that localize", "07_planning", _paths, "paths", PATHS_CSV,
          "wheretolook compare-paths --config {source}", ()),
     Item("runtimes", "Fig. 6", "times of the visibility check", "08_runtimes", _runtimes, "benchmark", RUNTIMES_CSV,
@@ -201,6 +279,8 @@ ITEMS: tuple[Item, ...] = (
     Item("table_input_variants", "Table 3", "inputs of the network", "05_tables", _paper_table("input_variants"),
          file="table_input_variants.md"),
     Item("top_n", "Fig. 7", "several viewpoints of a location", "06_top_n", _top_n),
+    Item("inputs", "", "from an image to an input", "03_inputs", _inputs, "train", "", _TRAIN, _PAPERS),
+    Item("peaks", "", "what the network looks at", "04_training", _peaks, "train", "", _TRAIN, _SET),
     Item("training", "", "learning curves", "04_training", _training, "train", HISTORY_CSV, _TRAIN),
     Item("calibration", "", "whether probabilities mean what they say", "04_training", _calibration,
          file=CALIBRATION_CSV),

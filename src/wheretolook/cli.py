@@ -288,8 +288,9 @@ configs/release.yaml.
 """,
     "figures": """
 Each file says which runs it was drawn from, and is attached to them as an artifact under figures/. Where a run is
-missing, the command that makes it is named, the others are drawn, and the exit code is 2. --out, --only and --kinds
-stand for the settings of figures. Without --config it is configs/release.yaml, whose runs are logged first.
+missing, the command that makes it is named and the others are drawn; if one of the paper's, or one of those named with
+--only, is missing, the exit code is 2. --out, --only and --kinds stand for the settings of figures. Without --config it
+is configs/release.yaml, whose runs are logged first.
 
   wheretolook figures --list                            what there is, of the paper and beyond
   wheretolook figures --out figures                     everything, as PNG and PDF, tables as CSV, Markdown and TeX

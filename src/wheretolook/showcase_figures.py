@@ -183,7 +183,7 @@ def planned_views(
     methods: Sequence[str] = PLANNED_BY,
     config: PlanConfig = PlanConfig(grid=(8, 8, 4), directions=200),
 ) -> dict[str, list[PathView]]:
-    """What a camera sees along the paths of several methods, between a start and a goal drawn with seed 0.
+    """What a camera sees along the paths of several methods, between a start and a goal: the farthest of ten pairs.
 
     Args:
         showcase: the scene.
@@ -192,7 +192,8 @@ def planned_views(
         config: grid and directions of the viewpoint maps, and of the paths.
     """
     one = showcase.localization_map
-    ((start, goal),) = draw_pairs(showcase.space, PathsConfig(pairs=1))
+    pairs = draw_pairs(showcase.space, PathsConfig(pairs=10))
+    start, goal = pairs[np.linalg.norm(pairs[:, 1] - pairs[:, 0], axis=1).argmax()]
     paths = plan_by_methods(
         methods, start, goal, showcase.scene, dataset, showcase.space, one.occlusion, config=config, device=one.device
     )

@@ -52,7 +52,7 @@ def test_training_figure_marks_the_best_epoch(tmp_path: Path) -> None:
                             "val_average_precision": [0.1, 0.4, 0.8, 0.7, 0.8]})  # fmt: skip
     figure = training_figure({"2d": history, "2d+3d": history + 0.01})
     rings = [line for line in figure.axes[1].lines if line.get_marker() == "o"]
-    assert [line.get_xdata()[0] for line in rings] == [2, 2.01]
+    assert [line.get_xdata()[0] for line in rings] == [3, 3.01]
     _assert_draws(figure, tmp_path)
 
 

@@ -13,7 +13,7 @@ from wheretolook.learning.config import LEARNERS
 
 
 def training_figure(histories: Mapping[str, pd.DataFrame]) -> Figure:
-    """Loss and average precision over the epochs.
+    """Loss and average precision over the epochs, of which the first is 1.
 
     Args:
         histories: for each input variant, one row an epoch with `epoch`, `train_bce`, `val_bce`,
@@ -28,16 +28,18 @@ def training_figure(histories: Mapping[str, pd.DataFrame]) -> Figure:
         for variant, history in histories.items():
             style = method_style(variant) if variant in LEARNERS else method_style("mlp", variant)
             for panel, name in zip(panels, ("bce", "average_precision"), strict=True):
-                panel.plot(history["epoch"], history[f"train_{name}"], ":", color=style.color, linewidth=1.1,
+                panel.plot(1 + history["epoch"], history[f"train_{name}"], ":", color=style.color, linewidth=1.1,
                            label=f"{style.label}: training")  # fmt: skip
-                panel.plot(history["epoch"], history[f"val_{name}"], "-", color=style.color,
+                panel.plot(1 + history["epoch"], history[f"val_{name}"], "-", color=style.color,
                            label=f"{style.label}: validation")  # fmt: skip
             best = history.iloc[int(history["val_average_precision"].to_numpy().argmax())]
-            panels[1].plot(best["epoch"], best["val_average_precision"], "o", markersize=8, markerfacecolor="none",
+            panels[1].plot(1 + best["epoch"], best["val_average_precision"], "o", markersize=8, markerfacecolor="none",
                            color=style.color)  # fmt: skip
-        panels[0].set(xlabel="epoch", ylabel="weighted cross-entropy")
-        panels[1].set(xlabel="epoch", ylabel="average precision")
-        for panel in panels:
-            panel.xaxis.get_major_locator().set_params(integer=True)
-        panels[1].legend(loc="lower right")
+        panels[0].set(xlabel="epoch (log)", ylabel="weighted cross-entropy")
+        panels[1].set(xlabel="epoch (log)", ylabel="average precision")
+        for panel in panels:  # some learn for eight epochs, others for hundreds
+            panel.set_xscale("log")
+            panel.xaxis.set_major_formatter("{x:g}")
+        handles, labels = panels[1].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=max(1, len(histories)))
         return figure

@@ -71,6 +71,9 @@ display(inputs_figure(worst.image))
 # %%
 display(learning_figure(*learning.drawn))
 
+# %% [markdown]
+# The view at the same place that it likes least:
+
 # %%
 display(learning_figure(*worst.drawn))
 

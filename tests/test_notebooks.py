@@ -17,7 +17,7 @@ from nbclient import NotebookClient
 from PIL import Image
 
 from synthetic_release import make_release
-from wheretolook.notebook_html import main, notebook_page, with_palette
+from wheretolook.notebook_html import main, notebook_page, small_picture
 from wheretolook.tracking import TrackingConfig, newest_run
 
 FOLDER = Path(__file__).parents[1] / "notebooks"
@@ -135,13 +135,25 @@ def test_pictures_keep_their_colours_in_less_space() -> None:
     pixels = np.full((200, 300, 4), 255, np.uint8)
     pixels[50:100, 50:200] = (0, 114, 178, 255)
     pixels[:10] = 0  # transparent
+    kind, small, n_bytes = shrunk(pixels)
+    assert kind == "data:image/png;base64" and n_bytes[1] < n_bytes[0] / 20
+    assert small.getpixel((60, 60)) == (0, 114, 178) and small.getpixel((60, 5)) == (255, 255, 255)
+    x = np.linspace(0, 255, 900)
+    photograph = np.stack([x[:, None] * np.ones(900), np.ones((900, 1)) * x, np.full((900, 900), 128.0)], axis=-1)
+    photograph += np.random.default_rng(0).normal(0, 4, photograph.shape)
+    photograph = photograph.clip(0, 255).astype(np.uint8)
+    kind, small, n_bytes = shrunk(photograph)
+    assert kind == "data:image/webp;base64" and n_bytes[1] < n_bytes[0] / 10
+    assert np.abs(np.asarray(small, dtype=float) - photograph).mean() < 6
+
+
+def shrunk(pixels: np.ndarray) -> tuple[str, Image.Image, tuple[int, int]]:
+    """Kind of the address, the picture, and its bytes before and after."""
     stream = io.BytesIO()
     Image.fromarray(pixels).save(stream, "PNG", compress_level=0)
-    small = base64.b64decode(with_palette(base64.b64encode(stream.getvalue()).decode()))
-    assert len(small) < len(stream.getvalue()) / 20
-    with Image.open(io.BytesIO(small)) as image:
-        assert image.convert("RGB").getpixel((60, 60)) == (0, 114, 178)
-        assert image.convert("RGB").getpixel((60, 5)) == (255, 255, 255)
+    kind, _, content = small_picture(base64.b64encode(stream.getvalue()).decode()).partition(",")
+    small = base64.b64decode(content)
+    return kind, Image.open(io.BytesIO(small)).convert("RGB"), (len(stream.getvalue()), len(small))
 
 
 def test_a_page_shows_tables_once() -> None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from wheretolook.camera_models import Camera, ColmapCamera
 from wheretolook.errors import ConfigError
 from wheretolook.features_kernel import bin_kernel, count_bins_kernel
-from wheretolook.geometry import Float, split_poses
+from wheretolook.geometry import Float, PinholeCamera, split_poses
 from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 from wheretolook.visibility.frustum import (
     MIN_DEPTH_M,
@@ -170,13 +170,9 @@ def bin_views(
             bin_kernel,
             dim=len(centers),
             inputs=[
-                wp.array(frustum_sides(camera, rotations), dtype=wp.vec3, device=device),
-                wp.array(rotations.astype(np.float32), dtype=wp.mat33, device=device),
-                wp.array(centers, dtype=wp.vec3d, device=device),
-                wp.array(np.asarray(location_rows[rows], dtype=np.int32), dtype=wp.int32, device=device),
+                *_of_views(camera, rotations, centers, location_rows[rows], device),
                 points_on_device, directions, attributes, starts, indices,
-                wp.float64(camera.focal_px), wp.float64(camera.cx), wp.float64(camera.cy),
-                wp.float64(bins / camera.width), wp.float64(bins / camera.height), wp.float64(MIN_DEPTH_M), bins,
+                *_of_camera(camera, bins), bins,
             ],
             outputs=[block_means, block_counts],
             device=device,
@@ -221,13 +217,9 @@ def count_bins(
             count_bins_kernel,
             dim=(len(centers), lanes),
             inputs=[
-                wp.array(frustum_sides(camera, rotations), dtype=wp.vec3, device=device),
-                wp.array(rotations.astype(np.float32), dtype=wp.mat33, device=device),
-                wp.array(centers, dtype=wp.vec3d, device=device),
-                wp.array(np.asarray(location_rows[rows], dtype=np.int32), dtype=wp.int32, device=device),
+                *_of_views(camera, rotations, centers, location_rows[rows], device),
                 points_on_device, starts, indices,
-                wp.float64(camera.focal_px), wp.float64(camera.cx), wp.float64(camera.cy),
-                wp.float64(bins / camera.width), wp.float64(bins / camera.height), wp.float64(MIN_DEPTH_M), bins, lanes,
+                *_of_camera(camera, bins), bins, lanes,
                 wp.zeros((len(centers), bins * bins), dtype=wp.int32, device=device),
             ],
             outputs=counted,
@@ -235,6 +227,24 @@ def count_bins(
         )  # fmt: skip
         n_visible[rows], n_filled[rows] = (one.numpy() for one in counted)
     return n_visible, n_filled
+
+
+def _of_views(
+    camera: PinholeCamera, rotations: Float, centers: Float, location_rows: NDArray[np.integer[Any]], device: str
+) -> list[Any]:
+    """What both kernels are told of the views."""
+    return [
+        wp.array(frustum_sides(camera, rotations), dtype=wp.vec3, device=device),
+        wp.array(rotations.astype(np.float32), dtype=wp.mat33, device=device),
+        wp.array(centers, dtype=wp.vec3d, device=device),
+        wp.array(np.asarray(location_rows, dtype=np.int32), dtype=wp.int32, device=device),
+    ]
+
+
+def _of_camera(camera: PinholeCamera, bins: int) -> list[Any]:
+    """What both kernels are told of the camera."""
+    values = (camera.focal_px, camera.cx, camera.cy, bins / camera.width, bins / camera.height, MIN_DEPTH_M)
+    return [wp.float64(value) for value in values]
 
 
 def bin_views_plain(

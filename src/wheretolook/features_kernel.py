@@ -15,6 +15,14 @@ wp.set_module_options({"fuse_fp": False})  # for `pixel_of`
 MAPPED_DISTANCE = wp.constant(MAP_ATTRIBUTES.index("mapped_distance"))
 
 
+@wp.func
+def cell_of(pixel: wp.vec2d, columns_per_pixel: wp.float64, rows_per_pixel: wp.float64, bins: wp.int32) -> wp.int32:
+    """Which of bins x bins cells of the image, row by row."""
+    column = wp.clamp(wp.int32(pixel[0] * columns_per_pixel), 0, bins - 1)
+    row = wp.clamp(wp.int32(pixel[1] * rows_per_pixel), 0, bins - 1)
+    return row * bins + column
+
+
 @wp.kernel
 def bin_kernel(
     sides: wp.array2d[wp.vec3],
@@ -45,9 +53,7 @@ def bin_kernel(
         offset = offset_from(center, points[landmark])
         if in_view(sides, view, offset, min_depth):
             pixel = pixel_of(rotation, offset, focal, cx, cy)
-            column = wp.clamp(wp.int32(pixel[0] * columns_per_pixel), 0, bins - 1)
-            row = wp.clamp(wp.int32(pixel[1] * rows_per_pixel), 0, bins - 1)
-            cell = row * bins + column
+            cell = cell_of(pixel, columns_per_pixel, rows_per_pixel, bins)
             counts[view, cell] = counts[view, cell] + 1
             means[view, 0, cell] = means[view, 0, cell] + wp.float32(pixel[0])
             means[view, 1, cell] = means[view, 1, cell] + wp.float32(pixel[1])
@@ -101,11 +107,10 @@ def count_bins_kernel(
         offset = offset_from(center, points[indices[entry]])
         if in_view(sides, view, offset, min_depth):
             pixel = pixel_of(rotation, offset, focal, cx, cy)
-            column = wp.clamp(wp.int32(pixel[0] * columns_per_pixel), 0, bins - 1)
-            row = wp.clamp(wp.int32(pixel[1] * rows_per_pixel), 0, bins - 1)
+            cell = cell_of(pixel, columns_per_pixel, rows_per_pixel, bins)
             visible += 1
             # whichever lane comes first fills the bin: the numbers do not depend on their order
-            if wp.atomic_max(taken, view, row * bins + column, 1) == 0:
+            if wp.atomic_max(taken, view, cell, 1) == 0:
                 filled += 1
     wp.atomic_add(n_visible, view, visible)
     wp.atomic_add(n_filled, view, filled)

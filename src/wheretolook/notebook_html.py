@@ -30,6 +30,9 @@ nav a { margin-right: 1em }
 COLOURS = 128
 """Of a picture's palette: figures have fewer, but for the soft edges of letters."""
 
+LARGE, QUALITY = 60_000, 80
+"""Bytes above which a picture becomes a WebP, and its quality."""
+
 
 def run_notebook(path: Path, timeout_s: float = 600) -> Any:
     """A notebook (`.ipynb`, or `.py` in jupytext's percent format) with its outputs, run in its own folder.
@@ -91,7 +94,7 @@ def _output(output: Any, markdown: Any) -> str:
         return f'<pre class="output">{html.escape(output.text)}</pre>' if output.name == "stdout" else ""
     data = output.get("data", {})
     if "image/png" in data:
-        return f'<p><img src="data:image/png;base64,{with_palette(data["image/png"])}" alt=""></p>'
+        return f'<p><img src="{small_picture(data["image/png"])}" alt=""></p>'
     if "text/html" in data:
         return f'<div class="output">{data["text/html"]}</div>'
     if "text/markdown" in data:
@@ -100,17 +103,23 @@ def _output(output: Any, markdown: Any) -> str:
     return f'<pre class="output">{html.escape(text)}</pre>' if text and not text.startswith("<Figure") else ""
 
 
-def with_palette(png: str) -> str:
-    """A PNG in base64 with at most `COLOURS` colours, or as it is if that is smaller."""
+def small_picture(png: str) -> str:
+    """A PNG in base64 as the address of a smaller picture: with at most `COLOURS` colours, or, where that remains large
+    because it shows photographs, as WebP."""
     from PIL import Image
 
     given = base64.b64decode(png)
     with Image.open(io.BytesIO(given)) as image:
         flat = Image.new("RGB", image.size, "white")
         flat.paste(image, mask=image.getchannel("A") if "A" in image.getbands() else None)
-    stream = io.BytesIO()
+    stream, kind = io.BytesIO(), "png"
     flat.quantize(COLOURS, dither=Image.Dither.NONE).save(stream, "PNG", optimize=True)
-    return base64.b64encode(min(stream.getvalue(), given, key=len)).decode()
+    smallest = min(stream.getvalue(), given, key=len)
+    if len(smallest) > LARGE:
+        stream, kind = io.BytesIO(), "webp"
+        flat.save(stream, "WEBP", quality=QUALITY, method=6)
+        smallest = stream.getvalue()
+    return f"data:image/{kind};base64,{base64.b64encode(smallest).decode()}"
 
 
 def main(arguments: list[str]) -> int:

@@ -158,6 +158,9 @@ def shrunk(pixels: np.ndarray) -> tuple[str, Image.Image, tuple[int, int]]:
 
 def test_a_page_shows_tables_once() -> None:
     table = nbformat.v4.new_output("display_data", {"text/html": "<b>told</b>", "text/plain": "told"})
-    cells = [nbformat.v4.new_code_cell("x", outputs=[table])]
+    widget = {"application/vnd.jupyter.widget-view+json": {}, "text/plain": "plan: 0%"}
+    bar = nbformat.v4.new_output("display_data", widget)
+    cells = [nbformat.v4.new_code_cell("x", outputs=[bar, table])]
     page = notebook_page(nbformat.v4.new_notebook(cells=cells), "a page")
+    assert "plan: 0%" not in page
     assert page.count("<b>told</b>") == page.count("told") == 1 and "<title>a page</title>" in page

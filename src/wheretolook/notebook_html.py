@@ -93,6 +93,8 @@ def _output(output: Any, markdown: Any) -> str:
     if output.output_type == "stream":
         return f'<pre class="output">{html.escape(output.text)}</pre>' if output.name == "stdout" else ""
     data = output.get("data", {})
+    if "application/vnd.jupyter.widget-view+json" in data:  # a progress bar, long done
+        return ""
     if "image/png" in data:
         return f'<p><img src="{small_picture(data["image/png"])}" alt=""></p>'
     if "text/html" in data:

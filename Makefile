@@ -36,6 +36,7 @@ lab: $(READY)
 	$(BIN)/jupyter lab notebooks
 
 html: $(READY)
+	@$(BIN)/wheretolook log-release >/dev/null
 	OMP_WAIT_POLICY=PASSIVE $(BIN)/python -m wheretolook.notebook_html notebooks notebooks/html
 
 setup: $(READY)

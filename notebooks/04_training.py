@@ -108,7 +108,8 @@ location = showcase.instructive_location()
 #
 # Numbers mark the highest scores among views that were labelled, letters the lowest, none within 40° of another of its
 # kind. Rings localized within 5 cm and 0.4°, crosses did not. The peaks turn out to show shelves, chairs and a
-# patterned carpet, the pits a bare ceiling. Below each view stands how far off the pose was that was found, if one was.
+# patterned carpet, the pits a bare ceiling or a dim corner. Below each view stands how far off the pose was that was
+# found, if one was.
 
 # %%
 mlp = load_scorer(release.root / "weights" / "mlp-2d+z.safetensors", showcase.localization_map)

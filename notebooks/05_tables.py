@@ -20,6 +20,7 @@
 
 # %%
 # %matplotlib inline
+# %config InlineBackend.figure_formats = ["retina"]
 from IPython.display import Markdown, display
 
 from wheretolook.evaluation.paper_tables import NOTE
@@ -81,7 +82,8 @@ display(regret_figure(latest_scores(tracking, "interiors")))
 # ## Seeing through walls
 #
 # Filled marks with true occlusion, open ones as if every method saw through walls, as the paper's released code does.
-# The order of the paper, network above bins above Fisher information, comes back with the walls gone.
+# With the walls gone bins and the networks are above all rows of Fisher information, as in the paper, but bins above
+# the paper's network. What suffers most is what counts landmarks or sums up their information.
 
 # %%
 from wheretolook.figures.occlusion import occlusion_figure

@@ -20,6 +20,7 @@
 
 # %%
 # %matplotlib inline
+# %config InlineBackend.figure_formats = ["retina"]
 from IPython.display import display
 
 from wheretolook.evaluation import latest_scores
@@ -32,9 +33,10 @@ scores = latest_scores(open_store(release), release.name)
 # %% [markdown]
 # ## Two meanings of a score
 #
-# Above, how many of the best N views are good, in % of what an oracle reaches: from left to right in a panel it does
-# not fall, so a planner may as well take the tenth best. Below, at how many locations one of N is good: with ten
-# tries every method comes near the oracle's line, since most locations have many good views, and even random does.
+# Above, how many of the best N views are good, in % of what an oracle reaches: from left to right in a panel it changes
+# by a point or two, so a planner may nearly as well take the tenth best. Below, at how many locations one of N is good:
+# with ten tries the methods shown are within two points of the oracle's line, since most locations have many good
+# views, and random is within five.
 # The paper prints numbers for N = 1 alone, on other scenes: open grey marks.
 
 # %%

@@ -77,7 +77,7 @@ display(still_figure(views["set"], one.landmarks.points, "apartment-210, set of 
 #
 # Views that localize within 0.25 m and 2°, with 95 % intervals over pairs of starts and goals. Above, each method chose
 # places and views; below, it chose the views along a path that was given, under the limit of 30° between waypoints,
-# exactly and by the greedy rule of the Active Localization Benchmark (hatched).
+# exactly and by the greedy rule of the Active Localization Benchmark (hatched); looking ahead keeps to no limit.
 
 # %%
 summary = pd.read_csv(newest_artifact(open_store(release), "paths", "paths.csv", release.name))

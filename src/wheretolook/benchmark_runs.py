@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -15,8 +16,9 @@ RUNTIMES_CSV, SCALING_CSV = "runtimes.csv", "scaling.csv"
 
 
 def log_runtimes(
-    tracking: TrackingConfig, sizes: pd.DataFrame, growth: pd.DataFrame, tags: Mapping[str, str] | None = None
-) -> str:
+    tracking: TrackingConfig, sizes: pd.DataFrame, growth: pd.DataFrame, tags: Mapping[str, str] | None = None,
+    file: Path | None = None,
+) -> str:  # fmt: skip
     """Log measured times: a run of the stage "benchmark" with both tables and their figures.
 
     Args:
@@ -24,6 +26,7 @@ def log_runtimes(
         sizes: as `wheretolook.figures.runtimes.runtime_figure` wants it.
         growth: as `scaling_figure` wants it; may be empty.
         tags: further tags.
+        file: that `sizes` were read from, to be logged to the byte.
 
     Returns:
         Id of the run.
@@ -41,7 +44,10 @@ def log_runtimes(
         start_run(tracking, "visibility runtimes", "benchmark", {"machines": machines}, tags=tags) as (client, run),
     ):
         log(client, run, metrics=metrics)
-        sizes.to_csv(Path(folder) / RUNTIMES_CSV, index=False)
+        if file is None:
+            sizes.to_csv(Path(folder) / RUNTIMES_CSV, index=False)
+        else:
+            shutil.copyfile(file, Path(folder) / RUNTIMES_CSV)
         save_figure(runtime_figure(sizes), Path(folder) / "runtimes.png")
         if len(growth):
             growth.to_csv(Path(folder) / SCALING_CSV, index=False)

@@ -27,11 +27,8 @@ td, th { padding: 2px 8px; border-bottom: 1px solid #ddd; text-align: left }
 nav a { margin-right: 1em }
 """
 
-COLOURS = 128
-"""Of a picture's palette: figures have fewer, but for the soft edges of letters."""
-
-LARGE, QUALITY = 60_000, 80
-"""Bytes above which a picture becomes a WebP, and its quality."""
+LARGE, QUALITY = 100_000, 88
+"""Bytes above which a picture loses something, and its quality then."""
 
 
 def run_notebook(path: Path, timeout_s: float = 600) -> Any:
@@ -106,27 +103,24 @@ def _output(output: Any, markdown: Any) -> str:
 
 
 def small_picture(png: str) -> str:
-    """A PNG in base64 as the address of a smaller picture: with at most `COLOURS` colours, or, where that remains large
-    because it shows photographs, as WebP."""
+    """A PNG in base64 as the address of a smaller picture: as WebP, without loss, or, where that remains large because
+    it shows photographs, with so little that colours stay what they are."""
     from PIL import Image
 
-    given = base64.b64decode(png)
-    with Image.open(io.BytesIO(given)) as image:
+    with Image.open(io.BytesIO(base64.b64decode(png))) as image:
         flat = Image.new("RGB", image.size, "white")
         flat.paste(image, mask=image.getchannel("A") if "A" in image.getbands() else None)
-    stream, kind = io.BytesIO(), "png"
-    flat.quantize(COLOURS, dither=Image.Dither.NONE).save(stream, "PNG", optimize=True)
-    smallest = min(stream.getvalue(), given, key=len)
-    if len(smallest) > LARGE:
-        stream, kind = io.BytesIO(), "webp"
-        flat.save(stream, "WEBP", quality=QUALITY, method=6)
-        smallest = stream.getvalue()
-    return f"data:image/{kind};base64,{base64.b64encode(smallest).decode()}"
+    for options in ({"lossless": True}, {"quality": QUALITY}):
+        stream = io.BytesIO()
+        flat.save(stream, "WEBP", method=6, **options)
+        if stream.tell() <= LARGE:
+            break
+    return f"data:image/webp;base64,{base64.b64encode(stream.getvalue()).decode()}"
 
 
 def main(arguments: list[str]) -> int:
     """Write the page of every notebook in a folder; those that fail are named. Returns the exit code."""
-    from nbclient.exceptions import CellExecutionError
+    from nbclient.exceptions import CellExecutionError, CellTimeoutError, DeadKernelError
 
     folder, out = Path(arguments[0]), Path(arguments[1])
     paths = sorted(path for path in folder.glob("*.py") if len(arguments) < 3 or path.stem in arguments[2:])
@@ -137,9 +131,10 @@ def main(arguments: list[str]) -> int:
         start = time.monotonic()
         try:
             page = notebook_page(run_notebook(path), path.stem, names)
-        except CellExecutionError as error:
+        except (CellExecutionError, CellTimeoutError, DeadKernelError) as error:
             failed.append(path.stem)
-            print(f"{path.stem}: {error.ename}: {error.evalue}", file=sys.stderr)
+            what = f"{error.ename}: {error.evalue}" if isinstance(error, CellExecutionError) else str(error)
+            print(f"{path.stem}: {what}", file=sys.stderr)
             continue
         (out / f"{path.stem}.html").write_text(page, encoding="utf-8")
         print(f"{path.stem}: {len(page) / 1e3:.0f} kB in {time.monotonic() - start:.0f} s -> {out / path.stem}.html")

@@ -6,7 +6,9 @@ Here they are logged as the stages log them, once: a run with the same file as i
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import fcntl
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -58,6 +60,9 @@ class ReleaseRuns:
 def log_release(dataset: Dataset, tracking: TrackingConfig, say: Say = lambda text: None) -> ReleaseRuns:
     """Log what a release holds, as far as the store does not have it yet.
 
+    What an earlier call left half done, because it was killed, is deleted first; of several calls at once one waits for
+    the other.
+
     Args:
         dataset: a release with its results.
         tracking: the store; made if there is none.
@@ -66,6 +71,38 @@ def log_release(dataset: Dataset, tracking: TrackingConfig, say: Say = lambda te
     Returns:
         The runs, those found again too.
     """
+    with _alone(tracking):
+        _forget_halves(tracking)
+        return _log_missing(dataset, tracking, say)
+
+
+@contextmanager
+def _alone(tracking: TrackingConfig) -> Iterator[None]:
+    """While another process logs a release into the store, wait."""
+    tracking.root.mkdir(parents=True, exist_ok=True)
+    with open(tracking.root / ".release.lock", "w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def _forget_halves(tracking: TrackingConfig) -> None:
+    """Delete runs that were being logged from a release when something ended it, and those nested in them."""
+    mlflow = client(tracking)
+    experiment = mlflow.get_experiment_by_name(tracking.experiment)
+    if experiment is None:
+        return
+
+    def matching(condition: str) -> list[str]:
+        found = mlflow.search_runs([experiment.experiment_id], condition, max_results=10_000)
+        return [str(run.info.run_id) for run in found]
+
+    tagged = " and ".join(f"tags.{name} = '{value}'" for name, value in TAGS.items())
+    for half in matching(f"{tagged} and attributes.status != 'FINISHED'"):
+        for run_id in (*matching(f"tags.`mlflow.parentRunId` = '{half}'"), half):
+            mlflow.delete_run(run_id)
+
+
+def _log_missing(dataset: Dataset, tracking: TrackingConfig, say: Say) -> ReleaseRuns:
     runs, results = ReleaseRuns(), dataset.root / "results"
 
     def keep(name: str, found: str | None, make: Callable[..., str], *arguments: Any) -> str:
@@ -206,9 +243,6 @@ def _log_paths(dataset: Dataset, tracking: TrackingConfig) -> str:
 
 def _log_benchmark(dataset: Dataset, tracking: TrackingConfig) -> str:
     results = dataset.root / "results"
-    growth = results / SCALING_CSV
-    run = log_runtimes(
-        tracking, pd.read_csv(results / RUNTIMES_CSV), pd.read_csv(growth) if growth.is_file() else pd.DataFrame(), TAGS
-    )
-    client(tracking).log_artifact(run, str(results / RUNTIMES_CSV))  # to the byte, to be found again by
-    return run
+    times, scaling = results / RUNTIMES_CSV, results / SCALING_CSV
+    growth = pd.read_csv(scaling) if scaling.is_file() else pd.DataFrame()
+    return log_runtimes(tracking, pd.read_csv(times), growth, TAGS, times)

@@ -37,9 +37,10 @@ def figures(experiment: Experiment, say: Say = print) -> Dataset:
         MissingRunError: some of the paper's, or of those named, could not be made for want of a run; the others were.
         ConfigError: there is no figure of such a name. TableError: there is no dataset.
     """
-    from wheretolook.figures.catalog import ITEMS, write_items
+    from wheretolook.figures.catalog import ITEMS, check_names, write_items
     from wheretolook.release import is_release
 
+    check_names(experiment.figures)
     dataset = Dataset.load(experiment.root)
     if is_release(dataset):
         log_release(experiment, say)

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from mlflow.entities import Run
 
 STAGE_TAG = "stage"
-"""Tag of every run this package logs: "label", "train", "evaluate", "paths", "learners" or "benchmark"."""
+"""Tag of every run this package logs: "label", "train", "evaluate", "plan", "paths", "learners" or "benchmark"."""
 
 
 @dataclass(frozen=True)

@@ -80,6 +80,8 @@ class Item:
         command: makes such a run; {config} stands for the dataset's configuration, {source} for that of the dataset
             with meshes: of a release, the one that it was copied from.
         params: parameters that the run must have; "{dataset}" stands for the dataset's name.
+        of_release: whether only a release has it: it shows a scene made anew from its seed, or other datasets' results.
+        of_source: whether a run of the dataset that a release was copied from serves, too.
     """
 
     name: str
@@ -91,19 +93,26 @@ class Item:
     file: str = SCORES_CSV
     command: str = "wheretolook evaluate --config {config}"
     params: tuple[tuple[str, str], ...] = (("dataset", "{dataset}"),)
+    of_release: bool = False
+    of_source: bool = False
 
     def runs(self, dataset: Dataset, tracking: TrackingConfig) -> tuple[Run, ...]:
         """The newest run of those that it can be drawn from; of train runs the newest of each variant."""
-        params = {name: value.format(dataset=dataset.name) for name, value in self.params}
         found: dict[str, Run] = {}
-        for run in finished_runs(tracking, self.stage, params=params, file=self.file) if self.stage else ():
-            found.setdefault(run.data.params.get("variant", ""), run)
+        for name in (dataset.name, *([_source_of(dataset)] if self.of_source else [])):
+            params = {key: value.format(dataset=name) for key, value in self.params}
+            for run in finished_runs(tracking, self.stage, params=params, file=self.file) if self.stage else ():
+                found.setdefault(run.data.params.get("variant", ""), run)
         return tuple(found.values())
 
     def command_for(self, dataset: Dataset) -> str:
         """What to run to make what is missing."""
-        source = str(read_about(dataset)["source"]) if is_release(dataset) else dataset.name
-        return self.command.format(config=f"configs/{dataset.name}.yaml", source=f"configs/{source}.yaml")
+        return self.command.format(config=f"configs/{dataset.name}.yaml", source=f"configs/{_source_of(dataset)}.yaml")
+
+
+def _source_of(dataset: Dataset) -> str:
+    """Name of the dataset that a release was copied from; of another, its own."""
+    return str(read_about(dataset)["source"]) if is_release(dataset) else dataset.name
 
 
 def _scores(source: Source) -> Figure:
@@ -255,32 +264,40 @@ def _planning(source: Source) -> Figure:
 _TRAIN = "wheretolook train --config {config}"
 _BENCH = "python tests/benchmarks/bench_visibility.py{} --out cpu.json && python tests/benchmarks/bench_visibility.py" \
     " --draw cpu.json --log"  # fmt: skip
-_RELEASE = "wheretolook release --config {config}"
+_LOG_RELEASE = "wheretolook log-release --config {config}"
 _OTHERS = (("dataset", "interiors"),)
 
-_SET, _PAPERS = ((("dataset", "{dataset}"), ("variant", variant)) for variant in ("set", "2d+z"))
+_SET, _PAPERS, _WIDEST = ((("dataset", "{dataset}"), ("variant", variant)) for variant in ("set", "2d+z", "2d+3d"))
+_TRAIN_SET, _TRAIN_WIDEST = (
+    "wheretolook train --config configs/release-set.yaml",
+    f"{_TRAIN} --train.variants '[2d+3d]'",
+)
 
 ITEMS: tuple[Item, ...] = (
     Item("pipeline", "Fig. 1", "from a map to the camera that is turned", "01_pipeline", _pipeline, "train", "",
-         _TRAIN, _SET),
+         _TRAIN_SET, _SET, of_release=True),
     Item("learning", "Fig. 2", "a view on its way through the network", "03_inputs", _learning, "train", "", _TRAIN,
-         _PAPERS),
+         _PAPERS, of_release=True),
     Item("viewpoint_generation", "Fig. 3", "voxels, directions, occlusion", "02_sampling", _sampling, "", "",
-         _RELEASE),
+         _LOG_RELEASE, of_release=True),
     Item("spherical_sampling", "Fig. 4", "lattices of directions", "02_sampling", _lattices, "", ""),
-    Item("architecture", "Table 1", "layers of the network", "04_training", _architecture, "train", "", _TRAIN),
+    Item("architecture", "Table 1", "layers of the network", "04_training", _architecture, "train", "", _TRAIN_WIDEST,
+         _WIDEST),
     Item("table_vs_others", "Table 2", "all methods", "05_tables", _paper_table("vs_others"),
          file="table_vs_others.md"),
-    Item("planning", "Fig. 5", "the same way by three methods", "07_planning", _planning, "train", "", _TRAIN, _SET),
+    Item("planning", "Fig. 5", "the same way by three methods", "07_planning", _planning, "train", "", _TRAIN_SET,
+         _SET, of_release=True),
     Item("paths", "Fig. 5", "planned paths that localize", "07_planning", _paths, "paths", PATHS_CSV,
-         "wheretolook compare-paths --config {source}", ()),
+         "wheretolook compare-paths --config {source}", of_source=True),
     Item("runtimes", "Fig. 6", "times of the visibility check", "08_runtimes", _runtimes, "benchmark", RUNTIMES_CSV,
          _BENCH.format(""), ()),
     Item("table_input_variants", "Table 3", "inputs of the network", "05_tables", _paper_table("input_variants"),
          file="table_input_variants.md"),
     Item("top_n", "Fig. 7", "several viewpoints of a location", "06_top_n", _top_n),
-    Item("inputs", "", "from an image to an input", "03_inputs", _inputs, "train", "", _TRAIN, _PAPERS),
-    Item("peaks", "", "what the network looks at", "04_training", _peaks, "train", "", _TRAIN, _SET),
+    Item("inputs", "", "from an image to an input", "03_inputs", _inputs, "train", "", _TRAIN, _PAPERS,
+         of_release=True),
+    Item("peaks", "", "what the network looks at", "04_training", _peaks, "train", "", _TRAIN_SET, _SET,
+         of_release=True),
     Item("training", "", "learning curves", "04_training", _training, "train", HISTORY_CSV, _TRAIN),
     Item("calibration", "", "whether probabilities mean what they say", "04_training", _calibration,
          file=CALIBRATION_CSV),
@@ -288,7 +305,8 @@ ITEMS: tuple[Item, ...] = (
     Item("score_table", "", "all that an evaluation tells", "05_tables", _score_table),
     Item("regret", "", "what each method loses", "05_tables", _regret),
     Item("occlusion", "", "what seeing through walls changes", "05_tables", _occlusion),
-    Item("regret_interiors", "", "what each loses on scenes by others", "05_tables", _regret, params=_OTHERS),
+    Item("regret_interiors", "", "what each loses on scenes by others", "05_tables", _regret, command=_LOG_RELEASE,
+         params=_OTHERS, of_release=True),
     Item("visibility_scaling", "", "how time and memory grow", "08_runtimes", _scaling, "benchmark", SCALING_CSV,
          _BENCH.format(" --scaling"), ()),
 )  # fmt: skip
@@ -307,6 +325,17 @@ def draw_item(item: Item, dataset: Dataset, tracking: TrackingConfig) -> tuple[F
     if item.stage and not source.runs:
         return None
     return item.draw(source), tuple(run.info.run_id for run in source.runs)
+
+
+def check_names(config: FiguresConfig) -> None:
+    """Check that there are all the items that are asked for.
+
+    Raises:
+        ConfigError: there is no item of such a name.
+    """
+    unknown = set(config.only) - {item.name for item in ITEMS}
+    if unknown:
+        raise ConfigError("unknown figure", value=sorted(unknown), fix="`wheretolook figures --list` names them.")
 
 
 def write_items(
@@ -330,18 +359,25 @@ def write_items(
     Raises:
         ConfigError: there is no item of such a name.
     """
-    unknown = set(config.only) - {item.name for item in ITEMS}
-    if unknown:
-        raise ConfigError("unknown figure", value=sorted(unknown), fix="`wheretolook figures --list` names them.")
+    check_names(config)
     out, missing = config.out or dataset.root / "results" / "figures", {}
     for item in ITEMS:
         if config.only and item.name not in config.only:
+            continue
+        if item.of_release and not is_release(dataset):
+            if item.name in config.only:
+                missing[item.name] = "wheretolook figures --config configs/release.yaml"
+            say(f"{item.name}: only releases have it")
             continue
         reason = "no such run"
         try:
             drawn = draw_item(item, dataset, tracking)
         except WhereToLookError as error:
             drawn, reason = None, str(error)
+        if drawn is None and reason != "no such run":
+            missing[item.name] = reason
+            say(f"{item.name}: {reason}")
+            continue
         if drawn is None:
             missing[item.name] = item.command_for(dataset)
             say(f"{item.name}: {reason}; first: {missing[item.name]}")

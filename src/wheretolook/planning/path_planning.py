@@ -108,7 +108,8 @@ def plan_path(
             if ahead:
                 raise
         if route is not None:
-            seconds = end - time.monotonic() if ahead else SHORTEN_SHARE * config.time_s
+            left = end - time.monotonic()
+            seconds = left if ahead else min(left, SHORTEN_SHARE * config.time_s)
             route = improve(route, _shorter, _length(route), space, box, seconds, rng)
         if viewpoint_map is None:
             assert route is not None
@@ -128,8 +129,9 @@ def plan_path(
         if route is not None:
             add(views.best(route), route, "short route")
         try:
-            most = SEARCH_SHARE * config.time_s if found else end - time.monotonic()
-            states = problem.solve(orientations, SEARCH_SHARE * config.time_s, most, bar)
+            left = max(1e-3, end - time.monotonic())
+            most = min(left, SEARCH_SHARE * config.time_s)
+            states = problem.solve(orientations, most, most if found else left, bar)
             add(problem.path(states, views), states[:, :3], "search")
             add(views.best(states[:, :3]), states[:, :3], "search")
         except PlanningError:

@@ -98,7 +98,8 @@ def _plan(scene: SceneFolder, dataset: Dataset, experiment: Experiment, say: Say
     weights = {method: weights_for(method, dataset, config.weights, say) for method in config.methods}
     settings = {name: value for name, value in asdict(config).items() if name not in _OF_THE_REPORT}
     key = stage_key("paths 2", [settings, asdict(experiment.scenes.free_space), asdict(experiment.occlusion),
-                              fingerprint(scene.mesh), fingerprint(scene.landmarks),
+                              asdict(dataset.camera), fingerprint(scene.mesh), fingerprint(scene.landmarks),
+                              fingerprint(scene.mapping_cameras) if scene.mapping_cameras.is_file() else None,
                               [path and fingerprint(path) for path in weights.values()]])  # fmt: skip
     files = {name: folder / f"{name}.parquet" for name in ("paths", "views")}
     made = folder / "made.json"

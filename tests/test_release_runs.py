@@ -135,9 +135,20 @@ def test_an_interrupted_run_is_not_taken_for_a_finished_one(store: tuple[Dataset
     release, tracking = store
     run = newest_run(tracking, "paths")
     assert run is not None
-    client(tracking).set_terminated(run.info.run_id, status="KILLED")
+    mlflow = client(tracking)
+    experiment = mlflow.get_experiment_by_name(tracking.experiment)
+    assert experiment is not None
+
+    def names(condition: str) -> list[str]:
+        found = mlflow.search_runs([experiment.experiment_id], condition, max_results=10_000)
+        return sorted(one.info.run_name for one in found)
+
+    before = names("tags.stage = 'paths'")
+    mlflow.update_run(run.info.run_id, status="RUNNING")  # as `kill -9` leaves it, with all that is nested in it
     runs = log_release(release, tracking)
     assert runs.new == 1 and runs.paths != run.info.run_id
+    assert names("tags.stage = 'paths'") == before and len(before) > 1  # none twice
+    assert log_release(release, tracking).new == 0
 
 
 def test_notebooks_open_a_filled_store(

@@ -117,6 +117,10 @@ def test_the_command_says_what_is_missing(
     assert (tmp_path / "out" / "training.png").is_file()
     assert main(["log-release", "--config", str(config)]) == 0
     assert "0 runs are new" in capsys.readouterr().out
+    fresh = TrackingConfig(str(tmp_path / "fresh"))
+    assert main(["log-release", "--config", str(config), "--tracking.folder", fresh.folder]) == 0
+    for stage, file in (("evaluate", "figures/top_n.png"), ("train", "figures/training.png")):
+        assert newest_artifact(fresh, stage, file, "release").stat().st_size > 1000
     (tmp_path / "data" / "release" / "release.json").unlink()
     assert main(["log-release", "--config", str(config)]) == 2
     assert "no release" in capsys.readouterr().err

@@ -16,7 +16,15 @@ from wheretolook.geometry import Float
 from wheretolook.grid import axes_of_angles
 from wheretolook.planning.config import PathConfig
 from wheretolook.planning.path_improvement import improve
-from wheretolook.planning.route_views import PlannedPath, RouteSamples, RouteViews, between
+from wheretolook.planning.route_views import (
+    IMPROVEMENT,
+    SEARCH,
+    SHORT_ROUTE,
+    PlannedPath,
+    RouteSamples,
+    RouteViews,
+    between,
+)
 from wheretolook.planning.turns import check_axis
 from wheretolook.planning.viewpoint_map import ViewpointMap
 
@@ -114,10 +122,7 @@ def plan_path(
         if viewpoint_map is None:
             assert route is not None
             _finish(bar)
-            samples = RouteSamples.of(route, config.spacing_m)
-            looking = _forward(samples.positions, np.radians(config.pitch_deg))
-            unknown = np.full(len(samples.positions), np.nan)
-            return PlannedPath(samples.positions, looking, unknown, float(samples.corners[-1]), "short route")
+            return _looking_ahead(route, config)
         axis = None if start_axis is None else axes_of_angles(np.degrees(orientations[0]))
         views = RouteViews(viewpoint_map, config, axis)
         found: dict[float, tuple[PlannedPath, Float]] = {}
@@ -127,13 +132,13 @@ def plan_path(
                 found[path.cost] = replace(path, found_by=found_by), places
 
         if route is not None:
-            add(views.best(route), route, "short route")
+            add(views.best(route), route, SHORT_ROUTE)
         try:
             left = max(1e-3, end - time.monotonic())
             most = min(left, SEARCH_SHARE * config.time_s)
             states = problem.solve(orientations, most, most if found else left, bar)
-            add(problem.path(states, views), states[:, :3], "search")
-            add(views.best(states[:, :3]), states[:, :3], "search")
+            add(problem.path(states, views), states[:, :3], SEARCH)
+            add(views.best(states[:, :3]), states[:, :3], SEARCH)
         except PlanningError:
             if not found:
                 raise
@@ -147,7 +152,7 @@ def plan_path(
 
         better = improve(places, cost_below, cheapest.cost, space, box, end - time.monotonic(), rng)
         if better is not places:
-            add(views.best(better), better, "improvement")
+            add(views.best(better), better, IMPROVEMENT)
         _finish(bar)
     return found[min(found)][0]
 
@@ -172,6 +177,14 @@ def check_ends(ends: Float, space: Space, bounds: Float) -> None:
     if np.linalg.norm(ends[1] - ends[0]) < SAME_M:
         fix = "Ask the map for the best view there."
         raise PlanningError("the start is the goal", value=tuple(ends[0].tolist()), fix=fix)
+
+
+def _looking_ahead(route: Float, config: PathConfig) -> PlannedPath:
+    """A route (S, 3) m, looking forward along it."""
+    samples = RouteSamples.of(route, config.spacing_m)
+    axes = _forward(samples.positions, np.radians(config.pitch_deg))
+    unknown = np.full(len(samples.positions), np.nan)
+    return PlannedPath(samples.positions, axes, unknown, float(samples.corners[-1]), SHORT_ROUTE)
 
 
 def _length(places: Float) -> float:

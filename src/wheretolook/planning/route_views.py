@@ -20,6 +20,11 @@ LIMIT_STEP_DEG = 0.5
 """Limits on turns are rounded down to multiples of this, so that routes of about the same length share one."""
 
 
+SHORT_ROUTE, SEARCH, IMPROVEMENT = "short route", "search", "improvement"
+"""What finds paths: a short route with views chosen along it, the search over places and views, the improvement of
+either."""
+
+
 @dataclass(frozen=True, eq=False)
 class PlannedPath:
     """A path of a camera, sampled at its corners and every `PathConfig.spacing_m` or a little less.
@@ -29,8 +34,7 @@ class PlannedPath:
         axes: (W, 3) unit optical axes in the world.
         scores: (W,) of the viewpoint map at the views, 0 where it knows nothing; NaN without a map.
         cost: of the path (`PathConfig`), its scores taken from view to view.
-        found_by: what found it: "short route", with views chosen along it, "search" over places and views, or
-            "improvement" of either; empty where it was not planned.
+        found_by: `SHORT_ROUTE`, `SEARCH` or `IMPROVEMENT`; empty where it was not planned.
     """
 
     positions: Float

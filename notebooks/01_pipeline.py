@@ -41,7 +41,8 @@ showcase = open_showcase(release, "apartment-210")
 Markdown(showcase.summary())
 
 # %% [markdown]
-# The scorer that ships knows the landmarks and the pose, never the image. It has learnt from nine other apartments.
+# The scorer that ships knows the landmarks and the pose, never the image. It has learnt from nine other apartments
+# and ten rooms of all sizes.
 
 # %%
 scorer = load_scorer(release.root / "weights", showcase.localization_map)

@@ -117,7 +117,7 @@ def test_pages_are_small_and_whole(
     folder = tmp_path / "notebooks"
     folder.mkdir()
     (folder / "01_one.py").write_text(
-        "# %% [markdown]\n# # One & all\n# ![a picture](images/one.png), [elsewhere](https://example.org)\n\n"
+        "# %% [markdown]\n# # One & all\n# ![a picture](images/one.webp), [elsewhere](https://example.org)\n\n"
         "# %%\n# %matplotlib inline\nimport sys\nfrom IPython.display import display\n"
         "from matplotlib.figure import Figure\nprint('1 < 2')\nprint('std' + 'error', file=sys.stderr)\n"
         "figure = Figure()\nfigure.subplots().plot([0, 1])\ndisplay(figure)\n"
@@ -128,7 +128,7 @@ def test_pages_are_small_and_whole(
     (page,) = (tmp_path / "html").iterdir()
     text = page.read_text()
     assert "<h1>One &amp; all</h1>" in text and "1 &lt; 2" in text and "stderror" not in text
-    assert 'src="../images/one.png"' in text and 'href="https://example.org"' in text
+    assert 'src="../images/one.webp"' in text and 'href="https://example.org"' in text
     assert text.count("data:image/webp;base64,") == 1 and len(text) < 40_000
     assert 'href="02_broken.html"' in text
 

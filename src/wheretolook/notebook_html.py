@@ -2,7 +2,8 @@
 
     python -m wheretolook.notebook_html notebooks notebooks/html
 
-nbconvert's template alone weighs 600 kB a page; this one weighs two, and pictures are stored with a palette.
+nbconvert's template alone weighs 600 kB a page; this one weighs two, and pictures are stored as WebP, no wider than
+the page.
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+from PIL import Image
+
 _STYLE = """\
 body { max-width: 75rem; margin: 2rem auto; padding: 0 1rem; color: #333; font: 16px/1.5 system-ui, sans-serif }
 pre { padding: .5rem .8rem; overflow-x: auto; font-size: 13px; line-height: 1.4; background: #f6f8fa }
@@ -27,8 +30,8 @@ td, th { padding: 2px 8px; border-bottom: 1px solid #ddd; text-align: left }
 nav a { margin-right: 1em }
 """
 
-LARGE, QUALITY = 100_000, 88
-"""Bytes above which a picture loses something, and its quality then."""
+LARGE, QUALITY, WIDEST_PX = 25_000, 55, 1050
+"""Bytes above which a picture loses something, its quality then, and its width at most."""
 
 
 def run_notebook(path: Path, timeout_s: float = 600) -> Any:
@@ -103,19 +106,23 @@ def _output(output: Any, markdown: Any) -> str:
 
 
 def small_picture(png: str) -> str:
-    """A PNG in base64 as the address of a smaller picture: as WebP, without loss, or, where that remains large because
-    it shows photographs, with so little that colours stay what they are."""
-    from PIL import Image
-
+    """A PNG in base64 as the address of a smaller picture: as WebP without loss, or, where that remains large, no wider
+    than the page and with or without a little loss, whichever is smaller."""
     with Image.open(io.BytesIO(base64.b64decode(png))) as image:
         flat = Image.new("RGB", image.size, "white")
         flat.paste(image, mask=image.getchannel("A") if "A" in image.getbands() else None)
-    for options in ({"lossless": True}, {"quality": QUALITY}):
-        stream = io.BytesIO()
-        flat.save(stream, "WEBP", method=6, **options)
-        if stream.tell() <= LARGE:
-            break
-    return f"data:image/webp;base64,{base64.b64encode(stream.getvalue()).decode()}"
+    smallest = _webp(flat, lossless=True)
+    if len(smallest) > LARGE:
+        if flat.width > WIDEST_PX:
+            flat = flat.resize((WIDEST_PX, round(flat.height * WIDEST_PX / flat.width)), Image.Resampling.LANCZOS)
+        smallest = min(_webp(flat, lossless=True), _webp(flat, quality=QUALITY), key=len)
+    return f"data:image/webp;base64,{base64.b64encode(smallest).decode()}"
+
+
+def _webp(image: Image.Image, **options: Any) -> bytes:
+    stream = io.BytesIO()
+    image.save(stream, "WEBP", method=6, **options)
+    return stream.getvalue()
 
 
 def main(arguments: list[str]) -> int:

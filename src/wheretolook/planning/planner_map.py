@@ -16,7 +16,7 @@ from wheretolook.planning.scene_map import scene_viewpoint_map
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.scenes.free_space import FreeSpace
 from wheretolook.scenes.mapped_space import MappedSpace
-from wheretolook.scoring.registry import SCORERS, WEIGHTS_OF
+from wheretolook.scoring.registry import WEIGHTS_OF, check_method
 from wheretolook.visibility import OcclusionModel
 
 
@@ -29,7 +29,7 @@ def planner_map(
 
     Args:
         method: that scores; empty for that of the weights, or bins without.
-        weights: for methods that have learnt; others leave them alone.
+        weights: of the method (`wheretolook.planning.scene_map.weights_for`).
         grid: voxels along x, y and z.
         directions: at each voxel.
         lattice: of the directions.
@@ -44,8 +44,7 @@ def planner_map(
     """
     if method in WEIGHTS_OF and weights is None:
         raise ConfigError(f"{method} needs weights", path=dataset.root, fix="Train it, or name weights.")
-    used = weights if not method or method in WEIGHTS_OF else None
-    config = ViewpointMapConfig(method=method, weights=used, grid=grid, directions=directions, lattice=lattice)
+    config = ViewpointMapConfig(method=method, weights=weights, grid=grid, directions=directions, lattice=lattice)
     views = scene_viewpoint_map(scene, dataset.camera, config, space, occlusion, device)
     if views.origin.scorer.split()[0] not in PROBABILITIES:
         views = shares_below(views)
@@ -62,5 +61,5 @@ def check_methods(methods: Iterable[str]) -> None:
         ConfigError: there is none of a name.
     """
     for name in methods:
-        if name and name not in SCORERS:
-            raise ConfigError("unknown method", value=name, fix=f"There are {', '.join(SCORERS)}.")
+        if name:
+            check_method(name)

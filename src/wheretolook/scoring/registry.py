@@ -139,6 +139,16 @@ def _first_line(scorer: type[Scorer]) -> str:
     return (scorer.__doc__ or "").partition("\n")[0]
 
 
+def check_method(name: str) -> None:
+    """Check that there is a method of a name.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    if name not in SCORERS:
+        raise ConfigError("unknown method", value=name, fix=f"There are {', '.join(SCORERS)}.")
+
+
 def make_scorer(
     name: str,
     localization_map: LocalizationMap,
@@ -159,6 +169,5 @@ def make_scorer(
         ConfigError: no such method, or it needs weights.
         WeightsError: the weights cannot be used.
     """
-    if name not in SCORERS:
-        raise ConfigError("unknown method", value=name, fix=f"There are {', '.join(SCORERS)}.")
+    check_method(name)
     return SCORERS[name](localization_map, ScorerOptions(seed, weights, heading))

@@ -30,7 +30,7 @@ td, th { padding: 2px 8px; border-bottom: 1px solid #ddd; text-align: left }
 nav a { margin-right: 1em }
 """
 
-LARGE, QUALITY, WIDEST_PX = 25_000, 55, 1050
+LARGE, QUALITY, WIDEST_PX = 25_000, 55, 960
 """Bytes above which a picture loses something, its quality then, and its width at most."""
 
 

@@ -10,17 +10,18 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from wheretolook.geometry import PinholeCamera, poses_looking_along
-    from wheretolook.localization_map import LocalizationMap
-    from wheretolook.scoring import load_scorer
+    from wheretolook.geometry.camera import PinholeCamera
+    from wheretolook.geometry.poses import poses_looking_along
+    from wheretolook.inputs.localization_map import LocalizationMap
+    from wheretolook.methods.registry import load_scorer
 
 __all__ = ["LocalizationMap", "PinholeCamera", "__version__", "load_scorer", "poses_looking_along"]
 
 _HOMES = {
-    "LocalizationMap": "wheretolook.localization_map",
-    "PinholeCamera": "wheretolook.geometry",
-    "load_scorer": "wheretolook.scoring",
-    "poses_looking_along": "wheretolook.geometry",
+    "LocalizationMap": "wheretolook.inputs.localization_map",
+    "PinholeCamera": "wheretolook.geometry.poses",
+    "load_scorer": "wheretolook.methods",
+    "poses_looking_along": "wheretolook.geometry.poses",
 }
 
 

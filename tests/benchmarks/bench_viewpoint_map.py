@@ -21,22 +21,19 @@ from bench_fisher import timed
 from bench_scorers import room_map
 from bench_visibility import on_surface
 
-from wheretolook.grid import VoxelGrid, fibonacci_sphere
-from wheretolook.localization_map import LocalizationMap
+from wheretolook.geometry.lattices import VoxelGrid, fibonacci_sphere
+from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.planning import (
-    TurnLimit,
-    ViewpointMap,
-    best_sequence,
-    build_viewpoint_map,
-    greedy_sequence,
-    refine_directions,
-)
-from wheretolook.rendering import MeshRaycaster
-from wheretolook.scenes.free_space import FreeSpace
-from wheretolook.scenes.procedural import ApartmentConfig, generate_apartment
-from wheretolook.scoring import Scorer, load_scorer, make_scorer
-from wheretolook.visibility import MeshOcclusion
+from wheretolook.methods.base import Scorer
+from wheretolook.methods.registry import load_scorer, make_scorer
+from wheretolook.planning.map_building import build_viewpoint_map
+from wheretolook.planning.refine import refine_directions
+from wheretolook.planning.sequences import TurnLimit, best_sequence, greedy_sequence
+from wheretolook.planning.viewpoint_map import ViewpointMap
+from wheretolook.rendering.raycasting import MeshRaycaster
+from wheretolook.scenes.procedural.generator import ApartmentConfig, generate_apartment
+from wheretolook.space.free_space import FreeSpace
+from wheretolook.visibility.occlusion import MeshOcclusion
 
 
 def rows_of(landmarks: Landmarks, rows: slice) -> Landmarks:

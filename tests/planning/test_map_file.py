@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 from planning.rooms import GRID, build, joined, room_landmarks, room_map
-from wheretolook.errors import MapFormatError
-from wheretolook.planning import ViewpointMap
+from wheretolook.methods.registry import make_scorer
 from wheretolook.planning.map_file import ARRAYS, DESCRIPTION, LAYOUT
 from wheretolook.planning.path_comparison import shares_below
-from wheretolook.scoring import make_scorer
+from wheretolook.planning.viewpoint_map import ViewpointMap
+from wheretolook.utils.errors import MapFormatError
 
 
 @pytest.fixture(scope="module")

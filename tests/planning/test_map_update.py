@@ -7,21 +7,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scoring.test_scorers import NO_STATISTICS, some_convolutions, some_trees
 
 from planning.rooms import CAMERA, DIRECTIONS, GRID, build, free_voxels, joined, occlusion, room_landmarks, room_map
-from scoring.test_scorers import NO_STATISTICS, some_convolutions, some_trees
-from wheretolook.errors import ConfigError
-from wheretolook.geometry import PinholeCamera
-from wheretolook.learning.matchability import Matchability
-from wheretolook.learning.set import SetModel
-from wheretolook.learning.set_network import MatchabilityNetwork, SetNetwork
-from wheretolook.localization_map import LocalizationMap
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.planning import ViewpointMap, build_viewpoint_map, update_viewpoint_map
+from wheretolook.methods.matchability.learn import Matchability
+from wheretolook.methods.registry import SCORERS, WEIGHTS_OF, make_scorer
+from wheretolook.methods.set.learn import SetModel
+from wheretolook.methods.set.network import MatchabilityNetwork, SetNetwork
+from wheretolook.planning.map_building import build_viewpoint_map, update_viewpoint_map
 from wheretolook.planning.path_comparison import shares_below
-from wheretolook.scoring import SCORERS, make_scorer
-from wheretolook.scoring.registry import WEIGHTS_OF
-from wheretolook.visibility import HiddenPointRemoval, NoOcclusion, OcclusionModel, StoredOcclusion
+from wheretolook.planning.viewpoint_map import ViewpointMap
+from wheretolook.utils.errors import ConfigError
+from wheretolook.visibility.hidden_points import HiddenPointRemoval
+from wheretolook.visibility.occlusion import NoOcclusion, OcclusionModel, StoredOcclusion
 
 OLD = room_landmarks(400)
 

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.dataset import write_json, write_text
-from wheretolook.errors import MapFormatError
-from wheretolook.grid import VoxelGrid
+from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.planning.viewpoint_map import MapOrigin, ViewpointMap
+from wheretolook.utils.errors import MapFormatError
+from wheretolook.utils.files import write_json, write_text
 
 FORMAT, VERSION = "wheretolook viewpoint map", 1
 

@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.geometry import Float, rotation_looking_along
-from wheretolook.grid import VoxelGrid
+from wheretolook.geometry.lattices import VoxelGrid
+from wheretolook.geometry.poses import Float, rotation_looking_along
 from wheretolook.planning.turns import angles_to_axis_deg, check_axis, turns_from_deg, within
 
 if TYPE_CHECKING:
-    from wheretolook.scoring.base import Scorer
+    from wheretolook.methods.base import Scorer
 
 Point = Sequence[float] | NDArray[Any]
 
@@ -95,7 +95,7 @@ class ViewpointMap:
     smooth between centres. Outside the grid, and in voxels that are not free, there is no camera to turn: queries of
     one point then return None, batches say `found = False`. What is not finite raises a ValueError.
 
-    `wheretolook.planning.build_viewpoint_map` makes one.
+    `wheretolook.planning.map_building.build_viewpoint_map` makes one.
 
     Attributes:
         grid: V voxels of the world, metres, z up.

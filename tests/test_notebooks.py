@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
 from nbclient import NotebookClient
+from pages import main, notebook_page, small_picture
 from PIL import Image
 
 from synthetic_release import make_release
 from wheretolook.methods.styles import MethodStyle, scorer_style
-from pages import main, notebook_page, small_picture
 from wheretolook.utils.tracking import TrackingConfig, newest_run
 
 FOLDER = Path(__file__).parents[1] / "notebooks"

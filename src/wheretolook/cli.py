@@ -14,8 +14,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from wheretolook import __version__
 from wheretolook.utils.errors import ConfigError, WhereToLookError
+from wheretolook.utils.version import VERSION
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser
@@ -110,7 +110,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(_usage())
         return 0
     if arguments[0] == "--version":
-        print(f"wheretolook {__version__}")
+        print(f"wheretolook {VERSION}")
         return 0
     if not debug:
         _quieten()

@@ -26,7 +26,7 @@ from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.methods.base import Scorer
 from wheretolook.methods.registry import load_scorer, make_scorer
-from wheretolook.planning.map_building import build_viewpoint_map
+from wheretolook.planning.map_building import build_viewpoint_map, update_viewpoint_map
 from wheretolook.planning.refine import refine_directions
 from wheretolook.planning.sequences import TurnLimit, best_sequence, greedy_sequence
 from wheretolook.planning.viewpoint_map import ViewpointMap
@@ -111,8 +111,12 @@ def main() -> None:
           f"{len(os.sched_getaffinity(0))} cores")  # fmt: skip
     timed("build", lambda: build_viewpoint_map(scorer, grid, free, directions), args.builds)
     before = build_viewpoint_map(scorer_on(rows_of(landmarks, slice(0, -10))), grid, free, directions)
-    viewpoint_map, changed = before.updated(scorer)
-    timed(f"update, 10 landmarks added that {len(changed)} voxels see", lambda: before.updated(scorer), args.builds)
+    viewpoint_map, changed = update_viewpoint_map(before, scorer)
+    timed(
+        f"update, 10 landmarks added that {len(changed)} voxels see",
+        lambda: update_viewpoint_map(before, scorer),
+        args.builds,
+    )
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "map"
         timed("save", lambda: viewpoint_map.save(path), args.repeats, 1e3, "ms")

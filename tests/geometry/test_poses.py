@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from wheretolook.geometry import poses as geo
+from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.utils.errors import ConfigError
 
 
@@ -17,14 +18,14 @@ def random_poses(n: int, seed: int = 0) -> np.ndarray:
 
 
 def test_projection_agrees_with_pycolmap() -> None:
-    camera = geo.PinholeCamera(640, 480, 320.0)
+    camera = PinholeCamera(640, 480, 320.0)
     colmap = pycolmap.Camera(model="SIMPLE_PINHOLE", width=640, height=480, params=[320.0, 320.0, 240.0])
     points = np.random.default_rng(0).uniform([-2, -2, 0.5], [2, 2, 6], (100, 3))
     np.testing.assert_allclose(camera.project(points), colmap.img_from_cam(points), atol=1e-9)
 
 
 def test_image_borders() -> None:
-    camera = geo.PinholeCamera(4, 2, 1.0)
+    camera = PinholeCamera(4, 2, 1.0)
     pixels = [[0, 0], [3.999, 1.999], [4, 1], [1, 2], [-1e-9, 1], [np.nan, 1]]
     assert camera.in_image(pixels).tolist() == [True, True, False, False, False, False]
 
@@ -71,7 +72,7 @@ def test_looking_straight_up_and_down_is_a_rotation(sign: int) -> None:
 
 
 def test_pose_looking_at_a_point_sees_it_in_the_image_centre() -> None:
-    camera = geo.PinholeCamera()
+    camera = PinholeCamera()
     pose = geo.poses_looking_along([1.0, 2, 3], [0.3, -0.4, 0.5])
     seen = geo.transform(pose, [[1.3, 1.6, 3.5]])
     np.testing.assert_allclose(camera.project(seen), [[camera.cx, camera.cy]], atol=1e-9)
@@ -98,4 +99,4 @@ def test_pose_error_is_between_centres_not_translations() -> None:
 
 def test_bad_camera() -> None:
     with pytest.raises(ConfigError, match="positive"):
-        geo.PinholeCamera(640, 0, 320)
+        PinholeCamera(640, 0, 320)

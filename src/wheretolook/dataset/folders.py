@@ -6,7 +6,6 @@ import hashlib
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import pandas as pd
@@ -18,10 +17,8 @@ from wheretolook.mapping.cameras import CAMERAS_FILE, colmap_poses, holds_model,
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.utils.errors import ConfigError, TableError
 from wheretolook.utils.files import fingerprint, write_json
-from wheretolook.viewpoints.table import read_table
+from wheretolook.viewpoints.table import Split, read_table
 from wheretolook.visibility.occlusion import StoredOcclusion
-
-Split = Literal["train", "val", "test"]
 
 RELEASE = "release"
 """Name of the dataset, beside all others, that ships with its weights."""

@@ -17,7 +17,6 @@ import numpy as np
 import pandas as pd
 from tqdm.auto import tqdm
 
-import wheretolook
 from wheretolook.features.keypoints import ExtractorConfig
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.labelling.config import LabelConfig
@@ -25,6 +24,7 @@ from wheretolook.labelling.shard import LabelledShard, SceneJob, Shard
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.utils.errors import MapError, SceneError, StorageError, TableError
 from wheretolook.utils.files import fingerprint, sha256, write_json
+from wheretolook.utils.version import VERSION
 from wheretolook.viewpoints.table import SCHEMA, read_table, write_table
 
 MANIFEST = "manifest.json"
@@ -161,7 +161,7 @@ def label_scenes(
 @cache
 def versions() -> dict[str, str]:
     """Versions of what decides a label."""
-    found = {"wheretolook": wheretolook.__version__}
+    found = {"wheretolook": VERSION}
     for package in ("pycolmap", "opencv-python-headless", "warp-lang", "numpy", "torch"):
         try:
             found[package] = version(package)

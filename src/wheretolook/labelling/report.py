@@ -10,12 +10,10 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from wheretolook.dataset.folders import Split
 from wheretolook.geometry.poses import Float, camera_centers
-from wheretolook.stages.label import _labels
 from wheretolook.utils.markdown import markdown_table
-from wheretolook.viewpoints.table import LOCALIZED, NO_POSE, TOO_FEW_MATCHES, is_good, poses
-from wheretolook.viewpoints.thresholds import ALL, THRESHOLDS, threshold_key
+from wheretolook.viewpoints.table import LOCALIZED, NO_POSE, TOO_FEW_MATCHES, Split, is_good, poses
+from wheretolook.viewpoints.thresholds import ALL, THRESHOLDS, threshold_key, threshold_label
 
 LABELS_CSV, LABELS_MD, LABELS_PNG = "labels.csv", "labels.md", "labels.png"
 """Files of a report on labels, in `<dataset>/results/` and as artifacts of its run."""
@@ -231,6 +229,11 @@ def _visible_label(low: float, high: float) -> str:
     if np.isinf(high):
         return f"≥ {low:,.0f}"
     return f"{low:,.0f}" if high == low + 1 else f"{low:,.0f}–{high - 1:,.0f}"
+
+
+def _labels() -> list[str]:
+    """The thresholds for people, in their order."""
+    return [threshold_label(threshold_key(threshold)) for threshold in THRESHOLDS]
 
 
 def _band_lines(bands: pd.DataFrame, name: Any) -> list[list[str]]:

@@ -36,8 +36,8 @@ _HOW_TO_USE = """\
 from pathlib import Path
 
 from wheretolook import load_scorer
-from wheretolook.dataset import Dataset
-from wheretolook.table import poses
+from wheretolook.dataset.folders import Dataset
+from wheretolook.viewpoints.table import poses
 
 dataset = Dataset.load(Path("{root}"))
 scene = dataset.split("test")[0]
@@ -48,8 +48,8 @@ scores = scorer.score(poses(scene.read_table()))  # one for each viewpoint, in [
 _TABLES = """\
 Each `<scene>/viewpoints.parquet` is a table for `pandas.read_parquet`, a row a viewpoint: `viewpoint_id`, \
 `location_id`, `direction_id`; the rotation cam_from_world as a quaternion `qw qx qy qz`, and the camera's centre in \
-the world, `x_m y_m z_m` (the translation is -R c; `wheretolook.viewpoints.table.read_table` gives it as `tx ty tz`); \
-`n_visible` landmarks and `visibility_rank` among the directions of the location; `status` (localized, \
+the world, `x_m y_m z_m` (the translation is -R c; `wheretolook.viewpoints.table.read_table` gives it as `tx ty tz` \
+instead); `n_visible` landmarks and `visibility_rank` among the directions of the location; `status` (localized, \
 too_few_matches, no_pose), `error_m`, `error_deg`, `n_inliers`. World in metres, z up; camera x right, y down, z \
 forward. `map/landmarks.npz` holds the landmarks (`wheretolook.mapping.landmarks.Landmarks`), `occlusion.npz` which of \
 them each location has a free line of sight to (`wheretolook.visibility.occlusion.StoredOcclusion`)."""

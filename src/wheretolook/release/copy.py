@@ -14,13 +14,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import wheretolook
 from wheretolook.dataset.folders import Dataset, SceneFolder
 from wheretolook.learning.config import MATCHABILITY, NETWORKS, RELEASED, VARIANTS, weights_name
 from wheretolook.mapping.cameras import CAMERAS_FILE, save_mapping_poses
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.utils.errors import ConfigError, StorageError, TableError, WeightsError
 from wheretolook.utils.files import sha256, write_json
+from wheretolook.utils.version import VERSION
 from wheretolook.viewpoints.table import write_table
 from wheretolook.visibility.occlusion import StoredOcclusion
 
@@ -82,7 +82,7 @@ def copy_dataset(dataset: Dataset, experiment: Experiment) -> Dataset:
     about = {
         "source": dataset.name,
         "source_fingerprint": dataset.fingerprint(),
-        "code_version": wheretolook.__version__,
+        "code_version": VERSION,
         "settings": _settings(experiment),
     }
     write_json(root / ABOUT, about)

@@ -27,7 +27,7 @@ from wheretolook.utils.errors import TableError
 from wheretolook.utils.files import write_text
 from wheretolook.utils.tracking import TrackingConfig, log, start_run
 from wheretolook.viewpoints.table import is_good
-from wheretolook.viewpoints.thresholds import ALL, THRESHOLDS, threshold_key, threshold_label
+from wheretolook.viewpoints.thresholds import ALL
 
 
 def label(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> Dataset:
@@ -146,11 +146,6 @@ def log_labels(
         for name in (LABELS_CSV, LABELS_MD, LABELS_PNG):
             client.log_artifact(run, str(folder / name))
     return summary
-
-
-def _labels() -> list[str]:
-    """The thresholds for people, in their order."""
-    return [threshold_label(threshold_key(threshold)) for threshold in THRESHOLDS]
 
 
 def _labelled_table(scene: SceneFolder) -> pd.DataFrame:

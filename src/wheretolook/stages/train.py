@@ -13,7 +13,6 @@ import pandas as pd
 from lightning.pytorch import seed_everything
 from lightning.pytorch.utilities.seed import isolate_rng
 
-import wheretolook
 from wheretolook.dataset.folders import Dataset, SceneFolder
 from wheretolook.inputs.bins import INPUT_VARIANTS
 from wheretolook.learning.classifier import ViewpointClassifier
@@ -36,6 +35,7 @@ from wheretolook.methods.mlp.weights import save_classifier
 from wheretolook.utils.files import fingerprint as file_fingerprint
 from wheretolook.utils.files import sha256, write_json
 from wheretolook.utils.tracking import TrackingConfig, log, start_run
+from wheretolook.utils.version import VERSION
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -130,7 +130,7 @@ def _about(dataset: Dataset, config: TrainConfig, fingerprint: str, variant: str
             for scene in dataset.scenes
             if scene.split != "test"
         },
-        "code_version": wheretolook.__version__,
+        "code_version": VERSION,
         "variant": variant,
         "camera": asdict(dataset.camera),
         "config": options,

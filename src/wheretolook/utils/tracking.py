@@ -22,8 +22,8 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import wheretolook
 from wheretolook.utils.errors import MissingRunError
+from wheretolook.utils.version import VERSION
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -287,7 +287,7 @@ def ui_command(tracking: TrackingConfig) -> str:
 @cache
 def code_version() -> dict[str, str]:
     """Version of this package and, in a checkout, the git commit ("+" appended when files differ from it)."""
-    version = {"code_version": wheretolook.__version__}
+    version = {"code_version": VERSION}
     here = Path(__file__).resolve().parent
     try:
         git = ["git", "-C", str(here)]

@@ -9,13 +9,12 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.dataset.folders import Split
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import Lattice, VoxelGrid, direction_lattice
 from wheretolook.geometry.poses import poses_looking_along, rotation_looking_along
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.utils.errors import ConfigError, SceneError
-from wheretolook.viewpoints.table import UNLABELLED, pose_columns
+from wheretolook.viewpoints.table import UNLABELLED, Split, pose_columns
 from wheretolook.visibility.occlusion import OcclusionModel, StoredOcclusion
 from wheretolook.visibility.survey import survey
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from wheretolook.learning.config import FittingConfig
+from wheretolook.learning.fitting_config import FittingConfig
 from wheretolook.methods.matchability.config import _check_enlarged, _check_hidden
 from wheretolook.utils.errors import ConfigError
 

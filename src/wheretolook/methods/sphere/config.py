@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from wheretolook.learning.config import FittingConfig
+from wheretolook.learning.fitting_config import FittingConfig
 from wheretolook.utils.errors import ConfigError
 
 

@@ -150,7 +150,7 @@ def run_python(code: str, **environment: str) -> str:
 def test_a_cpu_whose_byte_products_saturate_finds_the_same(instructions: str) -> None:
     """oneDNN is told to leave out this CPU's newer instructions."""
     code = (
-        "from labelling import test_matching as tests\n"
+        "from features import test_matching as tests\n"
         "for make in (tests.random_descriptors, tests.extreme_descriptors, tests.sift_like_descriptors):\n"
         "    for n, k in ((3, 1), (64, 17), (70, 5), (1000, 300)):\n"
         "        tests.assert_nearest_two('cpu', make(k, seed=1), make(n))\n"

@@ -163,7 +163,7 @@ def test_a_thread_keeps_to_the_cores_it_was_told() -> None:
     """Of four cores, to which OpenMP would start three threads from each thread that multiplies."""
     code = (
         "import os, threading, torch\n"
-        "from labelling.test_matching import DescriptorMatcher, random_descriptors\n"
+        "from features.test_matching import DescriptorMatcher, random_descriptors\n"
         "torch.set_num_threads(1)\n"
         "matcher = DescriptorMatcher(random_descriptors(5000))\n"
         "before = len(os.listdir('/proc/self/task'))\n"

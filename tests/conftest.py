@@ -11,7 +11,7 @@ import warp as wp
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import Float, poses_looking_along
 from wheretolook.utils.warp import start_warp
-from wheretolook.visibility.frustum import VisibleSets
+from wheretolook.visibility.frustum import LandmarkSets
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
@@ -30,7 +30,7 @@ class RandomViews:
     locations: Float
     directions: Float
     mask: np.ndarray
-    visible: VisibleSets
+    visible: LandmarkSets
     location_rows: np.ndarray
     cam_from_world: Float
 
@@ -44,4 +44,4 @@ def random_views(request: pytest.FixtureRequest) -> RandomViews:
     mask = rng.random((len(locations), len(points))) < 0.6
     location_rows = rng.integers(0, len(locations), 40)
     poses = poses_looking_along(locations[location_rows], rng.normal(size=(40, 3)))
-    return RandomViews(camera, points, locations, directions, mask, VisibleSets.from_mask(mask), location_rows, poses)
+    return RandomViews(camera, points, locations, directions, mask, LandmarkSets.from_mask(mask), location_rows, poses)

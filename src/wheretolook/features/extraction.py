@@ -17,12 +17,7 @@ from wheretolook.utils.processes import Processes
 
 
 class KeypointExtractor:
-    """Extracts SIFT keypoints, on one CPU core or a GPU.
-
-    Args:
-        config: see `ExtractorConfig`.
-        device: "cpu" or a CUDA device. COLMAP's SIFT runs on the CPU in any case: on a GPU it is not repeatable.
-    """
+    """Extracts SIFT keypoints, on a CPU core or a GPU (COLMAP's on the CPU only: on a GPU it is not repeatable)."""
 
     def __init__(self, config: ExtractorConfig | None = None, device: str = "cpu") -> None:
         self.config = config or ExtractorConfig()
@@ -35,16 +30,10 @@ class KeypointExtractor:
             self._extractor = _colmap_sift(self.config) if self.config.method == "colmap" else _opencv_sift(self.config)
 
     def extract(self, rgb: NDArray[np.uint8]) -> Keypoints:
-        """Extract keypoints of one image.
-
-        Args:
-            rgb: (H, W, 3) uint8.
-
-        Returns:
-            At most `max_keypoints` keypoints, in an order that depends on the image alone.
+        """At most `max_keypoints` keypoints of one image (H, W, 3) uint8, in an order that depends on the image alone.
 
         Raises:
-            ValueError: when the image is not (H, W, 3) uint8.
+            ValueError: the image has another shape or type.
         """
         return self.extract_batch([rgb])[0]
 
@@ -52,24 +41,19 @@ class KeypointExtractor:
         """Extract keypoints of images (H, W, 3) uint8 of one size, at once if this is on a GPU. See `extract`."""
         grey = [_grey(rgb) for rgb in images]
         if self.on_gpu:
-            found: list[Keypoints] = self._extractor.extract_many(np.stack([one.to_array() for one in grey]))
+            found: list[Keypoints] = self._extractor.extract_many(np.stack([bitmap.to_array() for bitmap in grey]))
             return found
         if self.config.method == "colmap":
-            return [self._extract_colmap(one) for one in grey]
-        return [self._extract_opencv(one.to_array()) for one in grey]
+            return [self._extract_colmap(bitmap) for bitmap in grey]
+        return [self._extract_opencv(bitmap.to_array()) for bitmap in grey]
 
     def extract_many(
         self, images: Iterable[NDArray[np.uint8]], workers: int | Processes = 1
     ) -> Generator[Keypoints, None, None]:
-        """Extract keypoints of many images, in processes of their own (pycolmap's extractor holds Python's lock), or
-        in batches on a GPU.
+        """Keypoints of many images (H, W, 3) uint8, in their order, extracted in worker processes or in GPU batches.
 
-        Args:
-            images: each (H, W, 3) uint8; read only a few images ahead of what is returned.
-            workers: processes, or how many to spawn; 1 stays in this one.
-
-        Yields:
-            Keypoints in the order of the images, the same whatever the number of workers.
+        Only a few images are read ahead. `workers` are processes, or how many to spawn (threads would wait for one
+        another, since pycolmap's extractor holds Python's lock); 1 stays in this process. The result is the same.
         """
         if self.on_gpu:
             source = iter(images)

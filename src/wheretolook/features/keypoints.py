@@ -46,16 +46,11 @@ class ExtractorConfig:
 
 @dataclass(frozen=True, eq=False)
 class Keypoints:
-    """Keypoints of one image.
+    """Keypoints of one image."""
 
-    Attributes:
-        pixels: (N, 2) float32, (x, y) in pixels; (0.5, 0.5) is the centre of the top-left pixel.
-        descriptors: (N, 128) float32 RootSIFT (Arandjelovic and Zisserman, CVPR 2012) of unit length.
-        scales_px: (N,) float32, standard deviation in pixels of the Gaussian at which the keypoint was found.
-    """
-
-    pixels: NDArray[np.float32]
-    descriptors: NDArray[np.float32]
+    pixels: NDArray[np.float32]  # (N, 2) (x, y) in pixels; (0.5, 0.5) is the centre of the top-left pixel
+    descriptors: NDArray[np.float32]  # (N, 128) RootSIFT (Arandjelovic and Zisserman, CVPR 2012) of unit length
+    # (N,) float32, standard deviation in pixels of the Gaussian at which the keypoint was found.
     scales_px: NDArray[np.float32]
 
     def __len__(self) -> int:

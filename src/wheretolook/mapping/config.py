@@ -18,15 +18,15 @@ class MapConfig:
         n_images: images rendered along the walk.
         walk: the walk and the camera's motion along it.
         extractor: keypoints and descriptors; queries must use the same.
-        partners: images that each image is matched with, those that share most surface with it.
+        partners: number of images that each image is matched with: those that share most surface with it.
         max_epipolar_error_px: matches farther from the epipolar line of the known poses are dropped.
-        min_triangulation_angle_deg: landmarks whose rays meet at less are not made.
+        min_triangulation_angle_deg: landmarks whose rays meet at a smaller angle are not made.
         two_view_landmarks: whether two observations make a landmark. COLMAP's default is to ask for three, which gives
-            a third as many, and fewer viewpoints that localize.
+            a third as many landmarks, and fewer viewpoints that localize.
         max_reprojection_error_px: landmarks with a larger mean reprojection error are removed from the map (the
             paper's 0.5 px).
-        photographs: a folder of photographs to map instead of a mesh; of the rest, only `extractor` and `keep_database`
-            then count.
+        photographs: a folder of photographs to map instead of a mesh; of the other settings, only `extractor` and
+            `keep_database` then count.
         keep_images: keep the rendered images, as `images/` in the map's folder.
         keep_database: keep COLMAP's database of keypoints and matches, as `database.db`.
     """

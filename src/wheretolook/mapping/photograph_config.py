@@ -25,18 +25,12 @@ class KnownDistance:
 
     def __post_init__(self) -> None:
         if not 0 < self.distance_m < inf or self.first == self.second:
-            raise ConfigError(
-                "a known distance is a positive number of metres between two places",
-                value=(self.first, self.second, self.distance_m),
-            )
+            value = (self.first, self.second, self.distance_m)
+            raise ConfigError("a known distance is a positive number of metres between two places", value=value)
 
     @property
     def marker_ids(self) -> tuple[int, ...]:
-        """Ids of the ends that are markers.
-
-        Raises:
-            ConfigError: an id is no number.
-        """
+        """Ids of the ends that are markers. Raises ConfigError if an id is not a number."""
         names = [end.removeprefix("marker:") for end in (self.first, self.second) if end.startswith("marker:")]
         if not all(name.isdecimal() for name in names):
             raise ConfigError("a marker's id is a number", value=(self.first, self.second), fix="Write marker:7.")
@@ -45,18 +39,18 @@ class KnownDistance:
 
 @dataclass(frozen=True)
 class ScaleConfig:
-    """Where a map from photographs takes its scale from: one of markers, a distance, positions; or nothing.
+    """Where the scale of a map from photographs comes from: markers, a distance, or positions; or nowhere.
 
     Args:
         dictionary: of the markers, by OpenCV's name: DICT_4X4_50, DICT_APRILTAG_36H11, DICT_ARUCO_ORIGINAL and so on.
         marker_size_m: side of the black square of every marker, in metres; 0 for no markers.
         marker_table: CSV file of markers of different sizes, with the columns `id` and `size_m`. Other markers are
-            passed over.
-        tolerance_percent: a marker's side that differs by more from its size is refused, and a position that is off
-            by more of the extent of all positions.
+            ignored.
+        tolerance_percent: the map is refused if a marker's side differs from its size by more than this, or a position
+            is off by more than this share of the extent of all positions.
         distance: one known distance.
         positions: CSV file with the columns `image`, `x`, `y`, `z`, or JSON file `{"image": [x, y, z]}`: where
-            photographs were taken, in metres, z up. They fix the whole frame, not only its scale.
+            photographs were taken, in metres, z up. They determine the whole frame of the map, not only its scale.
     """
 
     dictionary: str = "DICT_4X4_50"
@@ -72,15 +66,12 @@ class ScaleConfig:
         if not 0 < self.tolerance_percent < 100:
             raise ConfigError("tolerance_percent must lie between 0 and 100", value=self.tolerance_percent)
         if self.marker_size_m > 0 and self.marker_table is not None:
-            raise ConfigError(
-                "markers have one size, or a table of sizes", value=(self.marker_size_m, str(self.marker_table)),
-                fix="Give marker_size_m or marker_table.",
-            )  # fmt: skip
+            sizes, fix = (self.marker_size_m, str(self.marker_table)), "Give marker_size_m or marker_table."
+            raise ConfigError("markers have one size, or a table of sizes", value=sizes, fix=fix)
         if self.has_marker_sizes + (self.distance is not None) + (self.positions is not None) > 1:
-            raise ConfigError(
-                "the scale comes from one source", value="markers, a distance, positions: more than one was given",
-                fix="Give marker sizes, a distance or positions.",
-            )  # fmt: skip
+            value = "markers, a distance, positions: more than one was given"
+            fix = "Give marker sizes, a distance or positions."
+            raise ConfigError("the scale comes from one source", value=value, fix=fix)
 
     @property
     def has_marker_sizes(self) -> bool:
@@ -93,7 +84,7 @@ class PhotographsConfig:
     """How a folder of photographs is mapped. Without one, maps are made of rendered images.
 
     Args:
-        images: folder of the photographs, with any folders in it.
+        images: folder of the photographs, searched with its subfolders.
         name: of the scene; the folder's own name if empty.
         max_side_px: photographs are reduced to this many pixels along their longer side; 0 keeps their size. The map's
             cameras and keypoints are those of the reduced photographs.
@@ -101,15 +92,16 @@ class PhotographsConfig:
         camera_params: its parameters, in COLMAP's order and for a photograph of full size, kept as given. Without
             them, they are refined from the EXIF focal length, or from 1.2 times the longer side where there is none.
         shared_camera: whether photographs of one folder, size and EXIF focal length share their intrinsics.
-        exhaustive_up_to: every pair of photographs is matched up to this number of them. Of more, each is matched with
-            those that follow it by name.
-        overlap: how many follow directly; as many more at distances that double.
+        exhaustive_up_to: up to this number of photographs, every pair is matched. Of more photographs, each is matched
+            with some that follow it by name.
+        overlap: each is matched with this many next ones, and with as many more at distances that double.
         max_reprojection_error_px: landmarks with a larger mean reprojection error are removed. Photographs taken by
             hand do not reach the 0.5 px of rendered images.
-        up_in_camera: where up is as a camera sees it, (x, y, z) with x right, y down, z forward, if it is the same for
-            all: (0, 0, -1) for cameras that look straight down. By default cameras are held level, with any pitch.
+        up_in_camera: the direction up in the camera's frame, (x, y, z) with x right, y down, z forward, if it is the
+            same for all photographs: (0, 0, -1) for cameras that look straight down. By default cameras are taken to be
+            held without roll, at any pitch.
         scale: where the scale comes from.
-        assume_metric: take a map without a scale for one in metres, where metres are needed.
+        assume_metric: where metres are needed, treat a map without a scale as one in metres.
     """
 
     images: Path | None = None
@@ -127,10 +119,8 @@ class PhotographsConfig:
 
     def __post_init__(self) -> None:
         if self.max_side_px < 0 or self.exhaustive_up_to < 0 or self.overlap < 1:
-            raise ConfigError(
-                "max_side_px and exhaustive_up_to must not be negative, overlap at least 1",
-                value=(self.max_side_px, self.exhaustive_up_to, self.overlap),
-            )
+            problem = "max_side_px and exhaustive_up_to must not be negative, overlap at least 1"
+            raise ConfigError(problem, value=(self.max_side_px, self.exhaustive_up_to, self.overlap))
         if not self.max_reprojection_error_px > 0:
             raise ConfigError("max_reprojection_error_px must be positive", value=self.max_reprojection_error_px)
         if self.up_in_camera is not None and not 0 < sum(abs(value) for value in self.up_in_camera) < inf:

@@ -23,7 +23,7 @@ from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import Float, check_poses, split_poses
 from wheretolook.inputs.localization_map import SAME_LOCATION_DECIMALS, LocalizationMap
 from wheretolook.methods.base import Scorer
-from wheretolook.visibility.frustum import VisibleSets
+from wheretolook.visibility.frustum import LandmarkSets
 
 Approximation = Literal["exact", "quadratic", "gp"]
 APPROXIMATIONS: tuple[Approximation, ...] = ("exact", "quadratic", "gp")
@@ -104,7 +104,7 @@ class PoseInformation:
     def _numbers(self, approximation: Approximation) -> Float:
         _, rows, mask = self._locations()
         if approximation == "exact":
-            seen = VisibleSets.from_mask(mask)
+            seen = LandmarkSets.from_mask(mask)
             return exact_information(self.camera, self._poses, self.points, seen, rows, self.device)
         field, _ = self.field(self._poses, approximation)
         return field.information_of_views(rows, self._poses[:, 2, :3])

@@ -10,7 +10,7 @@ from wheretolook.geometry.lattices import axes_of_angles, yaw_pitch_angles
 from wheretolook.geometry.poses import Float, check_poses, poses_looking_along, split_poses
 from wheretolook.inputs.localization_map import SAME_LOCATION_DECIMALS, LocalizationMap
 from wheretolook.methods.base import Scorer
-from wheretolook.visibility.frustum import VisibleSets, visible_landmarks
+from wheretolook.visibility.frustum import LandmarkSets, landmarks_in_view
 
 MAX_DEPTH_M = 3.0
 """Landmarks farther along the optical axis do not count, in place of occlusion."""
@@ -33,12 +33,12 @@ class MaxVisibilityScorer(Scorer):
         poses = check_poses(cam_from_world)
         one, points = self.localization_map, self.localization_map.landmarks.points
         everything = np.arange(len(points), dtype=np.int32)
-        candidates = VisibleSets(np.array([0, len(points)], dtype=np.int32), everything)
+        candidates = LandmarkSets(np.array([0, len(points)], dtype=np.int32), everything)
         counts = np.empty(len(poses))
         for begin in range(0, len(poses), VIEWS_AT_ONCE):
             block = poses[begin : begin + VIEWS_AT_ONCE]
             rows = np.zeros(len(block), dtype=np.int64)
-            seen = visible_landmarks(one.camera, block, points, candidates, rows, one.device)
+            seen = landmarks_in_view(one.camera, block, points, candidates, rows, one.device)
             view = np.repeat(np.arange(len(block)), np.diff(seen.starts))
             depth = np.einsum("ni,ni->n", points[seen.indices], block[view, 2, :3]) + block[view, 2, 3]
             counts[begin : begin + len(block)] = np.bincount(view[depth < MAX_DEPTH_M], minlength=len(block))

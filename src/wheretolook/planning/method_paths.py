@@ -79,7 +79,7 @@ def path_views(
     camera, points = localization_map.camera, localization_map.landmarks.points
     assert isinstance(camera, PinholeCamera)
     cam_from_world = poses_looking_along(path.positions, path.axes)
-    visible = localization_map.visible_landmarks(cam_from_world)
+    visible = localization_map.landmarks_in_view(cam_from_world)
     rgb = None if renderer is None else renderer.render(camera, cam_from_world).rgb
     views = []
     for number, pose in enumerate(cam_from_world):

@@ -84,7 +84,7 @@ def pipeline_of(showcase: Showcase, scorer: Scorer, location_id: int, height_m: 
     row = int(np.argmax(candidate_scores))
     chosen = poses(candidates.iloc[[row]])
     seen = np.zeros(len(one.landmarks), dtype=bool)
-    seen[one.visible_landmarks(chosen)[0]] = True
+    seen[one.landmarks_in_view(chosen)[0]] = True
     mapping_poses = np.zeros((0, 3, 4)) if one.mapping_poses is None else one.mapping_poses
     return Pipeline(
         showcase.house, one.landmarks.points, mapping_poses, showcase.camera, locations, len(showcase.free),
@@ -113,7 +113,7 @@ def sampling_of(showcase: Showcase, location_id: int) -> Sampling:
 def binned_image_of(showcase: Showcase, cam_from_world: ArrayLike, bins: int = 30) -> BinnedImage:
     """One view (3, 4), rendered and binned."""
     one, pose = showcase.localization_map, np.asarray(cam_from_world, dtype=np.float64)[None]
-    points = one.landmarks.points[one.visible_landmarks(pose)[0]]
+    points = one.landmarks.points[one.landmarks_in_view(pose)[0]]
     pixels = pixels_of(showcase.camera, points @ pose[0, :, :3].T + pose[0, :, 3])
     binned = one.bin_views(pose, bins)
     empty = binned.counts[0] == 0

@@ -1,4 +1,4 @@
-"""From a map to a table of viewpoints: locations, directions, visibility, the best K kept (paper, Sec. 3.1-3.2)."""
+"""Samples a table of viewpoints in a map: the K directions of each location that see most (paper, Sec. 3.1-3.2)."""
 
 from __future__ import annotations
 
@@ -79,11 +79,9 @@ def free_locations(grid: VoxelGrid, free_space: FreeSpace | MappedSpace) -> NDAr
     """
     ids = np.flatnonzero(free_space.is_free(grid.centers()))
     if len(ids) == 0:
-        raise SceneError(
-            f"none of the {len(grid)} locations is in free space",
-            value=(grid.lower, grid.upper),
-            fix="Refine sample.grid, lower the clearance, or check the scene's units (metres) and up axis.",
-        )
+        problem = f"none of the {len(grid)} locations is in free space"
+        fix = "Refine sample.grid, lower the clearance, or check the scene's units (metres) and up axis."
+        raise SceneError(problem, value=(grid.lower, grid.upper), fix=fix)
     return ids
 
 
@@ -98,7 +96,7 @@ def sample_viewpoints(
     progress: str | None = None,
     split: Split = "train",
 ) -> tuple[pd.DataFrame, StoredOcclusion]:
-    """Choose viewpoints by what they see.
+    """Choose viewpoints by how many landmarks they see.
 
     At every location all directions of the lattice are ranked by the number of landmarks in view (descending, then by
     direction id), and the best K are kept.
@@ -109,45 +107,50 @@ def sample_viewpoints(
         landmarks: of the map.
         camera: intrinsics of the viewpoints.
         occlusion: which landmarks have a free line of sight.
-        config: how many of what.
-        device: where visibility is counted.
+        config: see `SampleConfig`.
+        device: where landmarks in view are counted.
         progress: text of a progress bar; None shows none.
-        split: the scene's, for an option that differs by split.
-
-    Raises:
-        SceneError: no viewpoint sees enough landmarks, or a location lies inside geometry. MapError: no landmarks.
+        split: of the scene, for options that differ by split.
 
     Returns:
-        The table of viewpoints, unlabelled, in the order of their ids; a viewpoint's id is its location's times the
-        number of directions plus its direction's. And the occlusion of the table's locations, for later stages.
+        The table of viewpoints, unlabelled, in the order of their ids (location id times the number of directions, plus
+        direction id), and the occlusion of the table's locations, for later stages.
+
+    Raises:
+        SceneError: no viewpoint sees enough landmarks, or a location lies inside geometry.
+        MapError: there are no landmarks.
     """
     config = config or SampleConfig()
     rng = np.random.default_rng(config.seed)
     ids = np.sort(_subset(np.asarray(location_ids, dtype=np.int64), config.max_locations, rng))
     locations = grid.centers()[ids]
     directions = direction_lattice(config.directions, config.lattice)
+    rotations, memory_bytes = rotation_looking_along(directions), round(config.memory_gb * 1e9)
     seen = survey(
-        camera, rotation_looking_along(directions), locations, landmarks.points, occlusion, keep=config.keep,
-        distinct_pixels=config.distinct_pixels, device=device, memory_bytes=round(config.memory_gb * 1e9),
+        camera,
+        rotations,
+        locations,
+        landmarks.points,
+        occlusion,
+        keep=config.keep,
         progress=progress,
-    )  # fmt: skip
+        distinct_pixels=config.distinct_pixels,
+        device=device,
+        memory_bytes=memory_bytes,
+    )
     counts, rank = seen.counts, np.full(seen.counts.shape, -1)
     np.put_along_axis(rank, seen.best, np.arange(seen.best.shape[1])[None], axis=1)
 
-    rows, columns = [], []
-    for row in range(len(ids)):
-        kept = seen.best[row]
-        kept = kept[counts[row, kept] >= config.min_visible]
-        kept = np.sort(_subset(kept, config.directions_of(split), rng))
-        rows.append(np.full(len(kept), row))
-        columns.append(kept)
-    row_index, direction = np.concatenate(rows), np.concatenate(columns)
+    kept_directions = []
+    for row, best in enumerate(seen.best):
+        kept = best[counts[row, best] >= config.min_visible]
+        kept_directions.append(np.sort(_subset(kept, config.directions_of(split), rng)))
+    row_index = np.repeat(np.arange(len(ids)), [len(kept) for kept in kept_directions])
+    direction = np.concatenate(kept_directions)
     if len(direction) == 0:
-        raise SceneError(
-            f"from no location does a viewpoint see {config.min_visible} of the {len(landmarks.points)} landmarks",
-            value=int(counts.max(initial=0)),
-            fix="Lower sample.min_visible, or map the scene with more images.",
-        )
+        n_landmarks, fix = len(landmarks.points), "Lower sample.min_visible, or map the scene with more images."
+        problem = f"from no location does a viewpoint see {config.min_visible} of the {n_landmarks} landmarks"
+        raise SceneError(problem, value=int(counts.max(initial=0)), fix=fix)
     table = pd.DataFrame(
         {
             "viewpoint_id": ids[row_index] * len(directions) + direction,

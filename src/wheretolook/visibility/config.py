@@ -18,12 +18,12 @@ class OcclusionConfig:
     """Options of occlusion.
 
     Args:
-        model: "mesh" casts one ray for each landmark; "tsdf" does so against the surface that depth images fuse to,
-            here rendered where the map's images were taken; "hidden-points" needs nothing but the landmarks; "none"
-            sees through walls, as the paper's released code. With "tsdf", collisions of viewpoint maps and paths are
-            with that surface too, not with the mesh, and what no depth image saw is not free.
+        model: "mesh" casts one ray for each landmark; "tsdf" does so against the surface fused from depth images, which
+            are rendered where the map's images were taken; "hidden-points" needs nothing but the landmarks; "none"
+            sees through walls, as the paper's released code. With "tsdf", viewpoint maps and paths also test
+            collisions against that surface instead of the mesh, and what no depth image saw is not free.
         margin_m: a surface this close in front of a landmark is the landmark's own.
-        radius: of hidden-point removal, in distances of the farthest landmark.
+        radius: of hidden-point removal, as a multiple of the distance to the farthest landmark.
         voxel_m: voxel size of the TSDF.
         max_depth_m: range of the depth images.
     """
@@ -45,17 +45,14 @@ class OcclusionConfig:
                 raise ConfigError(f"occlusion.{name} must be positive", value=getattr(self, name))
 
     def settings(self) -> dict[str, str | float]:
-        """The model and those settings that it reads."""
-        read = {"mesh": ["margin_m"], "tsdf": ["margin_m", "voxel_m", "max_depth_m"],
-                "hidden-points": ["margin_m", "radius"], "none": []}  # fmt: skip
-        return {"model": self.model, **{name: getattr(self, name) for name in read[self.model]}}
+        """The model and the settings it reads."""
+        names = {"mesh": "margin_m", "tsdf": "margin_m voxel_m max_depth_m", "hidden-points": "margin_m radius"}
+        return {"model": self.model, **{name: getattr(self, name) for name in names.get(self.model, "").split()}}
 
 
 def check_occlusion_names(names: tuple[str, ...]) -> None:
     """Raise ConfigError if an occlusion model is unknown or named twice."""
     unknown = [name for name in names if name not in OCCLUSION_NAMES]
     if unknown or len(set(names)) < len(names):
-        raise ConfigError(
-            "occlusion models must be known and named once", value=" ".join(names),
-            fix=f"There are {', '.join(OCCLUSION_NAMES)}.",
-        )  # fmt: skip
+        fix = f"There are {', '.join(OCCLUSION_NAMES)}."
+        raise ConfigError("occlusion models must be known and named once", value=" ".join(names), fix=fix)

@@ -1,4 +1,4 @@
-"""Labels without people: render a viewpoint, localize the image against the map, measure the pose error."""
+"""Labels without annotators: render a viewpoint, localize the image against the map, measure the pose error."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -83,7 +83,7 @@ def dollhouse(
     if elevation_deg == 90:
         to_eye = np.array([0.0, 0.0, 1.0])
     if one_sided:
-        mesh = _facing(mesh, to_eye)
+        mesh = mesh.only(mesh.normals @ to_eye > 0)
     if len(mesh.triangles) == 0:
         raise SceneError("nothing of the scene is left to be seen", value=cut_m, fix="Cut higher.")
     corners = np.stack(np.meshgrid(*np.stack([low, high], axis=1), indexing="ij"), axis=-1).reshape(-1, 3)
@@ -100,15 +100,3 @@ def dollhouse(
     rgb, depth_m = rendering.rgb[0], rendering.depth_m[0]
     rgb[depth_m == 0] = 255
     return Dollhouse(rgb, depth_m, camera, pose)
-
-
-def _facing(mesh: TexturedMesh, to_eye: Float) -> TexturedMesh:
-    """The triangles whose fronts face a direction (3,)."""
-    a, b, c = np.moveaxis(mesh.vertices[mesh.triangles].astype(np.float64), 1, 0)
-    front = np.cross(b - a, c - a) @ to_eye > 0
-    return replace(
-        mesh,
-        triangles=mesh.triangles[front],
-        corner_uvs=mesh.corner_uvs[front],
-        triangle_texture=mesh.triangle_texture[front],
-    )

@@ -195,7 +195,7 @@ FURNITURE: dict[str, Callable[[Style], list[patches_module.Patch]]] = {
     "bathtub": lambda s: fixtures.bathtub(s, 1.7),
     "toilet": fixtures.toilet,
     "radiator": lambda s: fixtures.radiator(s, 1.0, 0.5),
-    "curtain": lambda s: fixtures.curtain(s, 0.5, 2.0, s.upholstery),
+    "curtain": lambda s: fixtures.curtain(0.5, 2.0, s.upholstery),
 }
 
 

@@ -74,25 +74,12 @@ def label_viewpoints(
     progress: bool = True,
     description: str = "label",
 ) -> pd.DataFrame:
-    """`label_scenes` for one scene: render every viewpoint, localize its image and measure the error.
+    """`label_scenes` for one scene: the table with its labels, see `LabelledScene`.
 
-    Args:
-        table: viewpoints, see `wheretolook.table.SCHEMA`.
-        mesh: file of the scene's mesh.
-        landmarks: file of the map's landmarks, with descriptors.
-        camera: intrinsics of the viewpoints.
-        shards: folder for finished shards.
-        config: settings of labelling.
-        extractor: what the map was made with.
-        device: where images are rendered, keypoints extracted and descriptors matched.
-        progress: show a progress bar.
-        description: the bar's title.
-
-    Returns:
-        The table with its labels, see `LabelledScene`. Errors are raised as in `label_scenes`.
+    `SceneJob` describes the mesh, landmarks, camera, extractor and device, `LabelTask` the table and folder of shards.
+    `description` is the title of the progress bar.
     """
-    config = config or LabelConfig()
-    extractor = extractor or ExtractorConfig()
+    config, extractor = config or LabelConfig(), extractor or ExtractorConfig()
     job = SceneJob(mesh, landmarks, camera, config.localizer, extractor, device, config.store_matches)
     (scene,) = label_scenes([LabelTask(description, job, table, shards)], config, progress, description)
     return scene.table
@@ -158,6 +145,8 @@ def versions() -> dict[str, str]:
 
 @dataclass(eq=False)
 class _SceneInProgress:
+    """A scene whose shards are being labelled; `missing` are those without a file yet."""
+
     task: LabelTask
     settings: dict[str, Any]
     shards: list[Shard]

@@ -121,9 +121,6 @@ def match(matcher: DescriptorMatcher, descriptors: Sequence[NDArray[np.uint8]], 
         matcher: of the landmarks.
         descriptors: of each image, (K_i, 128) uint8.
         max_ratio: the nearest landmark's distance over the second nearest's must be below it.
-
-    Returns:
-        The matches of each image.
     """
     lengths = [len(of_image) for of_image in descriptors]
     if sum(lengths) == 0 or matcher.n_landmarks < 2:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -85,12 +85,7 @@ class ShardWorker:
         self._scene: tuple[SceneJob, Renderer, Localizer] | None = None
 
     def label(self, job: SceneJob, rows: pd.DataFrame, tick: Tick = lambda n: None) -> LabelledShard:
-        """Label viewpoints.
-
-        Args:
-            job: their scene.
-            rows: viewpoints, see `wheretolook.table.SCHEMA`.
-            tick: called with the number of viewpoints just finished.
+        """Label viewpoints of a scene; `tick` is called with the number of viewpoints just finished.
 
         Raises:
             SceneError, MapError: the mesh or the landmarks cannot be used.
@@ -135,29 +130,19 @@ def label_rows(
 ) -> pd.DataFrame:
     """Render viewpoints, localize the images and measure the errors, in batched steps that overlap in this process.
 
-    Args:
-        table: viewpoints.
-        renderer: of the scene.
-        localizer: of its map.
-        camera: intrinsics of the viewpoints.
-        seconds: the time spent in each step (render, extract, match, pose) is added to it.
-        tick: called with the number of viewpoints just finished.
-        store_matches: also store which landmarks were matched.
+    The time spent in each step (render, extract, match, pose) is added to `seconds`, and `tick` is called with the
+    number of viewpoints just finished.
 
     Returns:
         The table with status, error_m, error_deg and n_inliers filled in. It has the columns of
         `wheretolook.table.MATCH_FIELDS` only with `store_matches`; those of earlier labels are dropped.
     """
     true_poses = poses(table)
-
-    def estimate(batch: list[Any]) -> list[Localization]:
-        return [localizer.estimate(keypoints, *matches) for keypoints, matches in batch]
-
     steps = [
         Step("render", lambda batch: renderer.render(camera, batch).rgb),
         Step("extract", localizer.extract),
-        Step("match", lambda found: list(zip(found, localizer.match(found), strict=True))),
-        Step("pose", estimate),
+        Step("match", lambda keypoints: list(zip(keypoints, localizer.match(keypoints), strict=True))),
+        Step("pose", lambda pairs: [localizer.estimate(keypoints, *matches) for keypoints, matches in pairs]),
     ]
     batches = [true_poses[start : start + BATCH] for start in range(0, len(true_poses), BATCH)]
     results: list[Localization] = []

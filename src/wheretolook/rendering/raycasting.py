@@ -79,13 +79,7 @@ class MeshRaycaster:
         return occluded
 
     def unoccluded_on_device(self, origins: ArrayLike, points: Any, margin_m: float = 0.02) -> Any:
-        """The negation of `occluded`, as a Warp array (L, N) of bool that stays on the device.
-
-        Args:
-            origins: (L, 3) metres.
-            points: (N,) Warp array of vec3 on this raycaster's device.
-            margin_m: as in `occluded`.
-        """
+        """The negation of `occluded`, as a Warp array (L, N) of bool; `points` (N,) is a Warp array of vec3."""
         origins_on_device = vec3_array(origins, self.device)
         shape = (origins_on_device.shape[0], points.shape[0])
         (unoccluded,) = self._launch(unoccluded_kernel, shape, [origins_on_device, points, margin_m], wp.bool)

@@ -69,7 +69,7 @@ def _text(
 
 def _landscape(canvas: Canvas, rng: np.random.Generator, colours: list[Colour]) -> Image:
     sky, low = vary(rng, (0.55, 0.70, 0.85), 0.08), vary(rng, (0.93, 0.82, 0.68), 0.06)
-    image = mix(sky, low, np.broadcast_to(canvas.unit_y**0.8, (canvas.height, canvas.width)))
+    image = mix(sky, low, np.broadcast_to(canvas.unit_y**0.8, canvas.shape))
     shift = (int(rng.integers(SIZE)), int(rng.integers(SIZE)))
     cloud = np.clip(0.3 * canvas.crop(canvas.noise.cloud, shift, step=3), 0, 0.6)
     image = mix(image, 0.96, cloud)
@@ -136,9 +136,8 @@ def rug(rng: np.random.Generator, richness: float = 1.0) -> Material:
 
     def paint(canvas: Canvas) -> Image:
         local = np.random.default_rng(seed)
-        shape = (canvas.height, canvas.width)
-        x = np.broadcast_to(np.abs(canvas.unit_x - 0.5), shape) * canvas.width / canvas.texels_per_m
-        y = np.broadcast_to(np.abs(canvas.unit_y - 0.5), shape) * canvas.height / canvas.texels_per_m
+        x = np.broadcast_to(np.abs(canvas.unit_x - 0.5), canvas.shape) * canvas.width / canvas.texels_per_m
+        y = np.broadcast_to(np.abs(canvas.unit_y - 0.5), canvas.shape) * canvas.height / canvas.texels_per_m
         edge = np.minimum(x.max() - x, y.max() - y)
         if kind == "ornament":
             rows, columns = (y * canvas.texels_per_m).astype(int), (x * canvas.texels_per_m).astype(int)
@@ -213,11 +212,9 @@ def view(rng: np.random.Generator) -> Material:
     houses = bool(rng.random() < 0.5)
 
     def paint(canvas: Canvas) -> Image:
-        local = np.random.default_rng(seed)
-        shape = (canvas.height, canvas.width)
+        local, shape = np.random.default_rng(seed), canvas.shape
         image = mix((0.78, 0.88, 0.97), (0.96, 0.97, 0.97), np.broadcast_to(canvas.unit_y / horizon, shape).clip(0, 1))
-        cloud = np.clip(0.25 * canvas.crop(canvas.noise.cloud, shift), 0, 0.5)
-        image = mix(image, 0.98, cloud)
+        image = mix(image, 0.98, np.clip(0.25 * canvas.crop(canvas.noise.cloud, shift), 0, 0.5))
         for i, colour in enumerate(((0.70, 0.78, 0.82), (0.58, 0.68, 0.62), (0.47, 0.58, 0.42))):
             ridge = canvas.noise.cloud[int(local.integers(SIZE)), (np.arange(canvas.width) + shift[1]) % SIZE]
             level = horizon + 0.11 * i + 0.03 * ridge

@@ -127,15 +127,8 @@ def cabinet(
 ) -> list[Patch]:
     """Carcass with a grid of doors or drawers and their handles.
 
-    Args:
-        style: of the apartment.
-        size: width, depth and height in metres.
-        columns: of doors or drawers.
-        rows: of doors or drawers.
-        carcass: material of the sides; the style's wood if None.
-        front: material of the doors; the style's if None.
-        plinth: height of the recessed foot in metres.
-        faces: materials of single doors, by column and row.
+    `size` is width, depth and height, `plinth` the height of the recessed foot, in metres. `faces` are the materials of
+    single doors by column and row. Without materials, the carcass is of the style's wood, the doors are its fronts.
     """
     (width, depth, height), w = size, size[0] / 2
     carcass, front = carcass or style.wood, front or style.front

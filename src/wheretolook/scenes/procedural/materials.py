@@ -49,7 +49,7 @@ def vary(rng: np.random.Generator, colour: ArrayLike, amount: float = 0.04) -> C
 
 def fill(canvas: Canvas, colour: ArrayLike) -> Image:
     """Image (height, width, 3) of one colour."""
-    return np.broadcast_to(np.asarray(colour, np.float32), (canvas.height, canvas.width, 3)).copy()
+    return np.broadcast_to(np.asarray(colour, np.float32), (*canvas.shape, 3)).copy()
 
 
 def _shift(rng: np.random.Generator) -> tuple[int, int]:
@@ -142,10 +142,10 @@ def tiles(
         row = np.floor(row_position).astype(int)
         column_position = canvas.x / width + (0.5 * (row % 2) if brick else 0)
         column = np.floor(column_position).astype(int)
-        albedo = np.broadcast_to(np.asarray(colour, np.float32), (canvas.height, canvas.width, 3))
+        albedo = fill(canvas, colour)
         if second is not None:
-            albedo = mix(colour, second, np.broadcast_to((row + column) % 2, albedo.shape[:2]))
-        factor = 1 + np.broadcast_to(tone[row % 16, column % 16], albedo.shape[:2])
+            albedo = mix(colour, second, np.broadcast_to((row + column) % 2, canvas.shape))
+        factor = 1 + np.broadcast_to(tone[row % 16, column % 16], canvas.shape)
         if veins:
             a = (((column_position - column) * width * scale).astype(int) + shift[1]) % SIZE
             b = (((row_position - row) * height * scale).astype(int) + shift[0]) % SIZE
@@ -177,7 +177,7 @@ def wallpaper(
     def paint(canvas: Canvas) -> Image:
         u = canvas.x / period_m
         stripe = np.clip((np.abs(u - np.floor(u) - 0.5) - 0.25) * period_m * canvas.texels_per_m + 0.5, 0, 1)
-        albedo = mix(colour, second, np.broadcast_to(0.35 * stripe, (canvas.height, canvas.width)))
+        albedo = mix(colour, second, np.broadcast_to(0.35 * stripe, canvas.shape))
         if motif:
             cell_x = (u - np.floor(u) - 0.5) * period_m
             v = canvas.y / (1.6 * period_m) + 0.5 * (np.floor(u) % 2)
@@ -218,9 +218,8 @@ def fabric(
             amount = np.clip((np.abs((y + np.abs(x % 1 - 0.5)) % 1 - 0.5) - 0.25) * sharp + 0.5, 0, 1)
         else:
             amount = np.zeros((1, 1), np.float32)
-        amount = np.broadcast_to(amount, (canvas.height, canvas.width))
         tone = 1 + weave * canvas.crop(canvas.noise.fine, shift) + 0.4 * weave * canvas.crop(canvas.noise.cloud, shift)
-        return mix(colour, other, amount) * tone[..., None]
+        return mix(colour, other, np.broadcast_to(amount, canvas.shape)) * tone[..., None]
 
     return Material(paint, shared=shared)
 
@@ -250,7 +249,7 @@ def leaf(rng: np.random.Generator, colour: ArrayLike) -> Material:
 
     def paint(canvas: Canvas) -> Image:
         x, y = canvas.unit_x - 0.5, canvas.unit_y
-        albedo = mix(tip, colour, np.broadcast_to(y, (canvas.height, canvas.width)))
+        albedo = mix(tip, colour, np.broadcast_to(y, canvas.shape))
         rib = np.clip(1 - np.abs(x) * canvas.width / 1.5, 0, 1) + 0 * y
         side = np.clip(1 - np.abs(((y + np.abs(x)) * veins) % 1 - 0.5) * canvas.height / veins / 1.5, 0, 1)
         return albedo * (1 + 0.25 * np.maximum(rib, 0.5 * side))[..., None]

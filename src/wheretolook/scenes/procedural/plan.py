@@ -19,10 +19,8 @@ class Opening:
 
     Attributes:
         kind: `door`, `wide` (a wide opening without a frame or door) or `window`.
-        a0: left end along the wall in metres, seen from inside the room.
-        a1: right end.
-        z0: lower edge above the floor.
-        z1: upper edge.
+        a0, a1: left and right end along the wall in metres, seen from inside the room.
+        z0, z1: lower and upper edge above the floor in metres.
         other: index of the room behind it, -1 for outside.
         owner: whether this room's side carries the jambs and the threshold.
     """
@@ -42,12 +40,9 @@ class Room:
 
     Attributes:
         index: its number.
+        x0, y0, x1, y1: west, south, east and north wall, in metres.
         kind: `living`, `kitchen`, `bedroom`, `bathroom`, `hall` or `study`.
-        x0: west wall.
-        y0: south wall.
-        x1: east wall.
-        y1: north wall.
-        openings: per side (south, east, north, west), what its wall is cut by.
+        openings: doors and windows of each side (south, east, north, west).
         lamp_on: whether its ceiling lamp is lit.
         curtains_closed: whether its windows are covered.
     """

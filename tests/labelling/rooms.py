@@ -50,10 +50,8 @@ def map_room(folder: Path, texture_scale: float) -> MappedRoom:
     mesh = replace(mesh, textures=tuple(textures), corner_uvs=mesh.corner_uvs * np.float32(texture_scale))
     save_glb(mesh, folder / "mesh.glb")
     mesh = load_mesh(folder / "mesh.glb")
-    build_map(
-        mesh, WarpRenderer(mesh), BoxFreeSpace(), CAMERA, MapConfig(n_images=24), seed=0, out_dir=folder / "map",
-        raycaster=MeshRaycaster(mesh), workers=1, progress=False,
-    )  # fmt: skip
+    inputs = (mesh, WarpRenderer(mesh), BoxFreeSpace(), CAMERA, MapConfig(n_images=24))
+    build_map(*inputs, seed=0, out_dir=folder / "map", raycaster=MeshRaycaster(mesh), workers=1, progress=False)
     return MappedRoom(folder / "mesh.glb", folder / "map" / "landmarks.npz")
 
 
@@ -74,9 +72,8 @@ def facing(wall: int, n: int, distance_m: float, seed: int = 0) -> pd.DataFrame:
 
 def label(table: pd.DataFrame, room: MappedRoom, shards: Path, **config: Any) -> bytes:
     """Bytes of the labelled table's file."""
-    labelled = label_viewpoints(
-        table, room.mesh, room.landmarks, CAMERA, shards, LabelConfig(**config), progress=False
-    )  # fmt: skip
+    options = LabelConfig(**config)
+    labelled = label_viewpoints(table, room.mesh, room.landmarks, CAMERA, shards, options, progress=False)
     return file_bytes(labelled, shards)
 
 

@@ -31,10 +31,8 @@ def test_workers_and_shards_do_not_change_the_table(
 def test_a_run_that_was_left_goes_on_where_it_stopped(
     room: MappedRoom, views: pd.DataFrame, expected: bytes, tmp_path: Path
 ) -> None:
-    first, second = (
-        LabelTask(name, room.job, rows, tmp_path / name)
-        for name, rows in (("first", views[:4]), ("second", views))
-    )  # fmt: skip
+    first = LabelTask("first", room.job, views[:4], tmp_path / "first")
+    second = LabelTask("second", room.job, views, tmp_path / "second")
     run = label_scenes([first, second], LabelConfig(workers=2, shard_size=4), progress=False)
     assert next(run).task is first
     run.close()

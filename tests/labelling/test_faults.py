@@ -214,9 +214,15 @@ def test_shards_of_another_mesh_or_of_other_viewpoints_are_not_used(
 
 @pytest.mark.parametrize(("n_finished", "matches"), [(0, False), (3, False), (3, True)])
 def test_killed_at_any_moment_it_resumes_to_the_same_table(
-    room: MappedRoom, views: pd.DataFrame, expected: bytes, expected_matches: bytes, tmp_path: Path, n_finished: int,
-    matches: bool, request: pytest.FixtureRequest,
-) -> None:  # fmt: skip
+    room: MappedRoom,
+    views: pd.DataFrame,
+    expected: bytes,
+    expected_matches: bytes,
+    tmp_path: Path,
+    n_finished: int,
+    matches: bool,
+    request: pytest.FixtureRequest,
+) -> None:
     write_table(views, tmp_path / "table.parquet")
     script = tmp_path / "run.py"
     script.write_text(

@@ -138,9 +138,8 @@ def test_shards_with_and_without_matches_are_told_apart(room: MappedRoom, tmp_pa
 
     label(table, room, shards, shard_size=4, store_matches=True)
     (stored,) = set(times(shards)) - {without}
-    assert json.loads((shards / MANIFEST).read_text()) == {
-        **settings, "store_matches": True, "n_viewpoints": 4, "shards": {stored.name: 4}
-    }  # fmt: skip
+    expected = {**settings, "store_matches": True, "n_viewpoints": 4, "shards": {stored.name: 4}}
+    assert json.loads((shards / MANIFEST).read_text()) == expected
     both = times(shards)
     assert before.items() <= both.items()
     label(table, room, shards, shard_size=4)

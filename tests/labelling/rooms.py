@@ -1,4 +1,4 @@
-"""A room whose answers are known: a plain wall never localizes, a poster wall in the map always does. And what fails.
+"""A room whose answers are known: a plain wall never localizes, a poster wall in the map always does; and faulty workers.
 
 Worker processes import this module to unpickle what the tests hand them.
 """
@@ -63,7 +63,7 @@ def viewpoints(locations: np.ndarray, directions: np.ndarray) -> pd.DataFrame:
 
 
 def facing(wall: int, n: int, distance_m: float, seed: int = 0) -> pd.DataFrame:
-    """Views square to a wall x = const, near enough to see nothing but it."""
+    """Views perpendicular to a wall x = const, so near that they see only this wall."""
     rng = np.random.default_rng(seed)
     locations = np.column_stack([np.zeros(n), rng.uniform(1.6, 2.4, n), rng.uniform(1.2, 1.4, n)])
     locations[:, 0] = ROOM_SIZE[0] - distance_m if wall == PLAIN else distance_m
@@ -114,21 +114,21 @@ def wait_until(condition: Callable[[], bool], seconds: float = 120) -> None:
 
 
 class Deadly:
-    """Kills the worker that gets it."""
+    """Kills the worker that receives it."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         return signal.raise_signal, (signal.SIGKILL,)
 
 
 def half_a_message(pipe: Connection, number: int) -> None:
-    """In place of a worker: dies while it sends its labels."""
+    """Stands in for a worker: dies while it sends its labels."""
     pipe.recv()
     pipe._send((1000).to_bytes(4, "big") + b"the beginning")  # type: ignore[attr-defined]
     sys.exit(1)
 
 
 class BreaksRenderer(SceneJob):
-    """Wherever it arrives, the renderer fails."""
+    """Makes the renderer fail in the process that receives it."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _arrive, (self.mesh, self.landmarks, self.camera)

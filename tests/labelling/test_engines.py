@@ -58,7 +58,7 @@ def test_without_ray_the_extra_to_install_is_named(room: MappedRoom, monkeypatch
 
 @pytest.mark.parametrize("resources", [{"CPU": 8.0}, {"GPU": 1.0}])
 def test_what_no_machine_of_the_cluster_has_is_named(resources: dict[str, float]) -> None:
-    """Ray would wait for it for ever."""
+    """Without the check, Ray would wait forever."""
     missing = "GPU" if "CPU" in resources else "CPU"
     with pytest.raises(ConfigError, match=f"has no {missing}"):
         ray_engine._check_resources(resources, needs_gpu=True)
@@ -66,7 +66,7 @@ def test_what_no_machine_of_the_cluster_has_is_named(resources: dict[str, float]
 
 
 def test_an_address_without_a_cluster_is_refused_at_once(room: MappedRoom) -> None:
-    """Ray itself would try for many minutes."""
+    """Without the check, Ray would try for many minutes."""
     pytest.importorskip("ray")
     shard = Shard(room.job, Path("shard.parquet"), facing(POSTER, 1, 1.5))
     with socket.socket() as taken:  # but not listening
@@ -98,7 +98,7 @@ def cluster() -> Iterator[Any]:
 def test_a_cluster_gives_the_same_table(
     cluster: Any, room: MappedRoom, views: pd.DataFrame, expected: bytes, tmp_path: Path
 ) -> None:
-    """It connects to the cluster's address by itself, and leaves it again, also when an error ends it."""
+    """The engine connects to the cluster and disconnects again, also after an error."""
     import ray
 
     config = {"engine": "ray", "ray_address": cluster.address, "shard_size": 3}

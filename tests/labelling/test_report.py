@@ -1,4 +1,4 @@
-"""Numbers of a dataset's labels, by hand on small tables, and what is logged of them."""
+"""Statistics of labels, compared with numbers computed by hand on small tables, and their logging."""
 
 from __future__ import annotations
 

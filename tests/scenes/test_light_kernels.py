@@ -62,7 +62,7 @@ def direct(
 
 SCREEN = np.array([[[1.0, -0.4, -9], [1, 9, -9], [1, 9, 9], [1, -0.4, 9]]])
 WALL = np.array([[[1.0, -9, -9], [1, 9, -9], [1, 9, 9], [1, -9, 9]]])
-"""`SCREEN` hides all that a line crosses the plane x = 1 to the left of y = -0.4, `WALL` the whole window."""
+"""`SCREEN` blocks rays that cross the plane x = 1 at y > -0.4, `WALL` all rays to the window."""
 
 
 def test_window_light_is_that_of_its_plain_twin(device: str) -> None:
@@ -99,7 +99,7 @@ def test_lamp_light_falls_with_the_square_of_the_distance(height_m: float, devic
 def gather(
     faces: np.ndarray, points: np.ndarray, normals: np.ndarray, brightness: np.ndarray, rays: int, device: str
 ) -> Any:
-    """What the faces of a box, each of one brightness, throw back, and the shares of open and back rays."""
+    """Light reflected by the faces of a box, each of one brightness, and the shares of open and back rays."""
     device = start_warp(device)
     mesh = quads(faces, device)
     bounced = wp.empty(len(points), dtype=wp.vec3, device=device)

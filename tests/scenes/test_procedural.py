@@ -107,7 +107,7 @@ def test_texture_is_not_stretched(apartment: TexturedMesh) -> None:
 
 
 def test_texture_has_plain_and_rich_regions(apartment: TexturedMesh) -> None:
-    """Seen from the surface: random surface points by area, contrast in a window of 17 texels around each."""
+    """At random points of the surface, drawn by area: contrast in a window of 17 texels around each."""
     rng = np.random.default_rng(0)
     grey = apartment.textures[0].astype(np.float32).mean(-1)
     corners = apartment.vertices[apartment.triangles].astype(float)
@@ -201,7 +201,7 @@ FURNITURE: dict[str, Callable[[Style], list[patches_module.Patch]]] = {
 
 @pytest.mark.parametrize("name", FURNITURE)
 def test_furniture_is_closed_and_faces_outward(name: str) -> None:
-    """Once equal points are one, each directed edge is used as often as its reverse; rays from outside meet a front."""
+    """With equal points merged, each directed edge occurs as often as its reverse; rays from outside meet a front."""
     surface = patches_module.join(FURNITURE[name](Style(np.random.default_rng(3), 0.5, 0.5)))
     _, point = np.unique(np.floor(surface.vertices * 1e6 + 0.33), axis=0, return_inverse=True)
     corner = point.ravel()[surface.triangles]

@@ -86,9 +86,11 @@ class FreeSpace:
             (N,) bool.
         """
         at = np.asarray(points, dtype=np.float64).reshape(-1, 3)
-        free = ((at >= self.bounds[0]) & (at <= self.bounds[1])).all(axis=1)
-        for test in (self._is_clear, self._is_above_floor, self._is_enclosed):  # the cheap ones first
-            free[free] = test(at[free])
+        free = ((at >= self.bounds[0]) & (at <= self.bounds[1])).all(axis=1)  # the cheap tests first
+        clearance_m = self.config.clearance_m
+        free[free] = self._raycaster.distance_to_surface(at[free], clearance_m) >= clearance_m
+        free[free] = np.isfinite(self.floor_below(at[free]))
+        free[free] = self._is_enclosed(at[free])
         return free
 
     def segments_are_free(self, a: ArrayLike, b: ArrayLike) -> NDArray[np.bool_]:
@@ -108,17 +110,9 @@ class FreeSpace:
         """Height z (N,) of the floor below points (N, 3) metres; NaN where `is_free` would find none."""
         at = np.asarray(points, dtype=np.float64).reshape(-1, 3)
         hits = self._raycaster.cast(at, np.broadcast_to((0.0, 0.0, -1.0), at.shape))
-        return np.where(self._is_floor(hits), at[:, 2] - hits.distance_m, np.nan)
-
-    def _is_clear(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        return self._raycaster.distance_to_surface(points, self.config.clearance_m) >= self.config.clearance_m
-
-    def _is_above_floor(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        return np.isfinite(self.floor_below(points))
-
-    def _is_floor(self, hits: RayHits) -> NDArray[np.bool_]:
         near = hits.distance_m <= self.config.max_floor_drop_m
-        return near & self._level[hits.triangle] & (hits.front | self.two_sided)
+        is_floor = near & self._level[hits.triangle] & (hits.front | self.two_sided)
+        return np.where(is_floor, at[:, 2] - hits.distance_m, np.nan)
 
     def _is_enclosed(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
         hits = self._look_around(points)

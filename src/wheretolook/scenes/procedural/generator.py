@@ -21,6 +21,9 @@ from wheretolook.scenes.procedural.repetition import repeat_patterns
 from wheretolook.scenes.procedural.shell import build_shell
 from wheretolook.scenes.procedural.style import Style
 
+BRIGHTNESS = np.geomspace(0.12, 1.06, atlas.LEVELS)
+"""Factors on the albedo of shared materials."""
+
 
 @dataclass(frozen=True)
 class ApartmentConfig:
@@ -162,10 +165,6 @@ def _light_charts(
         else:
             factors[chart[k]] = factor
     return chart, factors
-
-
-BRIGHTNESS = np.geomspace(0.12, 1.06, atlas.LEVELS)
-"""Factors on the albedo of shared materials."""
 
 
 def _uvs(plan: atlas.AtlasPlan, chart: NDArray[np.int64], surface: Surface) -> NDArray[np.float32]:

@@ -17,7 +17,6 @@ DOOR_ZONE_M = 0.95
 
 Rectangle = tuple[float, float, float, float]
 
-
 WARM = (1.0, 0.80, 0.58)
 """Colour of a light bulb."""
 

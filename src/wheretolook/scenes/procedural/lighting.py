@@ -24,6 +24,15 @@ from wheretolook.warp_setup import start_warp, vec3_array
 
 Float = NDArray[np.floating[Any]]
 
+SKY = (5.2, 5.7, 6.3)
+"""Radiance of a window pane per colour; lamps are in the same unit."""
+AMBIENT = (0.018, 0.019, 0.02)
+LATER_BOUNCES = 1.7
+"""Light of all bounces together, relative to that of the first."""
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+"""Weights of linear red, green and blue (ITU-R BT.709)."""
+_BINOMIAL = np.array([0.25, 0.5, 0.25], np.float32)
+
 
 @dataclass(frozen=True, eq=False)
 class Samples:
@@ -80,13 +89,6 @@ def _evaluate(patch: Patch, s: Float, t: Float) -> tuple[Float, Float]:
     down = (1 - a) * (bl - tl) + a * (br - tr)
     normal = np.cross(down, right)
     return point, normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
-
-
-SKY = (5.2, 5.7, 6.3)
-"""Radiance of a window pane per colour; lamps are in the same unit."""
-AMBIENT = (0.018, 0.019, 0.02)
-LATER_BOUNCES = 1.7
-"""All bounces together, relative to the first."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,9 +180,6 @@ def bake(
     )
 
 
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-
-
 def light_grids(samples: Samples, light: Light) -> list[Float | None]:
     """Light per patch as (rows, columns, 3), smoothed, with samples inside solids filled from their neighbours."""
     grids: list[Float | None] = []
@@ -210,9 +209,6 @@ def _smooth(grid: Float, valid: NDArray[np.bool_], passes: int) -> Float:
         # After the requested passes, only samples without a value change.
         data = wider if k < passes else np.where(data[..., 3:] > 1e-3, data, wider)
     return np.asarray(np.where(data[..., 3:] > 1e-3, data[..., :3] / np.maximum(data[..., 3:], 1e-6), grid))
-
-
-_BINOMIAL = np.array([0.25, 0.5, 0.25], np.float32)
 
 
 def to_display(light: Float, reference: float) -> Float:

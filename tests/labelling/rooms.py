@@ -1,4 +1,4 @@
-"""A room whose answers are known: a plain wall never localizes, a poster wall in the map always does; and faulty workers.
+"""A room with known labels (its plain wall never localizes, its poster wall always does), and faulty workers.
 
 Worker processes import this module to unpickle what the tests hand them.
 """

@@ -34,7 +34,7 @@ def run_local(
     Args:
         shards: begun in this order.
         workers: number of processes.
-        tick: called with the number of viewpoints just finished; a worker's death takes its viewpoints back.
+        tick: called with the number of viewpoints just finished, negative when a worker died and they are redone.
 
     Yields:
         Shards as they are finished.

@@ -12,8 +12,10 @@ from wheretolook.scenes.procedural.plan import Room
 from wheretolook.scenes.procedural.shell import wall_items
 
 CELL_M = 0.1
+"""Side of the cells in which `Layout.passable` looks for ways."""
 WALKER_RADIUS_M = 0.25
 DOOR_ZONE_M = 0.95
+"""Depth of the floor before a door that stays free."""
 
 Rectangle = tuple[float, float, float, float]
 

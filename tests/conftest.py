@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import warp as wp
 
-from wheretolook.geometry import Float, PinholeCamera, poses_looking_along
-from wheretolook.visibility import VisibleSets
-from wheretolook.warp_setup import start_warp
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.poses import Float, poses_looking_along
+from wheretolook.utils.warp import start_warp
+from wheretolook.visibility.frustum import VisibleSets
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:

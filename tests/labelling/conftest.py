@@ -11,10 +11,11 @@ import pytest
 import torch
 
 from labelling.rooms import CAMERA, PLAIN, POSTER, MappedRoom, facing, file_bytes, map_room
-from wheretolook.labelling import Localizer, local_engine
+from wheretolook.labelling import local_engine
+from wheretolook.labelling.localizer import Localizer
 from wheretolook.labelling.shard import LabelledShard, Shard, ShardWorker, label_rows
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.rendering import WarpRenderer
+from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import load_mesh
 
 

@@ -17,15 +17,15 @@ import numpy as np
 import pandas as pd
 from tqdm.auto import tqdm
 
-import wheretolook
-from wheretolook.dataset import write_json
-from wheretolook.errors import MapError, SceneError, StorageError, TableError
-from wheretolook.geometry import PinholeCamera
+from wheretolook.features.keypoints import ExtractorConfig
+from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.labelling.config import LabelConfig
 from wheretolook.labelling.shard import LabelledShard, SceneJob, Shard
-from wheretolook.mapping.extraction import ExtractorConfig
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.table import SCHEMA, fingerprint, read_table, sha256, write_table
+from wheretolook.utils.errors import MapError, SceneError, StorageError, TableError
+from wheretolook.utils.files import fingerprint, sha256, write_json
+from wheretolook.utils.version import VERSION
+from wheretolook.viewpoints.table import SCHEMA, read_table, write_table
 
 MANIFEST = "manifest.json"
 """File in the folder of shards that says what the labels are made with; later `labels.json` beside the table."""
@@ -36,7 +36,7 @@ LABELS = ("status", "error_m", "error_deg", "n_inliers")
 
 @dataclass(frozen=True, eq=False)
 class LabelTask:
-    """A scene to label: its name, what workers need, its viewpoints (`wheretolook.table.SCHEMA`), folder of shards."""
+    """A scene to label: its name, what workers need, its viewpoints (`viewpoints.table.SCHEMA`), folder of shards."""
 
     name: str
     job: SceneJob
@@ -51,7 +51,7 @@ class LabelledScene:
     Attributes:
         task: the scene that was to be labelled.
         table: the viewpoints with status, error_m, error_deg and n_inliers; the paper's label y follows from them by
-            `wheretolook.table.is_good`. If the job stores matches, also `wheretolook.table.MATCH_FIELDS`.
+            `viewpoints.table.is_good`. If the job stores matches, also `viewpoints.table.MATCH_FIELDS`.
         manifest: versions, settings and fingerprints of what made the labels, and each shard's name and SHA-256.
         seconds: the workers' time in each step, for shards made in this run.
     """
@@ -134,7 +134,7 @@ def label_scenes(
 @cache
 def versions() -> dict[str, str]:
     """Versions of the packages that decide a label."""
-    found = {"wheretolook": wheretolook.__version__}
+    found = {"wheretolook": VERSION}
     for package in ("pycolmap", "opencv-python-headless", "warp-lang", "numpy", "torch"):
         try:
             found[package] = version(package)

@@ -11,10 +11,10 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
+from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.rendering import ray_kernels
 from wheretolook.rendering.ray_kernels import cast_kernel, clear_kernel, distance_kernel, unoccluded_kernel
-from wheretolook.scenes.mesh import TexturedMesh
-from wheretolook.warp_setup import start_warp, vec3_array, warp_mesh
+from wheretolook.utils.warp import start_warp, vec3_array
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,3 +122,11 @@ class MeshRaycaster:
         outputs = [wp.empty(shape, dtype=dtype, device=self.device) for dtype in dtypes]
         wp.launch(kernel, shape, [self.warp_mesh.id, *inputs], outputs, device=self.device)
         return outputs
+
+
+def warp_mesh(mesh: TexturedMesh, device: str) -> wp.Mesh:
+    """The mesh with its bounding volume hierarchy on a device. Warp must have been started."""
+    return wp.Mesh(
+        points=wp.array(mesh.vertices, dtype=wp.vec3, device=device),
+        indices=wp.array(np.ascontiguousarray(mesh.triangles).reshape(-1), dtype=wp.int32, device=device),
+    )

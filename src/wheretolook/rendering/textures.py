@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.errors import SceneError
-from wheretolook.scenes.mesh import TexturedMesh
+from wheretolook.geometry.mesh import TexturedMesh
+from wheretolook.utils.errors import SceneError
 
 MAX_ANISOTROPY = 8
 """Up to this ratio of a pixel footprint's axes, several samples along the long axis replace a coarser mip level.

@@ -7,7 +7,7 @@ from itertools import combinations
 
 import numpy as np
 
-from wheretolook.geometry import Float
+from wheretolook.geometry.poses import Float
 
 INNER_WALL_M = 0.12
 DOOR_HEIGHT_M = 2.05

@@ -34,7 +34,7 @@ def views() -> pd.DataFrame:
 
 @pytest.fixture(scope="session")
 def expected(room: MappedRoom, views: pd.DataFrame, tmp_path_factory: pytest.TempPathFactory) -> bytes:
-    """The file of their labels that any engine must end with."""
+    """The file of their labels that every engine must produce."""
     localizer = Localizer(Landmarks.load(room.landmarks), CAMERA)
     labelled = label_rows(views, WarpRenderer(load_mesh(room.mesh)), localizer, CAMERA)
     assert labelled["status"].nunique() > 1
@@ -50,13 +50,13 @@ def matched(room: MappedRoom, views: pd.DataFrame) -> pd.DataFrame:
 
 @pytest.fixture(scope="session")
 def expected_matches(matched: pd.DataFrame, tmp_path_factory: pytest.TempPathFactory) -> bytes:
-    """The file that any engine must end with when it stores matches."""
+    """The file that every engine must produce when it stores matches."""
     return file_bytes(matched, tmp_path_factory.mktemp("matched"))
 
 
 @pytest.fixture
 def in_this_process(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Shards are labelled here one after the other: quicker, for what the workers have no part in."""
+    """Label shards in this process, which is faster, for tests that are not about workers."""
     threads = torch.get_num_threads(), cv2.getNumThreads()
 
     def run(

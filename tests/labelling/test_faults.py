@@ -1,4 +1,4 @@
-"""A fault at each step of labelling ends in the same table, after a resumed run where need be, or in a typed error."""
+"""Faults at each step of labelling lead to the same table, possibly after resuming, or to a typed error."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def test_a_failing_renderer_is_named_with_the_mesh(room: MappedRoom, views: pd.D
 def test_a_full_disk_keeps_what_is_finished(
     room: MappedRoom, views: pd.DataFrame, expected: bytes, tmp_path: Path
 ) -> None:
-    """/dev/full takes the place of the file that is being written: first the manifest, then the third shard."""
+    """/dev/full replaces the file that is being written: first the manifest, then the third shard."""
     shards = tmp_path / "shards"
     shards.mkdir()
     (shards / f"{labeller.MANIFEST}.partial").symlink_to("/dev/full")
@@ -216,9 +216,15 @@ def test_shards_of_another_mesh_or_of_other_viewpoints_are_not_used(
 
 @pytest.mark.parametrize(("n_finished", "matches"), [(0, False), (3, False), (3, True)])
 def test_killed_at_any_moment_it_resumes_to_the_same_table(
-    room: MappedRoom, views: pd.DataFrame, expected: bytes, expected_matches: bytes, tmp_path: Path, n_finished: int,
-    matches: bool, request: pytest.FixtureRequest,
-) -> None:  # fmt: skip
+    room: MappedRoom,
+    views: pd.DataFrame,
+    expected: bytes,
+    expected_matches: bytes,
+    tmp_path: Path,
+    n_finished: int,
+    matches: bool,
+    request: pytest.FixtureRequest,
+) -> None:
     write_table(views, tmp_path / "table.parquet")
     script = tmp_path / "run.py"
     script.write_text(
@@ -257,5 +263,5 @@ def with_flipped_bit(content: bytes, place: int, bit: int = 0) -> bytes:
 
 
 def inside_a_page(path: Path) -> int:
-    """Among the translations, which do not compress: but for the checksum, another number would be read."""
+    """The bit is in the translations, which are not compressed: only the checksum reveals the change."""
     return int(pq.ParquetFile(path).metadata.row_group(0).column(7).data_page_offset) - 4  # its dictionary's last value

@@ -52,7 +52,7 @@ def test_rows_belong_to_the_labels_beside_them(room: MappedRoom, matched: pd.Dat
 def test_inliers_lie_where_the_true_pose_puts_them(
     room: MappedRoom, views: pd.DataFrame, matched: pd.DataFrame
 ) -> None:
-    """Within RANSAC's limit of the keypoint they were matched with; the other matches lie beyond it."""
+    """Inliers project within RANSAC's limit of their keypoint; the other matches project beyond it."""
     landmarks = Landmarks.load(room.landmarks)
     localizer = Localizer(landmarks, CAMERA)
     good = np.flatnonzero(is_good(matched))
@@ -117,7 +117,7 @@ def test_workers_and_shards_do_not_change_the_rows(
 
 @pytest.mark.usefixtures("in_this_process")
 def test_shards_with_and_without_matches_are_told_apart(room: MappedRoom, tmp_path: Path) -> None:
-    """Those without have the names and the manifest they had before matches could be stored."""
+    """Shards without matches have the names and the manifest of versions that could not store matches."""
     table, shards = pd.concat([facing(POSTER, 3, 1.5), facing(PLAIN, 1, 1.1)], ignore_index=True), tmp_path / "shards"
     settings = {
         "versions": versions(),
@@ -139,9 +139,8 @@ def test_shards_with_and_without_matches_are_told_apart(room: MappedRoom, tmp_pa
 
     label(table, room, shards, shard_size=4, store_matches=True)
     (stored,) = set(times(shards)) - {without}
-    assert json.loads((shards / MANIFEST).read_text()) == {
-        **settings, "store_matches": True, "n_viewpoints": 4, "shards": {stored.name: 4}
-    }  # fmt: skip
+    expected = {**settings, "store_matches": True, "n_viewpoints": 4, "shards": {stored.name: 4}}
+    assert json.loads((shards / MANIFEST).read_text()) == expected
     both = times(shards)
     assert before.items() <= both.items()
     label(table, room, shards, shard_size=4)

@@ -14,10 +14,10 @@ class LocalizerConfig:
 
     Args:
         max_ratio: Lowe's ratio: the nearest landmark's descriptor distance over the second nearest's must be below it.
-        min_matches: with fewer matches no pose is sought; four is the least that determines and checks one.
+        min_matches: with fewer matches no pose is estimated. Three leave up to four poses, a fourth decides.
         max_error_px: reprojection error under which RANSAC counts a match as an inlier.
-        min_inliers: poses with fewer inliers are taken for accidents: RANSAC finds some pose for almost any image.
-        seed: of RANSAC, the same for every image, so that a label depends on its viewpoint alone.
+        min_inliers: poses with fewer inliers are rejected, because RANSAC finds some pose for almost any image.
+        seed: of RANSAC, the same for every image, so that a label depends only on its viewpoint.
     """
 
     max_ratio: float = 0.85
@@ -42,14 +42,13 @@ class LabelConfig:
 
     Args:
         localizer: matching and pose estimation.
-        engine: "local" works in processes on this machine, "ray" the same shards on a Ray cluster
-            (`pip install ray`).
+        engine: "local" labels in processes on this machine, "ray" on a Ray cluster (`pip install ray`).
         ray_address: the cluster's address, such as "auto" on one of its machines, or "ray://head:10001" from elsewhere
             (which needs `pip install 'ray[client]'`); empty starts one on this machine.
         workers: processes of the local engine; 0 means one for each CPU core this process may use.
-        shard_size: viewpoints a shard, the unit of work and of what an interruption can lose.
-        store_matches: keep the rows of the landmarks that each view matched, and which agree with its pose, in the
-            columns matched_rows and inlier_rows; needed to learn matchability.
+        shard_size: viewpoints per shard. A shard is the unit of work, and the most that an interruption can lose.
+        store_matches: keep the rows of the landmarks that each view matched, and of those that agree with its pose, in
+            the columns matched_rows and inlier_rows; needed to learn matchability.
     """
 
     localizer: LocalizerConfig = field(default_factory=LocalizerConfig)

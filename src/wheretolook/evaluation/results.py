@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ VARIANTS_CSV = "variants.csv"
 """In a release's `results/`: scores of the networks for all inputs, as `scores.csv`, before one was chosen to ship."""
 
 LOCATIONS_PARQUET = "locations.parquet"
-"""Artifact of each nested run: what was chosen at each location."""
+"""Artifact of each nested run: what was chosen at each location, for each N."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,34 +73,61 @@ def evaluation_params(dataset: Dataset, scenes: Sequence[SceneFolder], weights: 
     }
 
 
-_NAMED = ("method", "inputs", "occlusion", "candidates", "top_n")
-"""What names a row of a score table, beside the scene."""
+_NAMED = ("method", "inputs", "occlusion", "candidates")
+"""What names a nested run."""
 
-_BY_SCENE = ("good_", "n_views", "normalized_", "regret_")
-"""Beginnings of the columns whose values in each scene are logged as well."""
+_OF_ALL_VIEWS = ("n_locations", "average_precision", "roc_auc", "ece", "ece_scaled", "temperature")
+"""Columns of a score table that do not depend on N."""
+
+_OF_CHOSEN = re.compile("(raw|any|normalized|p)_(?!low_|high_)|(regret|difference)_")
+"""Beginning of the columns that are logged for each N. `scores.csv`, an artifact, has the other intervals and counts;
+each metric costs MLflow 0.3 ms."""
+
+_OF_SCENE = re.compile("regret_(?!low_|high_)")
+"""Beginning of the columns that are logged for each N and scene."""
 
 
-def runs_of_rows(table: pd.DataFrame, params: Mapping[str, Any]) -> Iterator[tuple[dict[str, Any], NestedRun]]:
-    """Each row over all scenes of score tables, with the run nested in the evaluation's that it is logged as.
+def runs_of_rows(table: pd.DataFrame, params: Mapping[str, Any]) -> Iterator[NestedRun]:
+    """The runs that score tables are logged as: for each method, inputs, occlusion model and candidate set one.
+
+    Its metrics are named by N, the scene unless it is all of them, and the column, such as
+    `top-1/regret_0.05m_0.4deg` and `top-5/apartment-210/regret_5m_10deg`, or by the column if N does not matter.
 
     Args:
         table: score tables, one below the other, with columns `occlusion` and `candidates`.
         params: of the evaluation; the row's own are added.
     """
-    by_row: dict[tuple[Any, ...], list[dict[Any, Any]]] = {}
-    for record in table[table["scene"] != ALL].to_dict("records"):
-        by_row.setdefault(tuple(record[name] for name in _NAMED), []).append(record)
-    for record in table[table["scene"] == ALL].to_dict("records"):
-        row = {str(key): value for key, value in record.items()}
-        seen = (row["occlusion"], *([row["candidates"]] if row["candidates"] != ALL else []))
-        shown = (row["method"], row["inputs"], f"best {row['top_n']}", f"({', '.join(seen)})")
-        texts = (*_NAMED, "scene", "reference")
-        numbers = {key: float(value) for key, value in row.items() if key not in texts}
-        for scene in by_row.get(tuple(row[name] for name in _NAMED), []):
-            for key, value in scene.items():
-                if str(key).startswith(_BY_SCENE):
-                    numbers[f"{key}/{scene['scene']}"] = float(value)
-        yield row, NestedRun(" ".join(filter(None, shown)), {**params, **{key: row[key] for key in _NAMED}}, numbers)
+    for key, rows in table.groupby(list(_NAMED), sort=False):
+        own = dict(zip(_NAMED, map(str, key), strict=True))
+        numbers: dict[str, float] = {}
+        for row in rows.to_dict("records"):
+            pooled, place = row["scene"] == ALL, f"top-{row['top_n']}"
+            if pooled:
+                numbers |= {name: float(row[name]) for name in _OF_ALL_VIEWS if name in row}
+            for name, value in ((str(name), value) for name, value in row.items()):
+                if pooled and _OF_CHOSEN.match(name):
+                    numbers[f"{place}/{name}"] = float(value)
+                elif not pooled and _OF_SCENE.match(name):
+                    numbers[f"{place}/{row['scene']}/{name}"] = float(value)
+        candidates = [own["candidates"]] if own["candidates"] != ALL else []
+        shown = (own["method"], own["inputs"], f"({', '.join([own['occlusion'], *candidates])})")
+        yield NestedRun(" ".join(filter(None, shown)), {**params, **own}, numbers)
+
+
+def _runs_with_locations(
+    scored: Sequence[ScoredSet],
+    params: Mapping[str, Any],
+    scenes: Sequence[SceneFolder],
+    config: EvaluateConfig,
+    file: Path,
+) -> Iterator[NestedRun]:
+    """The runs of `runs_of_rows`, each with a `file` that holds what was chosen until the next is asked for."""
+    for one in scored:
+        for nested in runs_of_rows(one.table, params):
+            method = nested.params["method"], nested.params["inputs"]
+            chosen = [_location_table(one, method, n, scenes, config) for n in config.top_n]
+            pd.concat(chosen).to_parquet(file, index=False)
+            yield replace(nested, files=(file,))
 
 
 def _location_table(
@@ -107,7 +135,7 @@ def _location_table(
 ) -> pd.DataFrame:
     """What a method chooses at each location, one row each.
 
-    Columns: scene, location_id, chosen (views), for each threshold good_* (how many of them are good) and any_*
+    Columns: scene, location_id, top_n, chosen (views), for each threshold good_* (how many of them are good) and any_*
     (whether one is; for random choice both are expectations), and best_score, that of the view chosen first; NaN for
     random choice and the oracle, which choose by no score.
     """
@@ -115,6 +143,7 @@ def _location_table(
     columns: dict[str, Any] = {
         "scene": [scenes[number].name for number in views.location_scene],
         "location_id": scored.candidates.location_id,
+        "top_n": n,
         "chosen": top.chosen.astype(np.int64),
     }
     for index, key in enumerate(map(threshold_key, config.thresholds)):

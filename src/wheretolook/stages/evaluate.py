@@ -52,15 +52,14 @@ from wheretolook.evaluation.results import (
     SCORES_MD,
     SCORES_PNG,
     VARIANTS_CSV,
-    _location_table,
+    _runs_with_locations,
     evaluation_params,
-    runs_of_rows,
 )
 from wheretolook.evaluation.score_table import main_rows
 from wheretolook.evaluation.scores import read_scores
 from wheretolook.fisher.soft_visibility import GaussianProcessVisibility, cone_half_angle
 from wheretolook.utils.files import write_text
-from wheretolook.utils.tracking import log, start_run
+from wheretolook.utils.tracking import log, log_nested, start_run
 
 
 def evaluate_methods(
@@ -75,9 +74,9 @@ def evaluate_methods(
     """Compare all methods on the scenes of one split.
 
     Writes the table as `<dataset>/results/scores.csv` and `scores.md`, a figure `scores.png`, the reliability curves of
-    learned methods as `calibration.csv`, and an MLflow run with one nested run for each method, inputs, N, occlusion
-    model and candidate set, each with a table of what was chosen at each location, `locations.parquet`. With several
-    occlusion models `occlusion.png` compares them.
+    learned methods as `calibration.csv`, and an MLflow run with one nested run for each method, inputs, occlusion model
+    and candidate set, each with a table of what was chosen at each location for each N, `locations.parquet`. With
+    several occlusion models `occlusion.png` compares them.
 
     The temperatures of learned methods are fitted on the labelled views of the val scenes, seen by the first occlusion
     model, and hold for all rows; without val scenes, or when these are evaluated, they are not known.
@@ -241,7 +240,7 @@ def log_evaluation(
     occlusion: OcclusionConfig,
     results: Path,
 ) -> None:
-    """Log an evaluation: a run with the files of `results`, and in it one for each row over all scenes.
+    """Log an evaluation: a run with the files of `results`, and nested in it those of `runs_of_rows`.
 
     Args:
         dataset: evaluated.
@@ -279,10 +278,5 @@ def log_evaluation(
         for file in results.iterdir():
             if file.is_file():
                 client.log_artifact(run, str(file))
-        for one in scored:
-            for row, nested in runs_of_rows(one.table, params):
-                chosen = _location_table(one, (row["method"], row["inputs"]), row["top_n"], scenes, config)
-                chosen.to_parquet(Path(folder) / LOCATIONS_PARQUET, index=False)
-                with start_run(tracking, nested.name, "evaluate", nested.params, parent=run) as (_, child):
-                    log(client, child, metrics=nested.metrics)
-                    client.log_artifact(child, str(Path(folder) / LOCATIONS_PARQUET))
+        file = Path(folder) / LOCATIONS_PARQUET
+        log_nested(tracking, run, "evaluate", _runs_with_locations(scored, params, scenes, config, file))

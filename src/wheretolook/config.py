@@ -15,12 +15,11 @@ from wheretolook.labelling.config import LabelConfig
 from wheretolook.learning.config import TrainConfig
 from wheretolook.mapping.config import MapConfig
 from wheretolook.planning.config import PathsConfig, PlanConfig, ViewpointMapConfig
-from wheretolook.scenes.procedural.generator import ApartmentConfig
-from wheretolook.space.free_space import FreeSpaceConfig
-from wheretolook.space.mapped_space import MappedSpaceConfig
+from wheretolook.scenes.config import ApartmentConfig
+from wheretolook.space.config import FreeSpaceConfig, MappedSpaceConfig
 from wheretolook.utils.errors import ConfigError
-from wheretolook.utils.tracking import TrackingConfig
-from wheretolook.viewpoints.sampling import SampleConfig
+from wheretolook.utils.tracking_config import TrackingConfig
+from wheretolook.viewpoints.config import SampleConfig
 from wheretolook.visibility.config import OcclusionConfig
 
 

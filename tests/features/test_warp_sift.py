@@ -15,7 +15,8 @@ from wheretolook.features.warp_sift import WarpSift
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.rendering.warp_renderer import WarpRenderer
-from wheretolook.scenes.procedural.generator import ApartmentConfig, generate_apartment
+from wheretolook.scenes.config import ApartmentConfig
+from wheretolook.scenes.procedural.generator import generate_apartment
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.utils.errors import ConfigError
 

@@ -16,9 +16,9 @@ from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.mapping import triangulation
 from wheretolook.mapping.building import build_map
 from wheretolook.mapping.cameras import load_mapping_poses
-from wheretolook.mapping.config import MapConfig
+from wheretolook.mapping.config import MapConfig, WalkConfig
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
-from wheretolook.mapping.walk import WalkConfig, plan_walk
+from wheretolook.mapping.walk import plan_walk
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.utils.errors import ConfigError, MapError
 from wheretolook.utils.processes import Processes

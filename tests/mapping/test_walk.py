@@ -7,7 +7,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from wheretolook.mapping.walk import WalkConfig, plan_walk
+from wheretolook.mapping.config import WalkConfig
+from wheretolook.mapping.walk import plan_walk
 from wheretolook.utils.errors import ConfigError, SceneError
 
 SIZE = (8.0, 6.0, 2.6)

@@ -20,7 +20,8 @@ from wheretolook.release.notebook import open_store
 from wheretolook.release.runs import ReleaseRuns, log_release
 from wheretolook.stages.evaluate import evaluate_methods as evaluate
 from wheretolook.utils.errors import MissingRunError
-from wheretolook.utils.tracking import TrackingConfig, client, finished_runs, newest_artifact, newest_run
+from wheretolook.utils.tracking import client, finished_runs, newest_artifact, newest_run
+from wheretolook.utils.tracking_config import TrackingConfig
 
 PAGE = Path(__file__).parents[1] / "mlruns" / "README.md"
 

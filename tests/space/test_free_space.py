@@ -7,7 +7,8 @@ import pytest
 
 from box_scenes import CABINET, ROOM, TABLE_TOP, box_quads, furnished_room, quads_mesh
 from wheretolook.geometry.mesh import TexturedMesh
-from wheretolook.space.free_space import FreeSpace, FreeSpaceConfig
+from wheretolook.space.config import FreeSpaceConfig
+from wheretolook.space.free_space import FreeSpace
 from wheretolook.utils.errors import ConfigError
 
 

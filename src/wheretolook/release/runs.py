@@ -24,7 +24,8 @@ from wheretolook.learning.runs import HISTORY_CSV, TRAINING_CSV, log_history, pa
 from wheretolook.planning.path_report import PATHS_CSV, log_paths
 from wheretolook.release.benchmark_runs import RUNTIMES_CSV, SCALING_CSV, log_runtimes
 from wheretolook.release.card import GENERALIZATION_CSV
-from wheretolook.utils.tracking import NestedRun, TrackingConfig, client, finished_runs, log, log_nested, start_run
+from wheretolook.utils.tracking import NestedRun, client, finished_runs, log, log_nested, start_run
+from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import UNLABELLED, is_good
 from wheretolook.viewpoints.thresholds import ALL
 

@@ -26,10 +26,13 @@ from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.release.copy import ABOUT
 from wheretolook.rendering.warp_renderer import WarpRenderer
-from wheretolook.scenes.procedural.generator import ApartmentConfig, generate_apartment
-from wheretolook.space.free_space import FreeSpace, FreeSpaceConfig
+from wheretolook.scenes.config import ApartmentConfig
+from wheretolook.scenes.procedural.generator import generate_apartment
+from wheretolook.space.config import FreeSpaceConfig
+from wheretolook.space.free_space import FreeSpace
 from wheretolook.utils.errors import ConfigError, SceneError
-from wheretolook.viewpoints.sampling import SampleConfig, free_locations
+from wheretolook.viewpoints.config import SampleConfig
+from wheretolook.viewpoints.sampling import free_locations
 from wheretolook.viewpoints.table import is_good
 from wheretolook.visibility.config import OcclusionConfig
 from wheretolook.visibility.occlusion import OcclusionModel, StoredOcclusion

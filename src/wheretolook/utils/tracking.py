@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from wheretolook.utils.errors import MissingRunError
+from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.utils.version import VERSION
 
 if TYPE_CHECKING:
@@ -33,34 +34,6 @@ if TYPE_CHECKING:
 
 STAGE_TAG = "stage"
 """Tag of every run this package logs: "label", "train", "evaluate", "plan", "paths", "learners" or "benchmark"."""
-
-
-@dataclass(frozen=True)
-class TrackingConfig:
-    """Where runs are logged.
-
-    Args:
-        folder: folder of the MLflow store, holding `mlflow.db` and `artifacts/`. Made when needed.
-        experiment: name of the MLflow experiment that the runs belong to.
-    """
-
-    folder: str = "mlruns"
-    experiment: str = "wheretolook"
-
-    @property
-    def root(self) -> Path:
-        """Absolute path of the store's folder."""
-        return Path(self.folder).expanduser().resolve()
-
-    @property
-    def uri(self) -> str:
-        """Tracking URI of the store."""
-        return f"sqlite:///{self.root / 'mlflow.db'}"
-
-    @property
-    def artifacts(self) -> str:
-        """Artifact location of the experiment."""
-        return str(self.root / "artifacts")
 
 
 def client(tracking: TrackingConfig) -> MlflowClient:

@@ -7,7 +7,10 @@ from math import inf
 from typing import Literal, get_args
 
 from wheretolook.utils.errors import ConfigError
-from wheretolook.visibility.hidden_points import DEFAULT_RADIUS
+
+DEFAULT_RADIUS = 50.0
+"""Greatest mean F1 against the meshes of six mapped scenes (tests/benchmarks/bench_hidden_points.py). It is flat: from
+30 to 100 the mean stays within 0.01. Single scenes are best served by 5 to 100, mostly the larger the more open."""
 
 OcclusionName = Literal["mesh", "tsdf", "hidden-points", "none"]
 OCCLUSION_NAMES: tuple[str, ...] = get_args(OcclusionName)

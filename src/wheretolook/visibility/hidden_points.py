@@ -11,11 +11,9 @@ from scipy.spatial import ConvexHull, cKDTree
 
 from wheretolook.geometry.poses import Float
 from wheretolook.utils.errors import ConfigError, MapError, SceneError
+from wheretolook.visibility.config import DEFAULT_RADIUS
 from wheretolook.visibility.occlusion import OcclusionModel
 
-DEFAULT_RADIUS = 50.0
-"""Greatest mean F1 against the meshes of six mapped scenes (tests/benchmarks/bench_hidden_points.py). It is flat: from
-30 to 100 the mean stays within 0.01. Single scenes are best served by 5 to 100, mostly the larger the more open."""
 TOUCHING_M = 1e-6
 """A landmark this close to a location is in the same place, and has no direction as seen from it."""
 

@@ -240,6 +240,6 @@ def test_scene_without_texture_gives_no_map(room, room_free_space, tmp_path):
 
 
 def test_bad_settings():
-    for settings in ({"n_images": 1}, {"partners": 0}, {"max_reprojection_error_px": 0.0}):
+    for settings in ({"n_images": 1}, {"max_reprojection_error_px": 0.0}):
         with pytest.raises(ConfigError):
             MapConfig(**settings)

@@ -131,5 +131,3 @@ def test_a_steep_surface_is_no_floor():
 def test_bad_config():
     with pytest.raises(ConfigError, match="positive"):
         FreeSpaceConfig(clearance_m=0.0)
-    with pytest.raises(ConfigError, match="share"):
-        FreeSpaceConfig(min_enclosure=1.5)

@@ -18,15 +18,15 @@ class ApartmentConfig:
     Args:
         n_rooms: number of rooms, 3 to 6; None draws it from the seed.
         area_m2: floor area aimed at, in square metres; None takes about 13 per room.
-        texture_richness: 0 to 1; contrast of wood, stone and cloth, and how many pictures hang. Lower is harder to
-            localize in.
-        clutter: 0 to 1; books, plants, bottles and other small things. Lower is harder.
-        repetition: 0 to 1; share of large surfaces that repeat a strong pattern every 0.6 to 2 m, as in games. Such
-            views are full of features and yet hard to localize.
+        texture_richness: how rich in texture surfaces are, 0 to 1; lower is harder to localize in. The contrast of
+            wood, stone and cloth, and how many pictures hang.
+        clutter: how many small things there are, 0 to 1; lower is harder. Books, plants, bottles.
+        repetition: share of large surfaces with a strong pattern that repeats, 0 to 1. Every 0.6 to 2 m, as in games:
+            such views are full of features and yet hard to localize.
         dark_rooms: share of rooms whose lamp is off, some with their curtains closed. Higher is harder.
         enlarged: how many times as large everything is, furniture and patterns too: halls with few, far landmarks.
-        vary: every apartment draws its area and the five numbers above from its seed, whatever they are set to: rooms
-            unlike each other, to learn from.
+        vary: whether every apartment draws its own size and difficulty. Its area and the five numbers above come from
+            its seed, whatever they are set to: rooms unlike each other, to learn from.
         texels_per_m: texture resolution of large surfaces; lowered if the atlas would not fit.
         texture_size: greatest width and height of the texture in texels.
         light_spacing_m: distance between light samples in metres.

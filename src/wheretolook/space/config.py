@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from wheretolook.utils.errors import ConfigError
 
@@ -12,33 +12,32 @@ class FreeSpaceConfig:
     """What counts as free.
 
     Args:
-        clearance_m: least distance to any geometry.
+        clearance_m: least distance of a camera to any geometry.
         max_floor_drop_m: greatest height above the surface straight below, which must be roughly level.
-        min_enclosure: least share of 34 rays around a point (16 level, 8 rising and 8 falling by 45 degrees, up and
-            down) that meet a surface. A point in a room without a ceiling reaches 25 / 34 = 0.74; one outside a wall
-            or above a ceiling stays below 19 / 34 = 0.56, since at least half of its level rays and all rising ones
-            leave the scene. Windows, doors and holes of a scan let some rays out.
         two_sided: whether triangles are surfaces from both sides. If not, only fronts count as floor and as enclosure,
             so that a point inside a solid or outside a shell of one layer is never free. None finds out: triangles are
             taken as one-sided if most points that would be free in a two-sided scene see mostly fronts.
+
+    Attributes:
+        min_enclosure: least share of 34 rays around a point (16 level, 8 rising and 8 falling by 45 degrees, up and
+            down) that meet a surface. A point in a room without a ceiling reaches 25 / 34 = 0.74; one outside a wall or
+            above a ceiling stays below 19 / 34 = 0.56, since at least half of its level rays and all rising ones leave
+            the scene. Windows, doors and holes of a scan let some rays out.
         min_sight_m: in a two-sided scene, where the inside of closed furniture looks like a room, at least a quarter of
             the level rays must be this long; 1 m leaves corridors of 0.8 m free and closets of 0.7 m not.
     """
 
     clearance_m: float = 0.25
     max_floor_drop_m: float = 4.0
-    min_enclosure: float = 0.6
+    min_enclosure: float = field(default=0.6, init=False)
     two_sided: bool | None = None
-    min_sight_m: float = 1.0
+    min_sight_m: float = field(default=1.0, init=False)
 
     def __post_init__(self) -> None:
-        if not self.clearance_m > 0 or not self.max_floor_drop_m > 0 or self.min_sight_m < 0:
+        if not self.clearance_m > 0 or not self.max_floor_drop_m > 0:
             raise ConfigError(
-                "clearance and floor drop must be positive, sight not negative",
-                value=(self.clearance_m, self.max_floor_drop_m, self.min_sight_m),
+                "clearance and floor drop must be positive", value=(self.clearance_m, self.max_floor_drop_m)
             )
-        if not 0 <= self.min_enclosure <= 1:
-            raise ConfigError("min_enclosure is a share between 0 and 1", value=self.min_enclosure)
 
 
 @dataclass(frozen=True)

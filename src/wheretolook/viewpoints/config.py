@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, get_args
 
 from wheretolook.geometry.lattices import Lattice
@@ -21,15 +21,18 @@ class SampleConfig:
         directions: directions at each location; the released code has 500.
         lattice: how they are spread: "fibonacci" is even, "azimuth-elevation" is the paper's comparison, "released" is
             what the released code does, "yaw-pitch" are ActLoc's 6 pitches x 18 yaws, whatever `directions` says.
-        keep: K, the directions kept at each location, those that see most landmarks; 0 keeps all.
-        min_visible: directions that see fewer landmarks are dropped ("none or only a minimal number", Sec. 3.2).
+        keep: directions kept at each location, those that see most landmarks; 0 keeps all. The paper's K.
+        min_visible: directions that see fewer landmarks are dropped. In the paper, those with "none or only a minimal
+            number" (Sec. 3.2).
         max_locations: a random subset of the free locations, 0 for all.
         max_directions: a random subset of the kept directions of each location, 0 for all; one number, or one for
             each split, such as `{train: 50, val: 50, test: 100}`.
-        seed: of those subsets.
+        seed: seed of the random subsets.
         distinct_pixels: rank by the number of distinct pixels with a landmark, as the released code counts, instead of
             the number of landmarks.
-        memory_gb: bound on the memory that counting takes on its device, in 10^9 bytes.
+
+    Attributes:
+        memory_gb: bound on the memory that counting takes on its device, in 10^9 bytes; two million landmarks fit.
     """
 
     grid: tuple[int, int, int] = (8, 8, 8)
@@ -41,7 +44,7 @@ class SampleConfig:
     max_directions: int | dict[Split, int] = 0
     seed: int = 0
     distinct_pixels: bool = False
-    memory_gb: float = 2.0
+    memory_gb: float = field(default=2.0, init=False)
 
     def __post_init__(self) -> None:
         for name in ("keep", "min_visible", "max_locations"):
@@ -52,8 +55,6 @@ class SampleConfig:
             raise ConfigError("sample.max_directions lacks or misnames a split", value=self.max_directions, fix=fix)
         if min(map(self.directions_of, get_args(Split))) < 0:
             raise ConfigError("sample.max_directions must not be negative", value=self.max_directions)
-        if not 0 < self.memory_gb < float("inf"):
-            raise ConfigError("sample.memory_gb must be positive", value=self.memory_gb)
 
     def directions_of(self, split: Split) -> int:
         """`max_directions` for a split."""

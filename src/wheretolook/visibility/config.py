@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import inf
 from typing import Literal, get_args
 
@@ -21,26 +21,28 @@ class OcclusionConfig:
     """Options of occlusion.
 
     Args:
-        model: "mesh" casts one ray for each landmark; "tsdf" does so against the surface that depth images fuse to,
-            here rendered where the map's images were taken; "hidden-points" needs nothing but the landmarks; "none"
-            sees through walls, as the paper's released code. With "tsdf", collisions of viewpoint maps and paths are
-            with that surface too, not with the mesh, and what no depth image saw is not free.
-        margin_m: a surface this close in front of a landmark is the landmark's own.
-        radius: of hidden-point removal, in distances of the farthest landmark.
+        model: how occlusion is found: mesh, tsdf, hidden-points or none. "mesh" casts one ray for each landmark; "tsdf"
+            does so against the surface that depth images fuse to, here rendered where the map's images were taken;
+            "hidden-points" needs nothing but the landmarks; "none" sees through walls, as the paper's released code.
+            With "tsdf", collisions of viewpoint maps and paths are with that surface too, not with the mesh, and what
+            no depth image saw is not free.
+        radius: radius of hidden-point removal, in distances of the farthest landmark.
         voxel_m: voxel size of the TSDF.
         max_depth_m: range of the depth images.
+
+    Attributes:
+        margin_m: a surface this close in front of a landmark is the landmark's own: triangulated points
+            lie a few centimetres off it.
     """
 
     model: OcclusionName = "mesh"
-    margin_m: float = 0.05
+    margin_m: float = field(default=0.05, init=False)
     radius: float = DEFAULT_RADIUS
     voxel_m: float = 0.02
     max_depth_m: float = 10.0
 
     def __post_init__(self) -> None:
         check_occlusion_names((self.model,))
-        if not 0 <= self.margin_m < inf:
-            raise ConfigError("occlusion.margin_m must not be negative", value=self.margin_m)
         if not 1 <= self.radius < inf:
             raise ConfigError("occlusion.radius must be at least 1", value=self.radius)
         for name in ("voxel_m", "max_depth_m"):

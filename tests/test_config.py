@@ -123,16 +123,14 @@ def test_own_meshes_without_weights_fail_before_any_work(capsys: pytest.CaptureF
 
 
 @pytest.mark.parametrize("stage", cli.STAGES)
-@pytest.mark.parametrize(
-    ("device", "gpus", "says"), [("cuda", 0, "--device cpu"), ("cuda:3", 1, "cuda:0 is the first")]
-)
+@pytest.mark.parametrize(("name", "gpus", "says"), [("cuda", 0, "--device cpu"), ("cuda:3", 1, "cuda:0 is the first")])
 def test_a_gpu_that_is_not_there_is_refused_at_once(
-    stage: str, device: str, gpus: int, says: str,
+    stage: str, name: str, gpus: int, says: str,
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
     monkeypatch.setattr(devices, "_driver_gpus", lambda: gpus)
     monkeypatch.setattr(devices, "_torch_gpus", lambda: gpus)
-    arguments = ["--config", str(CONFIGS / "demo.yaml"), "--data", str(tmp_path), "--device", device]
+    arguments = ["--config", str(CONFIGS / "demo.yaml"), "--data", str(tmp_path), "--device", name]
     assert main([stage, *arguments]) == 2
     assert says in capsys.readouterr().err and not [*tmp_path.iterdir()]
 
@@ -162,12 +160,13 @@ HEAVY = ("torch", "warp", "scipy", "matplotlib", "mlflow", "pandas", "sklearn", 
     "arguments",
     [["--help"], ["--version"], ["label", "--help"], ["demo", "--help-all"], ["train", "--train.epoch", "10"]],
 )
-def test_what_needs_no_work_loads_nothing_heavy(arguments: list[str]) -> None:
+def test_what_needs_no_work_loads_nothing_heavy(arguments: list[str], tmp_path: Path) -> None:
     code = f"""import sys
+sys.path.insert(0, {str(Path(cli.__file__).parents[1])!r})
 from wheretolook.cli import main
 main({arguments!r})
 print([name for name in {HEAVY!r} if name in sys.modules], file=sys.stderr)"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path)
     assert done.stderr.splitlines()[-1] == "[]"
     assert "--train.epoch'" in done.stderr if "--train.epoch" in arguments else done.stdout
 

@@ -14,7 +14,8 @@ from wheretolook.geometry.poses import Float, poses_looking_along
 from wheretolook.inputs.bins import bin_views_plain
 from wheretolook.mapping.cameras import save_mapping_poses
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.viewpoints.table import LOCALIZED, NO_POSE, TOO_FEW_MATCHES, Split, pose_columns, write_table
+from wheretolook.viewpoints.config import Split
+from wheretolook.viewpoints.table import LOCALIZED, NO_POSE, TOO_FEW_MATCHES, pose_columns, write_table
 from wheretolook.visibility.frustum import LandmarkSets
 from wheretolook.visibility.occlusion import StoredOcclusion
 

@@ -20,7 +20,8 @@ from PIL import Image
 
 from synthetic_release import make_release
 from wheretolook.methods.styles import MethodStyle, scorer_style
-from wheretolook.utils.tracking import TrackingConfig, newest_run
+from wheretolook.utils.tracking import newest_run
+from wheretolook.utils.tracking_config import TrackingConfig
 
 FOLDER = Path(__file__).parents[1] / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))

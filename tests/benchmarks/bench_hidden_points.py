@@ -24,13 +24,16 @@ from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.rendering.raycasting import MeshRaycaster
+from wheretolook.scenes.config import ApartmentConfig
 from wheretolook.scenes.loading import load_mesh
-from wheretolook.scenes.procedural.generator import ApartmentConfig, generate_apartment
+from wheretolook.scenes.procedural.generator import generate_apartment
 from wheretolook.space.free_space import FreeSpace
-from wheretolook.utils.tracking import TrackingConfig, log, start_run
+from wheretolook.utils.tracking import log, start_run
+from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.sampling import free_locations
 from wheretolook.visibility.agreement import MaskAgreement
-from wheretolook.visibility.hidden_points import DEFAULT_RADIUS, HiddenPointRemoval
+from wheretolook.visibility.config import DEFAULT_RADIUS
+from wheretolook.visibility.hidden_points import HiddenPointRemoval
 from wheretolook.visibility.occlusion import MeshOcclusion
 
 RADII = (1, 2, 5, 10, 15, 20, 30, 40, 50, 70, 100, 150, 200, 300, 500, 1000)

@@ -54,7 +54,8 @@ def argument_parser(doc: str, views: int) -> argparse.ArgumentParser:
 def open_scene(source: Path | None, folder: Path, seed: int, device: str) -> Scene:
     """Read the scene, or generate an apartment into `folder`."""
     if source is None:
-        from wheretolook.scenes.procedural.generator import ApartmentConfig, generate_apartment
+        from wheretolook.scenes.config import ApartmentConfig
+        from wheretolook.scenes.procedural.generator import generate_apartment
 
         source = folder / "mesh.glb"
         save_glb(generate_apartment(ApartmentConfig(), seed, device=device), source)

@@ -34,7 +34,8 @@ from wheretolook.learning.config import TrainConfig
 from wheretolook.learning.data import LabelledViews, ViewpointDataModule
 from wheretolook.learning.fit import EpochRecord, RunLog, fit, home_device
 from wheretolook.methods.mlp.network import NetworkSpec, ViewpointNetwork
-from wheretolook.utils.tracking import TrackingConfig, start_run
+from wheretolook.utils.tracking import start_run
+from wheretolook.utils.tracking_config import TrackingConfig
 
 CAMERA = PinholeCamera()
 BLOCK = 4096

@@ -40,7 +40,8 @@ from wheretolook.methods.set import learn as set_learner
 from wheretolook.methods.set.config import SetConfig
 from wheretolook.methods.set.learn import SetData, learn_set
 from wheretolook.stages.train import train_variants as train
-from wheretolook.utils.tracking import TrackingConfig, start_run
+from wheretolook.utils.tracking import start_run
+from wheretolook.utils.tracking_config import TrackingConfig
 
 VARIANTS = ("2d+z", "2d+3d+landmark", "conv", "trees", "set", "sphere")
 

@@ -15,7 +15,8 @@ from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.labelling.report import POSITIVE, label_markdown, label_summary, threshold_sentence
 from wheretolook.stages.label import log_labels
 from wheretolook.utils.errors import TableError
-from wheretolook.utils.tracking import TrackingConfig, artifact, newest_run
+from wheretolook.utils.tracking import artifact, newest_run
+from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import (
     LOCALIZED,
     NO_POSE,

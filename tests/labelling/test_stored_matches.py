@@ -82,17 +82,17 @@ def test_labels_are_the_same_with_and_without(
     assert file_bytes(matched.drop(columns=MATCH_FIELDS.names), tmp_path / "bare") == expected
 
 
-def test_matches_of_every_status_are_told(room: MappedRoom) -> None:
+def test_matches_of_every_status_are_told(room: MappedRoom, monkeypatch: pytest.MonkeyPatch) -> None:
     table = facing(POSTER, 1, 1.5)
     image = WarpRenderer(load_mesh(room.mesh)).render(CAMERA, poses(table)).rgb[0]
     landmarks = Landmarks.load(room.landmarks)
     many = 10_000
-    for config, status in (
-        (LocalizerConfig(), LOCALIZED),
-        (LocalizerConfig(min_inliers=many), NO_POSE),
-        (LocalizerConfig(min_matches=many), TOO_FEW_MATCHES),
-    ):
-        found = Localizer(landmarks, CAMERA, config).localize(image)
+    for name, status in (("", LOCALIZED), ("min_inliers", NO_POSE), ("min_matches", TOO_FEW_MATCHES)):
+        with monkeypatch.context() as changed:
+            config = LocalizerConfig(min_inliers=many if name == "min_inliers" else 10)
+            if name == "min_matches":
+                changed.setattr(LocalizerConfig, name, many)
+            found = Localizer(landmarks, CAMERA, config).localize(image)
         assert found.status == status and found.matched_rows.dtype == np.int64
         assert found.matched_rows.shape == (found.n_matches,) and found.n_matches > 50
         assert (len(found.inlier_rows) > 0) == (status != TOO_FEW_MATCHES)

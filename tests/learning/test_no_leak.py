@@ -22,7 +22,7 @@ from wheretolook.methods.set.config import SetConfig
 from wheretolook.methods.trees.config import TreesConfig
 from wheretolook.stages.evaluate import evaluate_methods as evaluate
 from wheretolook.stages.train import train_variants as train
-from wheretolook.utils.tracking import TrackingConfig
+from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import LOCALIZED, is_good, read_table, write_table
 
 CONFIG = TrainConfig(

@@ -42,7 +42,7 @@ from wheretolook.methods.set.score import SetScorer
 from wheretolook.stages.evaluate import evaluate_methods as evaluate
 from wheretolook.stages.train import train_variants as train
 from wheretolook.utils.errors import ConfigError, TableError, WeightsError
-from wheretolook.utils.tracking import TrackingConfig
+from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import LOCALIZED, poses, read_table, write_table
 
 DISTANCE = ATTRIBUTES.index("distance")

@@ -31,7 +31,8 @@ from wheretolook.methods.sphere.views import FEATURES, OFFSET_M, LocationDescrib
 from wheretolook.stages.evaluate import evaluate_methods as evaluate
 from wheretolook.stages.train import train_variants as train
 from wheretolook.utils.errors import ConfigError, MapError, WeightsError
-from wheretolook.utils.tracking import TrackingConfig, client
+from wheretolook.utils.tracking import client
+from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import is_good, poses, write_table
 from wheretolook.visibility.occlusion import StoredOcclusion
 

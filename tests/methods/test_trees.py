@@ -26,7 +26,7 @@ from wheretolook.methods.trees.score import TreesScorer
 from wheretolook.stages.evaluate import evaluate_methods as evaluate
 from wheretolook.stages.train import train_variants as train
 from wheretolook.utils.errors import ConfigError, WeightsError
-from wheretolook.utils.tracking import TrackingConfig
+from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import is_good, poses
 
 FEW = TreesConfig(max_trees=20, max_leaves=7, min_leaf=5)

@@ -189,7 +189,7 @@ def test_what_cannot_be_planned_is_named() -> None:
 def test_impossible_options() -> None:
     for name, value in (
         ("pitch_deg", (40, -40)), ("time_s", 0), ("score_weight", -1), ("spacing_m", 0), ("max_turn_deg_per_m", 0),
-        *((name, value) for name in ("time_s", "spacing_m", "step_m", "max_turn_deg_per_m", "score_weight",
+        *((name, value) for name in ("time_s", "spacing_m", "max_turn_deg_per_m", "score_weight",
                                      "turn_weight_m") for value in (np.inf, np.nan)),
     ):  # fmt: skip
         with pytest.raises(ConfigError, match=name):

@@ -25,7 +25,8 @@ from wheretolook.release.showcase import open_showcase
 from wheretolook.release.showcase_figures import planned_views
 from wheretolook.release.table_view import latest_paper_table, paper_cells, paper_styler
 from wheretolook.utils.errors import ConfigError
-from wheretolook.utils.tracking import TrackingConfig, newest_artifact, newest_run
+from wheretolook.utils.tracking import newest_artifact, newest_run
+from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.thresholds import ALL
 
 RELEASE = Path(__file__).parents[2] / "data" / "release"

@@ -33,7 +33,7 @@ from wheretolook.stages.evaluate import evaluate_methods as evaluate
 from wheretolook.stages.train import train_variants as train
 from wheretolook.utils.errors import ConfigError, StorageError, TableError, WeightsError
 from wheretolook.utils.files import write_json
-from wheretolook.utils.tracking import TrackingConfig
+from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import is_good, poses, write_table
 from wheretolook.visibility.occlusion import StoredOcclusion
 

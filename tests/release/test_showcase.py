@@ -31,10 +31,13 @@ from wheretolook.release.showcase_figures import (
     sampling_of,
 )
 from wheretolook.rendering.raycasting import MeshRaycaster
-from wheretolook.scenes.procedural.generator import ApartmentConfig, generate_apartment
-from wheretolook.space.free_space import FreeSpace, FreeSpaceConfig
+from wheretolook.scenes.config import ApartmentConfig
+from wheretolook.scenes.procedural.generator import generate_apartment
+from wheretolook.space.config import FreeSpaceConfig
+from wheretolook.space.free_space import FreeSpace
 from wheretolook.utils.errors import ConfigError, SceneError
-from wheretolook.viewpoints.sampling import SampleConfig, free_locations, sample_viewpoints
+from wheretolook.viewpoints.config import SampleConfig
+from wheretolook.viewpoints.sampling import free_locations, sample_viewpoints
 from wheretolook.viewpoints.table import (
     LOCALIZED,
     NO_POSE,

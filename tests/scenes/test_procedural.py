@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from wheretolook.geometry.mesh import TexturedMesh
+from wheretolook.scenes.config import ApartmentConfig
 from wheretolook.scenes.procedural import atlas, decor, fixtures, furniture
 from wheretolook.scenes.procedural import patches as patches_module
-from wheretolook.scenes.procedural.generator import ApartmentConfig, furnish_apartment, generate_apartment
+from wheretolook.scenes.procedural.generator import furnish_apartment, generate_apartment
 from wheretolook.scenes.procedural.materials import plain
 from wheretolook.scenes.procedural.noise import NoiseBank
 from wheretolook.scenes.procedural.plan import Plan, draw_plan

@@ -10,7 +10,8 @@ from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.planning.config import PathConfig
 from wheretolook.planning.path_planning import plan_path
 from wheretolook.rendering.raycasting import MeshRaycaster
-from wheretolook.space.free_space import FreeSpace, FreeSpaceConfig
+from wheretolook.space.config import FreeSpaceConfig
+from wheretolook.space.free_space import FreeSpace
 from wheretolook.space.tsdf_space import TsdfSpace, seen_through
 from wheretolook.visibility.tsdf import DepthImage, TsdfConfig, TsdfVolume
 

@@ -23,7 +23,6 @@ from wheretolook.stages.evaluate import evaluate_methods as evaluate
 from wheretolook.stages.train import train_variants as train
 from wheretolook.utils.errors import ConfigError, SceneError, TableError, WeightsError
 from wheretolook.utils.tracking import (
-    TrackingConfig,
     artifact,
     client,
     experiment_ids,
@@ -32,6 +31,7 @@ from wheretolook.utils.tracking import (
     start_run,
     ui_command,
 )
+from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import UNLABELLED, is_good, poses, write_table
 
 CONFIG = EvaluateConfig(("random", "visible", "bins", "mlp"), resamples=100, top_n=(1, 5))

@@ -31,7 +31,8 @@ from wheretolook.space.free_space import FreeSpace
 from wheretolook.space.tsdf_space import TsdfSpace
 from wheretolook.utils.errors import TableError
 from wheretolook.utils.files import fingerprint
-from wheretolook.utils.tracking import TrackingConfig, artifact, client, newest_run
+from wheretolook.utils.tracking import artifact, client, newest_run
+from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import is_good, poses, read_table, write_table
 from wheretolook.visibility.agreement import MaskAgreement
 from wheretolook.visibility.hidden_points import HiddenPointRemoval

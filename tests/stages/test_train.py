@@ -25,7 +25,8 @@ from wheretolook.methods.mlp.weights import load_classifier
 from wheretolook.methods.registry import load_scorer
 from wheretolook.stages.train import train_variants as train
 from wheretolook.utils.errors import ConfigError, TableError
-from wheretolook.utils.tracking import TrackingConfig, client
+from wheretolook.utils.tracking import client
+from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import LOCALIZED, NO_POSE, UNLABELLED, is_good, write_table
 
 SMALL = TrainConfig(variants=("2d",), epochs=3, hidden=(32,), accelerator="cpu")

@@ -17,7 +17,8 @@ from wheretolook.mapping.cameras import CAMERAS_FILE, colmap_poses, holds_model,
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.utils.errors import ConfigError, TableError
 from wheretolook.utils.files import fingerprint, write_json
-from wheretolook.viewpoints.table import Split, read_table
+from wheretolook.viewpoints.config import Split
+from wheretolook.viewpoints.table import read_table
 from wheretolook.visibility.occlusion import StoredOcclusion
 
 RELEASE = "release"

@@ -14,8 +14,9 @@ from wheretolook.geometry.poses import camera_centers
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.mapping.scale import read_scale
 from wheretolook.scenes.loading import load_mesh
+from wheretolook.space.config import MappedSpaceConfig
 from wheretolook.space.free_space import FreeSpace
-from wheretolook.space.mapped_space import MappedSpace, MappedSpaceConfig
+from wheretolook.space.mapped_space import MappedSpace
 from wheretolook.space.tsdf_space import TsdfSpace
 from wheretolook.utils.errors import MapError
 from wheretolook.visibility.config import OcclusionConfig

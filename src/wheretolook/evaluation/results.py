@@ -18,7 +18,8 @@ from wheretolook.evaluation.views import CandidateSet
 from wheretolook.geometry.poses import Float
 from wheretolook.methods.names import Method
 from wheretolook.utils.files import fingerprint
-from wheretolook.utils.tracking import NestedRun, TrackingConfig, artifact, newest_run
+from wheretolook.utils.tracking import NestedRun, artifact, newest_run
+from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.thresholds import ALL, threshold_key
 
 SCORES_CSV, SCORES_MD, SCORES_PNG, OCCLUSION_PNG = "scores.csv", "scores.md", "scores.png", "occlusion.png"

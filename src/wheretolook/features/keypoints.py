@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -16,20 +16,23 @@ class ExtractorConfig:
     """Settings of the keypoint extractor.
 
     Args:
-        method: whose SIFT to run. `opencv` finds nearly the same keypoints as `colmap`, COLMAP's own extraction on the
-            CPU, in 40 % of the time; on a GPU, Warp kernels find OpenCV's up to rounding.
+        method: whose SIFT finds keypoints, opencv or colmap. `opencv` finds nearly the same keypoints as `colmap`,
+            COLMAP's own extraction on the CPU, in 40 % of the time; on a GPU, Warp kernels find OpenCV's up to
+            rounding.
         first_octave: -1 doubles the image first, which gives about three times as many (and smaller) keypoints, for
             `colmap` at four times the cost; 0 starts at the image's own size. COLMAP's default is -1.
         max_keypoints: the most keypoints kept an image. `colmap` prefers large scales, `opencv` strong contrast.
         peak_threshold: least contrast (difference of Gaussians, grey values in [0, 1]). COLMAP's default is 0.02 / 3.
-        edge_threshold: largest ratio of principal curvatures (Lowe 2004, section 4.1).
+
+    Attributes:
+        edge_threshold: largest ratio of principal curvatures: the value of Lowe 2004 (section 4.1), COLMAP and OpenCV.
     """
 
     method: Literal["opencv", "colmap"] = "opencv"
     first_octave: int = -1
     max_keypoints: int = 2048
     peak_threshold: float = 0.02 / 3
-    edge_threshold: float = 10.0
+    edge_threshold: float = field(default=10.0, init=False)
 
     def __post_init__(self) -> None:
         if self.method not in ("colmap", "opencv"):
@@ -38,10 +41,8 @@ class ExtractorConfig:
             raise ConfigError("first_octave must be -1 or 0", value=self.first_octave)
         if self.max_keypoints < 1:
             raise ConfigError("max_keypoints must be positive", value=self.max_keypoints)
-        if not (self.peak_threshold > 0 and self.edge_threshold > 0):
-            raise ConfigError(
-                "peak_threshold and edge_threshold must be positive", value=(self.peak_threshold, self.edge_threshold)
-            )
+        if not self.peak_threshold > 0:
+            raise ConfigError("peak_threshold must be positive", value=self.peak_threshold)
 
 
 @dataclass(frozen=True, eq=False)

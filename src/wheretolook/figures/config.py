@@ -17,7 +17,7 @@ class FiguresConfig:
 
     Args:
         out: folder of the files; `<dataset>/results/figures` if not given.
-        only: names of the items to make, as `wheretolook figures --list` tells; empty for all.
+        only: names of what to draw, as `wheretolook figures --list` tells; empty for all.
         kinds: kinds of files of a figure: png, pdf, svg.
     """
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -19,6 +19,12 @@ from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.colmap_camera import Camera, ColmapCamera
 from wheretolook.geometry.poses import Float, split_poses
 from wheretolook.inputs.bins_kernel import BinGrid, bin_kernel, count_bins_kernel
+from wheretolook.inputs.channels import ALL_CHANNELS as ALL_CHANNELS
+from wheretolook.inputs.channels import CHANNELS as CHANNELS
+from wheretolook.inputs.channels import INPUT_VARIANTS as INPUT_VARIANTS
+from wheretolook.inputs.channels import LANDMARK_CHANNELS as LANDMARK_CHANNELS
+from wheretolook.inputs.channels import PAPER_VARIANTS as PAPER_VARIANTS
+from wheretolook.inputs.channels import Layout as Layout
 from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.warp import start_warp
@@ -38,28 +44,8 @@ if TYPE_CHECKING:
 import torch
 from torch import Tensor
 
-CHANNELS = ("u", "v", "x", "y", "z")
-"""Channels of every landmark: pixel (u, v) and position (x, y, z) in the camera frame in metres."""
-
-LANDMARK_CHANNELS = ("mapped_angle", "distance_ratio", *MAP_ATTRIBUTES)
-"""Channels of landmarks' attributes, on request only: two of `landmarks_in_view.POSE_ATTRIBUTES`, and those of the
-map. A bin's mean is NaN if the value of one of its landmarks is not known."""
-
-ALL_CHANNELS = CHANNELS + LANDMARK_CHANNELS
-
-PAPER_VARIANTS: dict[str, tuple[str, ...]] = {
-    "2d": ("u", "v"),
-    "2d+z": ("u", "v", "z"),
-    "2d+3d": ("u", "v", "x", "y", "z"),
-}
-"""The paper's inputs by name: 1,800, 2,700 and 4,500 values at 30 x 30 bins (its "4220" is a stale number)."""
-
-INPUT_VARIANTS: dict[str, tuple[str, ...]] = {**PAPER_VARIANTS, "2d+3d+landmark": ALL_CHANNELS}
-"""All inputs of the paper's network by name: the paper's own, and one with the landmarks' attributes."""
-
-Layout = Literal["in_place", "compact"]
-
-GPU_LANES = 32  # threads that share a view on a GPU where bins are only counted
+GPU_LANES = 32
+"""Threads that share a view on a GPU where bins are only counted."""
 
 
 @dataclass(frozen=True, eq=False)

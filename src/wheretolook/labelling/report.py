@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.utils.markdown import markdown_table
-from wheretolook.viewpoints.table import LOCALIZED, NO_POSE, TOO_FEW_MATCHES, Split, is_good, poses
+from wheretolook.viewpoints.config import Split
+from wheretolook.viewpoints.table import LOCALIZED, NO_POSE, TOO_FEW_MATCHES, is_good, poses
 from wheretolook.viewpoints.thresholds import ALL, THRESHOLDS, threshold_key, threshold_label
 
 LABELS_CSV, LABELS_MD, LABELS_PNG = "labels.csv", "labels.md", "labels.png"

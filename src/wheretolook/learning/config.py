@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
-from wheretolook.inputs.bins import CHANNELS, INPUT_VARIANTS, PAPER_VARIANTS, Layout
+from wheretolook.inputs.channels import CHANNELS, INPUT_VARIANTS, PAPER_VARIANTS, Layout
 from wheretolook.learning.fitting_config import FittingConfig
 from wheretolook.methods.conv.config import ConvConfig
 from wheretolook.methods.matchability.config import MatchabilityConfig

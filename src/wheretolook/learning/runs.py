@@ -11,7 +11,8 @@ import pandas as pd
 
 from wheretolook.dataset.folders import Dataset
 from wheretolook.utils.files import write_text
-from wheretolook.utils.tracking import TrackingConfig, artifact, client, finished_runs
+from wheretolook.utils.tracking import artifact, client, finished_runs
+from wheretolook.utils.tracking_config import TrackingConfig
 
 HISTORY_CSV = "history.csv"
 """Artifact of a train run: a row an epoch."""

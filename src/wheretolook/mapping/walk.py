@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
 
+from wheretolook.mapping.config import WalkConfig
 from wheretolook.utils.errors import ConfigError, SceneError
 
 Float = NDArray[np.float64]
@@ -23,50 +24,6 @@ class FreeSpaceQueries(Protocol):
     def segments_are_free(self, a: Any, b: Any) -> NDArray[np.bool_]: ...
 
     def floor_below(self, points: Any) -> NDArray[np.floating[Any]]: ...
-
-
-@dataclass(frozen=True)
-class WalkConfig:
-    """How a person with a camera walks through a scene.
-
-    Args:
-        coverage: share of the reachable floor that is visited before the walk ends.
-        visit_radius_m: floor within this walking distance of the walk counts as visited. It is enlarged until the walk
-            is short enough for the images to be at most `image_spacing_m` apart.
-        image_spacing_m: largest distance along the walk between two images. Images farther apart overlap too little.
-        eye_height_m: mean height of the camera above the floor in metres.
-        eye_height_variation_m: largest deviation from it.
-        cell_m: spacing of the grid of places that the walk leads through.
-        max_step_height_m: largest change of the floor's height from one place to the next (stairs).
-        swing_deg: how far the camera swings to either side of the walk.
-        swing_period: number of images in one swing from left to right and back.
-        pitch_deg: mean pitch, negative is down.
-        pitch_variation_deg: largest deviation from it.
-    """
-
-    coverage: float = 0.7
-    visit_radius_m: float = 1.0
-    image_spacing_m: float = 0.6
-    eye_height_m: float = 1.45
-    eye_height_variation_m: float = 0.2
-    cell_m: float = 0.3
-    max_step_height_m: float = 0.4
-    swing_deg: float = 40.0
-    swing_period: float = 12.0
-    pitch_deg: float = -5.0
-    pitch_variation_deg: float = 10.0
-
-    def __post_init__(self) -> None:
-        if not 0 < self.coverage <= 1:
-            raise ConfigError("coverage must be in (0, 1]", value=self.coverage)
-        for name in ("visit_radius_m", "image_spacing_m", "eye_height_m", "cell_m", "swing_period"):
-            if not getattr(self, name) > 0:
-                raise ConfigError(f"{name} must be positive", value=getattr(self, name))
-        if not 0 <= self.eye_height_variation_m < self.eye_height_m:
-            problem = "eye_height_variation_m must be at least 0 and below eye_height_m"
-            raise ConfigError(problem, value=self.eye_height_variation_m)
-        if not abs(self.pitch_deg) + abs(self.pitch_variation_deg) < 90:
-            raise ConfigError("the pitch must stay within 90 degrees", value=(self.pitch_deg, self.pitch_variation_deg))
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from wheretolook.planning.config import PathsConfig
 from wheretolook.planning.path_comparison import FORWARD
 from wheretolook.utils.markdown import markdown_table
-from wheretolook.utils.tracking import NestedRun, TrackingConfig, log_nested, start_run
+from wheretolook.utils.tracking import NestedRun, log_nested, start_run
+from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import LOCALIZED
 
 PATHS_CSV, PATHS_MD, PATHS_PNG = "paths.csv", "paths.md", "paths.png"

@@ -9,7 +9,8 @@ from tempfile import TemporaryDirectory
 
 import pandas as pd
 
-from wheretolook.utils.tracking import TrackingConfig, log, start_run
+from wheretolook.utils.tracking import log, start_run
+from wheretolook.utils.tracking_config import TrackingConfig
 
 RUNTIMES_CSV, SCALING_CSV = "runtimes.csv", "scaling.csv"
 """Tables for `wheretolook.figures.runtimes`: times at the paper's size, and how time and memory grow."""

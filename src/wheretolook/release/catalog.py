@@ -32,7 +32,8 @@ from wheretolook.release.copy import is_release, read_about
 from wheretolook.utils.errors import ConfigError, MissingRunError, WhereToLookError
 from wheretolook.utils.files import write_text
 from wheretolook.utils.markdown import markdown_table
-from wheretolook.utils.tracking import TrackingConfig, artifact, finished_runs
+from wheretolook.utils.tracking import artifact, finished_runs
+from wheretolook.utils.tracking_config import TrackingConfig
 
 if TYPE_CHECKING:
     from mlflow.entities import Run

@@ -10,8 +10,9 @@ from wheretolook.mapping.building import build_map
 from wheretolook.mapping.config import MapConfig
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.rendering.warp_renderer import WarpRenderer
+from wheretolook.scenes.config import ApartmentConfig
 from wheretolook.scenes.loading import load_mesh, save_glb
-from wheretolook.scenes.procedural.generator import ApartmentConfig, generate_apartment
+from wheretolook.scenes.procedural.generator import generate_apartment
 from wheretolook.space.free_space import FreeSpace
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from wheretolook.dataset.folders import RELEASE, Dataset
 from wheretolook.utils.errors import ConfigError
-from wheretolook.utils.tracking import TrackingConfig
+from wheretolook.utils.tracking_config import TrackingConfig
 
 RELEASE_VARIABLE, STORE_VARIABLE = "WHERETOLOOK_RELEASE", "WHERETOLOOK_MLRUNS"
 """Environment variables that name the folders of a release and of a store, instead of the ones that are found."""

@@ -26,7 +26,6 @@ from wheretolook.release.benchmark_runs import RUNTIMES_CSV, SCALING_CSV, log_ru
 from wheretolook.release.card import GENERALIZATION_CSV
 from wheretolook.utils.tracking import (
     NestedRun,
-    TrackingConfig,
     artifact,
     client,
     experiment_ids,
@@ -35,6 +34,7 @@ from wheretolook.utils.tracking import (
     log_nested,
     start_run,
 )
+from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import UNLABELLED, is_good
 from wheretolook.viewpoints.thresholds import ALL
 

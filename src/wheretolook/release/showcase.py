@@ -26,10 +26,14 @@ from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.release.copy import ABOUT
 from wheretolook.rendering.warp_renderer import WarpRenderer
-from wheretolook.scenes.procedural.generator import ApartmentConfig, generate_apartment
-from wheretolook.space.free_space import FreeSpace, FreeSpaceConfig
+from wheretolook.scenes.config import ApartmentConfig
+from wheretolook.scenes.procedural.generator import generate_apartment
+from wheretolook.space.config import FreeSpaceConfig
+from wheretolook.space.free_space import FreeSpace
 from wheretolook.utils.errors import ConfigError, SceneError
-from wheretolook.viewpoints.sampling import SampleConfig, free_locations
+from wheretolook.utils.options import recorded
+from wheretolook.viewpoints.config import SampleConfig
+from wheretolook.viewpoints.sampling import free_locations
 from wheretolook.viewpoints.table import is_good
 from wheretolook.visibility.config import OcclusionConfig
 from wheretolook.visibility.occlusion import OcclusionModel, StoredOcclusion
@@ -171,13 +175,13 @@ def open_showcase(dataset: Dataset, name: str | None = None, device: str = "cpu"
     seeded = _SEEDED.fullmatch(scene.name)
     if seeded is None:
         raise SceneError("this scene was not generated from a seed", path=scene.folder, value=scene.name)
-    apartment = ApartmentConfig(**settings["scenes"]["apartment"])
+    apartment = recorded(ApartmentConfig, settings["scenes"]["apartment"])
     mesh = generate_apartment(apartment, int(seeded[1]), device=device)
-    space = FreeSpace(mesh, FreeSpaceConfig(**settings["scenes"]["free_space"]), device)
-    sampling = SampleConfig(**settings["sample"])
+    space = FreeSpace(mesh, recorded(FreeSpaceConfig, settings["scenes"]["free_space"]), device)
+    sampling = recorded(SampleConfig, settings["sample"])
     grid = VoxelGrid.over(space.bounds, sampling.grid)
     landmarks = Landmarks.load(scene.landmarks)
-    rays = OcclusionConfig(**{**settings["occlusion"], "model": "mesh"})
+    rays = recorded(OcclusionConfig, {**settings["occlusion"], "model": "mesh"})
     occlusion = scene_occlusion(scene, dataset.camera, rays, device, mesh, space.two_sided)
     if settings["occlusion"]["model"] == "mesh":
         _check_same(scene, landmarks, occlusion)

@@ -8,7 +8,8 @@ import pandas as pd
 
 from wheretolook.evaluation.paper_tables import KEYS
 from wheretolook.evaluation.scores import RELEASED_DIVISOR
-from wheretolook.utils.tracking import TrackingConfig, newest_artifact
+from wheretolook.utils.tracking import newest_artifact
+from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.thresholds import threshold_label
 
 if TYPE_CHECKING:

@@ -2,50 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.rendering.raycasting import MeshRaycaster, RayHits
-from wheretolook.utils.errors import ConfigError
+from wheretolook.space.config import FreeSpaceConfig
 
 _N_SIDEDNESS_POINTS = 1024  # random points that decide whether triangles are one-sided
-
-
-@dataclass(frozen=True)
-class FreeSpaceConfig:
-    """What counts as free.
-
-    Args:
-        clearance_m: least distance to any geometry.
-        max_floor_drop_m: greatest height above the surface straight below, which must be roughly level.
-        min_enclosure: least share of 34 rays around a point (16 level, 8 rising and 8 falling by 45 degrees, up and
-            down) that meet a surface. A point in a room without a ceiling reaches 25 / 34 = 0.74; one outside a wall
-            or above a ceiling stays below 19 / 34 = 0.56, since at least half of its level rays and all rising ones
-            leave the scene. Windows, doors and holes of a scan let some rays out.
-        two_sided: whether both sides of a triangle count as a surface. If not, only fronts count as floor and as
-            enclosure, so that a point inside a solid or outside a shell of one layer is never free. None decides from
-            the scene: triangles are one-sided if most points that are free in a two-sided scene see mostly fronts.
-        min_sight_m: in a two-sided scene, the inside of closed furniture looks like a room; at least a quarter of the
-            level rays must therefore be this long. 1 m leaves corridors 0.8 m wide free, but not closets of 0.7 m.
-    """
-
-    clearance_m: float = 0.25
-    max_floor_drop_m: float = 4.0
-    min_enclosure: float = 0.6
-    two_sided: bool | None = None
-    min_sight_m: float = 1.0
-
-    def __post_init__(self) -> None:
-        if not self.clearance_m > 0 or not self.max_floor_drop_m > 0 or self.min_sight_m < 0:
-            raise ConfigError(
-                "clearance and floor drop must be positive, sight not negative",
-                value=(self.clearance_m, self.max_floor_drop_m, self.min_sight_m),
-            )
-        if not 0 <= self.min_enclosure <= 1:
-            raise ConfigError("min_enclosure is a share between 0 and 1", value=self.min_enclosure)
 
 
 class FreeSpace:

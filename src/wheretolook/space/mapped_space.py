@@ -2,39 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from wheretolook.geometry.poses import Float
-from wheretolook.utils.errors import ConfigError, MapError
+from wheretolook.space.config import MappedSpaceConfig
+from wheretolook.utils.errors import MapError
 
 STEP_M = 0.02
 """Step between the points of a path segment that must be near mapping cameras."""
 
 _OUTLIERS = 0.01  # share of landmarks left out at either end of each axis, since a wrong one may lie anywhere
-
-
-@dataclass(frozen=True)
-class MappedSpaceConfig:
-    """What counts as free without a mesh. Landmarks do not tell where space is empty, but mapping cameras do.
-
-    Args:
-        max_camera_distance_m: greatest distance to the nearest position of a mapping camera.
-        clearance_m: least distance to any landmark.
-    """
-
-    max_camera_distance_m: float = 0.75
-    clearance_m: float = 0.25
-
-    def __post_init__(self) -> None:
-        if not self.max_camera_distance_m > 0 or not self.clearance_m >= 0:
-            raise ConfigError(
-                "the distance to cameras must be positive, the clearance not negative",
-                value=(self.max_camera_distance_m, self.clearance_m),
-            )
 
 
 class MappedSpace:

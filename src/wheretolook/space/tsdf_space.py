@@ -12,7 +12,8 @@ from tqdm.auto import tqdm
 
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float
-from wheretolook.space.free_space import FreeSpace, FreeSpaceConfig
+from wheretolook.space.config import FreeSpaceConfig
+from wheretolook.space.free_space import FreeSpace
 from wheretolook.visibility.tsdf import DepthImage, TsdfVolume
 
 CELL_M = 0.05

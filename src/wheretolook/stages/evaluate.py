@@ -22,7 +22,7 @@ from wheretolook.evaluation.views import candidate_sets, views_of
 from wheretolook.geometry.poses import Float
 from wheretolook.methods.names import PROBABILITIES, Method
 from wheretolook.utils.errors import TableError
-from wheretolook.utils.tracking import TrackingConfig
+from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import UNLABELLED, is_good
 from wheretolook.visibility.config import OcclusionConfig
 

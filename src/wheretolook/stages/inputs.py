@@ -13,6 +13,7 @@ from wheretolook.dataset.folders import Dataset, SceneFolder
 from wheretolook.dataset.stamps import read_stamp
 from wheretolook.utils.errors import ConfigError, MapError, SceneError, TableError
 from wheretolook.utils.files import fingerprint
+from wheretolook.utils.options import recorded
 
 if TYPE_CHECKING:
     from wheretolook.features.keypoints import ExtractorConfig
@@ -80,7 +81,7 @@ def extractor_of(scene: SceneFolder) -> ExtractorConfig:
 
     path = scene.map / "report.json"
     try:
-        return ExtractorConfig(**json.loads(path.read_text())["config"]["extractor"])
+        return recorded(ExtractorConfig, json.loads(path.read_text())["config"]["extractor"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise MapError("the map's report is missing or damaged", path=path, fix="Run the map stage again.") from error
 

@@ -25,7 +25,8 @@ import pandas as pd
 from wheretolook.labelling.report import LABELS_CSV, LABELS_MD, LABELS_PNG, LabelSummary, label_markdown, label_summary
 from wheretolook.utils.errors import TableError
 from wheretolook.utils.files import write_text
-from wheretolook.utils.tracking import TrackingConfig, log, start_run
+from wheretolook.utils.tracking import log, start_run
+from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import is_good
 from wheretolook.viewpoints.thresholds import ALL
 

@@ -11,7 +11,7 @@ from wheretolook.dataset.folders import Dataset, SceneFolder
 from wheretolook.dataset.stamps import is_done, read_stamp, stage_key, write_stamp
 from wheretolook.stages.inputs import Say, Tick, mesh_fingerprint, refuse_release
 from wheretolook.utils.errors import SceneError
-from wheretolook.viewpoints.table import Split
+from wheretolook.viewpoints.config import Split
 
 
 def make_scenes(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> Dataset:

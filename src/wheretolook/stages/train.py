@@ -34,7 +34,8 @@ from wheretolook.methods.mlp.network import NetworkSpec, ViewpointNetwork
 from wheretolook.methods.mlp.weights import save_classifier
 from wheretolook.utils.files import fingerprint as file_fingerprint
 from wheretolook.utils.files import sha256, write_json
-from wheretolook.utils.tracking import TrackingConfig, log, start_run
+from wheretolook.utils.tracking import log, start_run
+from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.utils.version import VERSION
 
 if TYPE_CHECKING:

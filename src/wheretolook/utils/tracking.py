@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from wheretolook.utils.errors import MissingRunError
+from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.utils.version import VERSION
 
 if TYPE_CHECKING:
@@ -40,34 +41,6 @@ AT_ONCE = 800
 
 PAGE = 50
 """Runs searched at a time."""
-
-
-@dataclass(frozen=True)
-class TrackingConfig:
-    """Where runs are logged.
-
-    Args:
-        folder: folder of the MLflow store, holding `mlflow.db` and `artifacts/`. Made when needed.
-        experiment: name of the MLflow experiment that the runs belong to.
-    """
-
-    folder: str = "mlruns"
-    experiment: str = "wheretolook"
-
-    @property
-    def root(self) -> Path:
-        """Absolute path of the store's folder."""
-        return Path(self.folder).expanduser().resolve()
-
-    @property
-    def uri(self) -> str:
-        """Tracking URI of the store."""
-        return f"sqlite:///{self.root / 'mlflow.db'}"
-
-    @property
-    def artifacts(self) -> str:
-        """Artifact location of the experiment."""
-        return str(self.root / "artifacts")
 
 
 def client(tracking: TrackingConfig) -> MlflowClient:

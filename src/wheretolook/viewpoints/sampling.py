@@ -2,73 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, get_args
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.geometry.lattices import Lattice, VoxelGrid, direction_lattice
+from wheretolook.geometry.lattices import VoxelGrid, direction_lattice
 from wheretolook.geometry.poses import poses_looking_along, rotation_looking_along
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.utils.errors import ConfigError, SceneError
-from wheretolook.viewpoints.table import UNLABELLED, Split, pose_columns
+from wheretolook.utils.errors import SceneError
+from wheretolook.viewpoints.config import SampleConfig, Split
+from wheretolook.viewpoints.table import UNLABELLED, pose_columns
 from wheretolook.visibility.occlusion import OcclusionModel, StoredOcclusion
 from wheretolook.visibility.survey import survey
 
 if TYPE_CHECKING:
     from wheretolook.space.free_space import FreeSpace
     from wheretolook.space.mapped_space import MappedSpace
-
-
-@dataclass(frozen=True)
-class SampleConfig:
-    """Settings of the sample stage.
-
-    Args:
-        grid: voxels along x, y and z over the scene's bounds; the paper has 8 x 8 x 8.
-        directions: directions at each location; the released code has 500.
-        lattice: how they are spread: "fibonacci" is even, "azimuth-elevation" is the paper's comparison, "released" is
-            what the released code does, "yaw-pitch" are ActLoc's 6 pitches x 18 yaws, whatever `directions` says.
-        keep: K, the directions kept at each location, those that see most landmarks; 0 keeps all.
-        min_visible: directions that see fewer landmarks are dropped ("none or only a minimal number", Sec. 3.2).
-        max_locations: a random subset of the free locations, 0 for all.
-        max_directions: a random subset of the kept directions of each location, 0 for all; one number, or one for
-            each split, such as `{train: 50, val: 50, test: 100}`.
-        seed: of those subsets.
-        distinct_pixels: rank by the number of distinct pixels with a landmark, as the released code counts, instead of
-            the number of landmarks.
-        memory_gb: bound on the memory that counting takes on its device, in 10^9 bytes.
-    """
-
-    grid: tuple[int, int, int] = (8, 8, 8)
-    directions: int = 500
-    lattice: Lattice = "fibonacci"
-    keep: int = 100
-    min_visible: int = 1
-    max_locations: int = 0
-    max_directions: int | dict[Split, int] = 0
-    seed: int = 0
-    distinct_pixels: bool = False
-    memory_gb: float = 2.0
-
-    def __post_init__(self) -> None:
-        for name in ("keep", "min_visible", "max_locations"):
-            if getattr(self, name) < 0:
-                raise ConfigError(f"sample.{name} must not be negative", value=getattr(self, name))
-        if isinstance(self.max_directions, dict) and set(self.max_directions) != set(get_args(Split)):
-            fix = "Give one number, or one for each of train, val and test."
-            raise ConfigError("sample.max_directions lacks or misnames a split", value=self.max_directions, fix=fix)
-        if min(map(self.directions_of, get_args(Split))) < 0:
-            raise ConfigError("sample.max_directions must not be negative", value=self.max_directions)
-        if not 0 < self.memory_gb < float("inf"):
-            raise ConfigError("sample.memory_gb must be positive", value=self.memory_gb)
-
-    def directions_of(self, split: Split) -> int:
-        """`max_directions` for a split."""
-        return self.max_directions[split] if isinstance(self.max_directions, dict) else self.max_directions
 
 
 def free_locations(grid: VoxelGrid, free_space: FreeSpace | MappedSpace) -> NDArray[np.int64]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import pandas as pd
@@ -17,9 +16,6 @@ import pyarrow.parquet as pq
 
 from wheretolook.geometry.poses import Float, camera_centers, quaternion_from_rotation, rotation_from_quaternion
 from wheretolook.utils.errors import TableError
-
-Split = Literal["train", "val", "test"]
-"""What the viewpoints of a scene are for."""
 
 POSE_COLUMNS = ("qw", "qx", "qy", "qz", "tx", "ty", "tz")
 CENTER_COLUMNS = ("x_m", "y_m", "z_m")

@@ -11,13 +11,11 @@ from scipy.spatial import ConvexHull, cKDTree
 
 from wheretolook.geometry.poses import Float
 from wheretolook.utils.errors import ConfigError, MapError, SceneError
+from wheretolook.visibility.config import DEFAULT_RADIUS
 from wheretolook.visibility.occlusion import OcclusionModel
 
-DEFAULT_RADIUS = 50.0
-"""Has the greatest mean F1 against the meshes of six mapped scenes (tests/benchmarks/bench_hidden_points.py). The mean
-stays within 0.01 of it from 30 to 100; single scenes have their optimum between 5 and 100, mostly larger the more open
-they are."""
-TOUCHING_M = 1e-6  # a landmark this close to a location is in the same place, and has no direction as seen from it
+TOUCHING_M = 1e-6
+"""A landmark this close to a location is in the same place, and has no direction as seen from it."""
 
 _FLAT = 1e-12  # least mean square of the directions along an axis; below it, all lie in the plane across that axis
 _NO_LENGTH = 1e-12  # keeps facets through the origin, which no direction leaves by, from dividing by zero

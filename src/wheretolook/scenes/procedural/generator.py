@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wheretolook.geometry.mesh import TexturedMesh
+from wheretolook.scenes.config import ApartmentConfig
 from wheretolook.scenes.procedural import atlas, lighting
 from wheretolook.scenes.procedural.furnishing import furnish
 from wheretolook.scenes.procedural.layout import Lamp
@@ -19,83 +18,9 @@ from wheretolook.scenes.procedural.plan import Plan, draw_plan
 from wheretolook.scenes.procedural.repetition import repeat_patterns
 from wheretolook.scenes.procedural.shell import build_shell
 from wheretolook.scenes.procedural.style import Style
-from wheretolook.utils.errors import ConfigError
 
 BRIGHTNESS = np.geomspace(0.12, 1.06, atlas.LEVELS)
 """Factors on the albedo of shared materials."""
-
-
-@dataclass(frozen=True)
-class ApartmentConfig:
-    """Options of the procedural apartment.
-
-    Args:
-        n_rooms: number of rooms, 3 to 6; None draws it from the seed.
-        area_m2: approximate floor area in square metres; None takes about 13 per room.
-        texture_richness: 0 to 1; contrast of wood, stone and cloth, and number of pictures. Lower is harder to localize
-            in.
-        clutter: 0 to 1; number of books, plants, bottles and other small things. Lower is harder.
-        repetition: 0 to 1; share of large surfaces that repeat a strong pattern every 0.6 to 2 m, as in games. Their
-            views are full of features and yet hard to localize.
-        dark_rooms: share of rooms whose lamp is off, some with their curtains closed. Higher is harder.
-        enlarged: scale of everything, furniture and patterns too; halls have few and far landmarks.
-        vary: draw the area and the five numbers above from each apartment's seed, whatever they are set to, so that
-            rooms to learn from are unlike each other.
-        texels_per_m: texture resolution of large surfaces; lowered if the atlas would not fit.
-        texture_size: greatest width and height of the texture in texels.
-        light_spacing_m: distance between light samples in metres.
-        light_rays: rays per light sample over the hemisphere.
-    """
-
-    n_rooms: int | None = None
-    area_m2: float | None = None
-    texture_richness: float = 0.85
-    clutter: float = 0.85
-    repetition: float = 0.0
-    dark_rooms: float = 0.2
-    enlarged: float = 1.0
-    vary: bool = False
-    texels_per_m: float = 125.0
-    texture_size: int = 4096
-    light_spacing_m: float = 0.1
-    light_rays: int = 24
-
-    def __post_init__(self) -> None:
-        if self.n_rooms is not None and not 3 <= self.n_rooms <= 6:
-            raise ConfigError("n_rooms must be 3 to 6", value=self.n_rooms)
-        if self.area_m2 is not None and not 25 <= self.area_m2 <= 200:
-            raise ConfigError("area_m2 must be 25 to 200", value=self.area_m2)
-        for name in ("texture_richness", "clutter", "repetition", "dark_rooms"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ConfigError(f"{name} must be between 0 and 1", value=getattr(self, name))
-        for name in ("enlarged", "texels_per_m", "texture_size", "light_spacing_m", "light_rays"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ConfigError(f"{name} must be a positive number", value=getattr(self, name))
-
-    def key(self) -> dict[str, Any]:
-        """The options that decide an apartment together with its seed.
-
-        Options added in later versions are left out at their default, so that keys of earlier versions stay the same.
-        """
-        default = ApartmentConfig()
-        unset = [name for name in ("repetition", "enlarged", "vary") if getattr(self, name) == getattr(default, name)]
-        return {name: value for name, value in asdict(self).items() if name not in unset}
-
-    def of_seed(self, seed: int) -> ApartmentConfig:
-        """The options of the apartment of a seed: these, or with `vary` options drawn from the seed."""
-        if not self.vary:
-            return self
-        rng = np.random.default_rng([seed, 2])
-        return replace(
-            self,
-            area_m2=float(rng.uniform(35, 130)),
-            texture_richness=float(rng.uniform(0.5, 1)),
-            clutter=float(rng.uniform(0.3, 1)),
-            repetition=float(rng.uniform(0.3, 1)) if rng.random() < 0.7 else 0.0,
-            dark_rooms=float(rng.uniform(0, 0.4)),
-            enlarged=float(np.exp(rng.uniform(0, np.log(3)))),
-            vary=False,
-        )
 
 
 def furnish_apartment(config: ApartmentConfig, seed: int) -> tuple[Plan, list[Patch], list[Lamp], np.random.Generator]:

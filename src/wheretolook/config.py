@@ -17,6 +17,7 @@ from wheretolook.mapping.config import MapConfig
 from wheretolook.planning.config import PathsConfig, PlanConfig, ViewpointMapConfig
 from wheretolook.scenes.config import ApartmentConfig
 from wheretolook.space.config import FreeSpaceConfig, MappedSpaceConfig
+from wheretolook.utils.devices import resolve_device
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.config import SampleConfig
@@ -150,8 +151,4 @@ class Experiment:
     @property
     def warp_device(self) -> str:
         """The device kernels run on, with "auto" resolved."""
-        if self.device != "auto":
-            return self.device
-        import torch
-
-        return "cuda" if torch.cuda.is_available() else "cpu"
+        return resolve_device(self.device)

@@ -123,7 +123,9 @@ def test_a_release_leaves_matches_out(tmp_path: Path) -> None:
             write_table(table.assign(matched_rows=rows, inlier_rows=rows), scene.table)
             write_json(scene.label_manifest, {**json.loads(scene.label_manifest.read_text()), "store_matches": True})
         copy = releases.copy_dataset(dataset, experiment_of(tmp_path / name))
-        releases_of.append({name: content for name, content in contents(copy.root).items() if name != releases.ABOUT})
+        releases_of.append(
+            {name: content for name, content in contents(copy.root).items() if name != releases.RELEASE_FILE}
+        )
     assert releases_of[0] == releases_of[1]
 
 
@@ -262,7 +264,7 @@ def test_scenes_made_by_others_keep_their_licence(folder: Path) -> None:
     experiment = experiment_of(folder)
     scenes = ScenesConfig(train=1, test=0, meshes=(MeshSource(Path("/secret/place/scan.glb")),))
     stages.release(replace(experiment, scenes=scenes), say=quiet)
-    assert "secret" not in (folder / "data" / "release" / releases.ABOUT).read_text()
+    assert "secret" not in (folder / "data" / "release" / releases.RELEASE_FILE).read_text()
     card = release_card(Dataset.load(folder / "data" / "release"))
     assert "made by others (scan)" in card and "secret" not in card
 
@@ -285,7 +287,7 @@ def test_other_data_is_not_overwritten(folder: Path) -> None:
     with pytest.raises(ConfigError, match=r"of another dataset than another \(got 'tiny'\)"):
         stages.release(experiment_of(folder, "another"), say=quiet)
     assert contents(folder / "data" / "release") == before
-    (folder / "data" / "release" / releases.ABOUT).unlink()
+    (folder / "data" / "release" / releases.RELEASE_FILE).unlink()
     with pytest.raises(ConfigError, match="no release and would be overwritten"):
         stages.release(experiment_of(folder), say=quiet)
 

@@ -7,12 +7,12 @@ from math import inf, isfinite
 from pathlib import Path
 from typing import Literal
 
-from wheretolook.geometry.lattices import Lattice
+from wheretolook.geometry.lattices import ViewLattice
 from wheretolook.utils.errors import ConfigError
 
 
 @dataclass(frozen=True)
-class ViewpointMapConfig:
+class ViewpointMapConfig(ViewLattice):
     """What a viewpoint map is made of.
 
     Args:
@@ -22,20 +22,15 @@ class ViewpointMapConfig:
         weights: file of weights that the train stage wrote, for a method that has learnt. Unless a method is named,
             the best of the dataset, or else of the release, for cameras with their field of view.
         out: folder to write; empty for `<data>/<name>/<scene>/viewpoint-map`. Only with a scene.
-        grid: voxels along x, y and z over the scene's bounds.
-        directions: directions at each voxel.
-        lattice: how they are spread: fibonacci is even; yaw-pitch are ActLoc's 6 x 18, whatever `directions` says.
     """
 
     scene: str = ""
     method: str = ""
     weights: Path | None = None
     out: Path | None = None
-    grid: tuple[int, int, int] = (8, 8, 8)
-    directions: int = 500
-    lattice: Lattice = "fibonacci"
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.out is not None and not self.scene:
             raise ConfigError("viewpoint_map.out is the folder of one scene", value=str(self.out), fix="Name a scene.")
 
@@ -78,7 +73,7 @@ class PathConfig:
 
 
 @dataclass(frozen=True)
-class PathsConfig:
+class PathsConfig(ViewLattice):
     """How methods are compared by planned paths.
 
     Args:
@@ -91,9 +86,6 @@ class PathsConfig:
             --list-methods`. Scores that are no probabilities enter by their ranks.
         weights: of the methods that have learnt, those that are of another kind; by default, and for the others, the
             best of each method in the dataset, or else in the release.
-        grid: voxels of the viewpoint maps along x, y and z.
-        directions: directions at each voxel.
-        lattice: how they are spread: fibonacci is even; yaw-pitch are ActLoc's 6 x 18, whatever `directions` says.
         max_turn_deg: along a path that is given, the camera turns by no more from one waypoint to the next.
         max_error_m: a view is good if it localizes with a smaller error of its position.
         max_error_deg: and of its orientation.
@@ -108,9 +100,6 @@ class PathsConfig:
     height_m: tuple[float, float] = (1.2, 1.6)
     methods: tuple[str, ...] = ("forward", "fisher-trace-gp", "set")
     weights: Path | None = None
-    grid: tuple[int, int, int] = (8, 8, 8)
-    directions: int = 500
-    lattice: Lattice = "fibonacci"
     max_turn_deg: float = 30.0
     max_error_m: float = 0.25
     max_error_deg: float = 2.0
@@ -118,16 +107,8 @@ class PathsConfig:
     planner: PathConfig = field(default_factory=PathConfig)
 
     def __post_init__(self) -> None:
-        positive = (
-            "pairs",
-            "min_distance_m",
-            "directions",
-            "max_turn_deg",
-            "max_error_m",
-            "max_error_deg",
-            "resamples",
-        )
-        for name in positive:
+        super().__post_init__()
+        for name in ("pairs", "min_distance_m", "max_turn_deg", "max_error_m", "max_error_deg", "resamples"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"{name} must be positive", value=getattr(self, name))
         if not 0 < self.height_m[0] <= self.height_m[1]:
@@ -137,7 +118,7 @@ class PathsConfig:
 
 
 @dataclass(frozen=True)
-class PlanConfig:
+class PlanConfig(ViewLattice):
     """A path to plan, and what to write about it.
 
     Args:
@@ -151,9 +132,6 @@ class PlanConfig:
             "fisher-trace-gp".
         film: "gif", "mp4" or "none".
         rerun: whether to write a recording for the Rerun viewer (needs `pip install rerun-sdk`).
-        grid: voxels of the viewpoint map along x, y and z.
-        directions: directions at each voxel.
-        lattice: how they are spread, fibonacci or yaw-pitch.
         planner: costs and limits of the path, time to plan.
     """
 
@@ -166,12 +144,10 @@ class PlanConfig:
     against: tuple[str, ...] = ()
     film: Literal["gif", "mp4", "none"] = "gif"
     rerun: bool = False
-    grid: tuple[int, int, int] = (8, 8, 8)
-    directions: int = 500
-    lattice: Lattice = "fibonacci"
     planner: PathConfig = field(default_factory=PathConfig)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.film not in ("gif", "mp4", "none"):
             raise ConfigError("unknown kind of film", value=self.film, fix="Use gif, mp4 or none.")
         for name in ("start", "goal"):

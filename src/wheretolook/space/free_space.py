@@ -21,6 +21,7 @@ class FreeSpace:
         device: "cpu" or a CUDA device.
 
     Attributes:
+        raycaster: the mesh, for rays and distances.
         bounds: (2, 3) metres, lowest and highest corner of the scene.
         two_sided: whether both sides of a triangle count as a surface, as configured or found out.
 
@@ -31,7 +32,7 @@ class FreeSpace:
     def __init__(self, mesh: TexturedMesh, config: FreeSpaceConfig | None = None, device: str = "cpu") -> None:
         self.config = config or FreeSpaceConfig()
         self.bounds = mesh.bounds
-        self._raycaster = MeshRaycaster(mesh, device)
+        self.raycaster = MeshRaycaster(mesh, device)
         corners = mesh.vertices[mesh.triangles].astype(np.float64)
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         length = np.linalg.norm(normals, axis=1)
@@ -66,17 +67,17 @@ class FreeSpace:
         """
         start, end = (np.asarray(points, dtype=np.float64).reshape(-1, 3) for points in (a, b))
         free = self.is_free(start) & self.is_free(end)
-        free[free] = self._raycaster.segments_are_clear(start[free], end[free], self.config.clearance_m)
+        free[free] = self.raycaster.segments_are_clear(start[free], end[free], self.config.clearance_m)
         return free
 
     def floor_below(self, points: ArrayLike) -> NDArray[np.float64]:
         """Height z (N,) of the floor below points (N, 3) metres; NaN where `is_free` would find none."""
         at = np.asarray(points, dtype=np.float64).reshape(-1, 3)
-        hits = self._raycaster.cast(at, np.broadcast_to((0.0, 0.0, -1.0), at.shape))
+        hits = self.raycaster.cast(at, np.broadcast_to((0.0, 0.0, -1.0), at.shape))
         return np.where(self._is_floor(hits), at[:, 2] - hits.distance_m, np.nan)
 
     def _is_clear(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        return self._raycaster.distance_to_surface(points, self.config.clearance_m) >= self.config.clearance_m
+        return self.raycaster.distance_to_surface(points, self.config.clearance_m) >= self.config.clearance_m
 
     def _is_above_floor(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
         return np.isfinite(self.floor_below(points))
@@ -96,7 +97,7 @@ class FreeSpace:
     def _look_around(self, points: NDArray[np.float64]) -> RayHits:
         """Hits (N, 34) of the rays that tell whether a point is enclosed; the 16 level ones come first."""
         directions = _around()
-        hits = self._raycaster.cast(np.repeat(points, len(directions), axis=0), np.tile(directions, (len(points), 1)))
+        hits = self.raycaster.cast(np.repeat(points, len(directions), axis=0), np.tile(directions, (len(points), 1)))
         shape = (len(points), len(directions))
         return RayHits(hits.distance_m.reshape(shape), hits.triangle.reshape(shape), hits.front.reshape(shape))
 

@@ -1,0 +1,12 @@
+"""Which device kernels and networks run on."""
+
+from __future__ import annotations
+
+
+def resolve_device(device: str) -> str:
+    """A device's name, with "auto" resolved: "cuda" if there is a GPU, else "cpu". Then it takes seconds: PyTorch loads."""
+    if device != "auto":
+        return device
+    import torch
+
+    return "cuda" if torch.cuda.is_available() else "cpu"

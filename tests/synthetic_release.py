@@ -9,7 +9,7 @@ import pandas as pd
 
 from synthetic_dataset import make_dataset
 from synthetic_scores import make_scores
-from wheretolook.dataset.folders import Dataset
+from wheretolook.dataset.folders import RELEASE_FILE, Dataset
 from wheretolook.evaluation.paper_tables import write_paper_tables
 from wheretolook.methods.names import Method
 

@@ -53,6 +53,16 @@ def make_example_model(
     save_glb(generate_apartment(apartment, seed), example.scan)
     mesh = load_mesh(example.scan)
     space, config = FreeSpace(mesh), MapConfig(n_images=n_images)
-    options = {"raycaster": space.raycaster, "workers": 1, "progress": False}
-    build_map(mesh, WarpRenderer(mesh), space, camera, config, seed, example.model, **options)
+    build_map(
+        mesh,
+        WarpRenderer(mesh),
+        space,
+        camera,
+        config,
+        seed,
+        example.model,
+        space.raycaster,
+        workers=1,
+        progress=False,
+    )
     return example

@@ -75,12 +75,11 @@ def _plan(scene: Scene, dataset: Dataset, config: PathsConfig, say: Say) -> Comp
     files, folder = scene.files, _folder(dataset, scene)
     weights = {method: weights_for(method, dataset, config.weights, say) for method in config.methods}
     settings = {name: value for name, value in asdict(config).items() if name not in _OF_THE_REPORT}
-    looked_at = [scene.config.free_space, scene.config.occlusion, scene.camera]
-    made_from = [files.mesh, files.landmarks, files.mapping_cameras if files.mapping_cameras.is_file() else None]
+    looked_at = [asdict(scene.config.free_space), asdict(scene.config.occlusion), asdict(scene.camera)]
+    poses = files.mapping_cameras if files.mapping_cameras.is_file() else None
+    made_from = [path and fingerprint(path) for path in (files.mesh, files.landmarks, poses)]
     used = [path and fingerprint(path) for path in weights.values()]
-    key = stage_key(
-        "paths 2", [settings, *map(asdict, looked_at), *(path and fingerprint(path) for path in made_from), used]
-    )
+    key = stage_key("paths 2", [settings, *looked_at, *made_from, used])
     tables = {name: folder / f"{name}.parquet" for name in ("paths", "views")}
     made = folder / "made.json"
     if made.is_file() and all(path.is_file() for path in tables.values()) and json.loads(made.read_text()) == key:

@@ -17,7 +17,7 @@ from wheretolook.utils.files import fingerprint
 
 
 def map_photograph_scene(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> Dataset:
-    """Map the photographs in the folder `map.photographs.images`: `<scene>/map/`, finished steps `<scene>/photographs/`.
+    """Map the photographs in `map.photographs.images`: `<scene>/map/`, with finished steps in `<scene>/photographs/`.
 
     The scene joins those of the dataset that are made of photographs too.
 

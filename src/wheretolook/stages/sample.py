@@ -37,14 +37,14 @@ def sample(experiment: Experiment, say: Say = print, tick: Tick = lambda work: N
 
 
 def _key(scene: Scene, config: SampleConfig) -> str:
-    files, space, stage = scene.files, scene.config.free_space, "scenes"
+    files, space, stage = scene.files, asdict(scene.config.free_space), "scenes"
     if scene.is_photographed:
         scene.require_metres()
-        space, stage = scene.config.mapped_space, "map"
+        space, stage = asdict(scene.config.mapped_space), "map"
     chosen = {name: value for name, value in asdict(config).items() if name != "memory_gb"}
     chosen["max_directions"] = config.directions_of(files.split)
     made_from = [existing(scene.source, SceneError, stage), existing(files.landmarks, MapError, "map")]
-    settings = [chosen, scene.occlusion_config.settings(), asdict(space), asdict(scene.camera)]
+    settings = [chosen, scene.occlusion_config.settings(), space, asdict(scene.camera)]
     return stage_key("sample", [*settings, *made_from])
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 def resolve_device(device: str) -> str:
-    """A device's name, with "auto" resolved: "cuda" if there is a GPU, else "cpu". Then it takes seconds: PyTorch loads."""
+    """A device's name, with "auto" resolved: "cuda" if there is a GPU, else "cpu". Finding out loads PyTorch: seconds."""
     if device != "auto":
         return device
     import torch

@@ -150,7 +150,7 @@ def run_python(code: str, **environment: str) -> str:
 def test_a_cpu_whose_byte_products_saturate_finds_the_same(instructions: str) -> None:
     """oneDNN is told to leave out this CPU's newer instructions."""
     code = (
-        "from labelling import test_matching as tests\n"
+        "from features import test_matching as tests\n"
         "for make in (tests.random_descriptors, tests.extreme_descriptors, tests.sift_like_descriptors):\n"
         "    for n, k in ((3, 1), (64, 17), (70, 5), (1000, 300)):\n"
         "        tests.assert_nearest_two('cpu', make(k, seed=1), make(n))\n"
@@ -163,7 +163,7 @@ def test_a_thread_keeps_to_the_cores_it_was_told() -> None:
     """Of four cores, to which OpenMP would start three threads from each thread that multiplies."""
     code = (
         "import os, threading, torch\n"
-        "from labelling.test_matching import DescriptorMatcher, random_descriptors\n"
+        "from features.test_matching import DescriptorMatcher, random_descriptors\n"
         "torch.set_num_threads(1)\n"
         "matcher = DescriptorMatcher(random_descriptors(5000))\n"
         "before = len(os.listdir('/proc/self/task'))\n"

@@ -113,7 +113,7 @@ def train_variants(
 
 def learner_of(variant: str) -> Learner:
     """How a variant of `LEARNERS` learns."""
-    module = import_module(f"wheretolook.learning.{variant}")  # some take long to load
+    module = import_module(f"wheretolook.methods.{variant}.learn")  # some take long to load
     learner: Learner = getattr(module, f"learn_{variant}")
     return learner
 

@@ -127,10 +127,11 @@ class Showcase(Scene):
         """How much of everything there is, as a sentence."""
         n_locations = self.table["location_id"].nunique()
         cameras = "" if self.mapping_poses is None else f" of {len(self.mapping_poses)} images"
+        good = is_good(self.table).mean()
         return (
-            f"**{self.name}**: {len(self.mesh.triangles):,} triangles; a map{cameras} with "
-            f"{len(self.landmarks):,} landmarks; {len(self.table):,} labelled viewpoints at {n_locations} locations, of "
-            f"which {is_good(self.table).mean():.0%} localize."
+            f"**{self.name}**: {len(self.mesh.triangles):,} triangles; a map{cameras} with {len(self.landmarks):,} "
+            f"landmarks; {len(self.table):,} labelled viewpoints at {n_locations} locations, of which {good:.0%} "
+            "localize."
         )
 
     def viewpoints(self, location_id: int) -> pd.DataFrame:

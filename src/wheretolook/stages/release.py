@@ -69,7 +69,7 @@ def release(experiment: Experiment, say: Say = print, tick: Tick = lambda work: 
 
 
 def release_settings(experiment: Experiment) -> dict[str, Any]:
-    """The settings that decide what a dataset holds, as JSON values. Meshes go by name: paths mean nothing elsewhere."""
+    """Settings that decide what a dataset holds, as JSON values. Meshes go by name: paths mean nothing elsewhere."""
     meshes = [{"name": mesh.scene_name, "split": mesh.split, "up": mesh.up} for mesh in experiment.scenes.meshes]
     settings = {
         "camera": asdict(experiment.camera),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 def resolve_device(device: str) -> str:
-    """A device's name, with "auto" resolved: "cuda" if there is a GPU, else "cpu". Finding out loads PyTorch: seconds."""
+    """A device's name, with "auto" resolved: "cuda" if there is a GPU, else "cpu". Finding out loads PyTorch."""
     if device != "auto":
         return device
     import torch

@@ -17,7 +17,7 @@ from synthetic_dataset import CAMERA, make_dataset
 from wheretolook import stages
 from wheretolook.cli import main, parse_experiment
 from wheretolook.config import Experiment, MeshSource, ScenesConfig
-from wheretolook.dataset.folders import RELEASE, Dataset
+from wheretolook.dataset.folders import RELEASE, RELEASE_FILE, Dataset
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.report import score_markdown
 from wheretolook.learning.config import TrainConfig
@@ -30,6 +30,7 @@ from wheretolook.methods.trees.config import TreesConfig
 from wheretolook.release import copy as releases
 from wheretolook.release.card import release_card
 from wheretolook.stages.evaluate import evaluate_methods as evaluate
+from wheretolook.stages.release import release_settings
 from wheretolook.stages.train import train_variants as train
 from wheretolook.utils.errors import ConfigError, StorageError, TableError, WeightsError
 from wheretolook.utils.files import write_json
@@ -62,6 +63,10 @@ def experiment_of(folder: Path, name: str = "tiny") -> Experiment:
         scenes=ScenesConfig(train=2, test=2, seed=70), evaluate=EvaluateConfig(resamples=100, top_n=(1, 5)),
         tracking=TrackingConfig(str(folder / "mlruns")),
     )  # fmt: skip
+
+
+def card_of(release: Dataset) -> str:
+    return release_card(release, release_settings(Experiment()))
 
 
 @pytest.fixture(scope="module")
@@ -122,8 +127,9 @@ def test_a_release_leaves_matches_out(tmp_path: Path) -> None:
             rows = [np.arange(n, dtype=np.int32) for n in table["n_inliers"]]
             write_table(table.assign(matched_rows=rows, inlier_rows=rows), scene.table)
             write_json(scene.label_manifest, {**json.loads(scene.label_manifest.read_text()), "store_matches": True})
-        copy = releases.copy_dataset(dataset, experiment_of(tmp_path / name))
-        releases_of.append({name: content for name, content in contents(copy.root).items() if name != releases.ABOUT})
+        root, settings = tmp_path / name / "data" / "release", release_settings(experiment_of(tmp_path / name))
+        copy = releases.copy_dataset(dataset, root, settings)
+        releases_of.append({name: content for name, content in contents(copy.root).items() if name != RELEASE_FILE})
     assert releases_of[0] == releases_of[1]
 
 
@@ -195,7 +201,7 @@ def test_what_is_best_of_all_ships_beside_the_network(folder: Path, tmp_path: Pa
     assert {"mlp", "set"} <= {*scores["method"]} and "trees" not in {*scores["method"]}
     assert {"mlp", "set", "trees"} <= {*variants["method"]}
     card = (root / "README.md").read_text()
-    assert card == release_card(release)
+    assert card == card_of(release)
     for said in (f"{network.name} and set.safetensors", "set of landmarks; and of the paper's best network", "0.9999"):
         assert said in card, said
     scorer = load_scorer(root / "weights", release.scenes[0].localization_map(release.camera))
@@ -250,20 +256,20 @@ def test_the_card_tells_what_lies_there(folder: Path, monkeypatch: pytest.Monkey
     table = root / "results" / "generalization.csv"
     elsewhere.assign(weights_sha256=releases.sha256(weights)).to_csv(table, index=False)
     (root / "results" / "generalization.md").write_text("Scans are from here, halls from there.\n")
-    longer = release_card(release)
+    longer = card_of(release)
     assert "Localization score on scans" in longer and "Localization score on halls" in longer
     assert "Scans are from here" in longer
     assert "on other datasets" not in card
     elsewhere.assign(weights_sha256="0" * 64).to_csv(table, index=False)  # of weights that shipped before
-    assert release_card(release) == card
+    assert card_of(release) == card
 
 
 def test_scenes_made_by_others_keep_their_licence(folder: Path) -> None:
     experiment = experiment_of(folder)
     scenes = ScenesConfig(train=1, test=0, meshes=(MeshSource(Path("/secret/place/scan.glb")),))
     stages.release(replace(experiment, scenes=scenes), say=quiet)
-    assert "secret" not in (folder / "data" / "release" / releases.ABOUT).read_text()
-    card = release_card(Dataset.load(folder / "data" / "release"))
+    assert "secret" not in (folder / "data" / "release" / RELEASE_FILE).read_text()
+    card = card_of(Dataset.load(folder / "data" / "release"))
     assert "made by others (scan)" in card and "secret" not in card
 
 
@@ -285,7 +291,7 @@ def test_other_data_is_not_overwritten(folder: Path) -> None:
     with pytest.raises(ConfigError, match=r"of another dataset than another \(got 'tiny'\)"):
         stages.release(experiment_of(folder, "another"), say=quiet)
     assert contents(folder / "data" / "release") == before
-    (folder / "data" / "release" / releases.ABOUT).unlink()
+    (folder / "data" / "release" / RELEASE_FILE).unlink()
     with pytest.raises(ConfigError, match="no release and would be overwritten"):
         stages.release(experiment_of(folder), say=quiet)
 
@@ -298,7 +304,7 @@ def test_what_is_missing_is_named(folder: Path, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.undo()
     (root / "results" / "scores.csv").unlink()
     with pytest.raises(TableError, match=r"no scores.*evaluate|scores\.csv"):
-        release_card(Dataset.load(root))
+        card_of(Dataset.load(root))
     shutil.copyfile(next((root / "weights").glob("*.safetensors")), root / "weights" / "mlp-2d+3d.safetensors")
     with pytest.raises(WeightsError, match=r"mlp-2d\+3d\.json"):
         stages.release(experiment, say=quiet)
@@ -341,7 +347,7 @@ def shipped() -> Dataset:
 
 
 def test_the_shipped_card_is_of_what_ships(shipped: Dataset) -> None:
-    assert (shipped.root / releases.CARD).read_text() == release_card(shipped)
+    assert (shipped.root / releases.CARD).read_text() == card_of(shipped)
     assert sum(releases.sizes(shipped.root).values()) < releases.MAX_BYTES
     tables = [scene.read_table() for scene in shipped.split("train")]
     assert sum(map(len, tables)) > 200_000

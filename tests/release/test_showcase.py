@@ -21,7 +21,7 @@ from wheretolook.methods.base import Scorer
 from wheretolook.methods.mlp.network import NetworkSpec, ViewpointNetwork
 from wheretolook.methods.mlp.score import LearnedScorer
 from wheretolook.methods.visible import VisibleScorer
-from wheretolook.release.showcase import Showcase, open_showcase, shares_good
+from wheretolook.release.showcase import Showcase, open_showcase
 from wheretolook.release.showcase_figures import (
     binned_image_of,
     learning_of,
@@ -37,6 +37,7 @@ from wheretolook.space.config import FreeSpaceConfig
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.viewpoints.config import SampleConfig
+from wheretolook.viewpoints.locations import shares_good
 from wheretolook.viewpoints.sampling import free_locations, sample_viewpoints
 from wheretolook.viewpoints.table import (
     LOCALIZED,
@@ -108,7 +109,7 @@ class UpScorer(Scorer):
 
 
 def test_the_scene_is_the_one_that_was_sampled(showcase: Showcase) -> None:
-    assert showcase.scene.name == "apartment-003" and showcase.keep == 100
+    assert showcase.name == "apartment-003" and showcase.keep == 100
     assert len(showcase.directions) == SAMPLING.directions
     assert set(showcase.table["location_id"]) <= set(showcase.free)
     centers = camera_centers(poses(showcase.table))

@@ -18,7 +18,6 @@ import pytest
 from wheretolook import labelling, stages
 from wheretolook.cli import main, parse_experiment
 from wheretolook.dataset.folders import Dataset
-from wheretolook.dataset.scene import space_and_occlusion
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.colmap_camera import ColmapCamera
 from wheretolook.geometry.poses import camera_centers
@@ -29,6 +28,7 @@ from wheretolook.methods.registry import load_scorer
 from wheretolook.planning.path_comparison import draw_pairs
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.space.tsdf_space import TsdfSpace
+from wheretolook.stages.inputs import open_scene
 from wheretolook.utils.errors import TableError
 from wheretolook.utils.files import fingerprint
 from wheretolook.utils.tracking import artifact, client, newest_run
@@ -396,13 +396,13 @@ def test_paths_keep_clear_of_what_depth_images_saw(copy: Path, tmp_path: Path) -
     assert experiment is not None
     dataset = Dataset.load(experiment.root)
     scene = dataset.split("test")[0]
-    by_mesh, _ = space_and_occlusion(scene, dataset.camera, experiment, experiment.occlusion, free_by_tsdf=False)
-    space, hides = space_and_occlusion(scene, dataset.camera, experiment, experiment.occlusion)
-    assert type(by_mesh) is FreeSpace and isinstance(space, TsdfSpace) and hides.name == "tsdf"
+    opened = open_scene(experiment, dataset, scene)
+    by_mesh, space = opened.sampled_space, opened.space
+    assert type(by_mesh) is FreeSpace and isinstance(space, TsdfSpace) and opened.occlusion.name == "tsdf"
     points = np.random.default_rng(0).uniform(*by_mesh.bounds, (4000, 3))
     free, expected = space.is_free(points), by_mesh.is_free(points)
     assert free.sum() > 100 and expected[free].mean() > 0.95 and free[expected].mean() < 1
-    assert not free[by_mesh._raycaster.distance_to_surface(points, 1.0) < 0.25 - 2 * experiment.occlusion.voxel_m].any()
+    assert not free[by_mesh.raycaster.distance_to_surface(points, 1.0) < 0.25 - 2 * experiment.occlusion.voxel_m].any()
     way = draw_pairs(space, replace(experiment.paths, pairs=1, min_distance_m=0.5))[0]
     ends = ["--start", str(way[0].tolist()), "--goal", str(way[1].tolist()), "--out", str(tmp_path / "way")]
     rest = ["--scene", scene.name, "--method", "forward", "--film", "none", "--plan.planner.time_s", "1"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -71,6 +72,40 @@ class VoxelGrid:
         return np.where(inside, (index[..., 0] * ny + index[..., 1]) * nz + index[..., 2], -1)
 
 
+@dataclass(frozen=True)
+class ViewLattice:
+    """The views that are looked at in a scene: a grid of locations, and the same directions at each of them.
+
+    Args:
+        grid: voxels along x, y and z over the scene's bounds.
+        directions: directions at each location.
+        lattice: how they are spread: "fibonacci" is even, "azimuth-elevation" is the paper's comparison, "released" is
+            what the released code does, "yaw-pitch" are ActLoc's 6 pitches x 18 yaws, whatever `directions` says.
+
+    Raises:
+        ConfigError: no voxel, no direction, or no such lattice.
+    """
+
+    grid: tuple[int, int, int] = (8, 8, 8)
+    directions: int = 500
+    lattice: Lattice = "fibonacci"
+
+    def __post_init__(self) -> None:
+        if min(self.grid) < 1:
+            raise ConfigError("grid needs at least one voxel along every axis", value=self.grid)
+        _positive(self.directions)
+        if self.lattice not in LATTICES:
+            raise ConfigError("unknown lattice", value=self.lattice, fix=f"Use one of {', '.join(LATTICES)}.")
+
+    def voxels(self, bounds: ArrayLike) -> VoxelGrid:
+        """The grid over a scene's bounds (2, 3): lowest and highest corner in metres."""
+        return VoxelGrid.over(bounds, self.grid)
+
+    def axes(self) -> Float:
+        """The directions, (D, 3) unit vectors in the world."""
+        return direction_lattice(self.directions, self.lattice)
+
+
 def fibonacci_sphere(n: int) -> Float:
     """Spherical Fibonacci lattice: n unit vectors (n, 3), from +z to -z, spread almost evenly (González 2010).
 
@@ -128,15 +163,18 @@ def direction_lattice(n: int, lattice: Lattice = "fibonacci") -> Float:
 
     m = n, except for "azimuth-elevation", where it is the nearest product, and "yaw-pitch", which are ActLoc's 108.
     """
-    lattices = {
-        "fibonacci": fibonacci_sphere,
-        "azimuth-elevation": azimuth_elevation_lattice,
-        "released": released_lattice,
-        "yaw-pitch": lambda n: axes_of_angles(yaw_pitch_angles()),
-    }
-    if lattice not in lattices:
-        raise ConfigError("unknown lattice", value=lattice, fix=f"Use one of {', '.join(lattices)}.")
-    return lattices[lattice](n)
+    if lattice not in LATTICES:
+        raise ConfigError("unknown lattice", value=lattice, fix=f"Use one of {', '.join(LATTICES)}.")
+    return LATTICES[lattice](n)
+
+
+LATTICES: dict[str, Callable[[int], Float]] = {
+    "fibonacci": fibonacci_sphere,
+    "azimuth-elevation": azimuth_elevation_lattice,
+    "released": released_lattice,
+    "yaw-pitch": lambda n: axes_of_angles(yaw_pitch_angles()),
+}
+"""What makes the directions of each `Lattice`."""
 
 
 def _positive(n: int) -> int:

@@ -69,14 +69,12 @@ class LocalizationMap:
         )
         occlusion = occlusion or NoOcclusion()
         if mesh is not None:
-            from wheretolook.rendering.raycasting import MeshRaycaster
             from wheretolook.scenes.loading import load_mesh
             from wheretolook.space.free_space import FreeSpace
             from wheretolook.visibility.occlusion import MeshOcclusion
 
-            loaded = load_mesh(Path(mesh))
-            two_sided = FreeSpace(loaded, device=device).two_sided
-            occlusion = MeshOcclusion(MeshRaycaster(loaded, device), two_sided=two_sided)
+            space = FreeSpace(load_mesh(Path(mesh)), device=device)
+            occlusion = MeshOcclusion(space.raycaster, two_sided=space.two_sided)
         return cls(landmarks, camera, occlusion, device, colmap_poses(model, reconstruction).astype(np.float32))
 
     def bin_views(self, cam_from_world: Float, bins: int = 30, landmark_channels: bool = False) -> BinnedViews:

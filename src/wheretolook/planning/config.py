@@ -7,12 +7,12 @@ from math import inf, isfinite
 from pathlib import Path
 from typing import Literal
 
-from wheretolook.geometry.lattices import Lattice
+from wheretolook.geometry.lattices import ViewLattice
 from wheretolook.utils.errors import ConfigError
 
 
 @dataclass(frozen=True)
-class ViewpointMapConfig:
+class ViewpointMapConfig(ViewLattice):
     """What a viewpoint map is made of.
 
     Args:
@@ -22,20 +22,15 @@ class ViewpointMapConfig:
         weights: file of weights that the train stage wrote, for a method that has learnt. Unless a method is named,
             the best of the dataset, or else of the release, for cameras with their field of view.
         out: folder to write; empty for `<data>/<name>/<scene>/viewpoint-map`. Only with a scene.
-        grid: voxels along x, y and z over the scene's bounds.
-        directions: directions at each voxel.
-        lattice: how they are spread: fibonacci is even; yaw-pitch are ActLoc's 6 x 18, whatever `directions` says.
     """
 
     scene: str = ""
     method: str = ""
     weights: Path | None = None
     out: Path | None = None
-    grid: tuple[int, int, int] = (8, 8, 8)
-    directions: int = 500
-    lattice: Lattice = "fibonacci"
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.out is not None and not self.scene:
             raise ConfigError("viewpoint_map.out is the folder of one scene", value=str(self.out), fix="Name a scene.")
 
@@ -80,7 +75,7 @@ class PathConfig:
 
 
 @dataclass(frozen=True)
-class PathsConfig:
+class PathsConfig(ViewLattice):
     """How methods are compared by planned paths.
 
     Args:
@@ -93,9 +88,6 @@ class PathsConfig:
             --list-methods`. Scores that are no probabilities enter by their ranks.
         weights: file of weights, for a method that has learnt. By default, and for methods of another kind, the best of
             each method in the dataset, or else in the release.
-        grid: voxels of the viewpoint maps along x, y and z.
-        directions: directions at each voxel.
-        lattice: how they are spread: fibonacci is even; yaw-pitch are ActLoc's 6 x 18, whatever `directions` says.
         max_turn_deg: along a path that is given, the camera turns by no more from one waypoint to the next.
         max_error_m: a view is good if it localizes with a smaller error of its position.
         max_error_deg: and with a smaller error of its orientation.
@@ -110,9 +102,6 @@ class PathsConfig:
     height_m: tuple[float, float] = (1.2, 1.6)
     methods: tuple[str, ...] = ("forward", "fisher-trace-gp", "set")
     weights: Path | None = None
-    grid: tuple[int, int, int] = (8, 8, 8)
-    directions: int = 500
-    lattice: Lattice = "fibonacci"
     max_turn_deg: float = 30.0
     max_error_m: float = 0.25
     max_error_deg: float = 2.0
@@ -120,16 +109,8 @@ class PathsConfig:
     planner: PathConfig = field(default_factory=PathConfig)
 
     def __post_init__(self) -> None:
-        positive = (
-            "pairs",
-            "min_distance_m",
-            "directions",
-            "max_turn_deg",
-            "max_error_m",
-            "max_error_deg",
-            "resamples",
-        )
-        for name in positive:
+        super().__post_init__()
+        for name in ("pairs", "min_distance_m", "max_turn_deg", "max_error_m", "max_error_deg", "resamples"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"{name} must be positive", value=getattr(self, name))
         if not 0 < self.height_m[0] <= self.height_m[1]:
@@ -139,7 +120,7 @@ class PathsConfig:
 
 
 @dataclass(frozen=True)
-class PlanConfig:
+class PlanConfig(ViewLattice):
     """A path to plan, and what to write about it.
 
     Args:
@@ -153,9 +134,6 @@ class PlanConfig:
         against: further methods to plan by, drawn beside it. As `methods.png`, such as "forward" and "fisher-trace-gp".
         film: kind of film to make: gif, mp4 or none.
         rerun: write a recording for the Rerun viewer too (needs `pip install rerun-sdk`).
-        grid: voxels of the viewpoint map along x, y and z.
-        directions: directions at each voxel.
-        lattice: how they are spread, fibonacci or yaw-pitch.
         planner: costs and limits of the path, time to plan.
     """
 
@@ -168,12 +146,10 @@ class PlanConfig:
     against: tuple[str, ...] = ()
     film: Literal["gif", "mp4", "none"] = "gif"
     rerun: bool = False
-    grid: tuple[int, int, int] = (8, 8, 8)
-    directions: int = 500
-    lattice: Lattice = "fibonacci"
     planner: PathConfig = field(default_factory=PathConfig)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.film not in ("gif", "mp4", "none"):
             raise ConfigError("unknown kind of film", value=self.film, fix="Use gif, mp4 or none.")
         for name in ("start", "goal"):

@@ -8,7 +8,6 @@ from pathlib import Path
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.mapping.building import build_map
 from wheretolook.mapping.config import MapConfig
-from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.config import ApartmentConfig
 from wheretolook.scenes.loading import load_mesh, save_glb
@@ -53,9 +52,17 @@ def make_example_model(
     example = ExampleModel(folder / "model", folder / "scan.glb")
     save_glb(generate_apartment(apartment, seed), example.scan)
     mesh = load_mesh(example.scan)
-    config = MapConfig(n_images=n_images)
+    space, config = FreeSpace(mesh), MapConfig(n_images=n_images)
     build_map(
-        mesh, WarpRenderer(mesh), FreeSpace(mesh), camera, config, seed, example.model, MeshRaycaster(mesh), workers=1,
+        mesh,
+        WarpRenderer(mesh),
+        space,
+        camera,
+        config,
+        seed,
+        example.model,
+        space.raycaster,
+        workers=1,
         progress=False,
-    )  # fmt: skip
+    )
     return example

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.dataset.folders import Dataset
+from wheretolook.dataset.scene import Scene
 from wheretolook.figures.inputs import BinnedImage
 from wheretolook.figures.overview import View
 from wheretolook.figures.peaks import spread_extrema
@@ -164,13 +166,28 @@ def peaks_of(showcase: Showcase, scorer: Scorer, location_id: int, n: int = 3, a
 
     def views(highest: bool) -> tuple[View, ...]:
         found = spread_extrema(axes, scores, n, apart_deg, highest)
-        shown = zip(showcase.render(looked[found]), found, strict=True)
-        return tuple(View(rgb, axes[row], float(scores[row]), outcome_in_brief(rows.iloc[row])) for rgb, row in shown)
+        return rendered_views(showcase, rows.iloc[found], scores[found], outcome_in_brief)
 
     known = (rows["status"] != UNLABELLED).to_numpy()
     everywhere = score_directions(scorer, showcase.center(location_id), showcase.directions)[0]
     tried = axes[known], is_good(rows[known])
     return Peaks(showcase.directions, everywhere, views(True), views(False), tried)
+
+
+def rendered_views(
+    scene: Scene, rows: pd.DataFrame, scores: Float, words: Callable[[pd.Series], str]
+) -> tuple[View, ...]:
+    """Viewpoints with what a camera sees there and what became of it.
+
+    Args:
+        scene: with a mesh.
+        rows: B labelled viewpoints of it.
+        scores: (B,).
+        words: says in words how a row's label came out.
+    """
+    looked = poses(rows)
+    seen = zip(scene.renderer.render(scene.camera, looked).rgb, looked, scores, range(len(rows)), strict=True)
+    return tuple(View(rgb, pose[2, :3], float(score), words(rows.iloc[row])) for rgb, pose, score, row in seen)
 
 
 PLANNED_BY = ("forward", "fisher-trace-gp", "set")
@@ -191,13 +208,10 @@ def planned_views(
         methods: names on the command line.
         config: grid and directions of the viewpoint maps, and of the paths.
     """
-    one = showcase.localization_map
     pairs = draw_pairs(showcase.space, PathsConfig(pairs=10))
     start, goal = pairs[np.linalg.norm(pairs[:, 1] - pairs[:, 0], axis=1).argmax()]
-    paths = plan_by_methods(
-        methods, start, goal, showcase.scene, dataset, showcase.space, one.occlusion, config=config, device=one.device
-    )
-    return {name: path_views(path, one) for name, path in paths.items()}
+    paths = plan_by_methods(showcase, dataset, methods, start, goal, config)
+    return {name: path_views(path, showcase.localization_map) for name, path in paths.items()}
 
 
 def _survey(showcase: Showcase, locations: Float) -> Survey:

@@ -21,6 +21,7 @@ class FreeSpace:
         device: "cpu" or a CUDA device.
 
     Attributes:
+        raycaster: the mesh, for rays and distances.
         bounds: (2, 3) metres, lowest and highest corner of the scene.
         two_sided: whether both sides of a triangle count as a surface.
 
@@ -31,7 +32,7 @@ class FreeSpace:
     def __init__(self, mesh: TexturedMesh, config: FreeSpaceConfig | None = None, device: str = "cpu") -> None:
         self.config = config or FreeSpaceConfig()
         self.bounds = mesh.bounds
-        self._raycaster = MeshRaycaster(mesh, device)
+        self.raycaster = MeshRaycaster(mesh, device)
         normals = mesh.normals
         length = np.linalg.norm(normals, axis=1)
         self._level = np.abs(normals[:, 2]) > 0.5 * np.where(length > 0, length, np.inf)
@@ -52,7 +53,7 @@ class FreeSpace:
         at = np.asarray(points, dtype=np.float64).reshape(-1, 3)
         free = ((at >= self.bounds[0]) & (at <= self.bounds[1])).all(axis=1)  # the cheap tests first
         clearance_m = self.config.clearance_m
-        free[free] = self._raycaster.distance_to_surface(at[free], clearance_m) >= clearance_m
+        free[free] = self.raycaster.distance_to_surface(at[free], clearance_m) >= clearance_m
         free[free] = np.isfinite(self.floor_below(at[free]))
         free[free] = self._is_enclosed(at[free])
         return free
@@ -67,13 +68,13 @@ class FreeSpace:
         """
         start, end = (np.asarray(points, dtype=np.float64).reshape(-1, 3) for points in (a, b))
         free = self.is_free(start) & self.is_free(end)
-        free[free] = self._raycaster.segments_are_clear(start[free], end[free], self.config.clearance_m)
+        free[free] = self.raycaster.segments_are_clear(start[free], end[free], self.config.clearance_m)
         return free
 
     def floor_below(self, points: ArrayLike) -> NDArray[np.float64]:
         """Height z (N,) of the floor below points (N, 3) metres; NaN where `is_free` would find none."""
         at = np.asarray(points, dtype=np.float64).reshape(-1, 3)
-        hits = self._raycaster.cast(at, np.broadcast_to((0.0, 0.0, -1.0), at.shape))
+        hits = self.raycaster.cast(at, np.broadcast_to((0.0, 0.0, -1.0), at.shape))
         near = hits.distance_m <= self.config.max_floor_drop_m
         is_floor = near & self._level[hits.triangle] & (hits.front | self.two_sided)
         return np.where(is_floor, at[:, 2] - hits.distance_m, np.nan)
@@ -90,7 +91,7 @@ class FreeSpace:
         """Hits (N, 34) of rays in all directions; the 16 level ones come first."""
         directions = _around()
         shape = (len(points), len(directions))
-        hits = self._raycaster.cast(np.repeat(points, shape[1], axis=0), np.tile(directions, (shape[0], 1)))
+        hits = self.raycaster.cast(np.repeat(points, shape[1], axis=0), np.tile(directions, (shape[0], 1)))
         return RayHits(hits.distance_m.reshape(shape), hits.triangle.reshape(shape), hits.front.reshape(shape))
 
     def _sees_fronts(self) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal, get_args
 
-from wheretolook.geometry.lattices import Lattice
+from wheretolook.geometry.lattices import ViewLattice
 from wheretolook.utils.errors import ConfigError
 
 Split = Literal["train", "val", "test"]
@@ -13,14 +13,10 @@ Split = Literal["train", "val", "test"]
 
 
 @dataclass(frozen=True)
-class SampleConfig:
+class SampleConfig(ViewLattice):
     """Settings of the sample stage.
 
     Args:
-        grid: voxels along x, y and z over the scene's bounds; the paper has 8 x 8 x 8.
-        directions: directions at each location; the released code has 500.
-        lattice: how they are spread: "fibonacci" is even, "azimuth-elevation" is the paper's comparison, "released" is
-            what the released code does, "yaw-pitch" are ActLoc's 6 pitches x 18 yaws, whatever `directions` says.
         keep: directions kept at each location, those that see most landmarks; 0 keeps all. The paper's K.
         min_visible: directions that see fewer landmarks are dropped. In the paper, those with "none or only a minimal
             number" (Sec. 3.2).
@@ -35,9 +31,6 @@ class SampleConfig:
         memory_gb: bound on the memory that counting takes on its device, in 10^9 bytes; two million landmarks fit.
     """
 
-    grid: tuple[int, int, int] = (8, 8, 8)
-    directions: int = 500
-    lattice: Lattice = "fibonacci"
     keep: int = 100
     min_visible: int = 1
     max_locations: int = 0
@@ -47,6 +40,7 @@ class SampleConfig:
     memory_gb: float = field(default=2.0, init=False)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name in ("keep", "min_visible", "max_locations"):
             if getattr(self, name) < 0:
                 raise ConfigError(f"sample.{name} must not be negative", value=getattr(self, name))

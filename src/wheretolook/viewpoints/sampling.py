@@ -9,7 +9,7 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.geometry.lattices import VoxelGrid, direction_lattice
+from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import poses_looking_along, rotation_looking_along
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.utils.errors import SceneError
@@ -76,7 +76,7 @@ def sample_viewpoints(
     rng = np.random.default_rng(config.seed)
     ids = np.sort(_subset(np.asarray(location_ids, dtype=np.int64), config.max_locations, rng))
     locations = grid.centers()[ids]
-    directions = direction_lattice(config.directions, config.lattice)
+    directions = config.axes()
     rotations, memory_bytes = rotation_looking_along(directions), round(config.memory_gb * 1e9)
     seen = survey(
         camera,

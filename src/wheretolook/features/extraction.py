@@ -1,4 +1,4 @@
-"""SIFT keypoints and descriptors. The same extractor serves the images of the map and the queries."""
+"""Extraction of SIFT keypoints and descriptors, for the images of the map and for queries alike."""
 
 from __future__ import annotations
 
@@ -17,11 +17,9 @@ from wheretolook.utils.processes import Processes
 
 
 class KeypointExtractor:
-    """Extracts SIFT keypoints, on one CPU core or a GPU.
+    """Extracts SIFT keypoints on one CPU core or on a CUDA device.
 
-    Args:
-        config: see `ExtractorConfig`.
-        device: "cpu" or a CUDA device. COLMAP's SIFT runs on the CPU in any case: on a GPU it is not repeatable.
+    COLMAP's SIFT always runs on the CPU, since its GPU version is not repeatable.
     """
 
     def __init__(self, config: ExtractorConfig | None = None, device: str = "cpu") -> None:
@@ -35,41 +33,31 @@ class KeypointExtractor:
             self._extractor = _colmap_sift(self.config) if self.config.method == "colmap" else _opencv_sift(self.config)
 
     def extract(self, rgb: NDArray[np.uint8]) -> Keypoints:
-        """Extract keypoints of one image.
-
-        Args:
-            rgb: (H, W, 3) uint8.
-
-        Returns:
-            At most `max_keypoints` keypoints, in an order that depends on the image alone.
+        """Extract at most `max_keypoints` keypoints of an image (H, W, 3) uint8, in an order that depends on it alone.
 
         Raises:
-            ValueError: when the image is not (H, W, 3) uint8.
+            ValueError: the image has another shape or type.
         """
         return self.extract_batch([rgb])[0]
 
     def extract_batch(self, images: Sequence[NDArray[np.uint8]]) -> list[Keypoints]:
-        """Extract keypoints of images (H, W, 3) uint8 of one size, at once if this is on a GPU. See `extract`."""
+        """Extract keypoints of images (H, W, 3) uint8 of one size, on a GPU all at once. See `extract`."""
         grey = [_grey(rgb) for rgb in images]
         if self.on_gpu:
-            found: list[Keypoints] = self._extractor.extract_many(np.stack([one.to_array() for one in grey]))
+            found: list[Keypoints] = self._extractor.extract_many(np.stack([image.to_array() for image in grey]))
             return found
         if self.config.method == "colmap":
-            return [self._extract_colmap(one) for one in grey]
-        return [self._extract_opencv(one.to_array()) for one in grey]
+            return [self._extract_colmap(image) for image in grey]
+        return [self._extract_opencv(image.to_array()) for image in grey]
 
     def extract_many(
         self, images: Iterable[NDArray[np.uint8]], workers: int | Processes = 1
     ) -> Generator[Keypoints, None, None]:
-        """Extract keypoints of many images, in processes of their own (pycolmap's extractor holds Python's lock), or
-        in batches on a GPU.
+        """Extract keypoints of many images (H, W, 3) uint8, in worker processes, or in batches on a GPU.
 
-        Args:
-            images: each (H, W, 3) uint8; read only a few images ahead of what is returned.
-            workers: processes, or how many to spawn; 1 stays in this one.
-
-        Yields:
-            Keypoints in the order of the images, the same whatever the number of workers.
+        Images are read only a few ahead of what is returned, and the keypoints come in their order, the same for any
+        number of workers. `workers` are processes (pycolmap's extractor holds Python's lock), or how many to spawn; 1
+        works in this process.
         """
         if self.on_gpu:
             source = iter(images)
@@ -87,7 +75,7 @@ class KeypointExtractor:
         if len(keypoints) == 0:
             return Keypoints.none()
         table = np.array([(k.x, k.y, k.compute_scale()) for k in keypoints], dtype=np.float32)
-        # COLMAP's own cap keeps whole scale levels from the largest down, so it can overshoot; cut what is beyond.
+        # COLMAP keeps whole scale levels, from the largest down, so there can be more than the limit.
         keep = np.argsort(-table[:, 2], kind="stable")[: self.config.max_keypoints]
         return Keypoints(table[keep, :2], unit_descriptors(descriptors.data[keep]), table[keep, 2])
 
@@ -110,7 +98,7 @@ _GPU_BATCH = 8
 
 
 def _grey(rgb: NDArray[np.uint8]) -> Any:
-    """COLMAP's own conversion to grey (Rec. 709 weights): with other weights other keypoints pass the thresholds."""
+    """Convert to grey as COLMAP does (Rec. 709 weights); with other weights other keypoints pass the thresholds."""
     import pycolmap
 
     if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3:

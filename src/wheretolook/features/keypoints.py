@@ -1,4 +1,4 @@
-"""Keypoints with their descriptors, and how they are extracted: settings and results."""
+"""Settings of the keypoint extractor, and its result: keypoints with their descriptors."""
 
 from __future__ import annotations
 
@@ -16,11 +16,12 @@ class ExtractorConfig:
     """Settings of the keypoint extractor.
 
     Args:
-        method: whose SIFT to run. `opencv` finds nearly the same keypoints as `colmap`, COLMAP's own extraction on the
-            CPU, in 40 % of the time; on a GPU, Warp kernels find OpenCV's up to rounding.
+        method: implementation of SIFT. `opencv` finds nearly the same keypoints as `colmap`, COLMAP's extraction on the
+            CPU, in 40 % of the time; on a GPU, Warp kernels find OpenCV's keypoints up to rounding.
         first_octave: -1 doubles the image first, which gives about three times as many (and smaller) keypoints, for
             `colmap` at four times the cost; 0 starts at the image's own size. COLMAP's default is -1.
-        max_keypoints: the most keypoints kept an image. `colmap` prefers large scales, `opencv` strong contrast.
+        max_keypoints: largest number of keypoints for each image. `colmap` prefers large scales, `opencv` strong
+            contrast.
         peak_threshold: least contrast (difference of Gaussians, grey values in [0, 1]). COLMAP's default is 0.02 / 3.
         edge_threshold: largest ratio of principal curvatures (Lowe 2004, section 4.1).
     """
@@ -39,9 +40,8 @@ class ExtractorConfig:
         if self.max_keypoints < 1:
             raise ConfigError("max_keypoints must be positive", value=self.max_keypoints)
         if not (self.peak_threshold > 0 and self.edge_threshold > 0):
-            raise ConfigError(
-                "peak_threshold and edge_threshold must be positive", value=(self.peak_threshold, self.edge_threshold)
-            )
+            thresholds = (self.peak_threshold, self.edge_threshold)
+            raise ConfigError("peak_threshold and edge_threshold must be positive", value=thresholds)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""The two landmarks nearest to each keypoint's descriptor, exactly, by one matrix product."""
+"""Matching of keypoints with landmarks: exact nearest neighbours among descriptors, by matrix products."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ Matches = tuple[NDArray[np.int64], NDArray[np.int64]]
 """Rows of keypoints and rows of their landmarks, (M,) each, in ascending order of the keypoints."""
 
 GROUP = 32
-"""Landmarks whose best is found first; the two best of all are then looked for in the two best groups."""
+"""Landmarks are searched in groups of this size: the two nearest ones are always in the two best groups."""
 
 _PRODUCT_BYTES = {"cpu": 2**22, "cuda": 2**30}
-"""Size of a block of products: on a CPU it should stay in the cache."""
+"""Size of a block of products; on a CPU it should fit into the cache."""
 
 
 class DescriptorMatcher:
     """Finds nearest neighbours among the landmarks' descriptors.
 
-    Descriptors are compared as COLMAP stores them, in whole numbers, by their scalar products. These are then exact, in
-    eight-bit integers on a CPU as in half precision with single-precision sums on a GPU: both give the same neighbours,
-    and those of one descriptor do not depend on what it is matched together with. `nearest_two_plain` is the twin. A
-    CPU whose byte products saturate works in single precision, where 128 * 255^2 < 2^24 is exact, too.
+    Descriptors are compared by scalar products in whole numbers, as COLMAP stores them. All devices compute them
+    exactly and so find the same neighbours: a CPU in eight-bit integers or, if its byte products saturate, in single
+    precision (128 * 255^2 < 2^24), a GPU in half precision with single-precision sums. `nearest_two_plain` is the plain
+    twin.
 
     Args:
         descriptors: (N, 128) uint8, of the landmarks.
@@ -41,14 +41,14 @@ class DescriptorMatcher:
         padded = -(-max(n, 2 * GROUP) // GROUP) * GROUP
         whole = torch.zeros((padded, length), dtype=torch.int32)
         whole[:n] = torch.from_numpy(descriptors.astype(np.int32))
-        if self._in_bytes:  # in signed bytes: q.d = (q - 128).(d - 128) + 128 (sum of d) + terms of q alone
+        if self._in_bytes:  # in signed bytes: q.d = (q - 128).(d - 128) + 128 (sum of d) + terms that depend on q only
             self._descriptors = (whole - 128).to(torch.int8).T
             self._bias = 128 * whole.sum(1, dtype=torch.int32)
         else:
             number = torch.float32 if self.device.type == "cpu" else torch.float16
             self._descriptors = whole.to(self.device, number).T
             self._bias = torch.zeros(padded, device=self.device)
-        self._bias[n:] = -(2**28)  # rows that only pad are never near
+        self._bias[n:] = -(2**28)  # padding rows are never nearest
 
     def nearest_two(
         self, descriptors: NDArray[np.uint8]
@@ -56,10 +56,10 @@ class DescriptorMatcher:
         """Nearest landmark of each descriptor (K, 128) uint8, and its products with the nearest and second nearest.
 
         Returns:
-            rows (K,), nearest (K,) and second (K,); of several landmarks equally near, `rows` names any. Where there
-            are fewer than two landmarks, what is missing has a product of -2^28.
+            rows (K,), nearest (K,) and second (K,); of several landmarks equally near, `rows` names any. If there are
+            fewer than two landmarks, the missing ones have a product of -2^28.
         """
-        # OpenMP counts by thread: without this, the first product in a new thread would start one thread for each core
+        # OpenMP's number of threads is set in each thread; by default the first product in a new one uses all cores
         torch.set_num_threads(torch.get_num_threads())
         queries = torch.from_numpy(descriptors.astype(np.int32))
         block = max(1, _PRODUCT_BYTES[self.device.type] // (4 * len(self._bias)))
@@ -88,9 +88,9 @@ class DescriptorMatcher:
 
 @cache
 def _byte_products_are_exact() -> bool:
-    """Whether this CPU adds up products of signed bytes without saturation, as it does with VNNI instructions.
+    """Whether this CPU sums products of signed bytes without saturation.
 
-    Without them (AVX2, the first AVX-512) pairs of products are added in 16 bits, and large ones come out wrong.
+    It does so with VNNI instructions; AVX2 and the first AVX-512 add pairs of products in 16 bits, which can overflow.
     """
     left, right = torch.full((64, 128), 127), torch.full((128, 64), 127)
     left[::2], right[:, ::2] = -128, -128
@@ -114,9 +114,8 @@ def nearest_two_plain(
 def match(matcher: DescriptorMatcher, descriptors: Sequence[NDArray[np.uint8]], max_ratio: float) -> list[Matches]:
     """2D-3D matches of several images at once.
 
-    A match passes Lowe's ratio test (IJCV 2004, Sec. 7.1), and a landmark keeps only its nearest keypoint.
-
-    With a single landmark there is no second nearest, so nothing matches.
+    A match passes Lowe's ratio test (IJCV 2004, Sec. 7.1), and a landmark keeps only its nearest keypoint. With a
+    single landmark there is no second nearest one, so nothing matches.
 
     Args:
         matcher: of the landmarks.
@@ -126,11 +125,11 @@ def match(matcher: DescriptorMatcher, descriptors: Sequence[NDArray[np.uint8]], 
     Returns:
         The matches of each image.
     """
-    lengths = [len(one) for one in descriptors]
+    lengths = [len(of_image) for of_image in descriptors]
     if sum(lengths) == 0 or matcher.n_landmarks < 2:
         return [(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)) for _ in descriptors]
     rows, nearest, second = matcher.nearest_two(np.concatenate(descriptors))
-    # squared distances of descriptors of length 512, of which rounding leaves some a little longer
+    # squared distances of descriptors of length 512; rounding makes some a little longer, hence the maximum
     distance, next_distance = (np.maximum(2 * (512**2 - best), 0) for best in (nearest, second))
     passed = distance < max_ratio**2 * next_distance
     ends = np.cumsum(lengths)

@@ -1,16 +1,16 @@
-"""SIFT in Warp, for CUDA: OpenCV's keypoints and descriptors up to rounding, the same bit for bit every time."""
+"""SIFT in Warp, for CUDA: OpenCV's keypoints and descriptors up to rounding, with bit-identical repetitions."""
 
 from __future__ import annotations
 
 import math
 from itertools import pairwise
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from wheretolook.features.keypoints import Keypoints
+from wheretolook.features.keypoints import ExtractorConfig, Keypoints
 from wheretolook.features.warp_sift_description_kernels import (
     CELL_BINS,
     CELLS,
@@ -30,36 +30,23 @@ from wheretolook.features.warp_sift_scale_space import ScaleSpace, roomy, values
 from wheretolook.utils.warp import start_warp
 
 
-class SiftSettings(Protocol):
-    """What `WarpSift` reads of an `ExtractorConfig`."""
-
-    @property
-    def first_octave(self) -> int: ...
-    @property
-    def max_keypoints(self) -> int: ...
-    @property
-    def peak_threshold(self) -> float: ...
-    @property
-    def edge_threshold(self) -> float: ...
-
-
 class WarpSift:
     """Extracts SIFT keypoints of many images at once (Lowe, IJCV 2004).
 
-    `cv2.SIFT` as `KeypointExtractor` uses it is the twin: its constants and conventions, in another order of summation.
-    An image's keypoints depend on the image alone, not on the others of its batch. An extractor serves one thread: it
-    keeps its memory on the device from call to call.
+    The plain twin is `cv2.SIFT` as `KeypointExtractor` uses it, with the same constants and conventions, but sums in
+    another order. An image's keypoints do not depend on the others of its batch. An extractor can be used from one
+    thread only, since it keeps its memory on the device from call to call.
 
     Args:
-        config: see `ExtractorConfig`; its method is not looked at.
+        config: settings, of which the method is ignored.
         device: a CUDA device, or "cpu" (one core and slow: for tests).
         block_bytes: memory of the scale spaces filled at a time (40 MB for an image of 640 x 480).
 
     Raises:
-        ConfigError: if there is no such device.
+        ConfigError: there is no such device.
     """
 
-    def __init__(self, config: SiftSettings, device: str = "cuda", block_bytes: int = 1 << 30) -> None:
+    def __init__(self, config: ExtractorConfig, device: str = "cuda", block_bytes: int = 1 << 30) -> None:
         self.config = config
         self.device = start_warp(device)
         self.block_bytes = block_bytes
@@ -72,16 +59,12 @@ class WarpSift:
         self._buffers: dict[str, Any] = {}
 
     def extract_many(self, grey: NDArray[np.uint8] | Any) -> list[Keypoints]:
-        """Extract keypoints of images of one size.
+        """For each image at most `max_keypoints` keypoints, those of most contrast first.
 
-        Args:
-            grey: (B, H, W) uint8, in NumPy or as a Warp array on any device.
-
-        Returns:
-            For each image at most `max_keypoints` keypoints, those of most contrast first.
+        `grey` is (B, H, W) uint8, in NumPy or as a Warp array on any device.
 
         Raises:
-            ValueError: when the images are not (B, H, W) uint8, or too large.
+            ValueError: the images are not (B, H, W) uint8, or too large.
         """
         if grey.dtype not in (np.uint8, wp.uint8) or grey.ndim != 3:
             raise ValueError(f"expected (B, H, W) uint8 images, got {grey.shape} {grey.dtype}")
@@ -91,7 +74,7 @@ class WarpSift:
             raise ValueError(f"expected images of at most {MAX_SIDE // 2} pixels a side, got {grey.shape}")
         if n_images == 0 or min(rows, columns) <= BORDER:
             return [Keypoints.none() for _ in range(n_images)]
-        # kernels count the values of a block in 31 bits
+        # kernels index the values of a block with 31 bits
         block = max(1, min(n_images, self.block_bytes // (4 * size), (1 << 31) // size - 1))
         space = self._space
         if space is None or (space.rows, space.columns) != (rows, columns) or space.n_images < block:
@@ -126,7 +109,7 @@ class WarpSift:
     def _turn(
         self, space: ScaleSpace, keys: NDArray[np.int64]
     ) -> tuple[NDArray[np.float32], NDArray[np.intp], NDArray[np.float32], Any]:
-        """Where the keypoints at sorted keys are, and their orientations.
+        """Places and orientations of the keypoints at sorted keys.
 
         Returns:
             (K, 4) x, y, scale and response; for each of N orientations, its row there and its angle; `Places`.
@@ -161,10 +144,10 @@ class WarpSift:
         self._launch(describe_kernel, (n, cells), [space.pyramid, places, chosen, turned], [histograms])
         self._launch(finish_kernel, n, [histograms], [descriptors])
         found: NDArray[np.float32] = descriptors[:n].numpy()
-        return found.copy() if self.device == "cpu" else found  # there, it is the buffer itself
+        return found.copy() if self.device == "cpu" else found  # on the CPU, numpy() is a view of the buffer
 
     def _launch(self, kernel: Any, dim: Any, inputs: list[Any], outputs: list[Any]) -> None:
-        # small thread blocks: a few thousand keypoints should reach all of a GPU
+        # small thread blocks, so that a few thousand keypoints are spread over the whole GPU
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=64)
 
     def _buffer(self, name: str, n: int, dtype: Any, *row: int) -> Any:
@@ -188,7 +171,7 @@ def _sorted_unique(keys: NDArray[np.int64]) -> NDArray[np.int64]:
 
 def _by_response(image: NDArray[np.int64], table: NDArray[np.float32], angle: NDArray[np.float32]) -> NDArray[np.intp]:
     """Order by image, -response, y, x, scale, angle. `table` is x, y, scale, response, which is positive."""
-    # Positive floats are in the order of their bits.
+    # Positive floats have the same order as their bits read as integers.
     key = (image << 32) - np.ascontiguousarray(table[:, 3]).view(np.int32)
     order = np.argsort(key)
     equal = np.diff(key[order]) == 0

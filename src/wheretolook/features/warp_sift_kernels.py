@@ -13,16 +13,16 @@ import warp as wp
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 LAYERS = wp.constant(3)
-"""Layers an octave in which extrema are sought; it holds three more levels of the Gaussian."""
+"""Layers of an octave in which extrema are searched; it has three more Gaussian levels."""
 LEVELS = wp.constant(6)
 BORDER = wp.constant(5)
-"""No extremum is sought closer than this to an octave's border, in its pixels."""
+"""Extrema closer than this to the border of an octave, in its pixels, are ignored."""
 STEPS = wp.constant(5)
-"""Steps of refinement after which a candidate that still moves is dropped."""
+"""Candidates that still move after this many steps of refinement are dropped."""
 SIGMA = wp.constant(1.6)
 
 MAX_SIDE = wp.constant(1 << 14)
-"""Rows or columns that a doubled image may have; with the two below, what a key is made of."""
+"""Largest number of rows or columns of a doubled image; this and the next two give the range of keys (`key_of`)."""
 MAX_OCTAVES = wp.constant(16)
 MAX_LAYERS = wp.constant(4)
 KEYS_OF_IMAGE = (1 << 14) ** 2 * 16 * 4
@@ -41,7 +41,7 @@ class Pyramid:
 
 @wp.struct
 class Limits:
-    """What a keypoint must pass."""
+    """Thresholds of keypoints."""
 
     pre_contrast: wp.float32  # of the extremum's own value, in 0..255
     contrast: wp.float32  # of the interpolated one, in 0..1
@@ -64,7 +64,7 @@ class Peak:
 def double_kernel(
     grey: wp.array3d[wp.uint8], values: wp.array[wp.float32], image_size: wp.int32, start: wp.int32, columns: wp.int32
 ):
-    """Twice the size: pixel (2x, 2y) is (x, y), those between are interpolated linearly."""
+    """Double the size: pixel (2x, 2y) is (x, y); pixels in between are interpolated linearly."""
     image, row, column = wp.tid()
     top = row >> 1
     left = column >> 1
@@ -88,7 +88,7 @@ def halve_kernel(
     target: wp.int32,
     columns: wp.int32,
 ):
-    """Every other pixel of every other row."""
+    """Halve the size: every other pixel of every other row."""
     image, row, column = wp.tid()
     base = image * image_size
     values[base + target + row * columns + column] = values[base + source + 2 * (row * source_columns + column)]
@@ -113,7 +113,7 @@ def smoothed(
     first_weight: wp.int32,
     radius: wp.int32,
 ):
-    """The symmetric filter at one place of a line of values; `weights` from its middle outwards."""
+    """A symmetric filter at one place of a line of values; `weights` go from its middle outwards."""
     middle = start + at * stride
     total = weights[first_weight] * values[middle]
     if at >= radius and at + radius < size:
@@ -160,7 +160,7 @@ def smooth_columns_kernel(
     image_size: wp.int32,
     target: wp.int32,
 ):
-    """Along each column of what `smooth_rows_kernel` left."""
+    """Smooth the result of `smooth_rows_kernel` along its columns."""
     image, row, column = wp.tid()
     start = image * half_size + column
     values[image * image_size + target + row * columns + column] = smoothed(
@@ -170,13 +170,13 @@ def smooth_columns_kernel(
 
 @wp.func
 def is_extremum(values: wp.array[wp.float32], at: wp.int32, size: wp.int32, columns: wp.int32, limit: wp.float32):
-    """Whether the difference of Gaussians at `at` is the largest, or the smallest, of its 27 (equal ones allowed)."""
+    """Whether the difference of Gaussians at `at` is the largest or smallest in its 3 x 3 x 3 neighbourhood."""
     value = values[at + size] - values[at]
     sign = wp.where(value > 0.0, 1.0, -1.0)
     highest = sign * value
     if highest <= limit:
         return False
-    # its own neighbours along the row first, then layer by layer, until one is higher
+    # neighbours in the row first, because they rule out most pixels
     if sign * (values[at + size + 1] - values[at + 1]) > highest:
         return False
     if sign * (values[at + size - 1] - values[at - 1]) > highest:
@@ -193,7 +193,7 @@ def is_extremum(values: wp.array[wp.float32], at: wp.int32, size: wp.int32, colu
 
 @wp.func
 def difference(values: wp.array[wp.float32], at: wp.int32, size: wp.int32):
-    """Difference of Gaussians in 0..1 (its level's and the next's)."""
+    """Difference of a level and the next one, in 0..1."""
     return (values[at + size] - values[at]) * (1.0 / 255.0)
 
 
@@ -207,7 +207,7 @@ def refined(
     column: wp.int32,
     limits: Limits,
 ):
-    """Where the parabola through an extremum and its neighbours has its own (Lowe 2004, section 4)."""
+    """Extremum of the quadratic fitted to an extremum and its neighbours (Lowe 2004, section 4), as a `Peak`."""
     peak = Peak()
     peak.found = False
     rows = pyramid.rows[octave]
@@ -265,9 +265,7 @@ def refined(
         offset = wp.vec3(0.0)
         if determinant != 0.0:
             offset = (-1.0 / determinant) * wp.vec3(
-                wp.dot(gradient, normal),
-                wp.dot(gradient, wp.cross(by_s, by_x)),
-                wp.dot(gradient, wp.cross(by_x, by_y)),
+                wp.dot(gradient, normal), wp.dot(gradient, wp.cross(by_s, by_x)), wp.dot(gradient, wp.cross(by_x, by_y))
             )
         largest = wp.max(wp.abs(offset[0]), wp.max(wp.abs(offset[1]), wp.abs(offset[2])))
         if largest < 0.5:
@@ -284,7 +282,7 @@ def refined(
                 and column >= BORDER
                 and column < columns - BORDER
             )
-        else:  # also where it is not a number
+        else:  # also if it is NaN
             inside = False
         step += 1
     if settled:
@@ -303,7 +301,7 @@ def refined(
 
 @wp.func
 def key_of(image: wp.int32, octave: wp.int32, layer: wp.int32, row: wp.int32, column: wp.int32):
-    """A place in the pyramids as one number, by which places are sorted."""
+    """Image, octave, layer and pixel as one number, by which keypoints are sorted."""
     level = (image * MAX_OCTAVES + octave) * MAX_LAYERS + layer
     return (wp.int64(level) * wp.int64(MAX_SIDE) + wp.int64(row)) * wp.int64(MAX_SIDE) + wp.int64(column)
 
@@ -325,15 +323,11 @@ def pixel_of(key: wp.int64):
 
 @wp.kernel
 def extrema_kernel(
-    pyramid: Pyramid,
-    octave: wp.int32,
-    limits: Limits,
-    number: wp.array[wp.int32],
-    keys: wp.array[wp.int64],
+    pyramid: Pyramid, octave: wp.int32, limits: Limits, number: wp.array[wp.int32], keys: wp.array[wp.int64]
 ):
-    """List the keypoints of an octave, or only count them where the list is full, in any order and with repetitions.
+    """Append the keypoints of an octave to `keys` and count them, even if the list is full.
 
-    Several extrema can move to the same place in their refinement.
+    They come in any order and repeated, since the refinement can move several extrema to the same place.
     """
     image, layer, row, column = wp.tid()
     layer += 1

@@ -1,4 +1,4 @@
-"""The Gaussian scale space of many images at once, on a device, and the extrema in it (Lowe, IJCV 2004)."""
+"""The Gaussian scale spaces of many images on a device, and their extrema (Lowe, IJCV 2004)."""
 
 from __future__ import annotations
 
@@ -24,19 +24,18 @@ from wheretolook.features.warp_sift_kernels import (
 )
 
 _ASSUMED_SIGMA = 0.5
-"""Blur of an image as it comes, in its pixels."""
+"""Assumed blur of an input image, in its pixels."""
 
 
 class ScaleSpace:
     """The Gaussian scale spaces of images of one size, and the list of their extrema.
 
     Args:
-        rows: of an image. With as many columns, `octave_sizes` must not be empty.
-        columns: of an image.
-        n_images: for how many there is room.
-        first_octave: -1 seeks keypoints in the doubled image too, 0 from the image's own size on.
+        rows, columns: size of an image, for which `octave_sizes` must not be empty.
+        n_images: largest number of images.
+        first_octave: -1 also finds keypoints in the doubled image, 0 from the image's own size on.
         limits: `Limits`.
-        device: as Warp calls it.
+        device: Warp's name of a device.
     """
 
     def __init__(self, rows: int, columns: int, n_images: int, first_octave: int, limits: Any, device: str) -> None:
@@ -46,7 +45,13 @@ class ScaleSpace:
         starts = np.cumsum([0, *(LEVELS * r * c for r, c in self.sizes)])
         self.image_size = int(starts[-1])
         self.starts = [int(start) for start in starts[:-1]]
-        self.pyramid = self._pyramid()
+        self.pyramid: Any = Pyramid()
+        self.pyramid.values = wp.empty(n_images * self.image_size, dtype=wp.float32, device=device)
+        self.pyramid.image_size = self.image_size
+        for name, numbers in zip(
+            ("starts", "rows", "columns"), (self.starts, *zip(*self.sizes, strict=True)), strict=True
+        ):
+            setattr(self.pyramid, name, wp.array(numbers, dtype=wp.int32, device=device))
         self.grey = wp.empty((n_images, rows, columns), dtype=wp.uint8, device=device)
         self.half_smooth = wp.empty(n_images * 4 * rows * columns, dtype=wp.float32, device=device)
         self.number = wp.zeros(1, dtype=wp.int32, device=device)
@@ -58,20 +63,8 @@ class ScaleSpace:
         self.weights: Any = wp.array(np.concatenate(filters).astype(np.float32), dtype=wp.float32, device=device)
         self._commands = self._record()
 
-    def _pyramid(self) -> Any:
-        pyramid: Any = Pyramid()
-        pyramid.values = wp.empty(self.n_images * self.image_size, dtype=wp.float32, device=self.device)
-        pyramid.image_size = self.image_size
-        for name, numbers in (
-            ("starts", self.starts),
-            ("rows", [rows for rows, _ in self.sizes]),
-            ("columns", [columns for _, columns in self.sizes]),
-        ):
-            setattr(pyramid, name, wp.array(numbers, dtype=wp.int32, device=self.device))
-        return pyramid
-
     def fill(self, grey: Any) -> None:
-        """The scale spaces of (B, H, W) uint8 images, in NumPy or Warp, B at most `n_images`."""
+        """Compute the scale spaces of (B, H, W) uint8 images, in NumPy or Warp, B at most `n_images`."""
         if isinstance(grey, np.ndarray):
             grey = wp.array(np.ascontiguousarray(grey), dtype=wp.uint8, device="cpu", copy=False)
         wp.copy(self.grey, grey.contiguous(), count=grey.size)
@@ -101,7 +94,7 @@ class ScaleSpace:
             self.keys = wp.empty(roomy(number), dtype=wp.int64, device=self.device)
 
     def _record(self) -> list[tuple[Any, tuple[int, int]]]:
-        """The launches that fill the scale spaces, and how many threads of each an image has."""
+        """The launches that fill the scale spaces, and the number of threads of each for an image."""
         commands: list[tuple[Any, tuple[int, int]]] = []
         values, image_size = self.pyramid.values, self.image_size
 
@@ -112,18 +105,14 @@ class ScaleSpace:
             commands.append((command, size))
 
         def smooth(octave: int, source: int, target: int) -> None:
-            """From level to level of an octave, with the filter of the latter."""
+            """From level to level of an octave, with the filter of the target."""
             rows, columns = self.sizes[octave]
-            start, size, half_size = self.starts[octave], rows * columns, 4 * self.rows * self.columns
-            half = [self.weights, self.first_weights[target], self.radii[target]]
-            add(
-                smooth_rows_kernel, octave, values, image_size, start + source * size, columns, *half,
-                self.half_smooth, half_size,
-            )  # fmt: skip
-            add(
-                smooth_columns_kernel, octave, self.half_smooth, half_size, rows, columns, *half,
-                values, image_size, start + target * size,
-            )  # fmt: skip
+            start, size = self.starts[octave], rows * columns
+            half = (self.half_smooth, 4 * self.rows * self.columns)
+            weights = (self.weights, self.first_weights[target], self.radii[target])
+            add(smooth_rows_kernel, octave, values, image_size, start + source * size, columns, *weights, *half)
+            target_start = start + target * size
+            add(smooth_columns_kernel, octave, *half, rows, columns, *weights, values, image_size, target_start)
 
         add(double_kernel, 0, self.grey, values, image_size, 0, self.sizes[0][1])
         smooth(0, 0, 0)
@@ -140,7 +129,7 @@ class ScaleSpace:
 
 
 def octave_sizes(rows: int, columns: int) -> list[tuple[int, int]]:
-    """Rows and columns of the octaves in which a keypoint can be, the first of twice the image's size."""
+    """Rows and columns of the octaves that can hold a keypoint; the first has twice the image's size."""
     sizes = [(2 * rows, 2 * columns)]
     while min(sizes[-1]) > 2 * BORDER:
         sizes.append((sizes[-1][0] // 2, sizes[-1][1] // 2))
@@ -148,25 +137,24 @@ def octave_sizes(rows: int, columns: int) -> list[tuple[int, int]]:
 
 
 def values_of_image(rows: int, columns: int) -> int:
-    """How many numbers the scale space of an image has."""
+    """Number of values in the scale space of an image."""
     return LEVELS * sum(r * c for r, c in octave_sizes(rows, columns))
 
 
 def _sigmas() -> list[float]:
-    """Standard deviation that each level adds to the one before; the first, to the doubled image."""
-    sigma = SIGMA
-    total = [sigma * 2 ** (level / LAYERS) for level in range(LEVELS)]
-    first = math.sqrt(sigma**2 - (2 * _ASSUMED_SIGMA) ** 2)
+    """Standard deviation of the blur that each level adds to the one before, the first one to the doubled image."""
+    total = [SIGMA * 2 ** (level / LAYERS) for level in range(LEVELS)]
+    first = math.sqrt(SIGMA**2 - (2 * _ASSUMED_SIGMA) ** 2)
     return [first, *(math.sqrt(b**2 - a**2) for a, b in pairwise(total))]
 
 
 def _half_gaussian(sigma: float) -> NDArray[np.float64]:
-    """Weights of a Gaussian filter from its middle outwards, cut where `cv2.GaussianBlur` cuts them."""
+    """Weights of a Gaussian filter from its middle outwards, truncated where `cv2.GaussianBlur` does."""
     radius = (round(8 * sigma + 1) | 1) // 2
     weights = np.exp(-(np.arange(-radius, radius + 1) ** 2) / (2 * sigma**2))
     return (weights / weights.sum())[radius:]
 
 
 def roomy(n: int) -> int:
-    """At least n, one of few sizes."""
+    """The next power of two from 1024 on, so that buffers have few sizes."""
     return 1 << max(10, (n - 1).bit_length())

@@ -13,7 +13,7 @@ KINDS = ("png", "pdf", "svg")
 
 @dataclass(frozen=True)
 class FiguresConfig:
-    """Options of drawing.
+    """Options of the figures stage.
 
     Args:
         out: folder of the files; `<dataset>/results/figures` if not given.

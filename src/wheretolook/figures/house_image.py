@@ -1,4 +1,4 @@
-"""A scene from obliquely above, as if its ceiling and its near walls were taken away."""
+"""Picture of a scene seen obliquely from above, without its ceiling and its near walls."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from wheretolook.scenes.cutting import cut_above
 from wheretolook.utils.errors import ConfigError, SceneError
 
 FAR = 25.0
-"""Distance of the eye in diagonals of the scene: so far that parallels stay so."""
+"""Distance of the camera in diagonals of the scene; so far away, parallel lines stay nearly parallel."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,9 +24,9 @@ class Dollhouse:
 
     Attributes:
         rgb: (H, W, 3) uint8; white where nothing is.
-        depth_m: (H, W) float32, from the eye; 0 where nothing is.
-        camera: that took it.
-        cam_from_world: (3, 4).
+        depth_m: (H, W) float32 distance along the optical axis; 0 where nothing is.
+        camera: intrinsics of the picture.
+        cam_from_world: (3, 4) its pose.
     """
 
     rgb: NDArray[np.uint8]
@@ -40,13 +40,16 @@ class Dollhouse:
         return self.camera.project(transform(self.cam_from_world, at.reshape(-1, 3))).reshape(*at.shape[:-1], 2)
 
     def shows(self, points: ArrayLike, margin_m: float = 0.1) -> NDArray[np.bool_]:
-        """Which of world points (N, 3) m lie in the picture with nothing before them but what is within the margin."""
-        seen = transform(self.cam_from_world, points)
-        pixels = self.camera.project(seen)
+        """Which world points (N, 3) m are in view, (N,): inside the picture, at most a margin behind a surface.
+
+        Landmarks lie a little behind surfaces, too.
+        """
+        in_camera = transform(self.cam_from_world, points)
+        pixels = self.camera.project(in_camera)
         inside = self.camera.in_image(pixels)
         column, row = np.where(inside[:, None], pixels, 0).astype(int).T
         depth = self.depth_m[row, column]
-        return inside & ((depth == 0) | (seen[:, 2] <= depth + margin_m))
+        return inside & ((depth == 0) | (in_camera[:, 2] <= depth + margin_m))
 
 
 def dollhouse(
@@ -62,16 +65,16 @@ def dollhouse(
 
     Args:
         mesh: metres, z up.
-        azimuth_deg: where the eye is, counter-clockwise from +x.
-        elevation_deg: how high it is; 90 gives a plan with +x to the right and +y up, whatever the azimuth.
-        cut_m: what lies above this world height is taken away; None keeps all.
-        width_px: of the picture, whose height follows.
-        one_sided: leave out triangles that turn their backs to the eye, such as ceilings and the near walls of rooms;
-            for meshes that are wound reliably.
+        azimuth_deg: direction of the camera from the scene, counter-clockwise from +x.
+        elevation_deg: its angle above the horizon; 90 gives a plan with +x to the right and +y up, for any azimuth.
+        cut_m: leave out what lies above this world height; None keeps all.
+        width_px: of the picture; its height follows from the scene.
+        one_sided: leave out triangles that face away from the camera, such as ceilings and the near walls of rooms;
+            only for meshes whose triangles are consistently oriented.
         device: "cpu" or a CUDA device.
 
     Raises:
-        ConfigError: no such elevation or width. SceneError: nothing is left.
+        ConfigError: the elevation is not in (0, 90] or the width below 2. SceneError: nothing of the scene is left.
     """
     if not 0 < elevation_deg <= 90 or width_px < 2:
         raise ConfigError("the eye must be above the scene, and the picture wide", value=(elevation_deg, width_px))

@@ -1,4 +1,4 @@
-"""Work spread over processes, a few items ahead of the results."""
+"""A lazy, ordered map over worker processes."""
 
 from __future__ import annotations
 
@@ -19,10 +19,9 @@ Result = TypeVar("Result")
 
 
 class Processes:
-    """Processes of one thread each, spawned when first needed and ended with the block.
+    """Worker processes of one thread each, spawned when first needed and ended with the `with` block.
 
-    Args:
-        workers: how many; 1 works in this process.
+    With one worker, everything runs in this process.
     """
 
     def __init__(self, workers: int) -> None:
@@ -40,10 +39,7 @@ class Processes:
             self._pool.shutdown()
 
     def map(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Generator[Result, None, None]:
-        """Apply a function, defined at the top of a module, to items that are read a few ahead of what is returned.
-
-        Yields:
-            Results in the order of the items.
+        """Apply a module's top-level function to items, read only a few ahead of the results, which keep their order.
 
         Raises:
             WorkerError: a process was killed.
@@ -61,10 +57,8 @@ class Processes:
                     return
                 yield pending.popleft().result()
         except BrokenProcessPool as error:
-            raise WorkerError(
-                "a process was killed, probably for lack of memory", value=f"{self.workers} workers",
-                fix="Lower label.workers and run again.",
-            ) from error  # fmt: skip
+            problem, fix = "a process was killed, probably for lack of memory", "Lower label.workers and run again."
+            raise WorkerError(problem, value=f"{self.workers} workers", fix=fix) from error
         finally:
             for future in pending:
                 future.cancel()

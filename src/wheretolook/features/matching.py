@@ -104,7 +104,7 @@ def _byte_products_are_exact() -> bool:
 def nearest_two_plain(
     queries: NDArray[np.uint8], descriptors: NDArray[np.uint8]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Twin of `DescriptorMatcher.nearest_two`: all products, sorted."""
+    """Plain twin of `DescriptorMatcher.nearest_two`: all products, sorted."""
     product = queries.astype(np.int64) @ descriptors.astype(np.int64).T
     order = np.argsort(-product, axis=1, kind="stable")
     best = np.take_along_axis(product, order[:, :2], axis=1)

@@ -82,7 +82,7 @@ class WarpSift:
             self._space = space = ScaleSpace(rows, columns, block, self.config.first_octave, self._limits, self.device)
         found: list[Keypoints] = []
         for start in range(0, n_images, space.n_images):
-            stop = min(start + space.n_images, n_images)  # Warp does not cut a slice at the end
+            stop = min(start + space.n_images, n_images)  # a Warp slice may not exceed the array
             found += self._extract_block(space, grey[start:stop])
         return found
 

@@ -35,8 +35,8 @@ class Places:
     level: wp.array[wp.int32]  # first value of its Gaussian level in the pyramids
     octave: wp.array[wp.int32]
     at: wp.array[wp.vec2i]  # column, row
-    centre: wp.array[wp.vec2]  # the same, refined
-    sigma: wp.array[wp.float32]  # of its Gaussian
+    centre: wp.array[wp.vec2]  # column, row, refined
+    sigma: wp.array[wp.float32]  # standard deviation of its Gaussian, in pixels of the octave
 
 
 PLACE_TYPES = {"level": wp.int32, "octave": wp.int32, "at": wp.vec2i, "centre": wp.vec2, "sigma": wp.float32}
@@ -63,7 +63,7 @@ def place_kernel(
     places.at[row] = wp.vec2i(peak.column, peak.row)
     places.centre[row] = wp.vec2(x, y)
     places.sigma[row] = sigma
-    pixels = 0.5 * wp.float32(1 << octave)  # of the image to one of the octave
+    pixels = 0.5 * wp.float32(1 << octave)  # image pixels for each pixel of the octave
     table[row, 0] = x * pixels
     table[row, 1] = y * pixels
     table[row, 2] = sigma * pixels

@@ -33,7 +33,7 @@ class Pyramid:
     """Gaussian levels: image by image, octave by octave, level by level, row by row."""
 
     values: wp.array[wp.float32]
-    image_size: wp.int32  # values an image
+    image_size: wp.int32  # number of values of an image
     starts: wp.array[wp.int32]  # first value of each octave of an image
     rows: wp.array[wp.int32]
     columns: wp.array[wp.int32]
@@ -70,13 +70,9 @@ def double_kernel(
     left = column >> 1
     bottom = wp.min(top + (row & 1), grey.shape[1] - 1)
     right = wp.min(left + (column & 1), grey.shape[2] - 1)
-    total = (
-        wp.int32(grey[image, top, left])
-        + wp.int32(grey[image, top, right])
-        + wp.int32(grey[image, bottom, left])
-        + wp.int32(grey[image, bottom, right])
-    )
-    values[image * image_size + start + row * columns + column] = 0.25 * wp.float32(total)
+    upper = wp.int32(grey[image, top, left]) + wp.int32(grey[image, top, right])
+    lower = wp.int32(grey[image, bottom, left]) + wp.int32(grey[image, bottom, right])
+    values[image * image_size + start + row * columns + column] = 0.25 * wp.float32(upper + lower)
 
 
 @wp.kernel
@@ -96,7 +92,7 @@ def halve_kernel(
 
 @wp.func
 def reflected(index: wp.int32, size: wp.int32):
-    """An index beyond the border mirrored at the border's pixels, as often as it takes."""
+    """An index mirrored at the first and last pixel until it lies inside (OpenCV's BORDER_REFLECT_101)."""
     period = 2 * size - 2
     wrapped = wp.abs(index) % period
     return wp.min(wrapped, period - wrapped)
@@ -139,7 +135,7 @@ def smooth_rows_kernel(
     half_smooth: wp.array[wp.float32],
     half_size: wp.int32,
 ):
-    """Along each row of a level."""
+    """Smooth a level along its rows."""
     image, row, column = wp.tid()
     start = image * image_size + source + row * columns
     half_smooth[image * half_size + row * columns + column] = smoothed(
@@ -198,6 +194,13 @@ def difference(values: wp.array[wp.float32], at: wp.int32, size: wp.int32):
 
 
 @wp.func
+def mixed_derivative(values: wp.array[wp.float32], at: wp.int32, a: wp.int32, b: wp.int32, size: wp.int32):
+    """Second derivative of `difference` along two axes whose steps in the array are a and b."""
+    total = difference(values, at + a + b, size) - difference(values, at + a - b, size)
+    return 0.25 * (total - difference(values, at - a + b, size) + difference(values, at - a - b, size))
+
+
+@wp.func
 def refined(
     pyramid: Pyramid,
     image: wp.int32,
@@ -226,37 +229,20 @@ def refined(
     middle = wp.float32(0.0)
     while inside and not settled and step < STEPS:
         at = start + layer * size + row * columns + column
-        above = at + size
-        below = at - size
         middle = difference(values, at, size)
         east = difference(values, at + 1, size)
         west = difference(values, at - 1, size)
         south = difference(values, at + columns, size)
         north = difference(values, at - columns, size)
-        up = difference(values, above, size)
-        down = difference(values, below, size)
+        up = difference(values, at + size, size)
+        down = difference(values, at - size, size)
         gradient = 0.5 * wp.vec3(east - west, south - north, up - down)
         xx = east + west - 2.0 * middle
         yy = south + north - 2.0 * middle
         ss = up + down - 2.0 * middle
-        xy = 0.25 * (
-            difference(values, at + columns + 1, size)
-            - difference(values, at + columns - 1, size)
-            - difference(values, at - columns + 1, size)
-            + difference(values, at - columns - 1, size)
-        )
-        xs = 0.25 * (
-            difference(values, above + 1, size)
-            - difference(values, above - 1, size)
-            - difference(values, below + 1, size)
-            + difference(values, below - 1, size)
-        )
-        ys = 0.25 * (
-            difference(values, above + columns, size)
-            - difference(values, above - columns, size)
-            - difference(values, below + columns, size)
-            + difference(values, below - columns, size)
-        )
+        xy = mixed_derivative(values, at, columns, 1, size)
+        xs = mixed_derivative(values, at, size, 1, size)
+        ys = mixed_derivative(values, at, size, columns, size)
         by_x = wp.vec3(xx, xy, xs)
         by_y = wp.vec3(xy, yy, ys)
         by_s = wp.vec3(xs, ys, ss)
@@ -274,14 +260,9 @@ def refined(
             column += wp.int32(wp.rint(offset[0]))
             row += wp.int32(wp.rint(offset[1]))
             layer += wp.int32(wp.rint(offset[2]))
-            inside = (
-                layer >= 1
-                and layer <= LAYERS
-                and row >= BORDER
-                and row < rows - BORDER
-                and column >= BORDER
-                and column < columns - BORDER
-            )
+            in_rows = row >= BORDER and row < rows - BORDER
+            in_columns = column >= BORDER and column < columns - BORDER
+            inside = layer >= 1 and layer <= LAYERS and in_rows and in_columns
         else:  # also if it is NaN
             inside = False
         step += 1

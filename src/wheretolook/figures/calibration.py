@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.style import context
 
 from wheretolook.evaluation.score_table import main_rows, methods_of
+from wheretolook.figures.config import Look
 from wheretolook.figures.style import INK, RC, new_figure
 from wheretolook.methods.styles import MethodStyle, method_style
 
@@ -48,11 +49,11 @@ def calibration_figure(table: pd.DataFrame) -> Figure:
 
 def _draw(curve: Axes, counts: Axes, part: pd.DataFrame, style: MethodStyle, when: str) -> None:
     scaled = when == _AFTER
-    line = {"color": style.color, "linewidth": 1.2, "linestyle": "-" if scaled else ":"}
-    mark = {"marker": style.marker, "markersize": 5, "markerfacecolor": style.color if scaled else "white"}
+    line: Look = {"color": style.color, "linewidth": 1.2, "linestyle": "-" if scaled else ":"}
+    mark: Look = {"marker": style.marker, "markersize": 5, "markerfacecolor": style.color if scaled else "white"}
     label = f"T = {part['temperature'].iloc[0]:.2f}" if scaled else "as predicted"
     label += f": ECE {part['ece'].iloc[0]:.3f}"
     known = part[part["n"] > 0]
-    where = {"clip_on": False, "zorder": 3 if scaled else 2.5}
+    where: Look = {"clip_on": False, "zorder": 3 if scaled else 2.5}
     curve.plot(known["mean_predicted"], known["share_good"], label=label, **line, **mark, **where)
     counts.stairs(part["n"], [*part["bin_low"], part["bin_high"].iloc[-1]], **line)

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from wheretolook.utils.errors import ConfigError
+
+Look = dict[str, Any]
+"""Keyword arguments of Matplotlib's functions, such as colours and sizes."""
 
 KINDS = ("png", "pdf", "svg")
 """Kinds of files that figures are written as."""

@@ -15,6 +15,7 @@ from matplotlib.style import context
 from matplotlib.ticker import MaxNLocator, NullLocator
 from numpy.typing import NDArray
 
+from wheretolook.figures.config import Look
 from wheretolook.figures.style import INK, RC, new_figure
 from wheretolook.labelling.report import POSITIVE, LabelSummary, threshold_sentence
 from wheretolook.viewpoints.thresholds import ALL, THRESHOLDS, threshold_key, threshold_label
@@ -74,7 +75,7 @@ def _draw_scenes(axes: Axes, shares: pd.DataFrame) -> None:
     gaps = rows["split"] != rows["split"].shift(fill_value=rows["split"].iloc[0])
     y = np.arange(len(rows)) + 0.4 * gaps.cumsum().to_numpy()
     _stack(axes.barh, y, rows, 0.72)
-    mark = {"color": "white", "markeredgecolor": INK, "markersize": 5, "clip_on": False}
+    mark: Look = {"color": "white", "markeredgecolor": INK, "markersize": 5, "clip_on": False}
     label = f"locations with a viewpoint\nwithin {_NAMES[0]}"
     axes.plot(100 * rows["locations_positive"], y, "D", label=label, **mark)
     names = [scene if split == ALL else f"{scene} ({split})" for scene, split in rows[["scene", "split"]].to_numpy()]
@@ -109,7 +110,7 @@ def _draw_errors(
     axes: Axes, errors: pd.DataFrame, row: Any, limits: Sequence[float], names: Sequence[str], ticks: dict[float, str]
 ) -> None:
     low, high = errors["low"].to_numpy(), errors["high"].to_numpy()
-    edges: dict[str, Any] = {"align": "edge", "edgecolor": INK, "linewidth": 0.5}
+    edges: Look = {"align": "edge", "edgecolor": INK, "linewidth": 0.5}
     below = np.zeros(len(errors))
     for column, (_, color, hatch) in _FOUND.items():
         share = 100 * errors[column].to_numpy() / row["n_views"]
@@ -119,7 +120,7 @@ def _draw_errors(
     end = high[-1] * step**2  # the bar of viewpoints without a pose stands apart from the errors
     _, color, hatch = _NO_POSE
     axes.bar(end, 100 * row["without_pose"], end * (step**2 - 1), color=color, hatch=hatch, **edges)
-    beside = {"textcoords": "offset points", "rotation": 90, "ha": "center", "va": "bottom", "fontsize": 8}
+    beside: Look = {"textcoords": "offset points", "rotation": 90, "ha": "center", "va": "bottom", "fontsize": 8}
     for limit, name, shade in zip(limits, names, SHADES, strict=True):
         axes.axvline(limit, color=INK, linewidth=1, linestyle=":")
         axes.annotate(name, (limit, 1), (0, 6), xycoords=("data", "axes fraction"), **beside)

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.style import context
 from numpy.typing import NDArray
 
+from wheretolook.figures.config import Look
 from wheretolook.figures.style import INK, RC, new_figure
 from wheretolook.geometry.poses import Float
 from wheretolook.planning.turns import pan_tilt_angles
@@ -72,7 +73,7 @@ def _draw_map(figure: Figure, axes: Axes, landmarks: Float, locations: Float, sh
     low, high = np.percentile(landmarks[:, :2], (0.5, 99.5), axis=0)
     axes.scatter(landmarks[:, 0], landmarks[:, 1], s=0.6, color="#9a9a9a", linewidths=0, rasterized=True)
     order = np.argsort(share_good, kind="stable")
-    look = {"s": 34, "cmap": "cividis", "vmin": 0, "vmax": 1, "edgecolors": "white", "linewidths": 0.6}
+    look: Look = {"s": 34, "cmap": "cividis", "vmin": 0, "vmax": 1, "edgecolors": "white", "linewidths": 0.6}
     points = axes.scatter(locations[order, 0], locations[order, 1], c=share_good[order], **look)
     axes.plot(*place[:2], "o", markersize=11, markerfacecolor="none", markeredgecolor=STAR, markeredgewidth=2)
     axes.set_aspect("equal")

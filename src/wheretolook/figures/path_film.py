@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.style import context
 from numpy.typing import NDArray
 
+from wheretolook.figures.config import Look
 from wheretolook.figures.style import INK, RC, new_figure
 from wheretolook.geometry.poses import Float
 from wheretolook.methods.styles import scorer_style
@@ -133,13 +134,13 @@ def _draw_map(
     low, high = np.minimum(low, positions[:, :2].min(0)), np.maximum(high, positions[:, :2].max(0))
     axes.scatter(landmarks[:, 0], landmarks[:, 1], s=0.5, color="#9a9a9a", linewidths=0, rasterized=True)
     axes.plot(*positions[:, :2].T, color=PATH, linewidth=1.6)
-    xy: list[tuple[float, float]] = list(map(tuple, positions[:, :2].tolist()))
+    xy = [(float(x), float(y)) for x, y in positions[:, :2]]
     reach = 0.07 * float(np.max(high - low))
-    arrow = {"arrowstyle": "-|>", "color": INK, "linewidth": 1.0, "shrinkA": 0, "shrinkB": 0}
+    arrow: Look = {"arrowstyle": "-|>", "color": INK, "linewidth": 1.0, "shrinkA": 0, "shrinkB": 0}
     for at in [number] if number is not None else range(0, len(views), max(1, len(views) // 25)):
         x, y = positions[at, :2] + views[at].axis[:2] * (2 if number is not None else 1) * reach
         axes.annotate("", (float(x), float(y)), xy[at], arrowprops=arrow)
-    disc = {"boxstyle": "circle,pad=0.15", "facecolor": PATH, "edgecolor": "white"}
+    disc: Look = {"boxstyle": "circle,pad=0.15", "facecolor": PATH, "edgecolor": "white"}
     for column, at in enumerate(() if shown is None else shown, 1):
         axes.annotate(str(column), xy[at], fontsize=9, color="white", ha="center", va="center", bbox=disc)
     axes.set(xlim=(low[0] - 0.3, high[0] + 0.3), ylim=(low[1] - 0.3, high[1] + 0.3), aspect="equal")

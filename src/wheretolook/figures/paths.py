@@ -9,6 +9,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.style import context
 
+from wheretolook.figures.config import Look
 from wheretolook.figures.style import INK, RC, new_figure
 from wheretolook.methods.styles import scorer_style
 
@@ -37,7 +38,7 @@ def paths_figure(summary: pd.DataFrame) -> Figure:
                 style = scorer_style(name)
                 value, low, high = (100 * of_method[f"localized{end}"].to_numpy() for end in ("", "_low", "_high"))
                 label, hatch = (f"{style.label}, greedy", "////") if rule else (style.label, "")
-                look = {"color": style.color, "hatch": hatch, "edgecolor": "white", "linewidth": 0.4}
+                look: Look = {"color": style.color, "hatch": hatch, "edgecolor": "white", "linewidth": 0.4}
                 axes.bar(at, value, 0.92 * width, label=label, **look)
                 whiskers = np.maximum(0, [value - low, high - value])  # few resamples may not enclose the share
                 axes.errorbar(at, value, whiskers, fmt="none", ecolor=INK, elinewidth=0.9)

@@ -12,6 +12,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.style import context
 from numpy.typing import ArrayLike, NDArray
 
+from wheretolook.figures.config import Look
 from wheretolook.figures.dollhouse import BLUE, VERMILION
 from wheretolook.figures.inputs import frame
 from wheretolook.figures.overview import View
@@ -70,7 +71,7 @@ def peaks_figure(
                 axes.set_title(f"{mark}  predicted {view.score:.2f}", loc="left")
                 axes.set_xlabel("\n".join(textwrap.wrap(view.outcome, _WIDE)), labelpad=2)
                 azimuth, elevation = map(float, pan_tilt_angles(view.direction))
-                look = {"color": color, "fontsize": 9, "fontweight": "bold", "ha": "center", "va": "center"}
+                look: Look = {"color": color, "fontsize": 9, "fontweight": "bold", "ha": "center", "va": "center"}
                 text = sphere.text(azimuth, elevation, mark, zorder=5, **look)
                 text.set_path_effects([withStroke(linewidth=2.5, foreground="white")])
         return figure
@@ -83,9 +84,9 @@ def _draw_sphere(
     dots = axes.scatter(*pan_tilt_angles(directions), s=size, c=scores, cmap="cividis", vmin=0, vmax=1, linewidths=0)
     if tried is not None:
         looked, good = tried
-        look = {"linewidths": 0.7, "path_effects": [withStroke(linewidth=1.8, foreground="white")]}
-        rings = {"s": 1.1 * size, "facecolors": "none", "edgecolors": INK, "label": "localizes"}
-        crosses = {"s": 0.6 * size, "marker": "x", "color": INK, "label": "does not"}
+        look: Look = {"linewidths": 0.7, "path_effects": [withStroke(linewidth=1.8, foreground="white")]}
+        rings: Look = {"s": 1.1 * size, "facecolors": "none", "edgecolors": INK, "label": "localizes"}
+        crosses: Look = {"s": 0.6 * size, "marker": "x", "color": INK, "label": "does not"}
         axes.scatter(*pan_tilt_angles(looked[good]), **rings, **look)
         axes.scatter(*pan_tilt_angles(looked[~good]), **crosses, **look)
         axes.legend(loc="upper center", bbox_to_anchor=(0.5, 1.2), ncols=2, columnspacing=1.2, handletextpad=0.2)

@@ -16,6 +16,7 @@ from matplotlib.patches import Patch
 from matplotlib.style import context
 from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter, NullLocator
 
+from wheretolook.figures.config import Look
 from wheretolook.figures.style import INK, RC, new_figure
 
 COUNTS, EVERYTHING = "counts alone", "occlusion, counts, best 100"
@@ -106,7 +107,7 @@ def runtime_table(sizes: pd.DataFrame) -> pd.DataFrame:
 
 
 def _draw_bars(axes: Axes, bars: list[_Bar], start: float) -> None:
-    plate = {"facecolor": "white", "edgecolor": "none", "pad": 0.5}
+    plate: Look = {"facecolor": "white", "edgecolor": "none", "pad": 0.5}
     for y, bar in enumerate(bars):
         axes.barh(y, bar.seconds - start, 0.68, left=start, **_LOOK[bar.source])
         end = bar.seconds
@@ -158,7 +159,7 @@ def _threads(row: dict[Any, Any]) -> str:
 
 
 def machine_label(name: str) -> str:
-    """A processor's name without trade marks, clock and filler, shortened. An architecture alone becomes "CPU"."""
+    """A short name of a processor, without trade marks and clock; "CPU" if only the architecture is known."""
     short = re.sub(r"\((R|TM|C)\)|\b\d+-Cores?\b|\b(Processor|CPU)\b|@.*$", " ", str(name), flags=re.IGNORECASE)
     short = shorten(short, 28, placeholder="…")
     return short if short not in ("", "x86_64", "AMD64", "aarch64", "arm64", "i386", "arm") else "CPU"
@@ -195,16 +196,16 @@ def scaling_figure(growth: pd.DataFrame) -> Figure:
     shown = [axis for axis in _GROWING if (growth["axis"] == axis).any()]
     with context(RC):
         figure = new_figure(2.2 * len(shown) + 0.7, 5.2)
-        scales = {"xscale": "log", "yscale": "log"}
+        scales: Look = {"xscale": "log", "yscale": "log"}
         panels = figure.subplots(2, len(shown), sharex="col", sharey="row", squeeze=False, subplot_kw=scales)
         for column, axis in enumerate(shown):
             part = growth[growth["axis"] == axis]
             for (device, name), (color, marker) in zip(machines, cycle(_MACHINES), strict=False):
                 on_machine = part[(part["device"] == device) & (part["name"] == name)]
-                whiskers = {"fmt": "none", "ecolor": color, "elinewidth": 1, "capsize": 2, "zorder": 1.9}
+                whiskers: Look = {"fmt": "none", "ecolor": color, "elinewidth": 1, "capsize": 2, "zorder": 1.9}
                 for what, (dashes, filled) in _WORK.items():
                     rows = on_machine[on_machine["what"] == what].sort_values(axis)
-                    look = {"color": color, "linestyle": dashes, "marker": marker, "markersize": 4.5}
+                    look: Look = {"color": color, "linestyle": dashes, "marker": marker, "markersize": 4.5}
                     look["markerfacecolor"] = color if filled else "white"
                     label = f"{machine_label(name)}, {what}"
                     seconds = rows["median_s"].to_numpy(dtype=float)
@@ -240,6 +241,6 @@ def _draw_proportional(axes: Axes) -> None:
     """A line of slope 1 through the middle of the panel, which does not change its limits."""
     (left, right), limits = axes.get_xlim(), axes.get_ylim()
     slope = np.sqrt(limits[0] * limits[1] / (left * right))
-    look = {"color": "#9a9a9a", "linewidth": 0.8, "linestyle": ":", "zorder": 0.9, "label": "proportional"}
+    look: Look = {"color": "#9a9a9a", "linewidth": 0.8, "linestyle": ":", "zorder": 0.9, "label": "proportional"}
     axes.plot([left, right], [slope * left, slope * right], scalex=False, scaley=False, **look)
     axes.set(xlim=(left, right), ylim=limits)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,6 +14,7 @@ from matplotlib.patches import Patch, Rectangle
 from matplotlib.style import context
 from numpy.typing import NDArray
 
+from wheretolook.figures.config import Look
 from wheretolook.figures.dollhouse import BLUE, ORANGE, SKY, VERMILION, draw_house, draw_points, draw_segments
 from wheretolook.figures.house_image import Dollhouse
 from wheretolook.figures.style import INK, PRINT, TWO_COLUMNS_IN, new_figure
@@ -76,8 +76,8 @@ def _draw_voxels(axes: Axes, sampling: Sampling) -> None:
     half = sampling.grid.voxel_m / 2
     centers = sampling.grid.centers()[sampling.layer]
     corners = sampling.plan.pixels(np.stack([centers - half, centers + half], axis=1))
-    free_look: dict[str, Any] = {"facecolor": (*to_rgb(SKY), 0.45), "edgecolor": BLUE, "linewidth": 0.5}
-    taken_look: dict[str, Any] = {"edgecolor": "#777777", "linewidth": 0.3, "hatch": "/////"}
+    free_look: Look = {"facecolor": (*to_rgb(SKY), 0.45), "edgecolor": BLUE, "linewidth": 0.5}
+    taken_look: Look = {"edgecolor": "#777777", "linewidth": 0.3, "hatch": "/////"}
     for chosen, look in ((sampling.free, free_look), (~sampling.free, {"facecolor": (1, 1, 1, 0.35), **taken_look})):
         squares = [Rectangle((float(a[0]), float(a[1])), *map(float, b - a)) for a, b in corners[chosen]]
         axes.add_collection(PatchCollection(squares, **look))
@@ -97,7 +97,7 @@ def _draw_directions(figure: Figure, axes: Axes, sampling: Sampling) -> None:
     kept, size = sampling.kept, 4500 / len(sampling.directions)
     dropped_at, kept_at = (pan_tilt_angles(sampling.directions[rows]) for rows in (~kept, kept))
     axes.scatter(*dropped_at, s=0.6 * size, facecolors="none", edgecolors="#aaaaaa", linewidths=0.5)
-    colors = {"c": sampling.n_visible[kept], "cmap": "cividis", "vmin": 0, "edgecolors": INK}
+    colors: Look = {"c": sampling.n_visible[kept], "cmap": "cividis", "vmin": 0, "edgecolors": INK}
     dots = axes.scatter(*kept_at, s=size, linewidths=0.3, **colors)
     axes.set(xticklabels=[], yticklabels=[], anchor="N")
     axes.set_title(f"b  Directions: {kept.sum()} of {len(kept)} kept", loc="left")
@@ -124,10 +124,10 @@ def _draw_occlusion(axes: Axes, sampling: Sampling) -> None:
 
 
 def _mark_place(axes: Axes, sampling: Sampling) -> None:
-    star = {"s": 75, "marker": "*", "color": VERMILION, "edgecolors": "white", "linewidths": 0.6}
+    star: Look = {"s": 75, "marker": "*", "color": VERMILION, "edgecolors": "white", "linewidths": 0.6}
     draw_points(axes, sampling.plan, sampling.place, zorder=4, **star)
 
 
 def _legend_below(axes: Axes, handles: list[Patch] | list[Line2D]) -> None:
-    padding = {"columnspacing": 1.0, "handletextpad": 0.4, "borderaxespad": 0.2}
+    padding: Look = {"columnspacing": 1.0, "handletextpad": 0.4, "borderaxespad": 0.2}
     axes.legend(handles=handles, loc="upper center", bbox_to_anchor=(0.5, 0.0), ncols=2, **padding)

@@ -14,6 +14,7 @@ from matplotlib.style import context
 from matplotlib.ticker import MaxNLocator
 
 from wheretolook.evaluation.score_table import main_rows, methods_of, reference_of, threshold_keys
+from wheretolook.figures.config import Look
 from wheretolook.figures.style import INK, RC, new_figure
 from wheretolook.methods.names import Method
 from wheretolook.methods.styles import method_group, method_style, rows_by_group
@@ -30,7 +31,7 @@ _WHISKERS = "whiskers: 95 % bootstrap interval over locations"
 
 @dataclass(frozen=True)
 class _Layout:
-    """What the panels of a figure share: rows of the table by method and N, and where they are drawn."""
+    """What the panels of a figure share: rows of the table by method and N, and the places y of methods."""
 
     rows: dict[tuple[Method, int], dict[str, float]]
     y: dict[Method, float]
@@ -47,11 +48,11 @@ class _Layout:
         ]
 
     def value(self, method: Method, n: int, column: str) -> float:
-        """In percent; NaN where it is not known."""
+        """A value of the table in percent; NaN if missing."""
         return 100 * self.rows.get((method, n), {}).get(column, float("nan"))
 
     def ends(self, method: Method, n: int, column: str) -> tuple[float, float]:
-        """Of the interval, in percent; NaN where it is not known."""
+        """Ends of its interval in percent; NaN if missing."""
         name, _, key = column.partition("_")
         return self.value(method, n, f"{name}_low_{key}"), self.value(method, n, f"{name}_high_{key}")
 
@@ -180,12 +181,12 @@ def _draw(axes: Axes, layout: _Layout, column: str) -> None:
         if low <= values[0] <= high:
             axes.hlines(y, *layout.ends(method, layout.top_n[0], column), color=INK, linewidth=1.2)
             filled = style.marker in Line2D.filled_markers
-            edge = {"markeredgecolor": INK if filled else style.color, "markeredgewidth": 0.5 if filled else 1.6}
+            edge: Look = {"markeredgecolor": INK if filled else style.color, "markeredgewidth": 0.5 if filled else 1.6}
             axes.plot(values[0], y, style.marker, color=style.color, markersize=7, label=style.label, **edge)
         for value, (n, marker, below) in zip(values[1:], layout.others(), strict=True):
             if low <= value <= high:
                 axes.hlines(y + below, *layout.ends(method, n, column), color=style.color, linewidth=0.8)
-                small = {"markersize": 3.4, "markerfacecolor": "white", "markeredgewidth": 1}
+                small: Look = {"markersize": 3.4, "markerfacecolor": "white", "markeredgewidth": 1}
                 axes.plot(value, y + below, marker, color=style.color, **small)
         for beyond, end, text, side, shift in (
             ([value for value in values if value < low], low, "◂ {}", "left", 2),
@@ -193,7 +194,7 @@ def _draw(axes: Axes, layout: _Layout, column: str) -> None:
         ):
             if beyond and not low <= values[0] <= high:  # else the first mark stands where the text would
                 numbers = " · ".join(f"{value:.0f}" for value in beyond).replace("-", "−")
-                look = {"fontsize": 7.5, "va": "center", "ha": side, "zorder": 1.9, "bbox": plate}
+                look: Look = {"fontsize": 7.5, "va": "center", "ha": side, "zorder": 1.9, "bbox": plate}
                 axes.annotate(text.format(numbers), (end, y), (shift, 0), textcoords="offset points", **look)
 
 
@@ -223,7 +224,7 @@ def _best(n: int) -> str:
 
 def _add_legend(figure: Figure, layout: _Layout, more: Sequence[Line2D]) -> None:
     handles = [Line2D([], [], color=INK, linewidth=1.2, marker="o", markersize=7, label=_best(layout.top_n[0]))]
-    small = {"color": INK, "linewidth": 0.8, "markersize": 3.4, "markerfacecolor": "white"}
+    small: Look = {"color": INK, "linewidth": 0.8, "markersize": 3.4, "markerfacecolor": "white"}
     handles += [Line2D([], [], marker=marker, label=_best(n), **small) for n, marker, _ in layout.others()]
     handles += more
     if any(axes.texts for axes in figure.axes):

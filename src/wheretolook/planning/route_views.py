@@ -93,7 +93,7 @@ class RouteViews:
         height = viewpoint_map.directions[:, 2]
         self._inside = (height >= low) & (height <= high)
         best = viewpoint_map.scores[:, self._inside].max(axis=1, initial=0.0)
-        self._best = np.append(best, 0.0)  # of each row, and of none
+        self._best = np.append(best, 0.0)  # best score of each row; the last entry stands for row -1
         self._limits: dict[int, TurnLimit] = {}
 
     def least_cost(self, places: Float) -> float:
@@ -123,7 +123,7 @@ class RouteViews:
         return self.costed(samples.positions, turned_evenly(samples.even, axes, samples.along))
 
     def costed(self, positions: Float, axes: Float) -> PlannedPath:
-        """A path with its scores and what it costs."""
+        """The path through positions (W, 3) m with axes (W, 3), with its scores and cost."""
         rows, nearest = self.map.rows(positions), (axes @ self.map.directions.T).argmax(1)
         scores = np.where(rows >= 0, self.map.scores[rows, nearest], 0.0).astype(np.float64)
         path = PlannedPath(positions, axes, scores, 0.0)

@@ -99,7 +99,7 @@ def best_sequence(scores: ArrayLike, limit: TurnLimit, start: ArrayLike | None =
     """
     values = _check(scores, limit)
     n, d = values.shape
-    before = np.zeros((n, d), dtype=np.int64)  # the direction at the waypoint before
+    before = np.zeros((n, d), dtype=np.int64)  # best direction at the previous waypoint
     total = np.where(limit.from_start(start), values[0], -np.inf)
     _check_reached(total, 0, limit, start)
     rows = np.arange(d)

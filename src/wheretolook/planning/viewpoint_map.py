@@ -245,7 +245,8 @@ class ViewpointMap:
         """
         rows = self.rows(points)
         found = rows >= 0
-        return ViewChoices(found, *(values[rows] for values in self._best_of_rows))
+        direction, score, n_visible = self._best_of_rows
+        return ViewChoices(found, direction[rows], score[rows], n_visible[rows])
 
     def rows(self, points: ArrayLike) -> NDArray[np.int64]:
         """Rows (N,) of the free voxels that hold world points (N, 3) m; -1 where none does.

@@ -139,5 +139,5 @@ def _draw_legend(figure: Figure, scenes: Axes) -> None:
         Patch(facecolor=color, hatch=hatch, edgecolor=INK, linewidth=0.5, label=label)
         for label, color, hatch in (*_FOUND.values(), _NO_POSE)
     ]
-    handles += scenes.get_legend_handles_labels()[0]
-    figure.legend(handles=handles, loc="outside upper center", ncols=4, columnspacing=1.6)
+    handles_of_scenes = scenes.get_legend_handles_labels()[0]
+    figure.legend(handles=[*handles, *handles_of_scenes], loc="outside upper center", ncols=4, columnspacing=1.6)

@@ -45,13 +45,13 @@ class ScaleSpace:
         starts = np.cumsum([0, *(LEVELS * r * c for r, c in self.sizes)])
         self.image_size = int(starts[-1])
         self.starts = [int(start) for start in starts[:-1]]
-        self.pyramid: Any = Pyramid()
-        self.pyramid.values = wp.empty(n_images * self.image_size, dtype=wp.float32, device=device)
-        self.pyramid.image_size = self.image_size
-        for name, numbers in zip(
-            ("starts", "rows", "columns"), (self.starts, *zip(*self.sizes, strict=True)), strict=True
-        ):
-            setattr(self.pyramid, name, wp.array(numbers, dtype=wp.int32, device=device))
+        pyramid: Any = Pyramid()
+        pyramid.values = wp.empty(n_images * self.image_size, dtype=wp.float32, device=device)
+        pyramid.image_size = self.image_size
+        all_rows, all_columns = map(list, zip(*self.sizes, strict=True))
+        for name, numbers in (("starts", self.starts), ("rows", all_rows), ("columns", all_columns)):
+            setattr(pyramid, name, wp.array(numbers, dtype=wp.int32, device=device))
+        self.pyramid = pyramid
         self.grey = wp.empty((n_images, rows, columns), dtype=wp.uint8, device=device)
         self.half_smooth = wp.empty(n_images * 4 * rows * columns, dtype=wp.float32, device=device)
         self.number = wp.zeros(1, dtype=wp.int32, device=device)

@@ -87,8 +87,9 @@ def _draw_sphere(
         look: Look = {"linewidths": 0.7, "path_effects": [withStroke(linewidth=1.8, foreground="white")]}
         rings: Look = {"s": 1.1 * size, "facecolors": "none", "edgecolors": INK, "label": "localizes"}
         crosses: Look = {"s": 0.6 * size, "marker": "x", "color": INK, "label": "does not"}
-        axes.scatter(*pan_tilt_angles(looked[good]), **rings, **look)
-        axes.scatter(*pan_tilt_angles(looked[~good]), **crosses, **look)
+        x, y = pan_tilt_angles(looked)
+        axes.scatter(x[good], y[good], **rings, **look)
+        axes.scatter(x[~good], y[~good], **crosses, **look)
         axes.legend(loc="upper center", bbox_to_anchor=(0.5, 1.2), ncols=2, columnspacing=1.2, handletextpad=0.2)
     axes.set(xticklabels=[], yticklabels=[])
     bar = figure.colorbar(dots, ax=axes, orientation="horizontal", shrink=0.7, pad=0.08, aspect=25)

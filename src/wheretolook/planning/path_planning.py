@@ -246,7 +246,8 @@ class _Problem:
         util.setLogLevel(util.LOG_NONE)
         # without a map nothing depends on where the camera looks: the pitch has next to no range, the yaw no weight
         pitch = self.pitch if self.map is not None else (-1e-6, 1e-6)
-        space = _state_space(*self.bounds, pitch, 0.2 if self.map is not None else 1e-6)
+        low, high = self.bounds
+        space = _state_space(low, high, pitch, 0.2 if self.map is not None else 1e-6)
         information = base.SpaceInformation(space)
         information.setStateValidityChecker(lambda state: bool(self.space.is_free([_numbers(state)[:3]])[0]))
 

@@ -1,4 +1,4 @@
-"""The two landmarks nearest to each keypoint's descriptor, exactly, by one matrix product."""
+"""Matching of keypoints with landmarks: exact nearest neighbours among descriptors, by matrix products."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ GROUP = 32
 """Landmarks per group. The two best groups are found first, and in them the two best landmarks."""
 
 _PRODUCT_BYTES = {"cpu": 2**22, "cuda": 2**30}
-"""Size of a block of products: on a CPU it should stay in the cache."""
+"""Size of a block of products; on a CPU it should fit into the cache."""
 
 
 class DescriptorMatcher:
@@ -41,7 +41,7 @@ class DescriptorMatcher:
         padded = -(-max(n, 2 * GROUP) // GROUP) * GROUP
         whole = torch.zeros((padded, length), dtype=torch.int32)
         whole[:n] = torch.from_numpy(descriptors.astype(np.int32))
-        if self._in_bytes:  # in signed bytes: q.d = (q - 128).(d - 128) + 128 (sum of d) + terms of q alone
+        if self._in_bytes:  # in signed bytes: q.d = (q - 128).(d - 128) + 128 (sum of d) + terms that depend on q only
             self._descriptors = (whole - 128).to(torch.int8).T
             self._bias = 128 * whole.sum(1, dtype=torch.int32)
         else:
@@ -88,9 +88,9 @@ class DescriptorMatcher:
 
 @cache
 def _byte_products_are_exact() -> bool:
-    """Whether this CPU adds up products of signed bytes without saturation, as it does with VNNI instructions.
+    """Whether this CPU sums products of signed bytes without saturation.
 
-    Without them (AVX2, the first AVX-512) pairs of products are added in 16 bits, and large ones come out wrong.
+    It does so with VNNI instructions; AVX2 and the first AVX-512 add pairs of products in 16 bits, which can overflow.
     """
     left, right = torch.full((64, 128), 127), torch.full((128, 64), 127)
     left[::2], right[:, ::2] = -128, -128
@@ -104,7 +104,7 @@ def _byte_products_are_exact() -> bool:
 def nearest_two_plain(
     queries: NDArray[np.uint8], descriptors: NDArray[np.uint8]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Twin of `DescriptorMatcher.nearest_two`: all products, sorted."""
+    """Plain twin of `DescriptorMatcher.nearest_two`: all products, sorted."""
     product = queries.astype(np.int64) @ descriptors.astype(np.int64).T
     order = np.argsort(-product, axis=1, kind="stable")
     best = np.take_along_axis(product, order[:, :2], axis=1)

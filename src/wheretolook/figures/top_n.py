@@ -1,4 +1,4 @@
-"""What several viewpoints of a location are worth: the paper's figure "Multiple viewpoints results"."""
+"""Scores of the best N viewpoints of a location: the paper's figure "Multiple viewpoints results"."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from wheretolook.methods.styles import method_style
 from wheretolook.viewpoints.thresholds import ALL, threshold_label
 
 SHOWN: tuple[Method, ...] = (("set", ""), (LEARNED, ""), ("fisher", "trace exact"), ("bins", ""), ("random", ""))
-"""Methods that are drawn where no others are asked for; the network is the first there is."""
+"""Methods drawn by default; the network without inputs stands for the first one in the table."""
 
 ROWS = {
     "normalized": "good ones among the best N\n(% of the oracle's share)",
     "any": "locations with a good one\namong N (%)",
 }
-"""The two meanings of a score of several viewpoints: columns of the score table, and what they tell."""
+"""The two scores of several viewpoints: columns of the score table, and their labels."""
 
 _PRINTED = {row.name: row.printed for row in PAPER["vs_others"]}
 _PAPER_MARKS = {"proposed": ("D", "paper, proposed"), "random": ("s", "paper, random")}
@@ -35,16 +35,14 @@ _GREY = "#7a7a7a"
 def top_n_figure(scores: pd.DataFrame, methods: Sequence[Method] = ()) -> Figure:
     """Scores over the number N of best viewpoints, at each threshold.
 
+    Above, the share of good viewpoints among the best N of all locations, in % of the oracle's; below, the share of
+    locations with a good one among N, the oracle's as lines. Whiskers are 95 % bootstrap intervals. Open grey marks are
+    the paper's numbers, which it prints for N = 1 only, on other scenes and divided by its released code's constant.
+
     Args:
         scores: a table of `wheretolook.evaluation.scores.score_table`; its rows over all scenes are drawn, those of the
             first occlusion model and the first set of candidates if there are several.
         methods: those to draw; `SHOWN` if empty.
-
-    Returns:
-        A column for each threshold. Above the share of good viewpoints among the best N of all locations, in % of the
-        oracle's; below the share of locations with a good one among N, the oracle's as lines. Whiskers are 95 %
-        bootstrap intervals. Open grey marks: what the paper prints for N = 1, on other scenes and divided by the
-        constant of its released code; of other N it prints no numbers.
     """
     scores = main_rows(scores)
     pooled, keys = scores[scores["scene"] == ALL], threshold_keys(scores)
@@ -70,7 +68,7 @@ def top_n_figure(scores: pd.DataFrame, methods: Sequence[Method] = ()) -> Figure
 
 
 def top_n_table(scores: pd.DataFrame, methods: Sequence[Method] = ()) -> pd.DataFrame:
-    """What `top_n_figure` draws at the finest threshold, in %, and the oracle's: a row a method, columns by N."""
+    """What `top_n_figure` draws at the finest threshold, in %: a row for each method and the oracle, columns by N."""
     scores = main_rows(scores)
     pooled, key = scores[scores["scene"] == ALL], threshold_keys(scores)[0]
     names = {"normalized": "good ones, % of the oracle's", "any": "locations with one, %"}

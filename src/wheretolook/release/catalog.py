@@ -231,7 +231,7 @@ def _learning(source: Source) -> Figure:
     from wheretolook.release.showcase_figures import learning_of
 
     showcase, scorer, location = _shown(source, weights_name("2d+z"))
-    return learning_figure(*learning_of(showcase, cast("LearnedScorer", scorer), location).drawn)
+    return learning_figure(*learning_of(showcase, cast("LearnedScorer", scorer), location))
 
 
 def _sampling(source: Source) -> Figure:
@@ -254,7 +254,7 @@ def _peaks(source: Source) -> Figure:
     from wheretolook.figures.peaks import peaks_figure
     from wheretolook.release.showcase_figures import peaks_of
 
-    return peaks_figure(*peaks_of(*_shown(source)).drawn)
+    return peaks_figure(*peaks_of(*_shown(source)))
 
 
 def _planning(source: Source) -> Figure:

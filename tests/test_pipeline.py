@@ -20,8 +20,10 @@ from wheretolook.camera_models import ColmapCamera
 from wheretolook.cli import main, parse_experiment
 from wheretolook.dataset import Dataset
 from wheretolook.errors import TableError
+from wheretolook.evaluation import EvaluateConfig
 from wheretolook.geometry import PinholeCamera, camera_centers
 from wheretolook.labelling import report
+from wheretolook.learning.config import TrainConfig
 from wheretolook.learning.weights import load_classifier
 from wheretolook.localization_map import LocalizationMap
 from wheretolook.planning.path_comparison import draw_pairs
@@ -40,12 +42,12 @@ camera: {width: 320, height: 240, focal_px: 160}
 scenes:
   train: 1
   test: 1
-  apartment: {n_rooms: 3, area_m2: 26, texture_size: 2048}
-map: {n_images: 30}
+  apartment: {n_rooms: 3, area_m2: 26, texture_size: 1024, texels_per_m: 40, light_spacing_m: 0.5, light_rays: 4}
+map: {n_images: 24}
 sample: {grid: [6, 6, 4], directions: 100, keep: 50, max_locations: 8, max_directions: 5}
-label: {workers: 2, shard_size: 8}
-train: {epochs: 2, val_fraction: 0.3}
-evaluate: {resamples: 50}
+label: {workers: 1, shard_size: 20}
+train: {epochs: 2, val_fraction: 0.3, variants: [2d, 2d+3d, set], set: {epochs: 2, batch_size: 1}}
+evaluate: {resamples: 20, top_n: [1, 5], methods: [random, visible, bins, fisher-trace-exact, mlp, set]}
 """
 
 
@@ -85,7 +87,7 @@ def test_every_stage_leaves_its_result(demo: Path) -> None:
         assert len(pycolmap.Reconstruction(scene.map).points3D) > 100
         assert not (scene.folder / "shards").exists()
     scores = pd.read_csv(dataset.root / "results" / "scores.csv")
-    assert {"random", "bins", "mlp", "oracle"} <= set(scores["method"])
+    assert {"random", "visible", "bins", "fisher", "mlp", "set", "oracle"} == set(scores["method"])
     for picture in ("scores.png", "overview.png"):
         assert (dataset.root / "results" / picture).stat().st_size > 10_000
     run_of_evaluation = newest_run(TrackingConfig(str(demo / "mlruns")), "evaluate")
@@ -98,15 +100,27 @@ def test_run_again_it_reuses_what_is_there(demo: Path) -> None:
     assert {path: path.stat().st_mtime_ns for path in before} == before
 
 
-def test_the_same_seed_gives_the_same_bytes(demo: Path, tmp_path: Path) -> None:
+@pytest.mark.slow
+def test_all_methods_are_trained_and_compared(copy: Path) -> None:
+    methods, variants = EvaluateConfig().methods, TrainConfig().variants
+    assert run("train", copy, "--train.variants", f"[{','.join(variants)}]") == 0
+    assert run("evaluate", copy, "--evaluate.methods", f"[{','.join(methods)}]") == 0
+    scores = pd.read_csv(copy / "data" / "tiny" / "results" / "scores.csv")
+    assert {name.split("-")[0] for name in methods} <= {name.split("-")[0] for name in scores["method"]}
+    assert {"2d", "2d+z", "2d+3d"} <= set(scores["inputs"])
+
+
+@pytest.mark.parametrize("workers", ["1", pytest.param("2", marks=pytest.mark.slow)])
+def test_the_same_seed_gives_the_same_bytes(demo: Path, tmp_path: Path, workers: str) -> None:
     (tmp_path / "tiny.yaml").write_text(EXPERIMENT)
     for stage in ("scenes", "map", "sample", "label"):
-        assert run(stage, tmp_path, "--scenes.test", "0", "--label.workers", "1", "--label.shard_size", "64") == 0
+        assert run(stage, tmp_path, "--scenes.test", "0", "--label.workers", workers, "--label.shard_size", "7") == 0
     for name in ("mesh.glb", "map/points3D.bin", "map/landmarks.npz", "occlusion.npz", "viewpoints.parquet"):
         ours, theirs = (folder / "data" / "tiny" / "apartment-000" / name for folder in (tmp_path, demo))
         assert fingerprint(ours) == fingerprint(theirs), name
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_a_changed_setting_remakes_what_depends_on_it(copy: Path) -> None:
     scene = Dataset.load(copy / "data" / "tiny").scenes[0]
     mesh, table = fingerprint(scene.mesh), scene.read_table()
@@ -117,6 +131,7 @@ def test_a_changed_setting_remakes_what_depends_on_it(copy: Path) -> None:
     pd.testing.assert_frame_equal(scene.read_table(), table)
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_matches_are_stored_when_asked_for_and_go_with_the_labels_they_belong_to(copy: Path) -> None:
     scenes = Dataset.load(copy / "data" / "tiny").scenes
     before = {scene: scene.table.read_bytes() for scene in scenes}
@@ -247,6 +262,7 @@ def test_a_stage_refuses_what_an_earlier_one_has_remade(copy: Path, capsys: pyte
         assert f"Run `wheretolook {needed}`" in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_labels_of_different_settings_are_not_used_together(
     copy: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -265,6 +281,7 @@ def test_labels_of_different_settings_are_not_used_together(
         assert "Run `wheretolook label`" in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_a_report_that_could_not_be_logged_is_logged_the_next_time(
     copy: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

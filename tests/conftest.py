@@ -20,6 +20,14 @@ from wheretolook.visibility import VisibleSets
 from wheretolook.warp_setup import start_warp
 
 
+LONG = ("test_pipeline.py", "test_release.py", "test_notebooks.py", "test_catalog.py", "test_faults.py", "test_engines.py")
+"""Files that take longest. They are begun first, so that no process is left with one when the others have finished."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    items.sort(key=lambda item: LONG.index(item.path.name) if item.path.name in LONG else len(LONG))
+
+
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     """Tests that take a device run on the CPU, and on CUDA where there is one."""
     if "device" in metafunc.fixturenames:

@@ -346,7 +346,7 @@ def test_stages_are_plain_functions(demo: Path) -> None:
 
 def test_planned_paths_are_rendered_and_localized(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = ["--paths.pairs", "2", "--paths.methods", "[forward,visible]", "--paths.grid", "[4, 4, 2]",
-               "--paths.directions", "40", "--paths.min_distance_m", "1", "--paths.planner.time_s", "2",
+               "--paths.directions", "40", "--paths.min_distance_m", "1", "--paths.planner.time_s", "1",
                "--paths.planner.spacing_m", "0.5", "--paths.max_turn_deg", "60"]  # fmt: skip
     assert run("compare-paths", copy, *options) == 0
     root = copy / "data" / "tiny" / "results"
@@ -373,7 +373,7 @@ def test_a_path_is_planned_and_shown(
     scene = Dataset.load(copy / "data" / "tiny").split("test")[0]
     centers = camera_centers(poses(scene.read_table()))
     options = ["--scene", scene.name, "--plan.grid", "[4, 4, 2]", "--plan.directions", "40",
-               "--plan.planner.time_s", "3", "--plan.planner.spacing_m", "0.5"]  # fmt: skip
+               "--plan.planner.time_s", "2", "--plan.planner.spacing_m", "0.5"]  # fmt: skip
     options += ["--out", str(tmp_path / "way")]
     away = np.linalg.norm(centers - centers[0], axis=1)
     goal = centers[np.where(away > 0.5, away, np.inf).argmin()]  # not far: there is little time

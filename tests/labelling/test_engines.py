@@ -19,8 +19,12 @@ from wheretolook.labelling import LabelConfig, LabelTask, label_scenes, ray_engi
 from wheretolook.labelling.labeller import MANIFEST
 from wheretolook.labelling.shard import Shard
 
+SLOW = pytest.mark.slow
 
-@pytest.mark.parametrize(("workers", "shard_size"), [(1, 24), (2, 5), (4, 3)])
+
+@pytest.mark.parametrize(
+    ("workers", "shard_size"), [(2, 5), pytest.param(1, 24, marks=SLOW), pytest.param(4, 3, marks=SLOW)]
+)
 def test_workers_and_shards_do_not_change_the_table(
     room: MappedRoom, views: pd.DataFrame, expected: bytes, tmp_path: Path, workers: int, shard_size: int
 ) -> None:
@@ -67,6 +71,7 @@ def test_what_no_machine_of_the_cluster_has_is_named(resources: dict[str, float]
     ray_engine._check_resources({"CPU": 1.0}, needs_gpu=False)
 
 
+@pytest.mark.slow
 def test_an_address_without_a_cluster_is_refused_at_once(room: MappedRoom) -> None:
     """Ray itself would try for many minutes."""
     pytest.importorskip("ray")
@@ -97,6 +102,7 @@ def cluster() -> Iterator[Any]:
             cluster.shutdown()
 
 
+@pytest.mark.slow
 def test_a_cluster_gives_the_same_table(
     cluster: Any, room: MappedRoom, views: pd.DataFrame, expected: bytes, tmp_path: Path
 ) -> None:
@@ -114,6 +120,7 @@ def test_a_cluster_gives_the_same_table(
     assert not ray.is_initialized()
 
 
+@pytest.mark.slow
 def test_a_machine_that_is_removed_loses_nothing(
     cluster: Any, room: MappedRoom, views: pd.DataFrame, expected: bytes, tmp_path: Path
 ) -> None:

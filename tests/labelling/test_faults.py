@@ -212,6 +212,7 @@ def test_shards_of_another_mesh_or_of_other_viewpoints_are_not_used(
     assert (read_table(tmp_path / "shards-labelled.parquet")["status"] == "too_few_matches").all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("n_finished", "matches"), [(0, False), (3, False), (3, True)])
 def test_killed_at_any_moment_it_resumes_to_the_same_table(
     room: MappedRoom, views: pd.DataFrame, expected: bytes, expected_matches: bytes, tmp_path: Path, n_finished: int,

@@ -298,6 +298,7 @@ def test_the_same_seed_gives_the_same_weights(dataset: Dataset, store: str) -> N
     assert train(dataset, replace(config, seed=1), tracking, progress=False)[0].path.read_bytes() != first
 
 
+@pytest.mark.slow
 def test_two_processes_train_as_one_does(dataset: Dataset, store: str, capfd: pytest.CaptureFixture[str]) -> None:
     # 920 training views: the last batch has one view, so that one of two processes has none
     tracking, one = TrackingConfig(store, "devices"), replace(SMALL, dropout=0.0, batch_size=919)

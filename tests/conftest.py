@@ -19,8 +19,7 @@ from wheretolook.tracking import TrackingConfig, client
 from wheretolook.visibility import VisibleSets
 from wheretolook.warp_setup import start_warp
 
-
-LONG = ("test_pipeline.py", "test_release.py", "test_notebooks.py", "test_catalog.py", "test_faults.py", "test_engines.py")
+LONG = [f"test_{name}.py" for name in ("pipeline", "release", "notebooks", "catalog", "faults", "engines")]
 """Files that take longest. They are begun first, so that no process is left with one when the others have finished."""
 
 

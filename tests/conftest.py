@@ -5,12 +5,14 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import torch
 import warp as wp
+from matplotlib.figure import Figure
 
 from wheretolook.geometry import Float, PinholeCamera, poses_looking_along
 from wheretolook.labelling import local_engine
@@ -51,6 +53,18 @@ def migrated_stores(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(TrackingConfig, "uri", property(uri))
+        yield
+
+
+@pytest.fixture(scope="module")
+def no_pictures() -> Iterator[None]:
+    """Figures are built, but their files stay empty: drawing is a third of a small training or evaluation."""
+
+    def savefig(figure: Figure, path: str | Path, **options: object) -> None:
+        Path(path).write_bytes(b"")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Figure, "savefig", savefig)
         yield
 
 

@@ -33,6 +33,8 @@ from wheretolook.table import is_good, poses, write_table
 from wheretolook.tracking import TrackingConfig
 from wheretolook.visibility import StoredOcclusion
 
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
 TRAIN = TrainConfig(("2d", "2d+z"), epochs=3, hidden=(16,), accelerator="cpu")
 EVALUATE = EvaluateConfig(("random", "visible", "bins", "fisher-trace-exact", "mlp"), resamples=100, top_n=(1, 5))
 CONFIGS = Path(__file__).parents[1] / "configs"

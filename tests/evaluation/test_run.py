@@ -22,6 +22,8 @@ from wheretolook.scoring import VisibleScorer, load_scorer
 from wheretolook.table import UNLABELLED, is_good, poses, write_table
 from wheretolook.tracking import TrackingConfig, client, newest_run, ui_command
 
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
 CONFIG = EvaluateConfig(("random", "visible", "bins", "mlp"), resamples=100, top_n=(1, 5))
 RULES = replace(CONFIG, methods=("random", "visible", "bins"))
 

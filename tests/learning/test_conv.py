@@ -32,6 +32,8 @@ from wheretolook.scoring.learned import LearnedScorer
 from wheretolook.table import LOCALIZED, NO_POSE, UNLABELLED, poses, write_table
 from wheretolook.tracking import TrackingConfig, client
 
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
 FEW = ConvConfig(epochs=2, batch_size=64, widths=(4, 8, 8), bins=12)
 
 

@@ -42,6 +42,8 @@ from wheretolook.scoring.set import SetScorer
 from wheretolook.table import LOCALIZED, poses, read_table, write_table
 from wheretolook.tracking import TrackingConfig
 
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
 DISTANCE = ATTRIBUTES.index("distance")
 NO_STATISTICS = AttributeStatistics((0.0,) * len(ATTRIBUTES), (1.0,) * len(ATTRIBUTES))
 

@@ -20,6 +20,8 @@ from wheretolook.mapping.landmarks import MAP_ATTRIBUTES, Landmarks
 from wheretolook.table import LOCALIZED, is_good, read_table, write_table
 from wheretolook.tracking import TrackingConfig
 
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
 CONFIG = TrainConfig(
     variants=("2d+3d", "trees", "set"),
     epochs=2,

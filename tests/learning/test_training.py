@@ -33,6 +33,8 @@ from wheretolook.scoring import load_scorer
 from wheretolook.table import LOCALIZED, NO_POSE, UNLABELLED, is_good, write_table
 from wheretolook.tracking import TrackingConfig, client
 
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
 SMALL = TrainConfig(variants=("2d",), epochs=3, hidden=(32,), accelerator="cpu")
 
 

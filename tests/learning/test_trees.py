@@ -26,6 +26,8 @@ from wheretolook.scoring.trees import TreesScorer
 from wheretolook.table import is_good, poses
 from wheretolook.tracking import TrackingConfig
 
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
 FEW = TreesConfig(max_trees=20, max_leaves=7, min_leaf=5)
 
 

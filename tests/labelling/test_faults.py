@@ -36,6 +36,7 @@ from wheretolook.scenes.loading import load_mesh, save_glb
 from wheretolook.table import read_table, write_table
 
 
+@pytest.mark.slow
 def test_killed_workers_are_replaced_and_repeat_their_shard_only(
     room: MappedRoom, views: pd.DataFrame, expected: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -72,6 +73,7 @@ def test_killed_workers_are_replaced_and_repeat_their_shard_only(
     assert not multiprocessing.active_children()
 
 
+@pytest.mark.slow
 def test_a_shard_that_kills_its_worker_every_time_is_given_up(
     room: MappedRoom, views: pd.DataFrame, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

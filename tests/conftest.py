@@ -56,8 +56,7 @@ def migrated_stores(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         yield
 
 
-@pytest.fixture(scope="module")
-def no_pictures() -> Iterator[None]:
+def _without_pictures() -> Iterator[None]:
     """Figures are built, but their files stay empty: drawing is a third of a small training or evaluation."""
 
     def savefig(figure: Figure, path: str | Path, **options: object) -> None:
@@ -66,6 +65,10 @@ def no_pictures() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Figure, "savefig", savefig)
         yield
+
+
+no_pictures = pytest.fixture(_without_pictures, scope="module", name="no_pictures")
+no_pictures_here = pytest.fixture(_without_pictures, name="no_pictures_here")
 
 
 @pytest.fixture

@@ -113,7 +113,11 @@ def test_all_methods_are_trained_and_compared(copy: Path) -> None:
 
 
 @pytest.mark.parametrize("workers", ["1", pytest.param("2", marks=pytest.mark.slow)])
-def test_the_same_seed_gives_the_same_bytes(demo: Path, tmp_path: Path, workers: str) -> None:
+def test_the_same_seed_gives_the_same_bytes(
+    demo: Path, tmp_path: Path, workers: str, request: pytest.FixtureRequest
+) -> None:
+    if workers == "1":
+        request.getfixturevalue("in_this_process")
     (tmp_path / "tiny.yaml").write_text(EXPERIMENT)
     for stage in ("scenes", "map", "sample", "label"):
         assert run(stage, tmp_path, "--scenes.test", "0", "--label.workers", workers, "--label.shard_size", "7") == 0
@@ -122,7 +126,7 @@ def test_the_same_seed_gives_the_same_bytes(demo: Path, tmp_path: Path, workers:
         assert fingerprint(ours) == fingerprint(theirs), name
 
 
-@pytest.mark.usefixtures("in_this_process")
+@pytest.mark.usefixtures("in_this_process", "no_pictures_here")
 def test_a_changed_setting_remakes_what_depends_on_it(copy: Path) -> None:
     scene = Dataset.load(copy / "data" / "tiny").scenes[0]
     mesh, table = fingerprint(scene.mesh), scene.read_table()
@@ -133,7 +137,7 @@ def test_a_changed_setting_remakes_what_depends_on_it(copy: Path) -> None:
     pd.testing.assert_frame_equal(scene.read_table(), table)
 
 
-@pytest.mark.usefixtures("in_this_process")
+@pytest.mark.usefixtures("in_this_process", "no_pictures_here")
 def test_matches_are_stored_when_asked_for_and_go_with_the_labels_they_belong_to(copy: Path) -> None:
     scenes = Dataset.load(copy / "data" / "tiny").scenes
     before = {scene: scene.table.read_bytes() for scene in scenes}
@@ -264,7 +268,7 @@ def test_a_stage_refuses_what_an_earlier_one_has_remade(copy: Path, capsys: pyte
         assert f"Run `wheretolook {needed}`" in capsys.readouterr().err
 
 
-@pytest.mark.usefixtures("in_this_process")
+@pytest.mark.usefixtures("in_this_process", "no_pictures_here")
 def test_labels_of_different_settings_are_not_used_together(
     copy: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -283,7 +287,7 @@ def test_labels_of_different_settings_are_not_used_together(
         assert "Run `wheretolook label`" in capsys.readouterr().err
 
 
-@pytest.mark.usefixtures("in_this_process")
+@pytest.mark.usefixtures("in_this_process", "no_pictures_here")
 def test_a_report_that_could_not_be_logged_is_logged_the_next_time(
     copy: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -33,7 +33,7 @@ def test_workers_and_shards_do_not_change_the_table(
 
 
 def test_a_run_that_was_left_goes_on_where_it_stopped(
-    room: MappedRoom, views: pd.DataFrame, expected: bytes, tmp_path: Path
+    room: MappedRoom, views: pd.DataFrame, expected: bytes, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
     first, second = (
         LabelTask(name, room.job, rows, tmp_path / name)
@@ -45,6 +45,7 @@ def test_a_run_that_was_left_goes_on_where_it_stopped(
     assert not multiprocessing.active_children()
     finished = times(first.shards) | times(second.shards)
 
+    request.getfixturevalue("in_this_process")
     again = label_scenes([first, second], LabelConfig(workers=1, shard_size=4), progress=False)
     scenes = {scene.task.name: scene for scene in again}
     assert list(scenes) == ["first", "second"]

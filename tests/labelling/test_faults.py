@@ -168,7 +168,7 @@ def test_a_shard_that_is_damaged_while_others_are_made_is_an_error(
     assert [path.name[:8] for path in times(tmp_path)] == ["00000002"]  # the next run makes the other anew
 
 
-@pytest.mark.parametrize("matches", [False, True])
+@pytest.mark.parametrize("matches", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_no_flipped_bit_of_a_table_goes_unnoticed(
     matches: bool, expected: bytes, expected_matches: bytes, tmp_path: Path
 ) -> None:

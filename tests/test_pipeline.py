@@ -317,7 +317,7 @@ def test_weights_are_not_tested_on_what_they_learnt_from(copy: Path, capsys: pyt
     dataset = Dataset.load(root)
     replace(dataset, scenes=tuple(replace(scene, split="test") for scene in dataset.scenes)).save()
     weights = root / "weights" / "mlp-2d.safetensors"
-    assert run("evaluate", copy, "--evaluate.weights", f"[{weights}]") == 2
+    assert run("evaluate", copy, "--evaluate.methods", "[mlp]", "--evaluate.weights", f"[{weights}]") == 2
     assert "learnt from a scene of the test split (got 'apartment-000')" in capsys.readouterr().err
     assert run("evaluate", copy) == 2
     assert "trained on other data" in capsys.readouterr().err

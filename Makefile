@@ -44,7 +44,7 @@ lab: $(READY)
 
 html: $(READY)
 	@$(BIN)/wheretolook log-release >/dev/null
-	OMP_WAIT_POLICY=PASSIVE $(BIN)/python -m wheretolook.notebook_html notebooks notebooks/html
+	OMP_WAIT_POLICY=PASSIVE $(BIN)/python notebooks/pages.py notebooks notebooks/html
 
 setup: $(READY)
 

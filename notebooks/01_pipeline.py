@@ -27,9 +27,9 @@ from IPython.display import Markdown, display
 from wheretolook import load_scorer
 from wheretolook.figures.peaks import peaks_figure
 from wheretolook.figures.pipeline import pipeline_figure
-from wheretolook.notebook import open_release
-from wheretolook.showcase import open_showcase
-from wheretolook.showcase_figures import peaks_of, pipeline_of
+from wheretolook.release.notebook import open_release
+from wheretolook.release.showcase import open_showcase
+from wheretolook.release.showcase_figures import peaks_of, pipeline_of
 
 # %% [markdown]
 # The release holds landmarks, viewpoints and labels, but no meshes: the apartment is generated anew from its seed. That

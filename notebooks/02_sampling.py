@@ -25,9 +25,9 @@ from IPython.display import display
 
 from wheretolook.figures.lattices import fibonacci_figure
 from wheretolook.figures.sampling import sampling_figure
-from wheretolook.notebook import open_release
-from wheretolook.showcase import open_showcase
-from wheretolook.showcase_figures import sampling_of
+from wheretolook.release.notebook import open_release
+from wheretolook.release.showcase import open_showcase
+from wheretolook.release.showcase_figures import sampling_of
 
 # %% [markdown]
 # An apartment of the release, generated anew from its seed; a place in it where half of all views fail.

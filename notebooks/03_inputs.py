@@ -26,10 +26,10 @@ from IPython.display import display
 from wheretolook import load_scorer
 from wheretolook.figures.inputs import inputs_figure
 from wheretolook.figures.learning import learning_figure
-from wheretolook.learning.architecture import architecture_table
-from wheretolook.notebook import open_release
-from wheretolook.showcase import open_showcase
-from wheretolook.showcase_figures import learning_of
+from wheretolook.methods.mlp.architecture import architecture_table
+from wheretolook.release.notebook import open_release
+from wheretolook.release.showcase import open_showcase
+from wheretolook.release.showcase_figures import learning_of
 
 # %% [markdown]
 # An apartment of the release, generated anew from its seed, and the paper's network that ships.

@@ -23,7 +23,7 @@
 # %config InlineBackend.figure_formats = ["retina"]
 from IPython.display import Markdown, display
 
-from wheretolook.notebook import open_release, open_store
+from wheretolook.release.notebook import open_release, open_store
 
 release = open_release()
 tracking = open_store(release)
@@ -35,8 +35,8 @@ tracking = open_store(release)
 # 30 × 30 bins of the image, each with the mean of the landmarks in it: their pixel, and depth or position.
 
 # %%
-from wheretolook.learning.paper_architecture import paper_architecture_table
-from wheretolook.tracking import newest_run
+from wheretolook.release.paper_architecture import paper_architecture_table
+from wheretolook.utils.tracking import newest_run
 
 run = newest_run(tracking, "train", params={"dataset": release.name, "variant": "2d+3d"})
 paper_architecture_table(run.data.params).style.hide()
@@ -78,7 +78,7 @@ display(training_figure(curves) if curves else Markdown(f"No run has a history y
 # %%
 from wheretolook.evaluation.calibration import read_calibration
 from wheretolook.figures.calibration import calibration_figure
-from wheretolook.tracking import newest_artifact
+from wheretolook.utils.tracking import newest_artifact
 
 calibration = read_calibration(newest_artifact(tracking, "evaluate", "calibration.csv", release.name))
 display(calibration_figure(calibration))
@@ -92,8 +92,8 @@ display(calibration_figure(calibration))
 # %%
 from wheretolook import load_scorer
 from wheretolook.figures.peaks import peaks_figure
-from wheretolook.showcase import open_showcase
-from wheretolook.showcase_figures import mistaken_location, peaks_of
+from wheretolook.release.showcase import open_showcase
+from wheretolook.release.showcase_figures import mistaken_location, peaks_of
 
 # %% [markdown]
 # The place is one of an apartment that none of them has learnt from, where half of all views fail. Its mesh is

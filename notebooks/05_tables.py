@@ -24,8 +24,8 @@
 from IPython.display import Markdown, display
 
 from wheretolook.evaluation.paper_tables import NOTE
-from wheretolook.evaluation.table_view import latest_paper_table, paper_styler
-from wheretolook.notebook import open_release, open_store
+from wheretolook.release.notebook import open_release, open_store
+from wheretolook.release.table_view import latest_paper_table, paper_styler
 
 release = open_release()
 tracking = open_store(release)
@@ -56,7 +56,7 @@ paper_styler(latest_paper_table(tracking, "input_variants", release.name))
 # axis. The methods that know what landmarks are like lead at the finest limit; at coarser ones most are alike.
 
 # %%
-from wheretolook.evaluation import latest_scores
+from wheretolook.evaluation.results import latest_scores
 from wheretolook.figures.scores import regret_figure, score_figure
 
 scores = latest_scores(tracking, release.name)

@@ -23,9 +23,9 @@
 # %config InlineBackend.figure_formats = ["retina"]
 from IPython.display import display
 
-from wheretolook.evaluation import latest_scores
+from wheretolook.evaluation.results import latest_scores
 from wheretolook.figures.top_n import top_n_figure
-from wheretolook.notebook import open_release, open_store
+from wheretolook.release.notebook import open_release, open_store
 
 release = open_release()
 scores = latest_scores(open_store(release), release.name)

@@ -27,12 +27,12 @@ from IPython.display import Markdown, display
 
 from wheretolook.figures.path_film import methods_figure, still_figure
 from wheretolook.figures.paths import paths_figure
-from wheretolook.notebook import open_release, open_store
 from wheretolook.planning.config import PathConfig, PathsConfig, PlanConfig
 from wheretolook.planning.method_paths import path_views, plan_by_methods
 from wheretolook.planning.path_report import path_markdown
-from wheretolook.showcase import open_showcase
-from wheretolook.tracking import newest_artifact
+from wheretolook.release.notebook import open_release, open_store
+from wheretolook.release.showcase import open_showcase
+from wheretolook.utils.tracking import newest_artifact
 
 # %% [markdown]
 # ## Three ways to look

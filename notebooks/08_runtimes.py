@@ -24,8 +24,8 @@
 import pandas as pd
 from IPython.display import display
 
-from wheretolook.notebook import open_release, open_store
-from wheretolook.tracking import newest_artifact
+from wheretolook.release.notebook import open_release, open_store
+from wheretolook.utils.tracking import newest_artifact
 
 tracking = open_store(open_release())
 
@@ -60,8 +60,8 @@ runtime_table(times).style.hide().format(precision=3)
 # With `--scaling` it measures how time and memory grow, too, which is drawn here if the store knows it.
 
 # %%
-from wheretolook.errors import MissingRunError
 from wheretolook.figures.runtimes import scaling_figure
+from wheretolook.utils.errors import MissingRunError
 
 try:
     display(scaling_figure(pd.read_csv(newest_artifact(tracking, "benchmark", "scaling.csv"))))

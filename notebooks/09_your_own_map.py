@@ -28,16 +28,18 @@ from IPython.display import display
 from PIL import Image
 
 from wheretolook import LocalizationMap, load_scorer, poses_looking_along
-from wheretolook.example_model import make_example_model
+from wheretolook.figures.house_image import dollhouse
 from wheretolook.figures.pipeline import ranked_figure
-from wheretolook.grid import VoxelGrid, fibonacci_sphere
-from wheretolook.notebook import open_release
-from wheretolook.planning import ViewpointMap, build_viewpoint_map, refine_directions
-from wheretolook.rendering import WarpRenderer
-from wheretolook.rendering.dollhouse import dollhouse
-from wheretolook.sampling import free_locations
-from wheretolook.scenes.free_space import FreeSpace
+from wheretolook.geometry.lattices import VoxelGrid, fibonacci_sphere
+from wheretolook.planning.map_building import build_viewpoint_map
+from wheretolook.planning.refine import refine_directions
+from wheretolook.planning.viewpoint_map import ViewpointMap
+from wheretolook.release.example_model import make_example_model
+from wheretolook.release.notebook import open_release
+from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import load_mesh
+from wheretolook.space.free_space import FreeSpace
+from wheretolook.viewpoints.sampling import free_locations
 
 # %% [markdown]
 # ## A map

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from wheretolook.scenes.mesh import TexturedMesh
+from wheretolook.geometry.mesh import TexturedMesh
 
 # Corners of a unit cube's faces, counter-clockwise seen from outside.
 _FACES = np.array(

@@ -14,14 +14,15 @@ import torch
 import warp as wp
 from matplotlib.figure import Figure
 
-from wheretolook.geometry import Float, PinholeCamera, poses_looking_along
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.poses import Float, poses_looking_along
 from wheretolook.labelling import local_engine
 from wheretolook.labelling.shard import LabelledShard, Shard, ShardWorker
-from wheretolook.tracking import TrackingConfig, client
-from wheretolook.visibility import VisibleSets
-from wheretolook.warp_setup import start_warp
+from wheretolook.utils.tracking import TrackingConfig, client
+from wheretolook.utils.warp import start_warp
+from wheretolook.visibility.frustum import VisibleSets
 
-LONG = [f"test_{name}.py" for name in ("pipeline", "release", "notebooks", "catalog", "faults", "engines")]
+LONG = [f"test_{name}.py" for name in ("pipeline", "release", "notebooks", "evaluate", "train", "engines", "faults")]
 """Files that take longest. They are begun first, so that no process is left with one when the others have finished."""
 
 

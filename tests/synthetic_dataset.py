@@ -7,14 +7,16 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from wheretolook.dataset import Dataset, SceneFolder, Split
-from wheretolook.features import bin_views_plain
-from wheretolook.geometry import Float, PinholeCamera, poses_looking_along
-from wheretolook.grid import fibonacci_sphere
+from wheretolook.dataset.folders import Dataset, SceneFolder
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.lattices import fibonacci_sphere
+from wheretolook.geometry.poses import Float, poses_looking_along
+from wheretolook.inputs.bins import bin_views_plain
 from wheretolook.mapping.cameras import save_mapping_poses
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.table import LOCALIZED, NO_POSE, TOO_FEW_MATCHES, pose_columns, write_table
-from wheretolook.visibility import StoredOcclusion, VisibleSets
+from wheretolook.viewpoints.table import LOCALIZED, NO_POSE, TOO_FEW_MATCHES, Split, pose_columns, write_table
+from wheretolook.visibility.frustum import VisibleSets
+from wheretolook.visibility.occlusion import StoredOcclusion
 
 CAMERA = PinholeCamera(160, 120, 80.0)
 BINS = 30

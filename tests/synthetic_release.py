@@ -9,10 +9,10 @@ import pandas as pd
 
 from synthetic_dataset import make_dataset
 from synthetic_scores import make_scores
-from wheretolook.dataset import Dataset
+from wheretolook.dataset.folders import Dataset
 from wheretolook.evaluation.paper_tables import write_paper_tables
-from wheretolook.evaluation.scores import Method
-from wheretolook.release import ABOUT
+from wheretolook.methods.names import Method
+from wheretolook.release.copy import ABOUT
 
 METHODS: tuple[Method, ...] = (
     ("random", ""),

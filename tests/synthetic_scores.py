@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 
-from wheretolook.evaluation.config import THRESHOLDS, threshold_key
-from wheretolook.evaluation.scores import RELEASED_DIVISOR, Method
+from wheretolook.evaluation.scores import RELEASED_DIVISOR
+from wheretolook.methods.names import Method
+from wheretolook.viewpoints.thresholds import THRESHOLDS, threshold_key
 
 KEYS = tuple(map(threshold_key, THRESHOLDS))
 FISHER: tuple[Method, ...] = tuple(

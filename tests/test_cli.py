@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from wheretolook.cli import main
-from wheretolook.scoring.bins import BinsScorer
-from wheretolook.scoring.registry import SCORERS, describe_methods
+from wheretolook.methods.bins import BinsScorer
+from wheretolook.methods.registry import SCORERS, describe_methods
 
 
 def test_methods_are_listed_without_a_dataset(

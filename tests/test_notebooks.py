@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
 from nbclient import NotebookClient
+from pages import main, notebook_page, small_picture
 from PIL import Image
 
 from synthetic_release import make_release
-from wheretolook.figures.style import MethodStyle, scorer_style
-from wheretolook.notebook_html import main, notebook_page, small_picture
-from wheretolook.tracking import TrackingConfig, newest_run
+from wheretolook.methods.styles import MethodStyle, scorer_style
+from wheretolook.utils.tracking import TrackingConfig, newest_run
 
 FOLDER = Path(__file__).parents[1] / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
@@ -61,7 +61,7 @@ def outputs(notebook: nbformat.NotebookNode, mime: str) -> list[str]:
 
 def test_each_script_has_its_notebook() -> None:
     assert {*FROM_RUNS, *OF_THE_RELEASE} == {path.stem for path in NOTEBOOKS}
-    assert {path.stem for path in FOLDER.glob("*.py")} == {path.stem for path in NOTEBOOKS}
+    assert {path.stem for path in FOLDER.glob("[0-9]*.py")} == {path.stem for path in NOTEBOOKS}
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)

@@ -7,20 +7,23 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
+from wheretolook.utils.version import VERSION as __version__
 
 if TYPE_CHECKING:
-    from wheretolook.geometry import PinholeCamera, poses_looking_along
-    from wheretolook.localization_map import LocalizationMap
-    from wheretolook.scoring import load_scorer
+    from wheretolook.geometry.camera import PinholeCamera
+    from wheretolook.geometry.poses import poses_looking_along
+    from wheretolook.inputs.localization_map import LocalizationMap
+    from wheretolook.methods.registry import load_scorer
+    from wheretolook.planning.viewpoint_map import ViewpointMap
 
-__all__ = ["LocalizationMap", "PinholeCamera", "__version__", "load_scorer", "poses_looking_along"]
+__all__ = ["LocalizationMap", "PinholeCamera", "ViewpointMap", "__version__", "load_scorer", "poses_looking_along"]
 
 _HOMES = {
-    "LocalizationMap": "wheretolook.localization_map",
-    "PinholeCamera": "wheretolook.geometry",
-    "load_scorer": "wheretolook.scoring",
-    "poses_looking_along": "wheretolook.geometry",
+    "LocalizationMap": "wheretolook.inputs.localization_map",
+    "PinholeCamera": "wheretolook.geometry.camera",
+    "load_scorer": "wheretolook.methods.registry",
+    "ViewpointMap": "wheretolook.planning.viewpoint_map",
+    "poses_looking_along": "wheretolook.geometry.poses",
 }
 
 

@@ -14,8 +14,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from wheretolook import __version__
-from wheretolook.errors import ConfigError, WhereToLookError
+from wheretolook.utils.errors import ConfigError, WhereToLookError
+from wheretolook.utils.version import VERSION
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser
@@ -74,7 +74,7 @@ STAGES = {
         ("figures", "tracking"),
     ),
 }
-"""Sub-command: function in `wheretolook.stages` or `store_stages`, what it does, groups of settings it reads."""
+"""Sub-command: function in `wheretolook.stages`, what it does, groups of settings it reads."""
 
 DEMO = "Run all stages on the embedded default and draw the score figure."
 
@@ -110,7 +110,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(_usage())
         return 0
     if arguments[0] == "--version":
-        print(f"wheretolook {__version__}")
+        print(f"wheretolook {VERSION}")
         return 0
     if not debug:
         _quieten()
@@ -138,7 +138,7 @@ def _usage() -> str:
 
 def _method_list() -> str:
     """Every method that `evaluate.methods` may name, with what it is."""
-    from wheretolook.scoring.registry import describe_methods
+    from wheretolook.methods.registry import describe_methods
 
     texts = describe_methods()
     width = max(map(len, texts))
@@ -152,23 +152,23 @@ def _run(command: str, arguments: list[str]) -> int:
         print(_method_list())
         return 0
     if command == "figures" and "--list" in arguments:
-        from wheretolook.figures.catalog import catalog_text
+        from wheretolook.release.catalog import catalog_text
 
         print(catalog_text())
         return 0
     experiment = parse_experiment(command, arguments)
     if experiment is None:
         return 0
-    from wheretolook import stages, store_stages
+    from wheretolook import stages
 
     if command == "demo":
-        from wheretolook.demo import run_demo
+        from wheretolook.stages.demo import run_demo
 
         run_demo(experiment)
     else:
         start = time.monotonic()
         name = STAGES[command][0]
-        getattr(store_stages if hasattr(store_stages, name) else stages, name)(experiment)
+        getattr(stages, name)(experiment)
         print(f"done in {time.monotonic() - start:.0f} s: {experiment.root}")
     return 0
 

@@ -8,19 +8,19 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from wheretolook.errors import ConfigError
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.figures.config import FiguresConfig
-from wheretolook.geometry import PinholeCamera
+from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.labelling.config import LabelConfig
 from wheretolook.learning.config import TrainConfig
 from wheretolook.mapping.config import MapConfig
 from wheretolook.planning.config import PathsConfig, PlanConfig, ViewpointMapConfig
-from wheretolook.sampling import SampleConfig
-from wheretolook.scenes.free_space import FreeSpaceConfig
-from wheretolook.scenes.mapped_space import MappedSpaceConfig
-from wheretolook.scenes.procedural import ApartmentConfig
-from wheretolook.tracking import TrackingConfig
+from wheretolook.scenes.procedural.generator import ApartmentConfig
+from wheretolook.space.free_space import FreeSpaceConfig
+from wheretolook.space.mapped_space import MappedSpaceConfig
+from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.tracking import TrackingConfig
+from wheretolook.viewpoints.sampling import SampleConfig
 from wheretolook.visibility.config import OcclusionConfig
 
 

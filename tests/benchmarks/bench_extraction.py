@@ -24,16 +24,17 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from wheretolook.mapping.extraction import ExtractorConfig, KeypointExtractor, Keypoints
+from wheretolook.features.extraction import KeypointExtractor
+from wheretolook.features.keypoints import ExtractorConfig, Keypoints
 
 METHODS = ("opencv", "colmap", "warp")
 
 
 def rendered(args: argparse.Namespace) -> NDArray[np.uint8]:
     """Views (N, 480, 640, 3) from anywhere in the scene."""
-    from wheretolook.geometry import PinholeCamera
-    from wheretolook.rendering import WarpRenderer
-    from wheretolook.table import poses
+    from wheretolook.geometry.camera import PinholeCamera
+    from wheretolook.rendering.warp_renderer import WarpRenderer
+    from wheretolook.viewpoints.table import poses
 
     with tempfile.TemporaryDirectory() as name:
         scene = bench_scenes.open_scene(args.scene, Path(name), args.seed, args.device)
@@ -69,7 +70,7 @@ def time_on_device(
     config: ExtractorConfig, images: NDArray[np.uint8], device: str, batch: int, repeats: int
 ) -> tuple[dict[str, Any], list[Keypoints]]:
     """Milliseconds an image in batches, and the keypoints."""
-    from wheretolook.mapping.warp_sift import WarpSift
+    from wheretolook.features.warp_sift import WarpSift
 
     extractor = WarpSift(config, device)
     # Rec. 709 and rounded, as COLMAP's own conversion

@@ -25,11 +25,14 @@ import pandas as pd
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from wheretolook.geometry import PinholeCamera
-from wheretolook.labelling import label_viewpoints
-from wheretolook.mapping import ExtractorConfig, KeypointExtractor, MapConfig, build_map
-from wheretolook.rendering import WarpRenderer
-from wheretolook.table import LOCALIZED, is_good, poses
+from wheretolook.features.extraction import KeypointExtractor
+from wheretolook.features.keypoints import ExtractorConfig
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.labelling.labeller import label_viewpoints
+from wheretolook.mapping.building import build_map
+from wheretolook.mapping.config import MapConfig
+from wheretolook.rendering.warp_renderer import WarpRenderer
+from wheretolook.viewpoints.table import LOCALIZED, is_good, poses
 
 EXTRACTORS = {
     "opencv": ExtractorConfig("opencv"),

@@ -26,9 +26,10 @@ from wheretolook.fisher.soft_visibility import (
     SoftVisibility,
     cone_half_angle,
 )
-from wheretolook.geometry import Float, PinholeCamera, poses_looking_along
-from wheretolook.grid import VoxelGrid, fibonacci_sphere
-from wheretolook.visibility import VisibleSets
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.lattices import VoxelGrid, fibonacci_sphere
+from wheretolook.geometry.poses import Float, poses_looking_along
+from wheretolook.visibility.frustum import VisibleSets
 
 ROOM_M = ((-5.0, -4.0, 0.0), (5.0, 4.0, 2.6))
 

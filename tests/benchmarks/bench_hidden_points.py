@@ -20,15 +20,15 @@ import pandas as pd
 
 from wheretolook.figures.hidden_points import hidden_points_figure
 from wheretolook.figures.style import save_figure
-from wheretolook.grid import VoxelGrid
+from wheretolook.geometry.lattices import VoxelGrid
+from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.rendering import MeshRaycaster
-from wheretolook.sampling import free_locations
-from wheretolook.scenes.free_space import FreeSpace
+from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.scenes.loading import load_mesh
-from wheretolook.scenes.mesh import TexturedMesh
-from wheretolook.scenes.procedural import ApartmentConfig, generate_apartment
-from wheretolook.tracking import TrackingConfig, log, start_run
+from wheretolook.scenes.procedural.generator import ApartmentConfig, generate_apartment
+from wheretolook.space.free_space import FreeSpace
+from wheretolook.utils.tracking import TrackingConfig, log, start_run
+from wheretolook.viewpoints.sampling import free_locations
 from wheretolook.visibility.agreement import MaskAgreement
 from wheretolook.visibility.hidden_points import DEFAULT_RADIUS, HiddenPointRemoval
 from wheretolook.visibility.occlusion import MeshOcclusion

@@ -21,8 +21,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from wheretolook.labelling.matching import DescriptorMatcher
-from wheretolook.mapping.extraction import quantize_descriptors, unit_descriptors
+from wheretolook.features.keypoints import quantize_descriptors, unit_descriptors
+from wheretolook.features.matching import DescriptorMatcher
 
 
 def descriptors_like_sift(n: int, rng: np.random.Generator) -> NDArray[np.uint8]:

@@ -36,13 +36,17 @@ import pycolmap
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from wheretolook.geometry import Float, PinholeCamera, camera_centers, pose_error
-from wheretolook.labelling import Localizer
-from wheretolook.mapping import ExtractorConfig, KeypointExtractor, Keypoints, Landmarks, MapConfig, build_map
-from wheretolook.mapping.colmap_model import quiet_colmap
-from wheretolook.mapping.extraction import quantize_descriptors
-from wheretolook.rendering import WarpRenderer
-from wheretolook.table import LOCALIZED, poses
+from wheretolook.features.extraction import KeypointExtractor
+from wheretolook.features.keypoints import ExtractorConfig, Keypoints, quantize_descriptors
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.poses import Float, camera_centers, pose_error
+from wheretolook.labelling.localizer import Localizer
+from wheretolook.mapping.building import build_map
+from wheretolook.mapping.config import MapConfig
+from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.rendering.warp_renderer import WarpRenderer
+from wheretolook.utils.colmap import quiet_colmap
+from wheretolook.viewpoints.table import LOCALIZED, poses
 
 LIMIT_M, LIMIT_DEG = 0.05, 0.4
 FEW_INLIERS = 10

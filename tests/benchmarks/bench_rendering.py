@@ -13,10 +13,13 @@ from collections.abc import Callable
 
 import numpy as np
 
-from wheretolook.geometry import PinholeCamera, poses_looking_along
-from wheretolook.rendering import MeshRaycaster, Open3DRenderer, WarpRenderer
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.mesh import TexturedMesh
+from wheretolook.geometry.poses import poses_looking_along
+from wheretolook.rendering.open3d_renderer import Open3DRenderer
+from wheretolook.rendering.raycasting import MeshRaycaster
+from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import load_mesh
-from wheretolook.scenes.mesh import TexturedMesh
 
 
 def bumpy_room(n_triangles: int = 100_000, seed: int = 0) -> TexturedMesh:

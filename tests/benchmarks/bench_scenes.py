@@ -15,11 +15,11 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from wheretolook.geometry import poses_looking_along
-from wheretolook.scenes.free_space import FreeSpace
+from wheretolook.geometry.mesh import TexturedMesh
+from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.scenes.loading import load_mesh, save_glb
-from wheretolook.scenes.mesh import TexturedMesh
-from wheretolook.table import SCHEMA, UNLABELLED, pose_columns
+from wheretolook.space.free_space import FreeSpace
+from wheretolook.viewpoints.table import SCHEMA, UNLABELLED, pose_columns
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ def argument_parser(doc: str, views: int) -> argparse.ArgumentParser:
 def open_scene(source: Path | None, folder: Path, seed: int, device: str) -> Scene:
     """Read the scene, or generate an apartment into `folder`."""
     if source is None:
-        from wheretolook.scenes.procedural import ApartmentConfig, generate_apartment
+        from wheretolook.scenes.procedural.generator import ApartmentConfig, generate_apartment
 
         source = folder / "mesh.glb"
         save_glb(generate_apartment(ApartmentConfig(), seed, device=device), source)

@@ -17,13 +17,14 @@ import numpy as np
 import torch
 from bench_fisher import ROOM_M, room_landmarks, timed
 
-from wheretolook.geometry import Float, PinholeCamera, poses_looking_along
-from wheretolook.grid import fibonacci_sphere
-from wheretolook.localization_map import LocalizationMap
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.lattices import fibonacci_sphere
+from wheretolook.geometry.poses import Float, poses_looking_along
+from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.scoring import Scorer, make_scorer
-from wheretolook.scoring.learned import load_scorer
-from wheretolook.visibility import StoredOcclusion
+from wheretolook.methods.base import Scorer
+from wheretolook.methods.registry import load_scorer, make_scorer
+from wheretolook.visibility.occlusion import StoredOcclusion
 
 
 def room_map(n_landmarks: int, locations: Float, device: str) -> LocalizationMap:

@@ -26,15 +26,15 @@ import numpy as np
 import torch
 from lightning.pytorch import LightningModule, Trainer, seed_everything
 
-from wheretolook.dataset import Dataset
-from wheretolook.features import CHANNELS, PAPER_VARIANTS
-from wheretolook.geometry import PinholeCamera
+from wheretolook.dataset.folders import Dataset
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.inputs.bins import CHANNELS, PAPER_VARIANTS
 from wheretolook.learning.classifier import ViewpointClassifier, weight_penalty, weighted_bce
 from wheretolook.learning.config import TrainConfig
 from wheretolook.learning.data import LabelledViews, ViewpointDataModule
 from wheretolook.learning.fit import EpochRecord, RunLog, fit, home_device
-from wheretolook.learning.network import NetworkSpec, ViewpointNetwork
-from wheretolook.tracking import TrackingConfig, start_run
+from wheretolook.methods.mlp.network import NetworkSpec, ViewpointNetwork
+from wheretolook.utils.tracking import TrackingConfig, start_run
 
 CAMERA = PinholeCamera()
 BLOCK = 4096

@@ -17,14 +17,15 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from wheretolook.geometry import PinholeCamera, poses_looking_along
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.mesh import TexturedMesh
+from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.rendering import MeshRaycaster
+from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.rendering.types import camera_rays
-from wheretolook.scenes.free_space import FreeSpace
 from wheretolook.scenes.loading import load_mesh
-from wheretolook.scenes.mesh import TexturedMesh
-from wheretolook.scenes.procedural import ApartmentConfig, generate_apartment
+from wheretolook.scenes.procedural.generator import ApartmentConfig, generate_apartment
+from wheretolook.space.free_space import FreeSpace
 from wheretolook.visibility.agreement import MaskAgreement
 from wheretolook.visibility.occlusion import MeshOcclusion
 from wheretolook.visibility.tsdf import BYTES_PER_BLOCK, DepthImage, TsdfConfig, TsdfOcclusion, TsdfVolume

@@ -21,22 +21,19 @@ from bench_fisher import timed
 from bench_scorers import room_map
 from bench_visibility import on_surface
 
-from wheretolook.grid import VoxelGrid, fibonacci_sphere
-from wheretolook.localization_map import LocalizationMap
+from wheretolook.geometry.lattices import VoxelGrid, fibonacci_sphere
+from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.planning import (
-    TurnLimit,
-    ViewpointMap,
-    best_sequence,
-    build_viewpoint_map,
-    greedy_sequence,
-    refine_directions,
-)
-from wheretolook.rendering import MeshRaycaster
-from wheretolook.scenes.free_space import FreeSpace
-from wheretolook.scenes.procedural import ApartmentConfig, generate_apartment
-from wheretolook.scoring import Scorer, load_scorer, make_scorer
-from wheretolook.visibility import MeshOcclusion
+from wheretolook.methods.base import Scorer
+from wheretolook.methods.registry import load_scorer, make_scorer
+from wheretolook.planning.map_building import build_viewpoint_map, update_viewpoint_map
+from wheretolook.planning.refine import refine_directions
+from wheretolook.planning.sequences import TurnLimit, best_sequence, greedy_sequence
+from wheretolook.planning.viewpoint_map import ViewpointMap
+from wheretolook.rendering.raycasting import MeshRaycaster
+from wheretolook.scenes.procedural.generator import ApartmentConfig, generate_apartment
+from wheretolook.space.free_space import FreeSpace
+from wheretolook.visibility.occlusion import MeshOcclusion
 
 
 def rows_of(landmarks: Landmarks, rows: slice) -> Landmarks:
@@ -114,8 +111,12 @@ def main() -> None:
           f"{len(os.sched_getaffinity(0))} cores")  # fmt: skip
     timed("build", lambda: build_viewpoint_map(scorer, grid, free, directions), args.builds)
     before = build_viewpoint_map(scorer_on(rows_of(landmarks, slice(0, -10))), grid, free, directions)
-    viewpoint_map, changed = before.updated(scorer)
-    timed(f"update, 10 landmarks added that {len(changed)} voxels see", lambda: before.updated(scorer), args.builds)
+    viewpoint_map, changed = update_viewpoint_map(before, scorer)
+    timed(
+        f"update, 10 landmarks added that {len(changed)} voxels see",
+        lambda: update_viewpoint_map(before, scorer),
+        args.builds,
+    )
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "map"
         timed("save", lambda: viewpoint_map.save(path), args.repeats, 1e3, "ms")

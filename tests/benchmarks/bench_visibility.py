@@ -32,14 +32,18 @@ import numpy as np
 import pandas as pd
 import warp as wp
 
-from wheretolook.geometry import PinholeCamera, rotation_looking_along
-from wheretolook.grid import fibonacci_sphere
-from wheretolook.rendering import MeshRaycaster
-from wheretolook.scenes.free_space import FreeSpace
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.lattices import fibonacci_sphere
+from wheretolook.geometry.mesh import TexturedMesh
+from wheretolook.geometry.poses import rotation_looking_along
+from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.scenes.loading import load_mesh
-from wheretolook.scenes.mesh import TexturedMesh
-from wheretolook.visibility import DevicePoints, FrustumCounter, MeshOcclusion, NoOcclusion, count_plain, survey
-from wheretolook.warp_setup import start_warp
+from wheretolook.space.free_space import FreeSpace
+from wheretolook.utils.warp import start_warp
+from wheretolook.visibility.counting import FrustumCounter, count_plain
+from wheretolook.visibility.device_points import DevicePoints
+from wheretolook.visibility.occlusion import MeshOcclusion, NoOcclusion
+from wheretolook.visibility.survey import survey
 
 CAMERA = PinholeCamera()
 FLOPS_PER_PROJECTION = 22
@@ -161,7 +165,7 @@ def machine(device: str) -> dict[str, Any]:
 
 
 def paper_size(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
-    from wheretolook.scenes.procedural import ApartmentConfig, generate_apartment
+    from wheretolook.scenes.procedural.generator import ApartmentConfig, generate_apartment
 
     rng = np.random.default_rng(0)
     base = load_mesh(args.scene) if args.scene else generate_apartment(ApartmentConfig(), 0, device=device)
@@ -258,7 +262,7 @@ BASE = {"landmarks": 24_919, "locations": 64, "directions": 500}
 
 
 def scaling(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
-    from wheretolook.scenes.procedural import ApartmentConfig, generate_apartment
+    from wheretolook.scenes.procedural.generator import ApartmentConfig, generate_apartment
 
     rng = np.random.default_rng(0)
     base = load_mesh(args.scene) if args.scene else generate_apartment(ApartmentConfig(), 0, device=device)
@@ -290,7 +294,7 @@ def scaling(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
 
 def bounded(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
     """2 million landmarks x 5,000 locations within the memory allowed."""
-    from wheretolook.scenes.procedural import ApartmentConfig, generate_apartment
+    from wheretolook.scenes.procedural.generator import ApartmentConfig, generate_apartment
 
     rng = np.random.default_rng(0)
     mesh = untextured(*with_triangles(generate_apartment(ApartmentConfig(), 0, device=device), args.triangles))
@@ -317,10 +321,10 @@ def rows_of(file: Path, part: str) -> list[dict[str, Any]]:
 
 
 def draw(args: argparse.Namespace) -> None:
-    from wheretolook.benchmark_runs import RUNTIMES_CSV, SCALING_CSV, log_runtimes
     from wheretolook.figures.runtimes import runtime_figure, scaling_figure
     from wheretolook.figures.style import save_figure
-    from wheretolook.tracking import TrackingConfig
+    from wheretolook.release.benchmark_runs import RUNTIMES_CSV, SCALING_CSV, log_runtimes
+    from wheretolook.utils.tracking import TrackingConfig
 
     sizes, growth = (
         pd.DataFrame([row for file in args.draw for row in rows_of(Path(file), part)])

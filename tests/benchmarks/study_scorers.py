@@ -30,16 +30,17 @@ import numpy as np
 import pandas as pd
 import torch
 
-from wheretolook.attributes import ATTRIBUTES
-from wheretolook.dataset import Dataset
-from wheretolook.learning import set as set_learner
-from wheretolook.learning.config import MATCHABILITY, SET, SetConfig, TrainConfig, weights_name
+from wheretolook.dataset.folders import Dataset
+from wheretolook.inputs.landmarks_in_view import ATTRIBUTES
+from wheretolook.learning.config import MATCHABILITY, SET, TrainConfig, weights_name
 from wheretolook.learning.data import with_also
 from wheretolook.learning.fit import RunLog
 from wheretolook.learning.learner import Task
-from wheretolook.learning.set import SetData, learn_set
-from wheretolook.learning.training import train
-from wheretolook.tracking import TrackingConfig, start_run
+from wheretolook.methods.set import learn as set_learner
+from wheretolook.methods.set.config import SetConfig
+from wheretolook.methods.set.learn import SetData, learn_set
+from wheretolook.stages.train import train_variants as train
+from wheretolook.utils.tracking import TrackingConfig, start_run
 
 VARIANTS = ("2d+z", "2d+3d+landmark", "conv", "trees", "set", "sphere")
 

@@ -17,7 +17,7 @@ from wheretolook.evaluation.calibration import (
     reliability,
     scale_probability,
 )
-from wheretolook.geometry import Float
+from wheretolook.geometry.poses import Float
 
 
 def draw(rng: np.random.Generator, chance: Float) -> np.ndarray:

@@ -9,10 +9,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from wheretolook.errors import ConfigError
-from wheretolook.evaluation.config import EvaluateConfig, candidates_label, threshold_key, threshold_label
+from wheretolook.evaluation.config import EvaluateConfig, candidates_label
 from wheretolook.evaluation.ranking import TestViews, choose_at_random, choose_best, choose_by_truth, rank_views
 from wheretolook.evaluation.scores import reference_method, score_table
+from wheretolook.utils.errors import ConfigError
+from wheretolook.viewpoints.thresholds import threshold_key, threshold_label
 
 HAND = TestViews(
     # location 0 has four views, location 1 has one, location 2 has three, in mixed order

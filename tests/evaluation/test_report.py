@@ -9,8 +9,9 @@ import pandas as pd
 import pytest
 
 from synthetic_scores import EVERY_METHOD, KEYS, make_scores, older
-from wheretolook.evaluation.report import main_rows, reference_of, score_markdown
-from wheretolook.figures.style import method_style
+from wheretolook.evaluation.report import score_markdown
+from wheretolook.evaluation.score_table import main_rows, reference_of
+from wheretolook.methods.styles import method_style
 
 FINEST = KEYS[0]
 

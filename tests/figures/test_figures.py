@@ -11,11 +11,12 @@ from matplotlib.colors import to_rgb
 
 from wheretolook.figures.lattices import covering_radius_deg, fibonacci_figure, nearest_angles_deg
 from wheretolook.figures.sphere import viewpoint_sphere_figure
-from wheretolook.figures.style import method_group, method_style, save_figure
+from wheretolook.figures.style import save_figure
 from wheretolook.figures.training import training_figure
-from wheretolook.grid import fibonacci_sphere, released_lattice
-from wheretolook.scoring.fisher import FISHER_METHODS
-from wheretolook.scoring.registry import PROBES
+from wheretolook.geometry.lattices import fibonacci_sphere, released_lattice
+from wheretolook.methods.fisher import FISHER_METHODS
+from wheretolook.methods.registry import PROBES
+from wheretolook.methods.styles import method_group, method_style
 
 
 def test_covering_radius_of_platonic_solids() -> None:

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from wheretolook.errors import ConfigError
-from wheretolook.figures.path_film import PathView, film_frames, methods_figure, save_film, still_figure
+from wheretolook.figures.path_film import film_frames, methods_figure, save_film, still_figure
+from wheretolook.planning.path_view import PathView
+from wheretolook.utils.errors import ConfigError
 
 
 def some_views(n: int, images: bool = True) -> list[PathView]:

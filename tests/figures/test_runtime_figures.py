@@ -13,7 +13,8 @@ from matplotlib.image import imread
 
 from wheretolook.figures.occlusion import occlusion_figure
 from wheretolook.figures.runtimes import duration, machine_label, runtime_figure, scaling_figure
-from wheretolook.figures.style import method_style, save_figure
+from wheretolook.figures.style import save_figure
+from wheretolook.methods.styles import method_style
 
 COUNTS, EVERYTHING, TWIN = "counts alone", "occlusion, counts, best 100", "NumPy twin, counts alone, scaled"
 CPU = {"device": "cpu", "name": "Intel(R) Xeon(R) Gold 6430 CPU @ 2.10GHz", "cores": 2}

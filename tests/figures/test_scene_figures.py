@@ -15,6 +15,7 @@ from matplotlib.transforms import Bbox
 
 from box_scenes import ROOM, furnished_room
 from wheretolook.figures.dollhouse import frustum_corners, frustum_segments
+from wheretolook.figures.house_image import dollhouse
 from wheretolook.figures.inputs import BinnedImage, inputs_figure
 from wheretolook.figures.learning import learning_figure
 from wheretolook.figures.overview import View
@@ -22,9 +23,9 @@ from wheretolook.figures.peaks import peaks_figure, spread_extrema
 from wheretolook.figures.pipeline import Pipeline, pipeline_figure, ranked_figure
 from wheretolook.figures.sampling import Sampling, sampling_figure
 from wheretolook.figures.style import TWO_COLUMNS_IN, save_figure
-from wheretolook.geometry import PinholeCamera, poses_looking_along, transform
-from wheretolook.grid import VoxelGrid, fibonacci_sphere
-from wheretolook.rendering.dollhouse import dollhouse
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.lattices import VoxelGrid, fibonacci_sphere
+from wheretolook.geometry.poses import poses_looking_along, transform
 
 CAMERA = PinholeCamera(64, 48, 32.0)
 HOUSE = dollhouse(furnished_room(), width_px=240)

@@ -14,10 +14,11 @@ from matplotlib.lines import Line2D
 
 from synthetic_scores import EVERY_METHOD, KEYS, make_scores, older
 from wheretolook.evaluation.calibration import calibration_rows
-from wheretolook.evaluation.scores import Method
 from wheretolook.figures.calibration import calibration_figure
 from wheretolook.figures.scores import regret_figure, score_figure
-from wheretolook.figures.style import method_style, save_figure
+from wheretolook.figures.style import save_figure
+from wheretolook.methods.names import Method
+from wheretolook.methods.styles import method_style
 
 FEW: tuple[Method, ...] = (("random", ""), ("visible", ""), ("bins", ""), ("mlp", "2d"))
 FAR = ("random", "forward", "max-visibility-swapped", "fisher-worst-trace", "fisher-stationary-trace")

@@ -8,17 +8,10 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.style import context
 
-from wheretolook.errors import ConfigError
-from wheretolook.figures.style import (
-    KINDS,
-    ONE_COLUMN_IN,
-    PRINT,
-    method_style,
-    new_figure,
-    note_of,
-    save_figure,
-    scorer_style,
-)
+from wheretolook.figures.config import KINDS
+from wheretolook.figures.style import ONE_COLUMN_IN, PRINT, new_figure, note_of, save_figure
+from wheretolook.methods.styles import method_style, scorer_style
+from wheretolook.utils.errors import ConfigError
 
 
 def drawn() -> Figure:

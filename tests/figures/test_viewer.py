@@ -10,7 +10,8 @@ import pytest
 
 from box_scenes import furnished_room, random_triangles
 from wheretolook.figures.viewer import FRUSTUM_M, scene_geometries, show_scene
-from wheretolook.geometry import PinholeCamera, poses_looking_along
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.poses import poses_looking_along
 
 POSES = poses_looking_along([[1.0, 1, 1], [2, 2, 2]], [[1.0, 0, 0], [0, 1, 0]])
 LANDMARKS = np.random.default_rng(0).uniform(0, 3, (20, 3))

@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from conftest import RandomViews
-from wheretolook.camera_models import ColmapCamera
 from wheretolook.fisher.exact import exact_information, exact_information_plain
 from wheretolook.fisher.information import TRACE, bearing_numbers, information_matrices
-from wheretolook.geometry import PinholeCamera, poses_looking_along, rotation_looking_along, transform
-from wheretolook.grid import fibonacci_sphere
-from wheretolook.visibility import VisibleSets
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.colmap_camera import ColmapCamera
+from wheretolook.geometry.lattices import fibonacci_sphere
+from wheretolook.geometry.poses import poses_looking_along, rotation_looking_along, transform
+from wheretolook.visibility.frustum import VisibleSets
 
 
 def test_information_is_that_of_the_plain_twin(random_views: RandomViews, device: str) -> None:

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 import torch
 
-from wheretolook.errors import MapError
 from wheretolook.fisher.field import FisherField, stationary_axis_of_trace, worst_axis_of_trace
 from wheretolook.fisher.field_sums import field_sums, field_sums_plain
 from wheretolook.fisher.information import TRACE, information_matrices
 from wheretolook.fisher.metrics import METRICS
 from wheretolook.fisher.soft_visibility import GaussianProcessVisibility, QuadraticVisibility, SoftVisibility
-from wheretolook.geometry import Float
-from wheretolook.grid import fibonacci_sphere
+from wheretolook.geometry.lattices import fibonacci_sphere
+from wheretolook.geometry.poses import Float
+from wheretolook.utils.errors import MapError
 
 HALF_ANGLE = 0.766  # of the paper's camera
 VISIBILITIES = [QuadraticVisibility(HALF_ANGLE), GaussianProcessVisibility(HALF_ANGLE, 0.45)]

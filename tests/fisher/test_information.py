@@ -7,10 +7,10 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from wheretolook.errors import ConfigError
 from wheretolook.fisher.information import TRACE, bearing_numbers, information_matrices
 from wheretolook.fisher.metrics import METRICS, eigenvalues, eigenvalues_plain, metric_of
-from wheretolook.geometry import Float
+from wheretolook.geometry.poses import Float
+from wheretolook.utils.errors import ConfigError
 
 
 def turn_of(vector: torch.Tensor) -> torch.Tensor:

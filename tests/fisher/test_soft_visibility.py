@@ -7,14 +7,15 @@ import pytest
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF
 
-from wheretolook.camera_models import ColmapCamera
 from wheretolook.fisher.soft_visibility import (
     GaussianProcessVisibility,
     QuadraticVisibility,
     SoftVisibility,
     cone_half_angle,
 )
-from wheretolook.geometry import Float, PinholeCamera
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.colmap_camera import ColmapCamera
+from wheretolook.geometry.poses import Float
 
 QUARTER = np.pi / 4
 

@@ -7,10 +7,10 @@ import pandas as pd
 import pytest
 
 from labelling.rooms import CAMERA, PLAIN, POSTER, MappedRoom, facing, file_bytes, map_room
-from wheretolook.labelling import Localizer
+from wheretolook.labelling.localizer import Localizer
 from wheretolook.labelling.shard import label_rows
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.rendering import WarpRenderer
+from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import load_mesh
 
 

@@ -18,13 +18,17 @@ import numpy as np
 import pandas as pd
 
 from mapping.conftest import ROOM_SIZE, BoxFreeSpace, box_room
-from wheretolook.geometry import PinholeCamera, poses_looking_along
-from wheretolook.labelling import LabelConfig, label_viewpoints
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.poses import poses_looking_along
+from wheretolook.labelling.config import LabelConfig
+from wheretolook.labelling.labeller import label_viewpoints
 from wheretolook.labelling.shard import SceneJob
-from wheretolook.mapping.building import MapConfig, build_map
-from wheretolook.rendering import MeshRaycaster, WarpRenderer
+from wheretolook.mapping.building import build_map
+from wheretolook.mapping.config import MapConfig
+from wheretolook.rendering.raycasting import MeshRaycaster
+from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import load_mesh, save_glb
-from wheretolook.table import SCHEMA, UNLABELLED, pose_columns, write_table
+from wheretolook.viewpoints.table import SCHEMA, UNLABELLED, pose_columns, write_table
 
 CAMERA = PinholeCamera(320, 240, 160.0)
 PLAIN = 1  # the face x = high of `box_room`

@@ -14,10 +14,11 @@ import pandas as pd
 import pytest
 
 from labelling.rooms import POSTER, MappedRoom, facing, file_bytes, label, times, wait_until
-from wheretolook.errors import ConfigError, SceneError
-from wheretolook.labelling import LabelConfig, LabelTask, label_scenes, ray_engine
-from wheretolook.labelling.labeller import MANIFEST
+from wheretolook.labelling import ray_engine
+from wheretolook.labelling.config import LabelConfig
+from wheretolook.labelling.labeller import MANIFEST, LabelTask, label_scenes
 from wheretolook.labelling.shard import Shard
+from wheretolook.utils.errors import ConfigError, SceneError
 
 SLOW = pytest.mark.slow
 

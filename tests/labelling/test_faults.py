@@ -28,12 +28,14 @@ from labelling.rooms import (
     wait_until,
     workers_of,
 )
-from wheretolook.errors import StorageError, TableError, WorkerError
-from wheretolook.labelling import LabelConfig, LabelTask, label_scenes, labeller, local_engine
+from wheretolook.labelling import labeller, local_engine
+from wheretolook.labelling.config import LabelConfig
+from wheretolook.labelling.labeller import LabelTask, label_scenes
 from wheretolook.labelling.local_engine import run_local
 from wheretolook.labelling.shard import Shard
 from wheretolook.scenes.loading import load_mesh, save_glb
-from wheretolook.table import read_table, write_table
+from wheretolook.utils.errors import StorageError, TableError, WorkerError
+from wheretolook.viewpoints.table import read_table, write_table
 
 
 @pytest.mark.slow
@@ -225,7 +227,7 @@ def test_killed_at_any_moment_it_resumes_to_the_same_table(
     script.write_text(
         "import sys\nfrom pathlib import Path\n"
         "from labelling.rooms import MappedRoom, label\n"
-        "from wheretolook.table import read_table\n"
+        "from wheretolook.viewpoints.table import read_table\n"
         "if __name__ == '__main__':\n"
         "    folder, mesh, landmarks = map(Path, sys.argv[1:])\n"
         "    table = read_table(folder / 'table.parquet')\n"

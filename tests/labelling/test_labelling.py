@@ -10,13 +10,15 @@ import numpy as np
 import pytest
 
 from labelling.rooms import CAMERA, PLAIN, POSTER, MappedRoom, facing, map_room
-from wheretolook.errors import MapError, SceneError
-from wheretolook.labelling import LabelConfig, Localizer, label_viewpoints
+from wheretolook.labelling.config import LabelConfig
+from wheretolook.labelling.labeller import label_viewpoints
+from wheretolook.labelling.localizer import Localizer
 from wheretolook.labelling.shard import label_rows
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.rendering import WarpRenderer
+from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import load_mesh
-from wheretolook.table import is_good
+from wheretolook.utils.errors import MapError, SceneError
+from wheretolook.viewpoints.table import is_good
 
 
 @pytest.mark.usefixtures("in_this_process")

@@ -10,13 +10,22 @@ import pandas as pd
 import pytest
 
 from synthetic_dataset import make_dataset
-from wheretolook.dataset import Dataset
-from wheretolook.errors import TableError
-from wheretolook.evaluation.scores import ALL
-from wheretolook.geometry import poses_looking_along
-from wheretolook.labelling.report import POSITIVE, label_markdown, label_summary, log_labels, threshold_sentence
-from wheretolook.table import LOCALIZED, NO_POSE, TOO_FEW_MATCHES, UNLABELLED, pose_columns, read_table, write_table
-from wheretolook.tracking import TrackingConfig, artifact, newest_run
+from wheretolook.dataset.folders import Dataset
+from wheretolook.geometry.poses import poses_looking_along
+from wheretolook.labelling.report import POSITIVE, label_markdown, label_summary, threshold_sentence
+from wheretolook.stages.label import log_labels
+from wheretolook.utils.errors import TableError
+from wheretolook.utils.tracking import TrackingConfig, artifact, newest_run
+from wheretolook.viewpoints.table import (
+    LOCALIZED,
+    NO_POSE,
+    TOO_FEW_MATCHES,
+    UNLABELLED,
+    pose_columns,
+    read_table,
+    write_table,
+)
+from wheretolook.viewpoints.thresholds import ALL
 
 NAN = float("nan")
 

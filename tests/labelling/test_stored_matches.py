@@ -12,21 +12,22 @@ import pandas as pd
 import pytest
 
 from labelling.rooms import CAMERA, PLAIN, POSTER, MappedRoom, facing, file_bytes, label, times
-from wheretolook.geometry import transform
-from wheretolook.labelling import Localizer, LocalizerConfig
+from wheretolook.features.keypoints import ExtractorConfig
+from wheretolook.geometry.poses import transform
+from wheretolook.labelling.config import LocalizerConfig
 from wheretolook.labelling.labeller import LABELS, MANIFEST, versions
+from wheretolook.labelling.localizer import Localizer
 from wheretolook.labelling.shard import label_rows
-from wheretolook.mapping.extraction import ExtractorConfig
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.rendering import WarpRenderer
+from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import load_mesh
-from wheretolook.table import (
+from wheretolook.utils.files import fingerprint
+from wheretolook.viewpoints.table import (
     LOCALIZED,
     MATCH_FIELDS,
     NO_POSE,
     SCHEMA,
     TOO_FEW_MATCHES,
-    fingerprint,
     is_good,
     poses,
     read_table,

@@ -9,10 +9,10 @@ import torch
 from torch import nn
 from torchmetrics.classification import BinaryCalibrationError
 
-from wheretolook.features import CHANNELS
+from wheretolook.inputs.bins import CHANNELS
 from wheretolook.learning.classifier import CALIBRATION_BINS, weight_penalty, weighted_bce
 from wheretolook.learning.data import class_weights
-from wheretolook.learning.network import add_noise
+from wheretolook.methods.mlp.network import add_noise
 
 
 def test_loss_equals_a_hand_computation() -> None:

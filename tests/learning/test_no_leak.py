@@ -10,15 +10,20 @@ import numpy as np
 import pytest
 
 from synthetic_dataset import make_dataset
-from wheretolook.attributes import ATTRIBUTES, POOLED, LandmarkDescriber
-from wheretolook.dataset import Dataset
-from wheretolook.evaluation import EvaluateConfig, evaluate
-from wheretolook.learning.config import MatchabilityConfig, SetConfig, TrainConfig, TreesConfig
-from wheretolook.learning.training import train
+from wheretolook.dataset.folders import Dataset
+from wheretolook.evaluation.config import EvaluateConfig
+from wheretolook.inputs.landmarks_in_view import ATTRIBUTES, POOLED, LandmarkDescriber
+from wheretolook.learning.config import TrainConfig
 from wheretolook.learning.weights import read_weights
-from wheretolook.mapping.landmarks import MAP_ATTRIBUTES, Landmarks
-from wheretolook.table import LOCALIZED, is_good, read_table, write_table
-from wheretolook.tracking import TrackingConfig
+from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
+from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.methods.matchability.config import MatchabilityConfig
+from wheretolook.methods.set.config import SetConfig
+from wheretolook.methods.trees.config import TreesConfig
+from wheretolook.stages.evaluate import evaluate_methods as evaluate
+from wheretolook.stages.train import train_variants as train
+from wheretolook.utils.tracking import TrackingConfig
+from wheretolook.viewpoints.table import LOCALIZED, is_good, read_table, write_table
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from wheretolook.scenes.mesh import TexturedMesh
+from wheretolook.geometry.mesh import TexturedMesh
 
 ROOM_SIZE = (5.0, 4.0, 2.6)
 

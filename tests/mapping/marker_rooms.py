@@ -9,9 +9,10 @@ import cv2
 import numpy as np
 
 from mapping.conftest import box_room
-from wheretolook.geometry import Float, PinholeCamera, poses_looking_along
-from wheretolook.rendering import WarpRenderer
-from wheretolook.scenes.mesh import TexturedMesh
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.mesh import TexturedMesh
+from wheretolook.geometry.poses import Float, poses_looking_along
+from wheretolook.rendering.warp_renderer import WarpRenderer
 
 CAMERA = PinholeCamera(480, 360, 330.0)
 DICTIONARY = "DICT_4X4_50"

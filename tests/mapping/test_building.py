@@ -10,21 +10,18 @@ import numpy as np
 import pycolmap
 import pytest
 
-from wheretolook.errors import ConfigError, MapError
-from wheretolook.geometry import PinholeCamera, poses_looking_along
-from wheretolook.mapping import (
-    Landmarks,
-    MapConfig,
-    WalkConfig,
-    build_map,
-    load_colmap_landmarks,
-    plan_walk,
-    triangulation,
-)
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.mesh import TexturedMesh
+from wheretolook.geometry.poses import poses_looking_along
+from wheretolook.mapping import triangulation
+from wheretolook.mapping.building import build_map
 from wheretolook.mapping.cameras import load_mapping_poses
-from wheretolook.mapping.processes import Processes
-from wheretolook.rendering import WarpRenderer
-from wheretolook.scenes.mesh import TexturedMesh
+from wheretolook.mapping.config import MapConfig
+from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
+from wheretolook.mapping.walk import WalkConfig, plan_walk
+from wheretolook.rendering.warp_renderer import WarpRenderer
+from wheretolook.utils.errors import ConfigError, MapError
+from wheretolook.utils.processes import Processes
 
 CAMERA = PinholeCamera(320, 240, 160.0)
 CONFIG = MapConfig(n_images=14, walk=WalkConfig(image_spacing_m=0.35), keep_database=True, keep_images=True)

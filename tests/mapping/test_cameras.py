@@ -9,11 +9,11 @@ import pytest
 
 from mapping.test_landmarks import CENTERS, hand_written_model
 from synthetic_dataset import CAMERA, make_mapping_poses, make_scene
-from wheretolook.dataset import Dataset, SceneFolder
-from wheretolook.errors import MapError
-from wheretolook.geometry import camera_centers
-from wheretolook.localization_map import LocalizationMap
+from wheretolook.dataset.folders import Dataset, SceneFolder
+from wheretolook.geometry.poses import camera_centers
+from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.cameras import load_mapping_poses, save_mapping_poses
+from wheretolook.utils.errors import MapError
 
 
 @pytest.fixture

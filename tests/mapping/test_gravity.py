@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from wheretolook.geometry import poses_looking_along
+from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.mapping.gravity import estimate_gravity, rotation_to_z
 
 TURN = Rotation.from_euler("xyz", [40, -65, 110], degrees=True).as_matrix()

@@ -9,10 +9,10 @@ import numpy as np
 import pycolmap
 import pytest
 
-from wheretolook.errors import MapError
-from wheretolook.geometry import poses_looking_along
-from wheretolook.mapping.extraction import quantize_descriptors, unit_descriptors
+from wheretolook.features.keypoints import quantize_descriptors, unit_descriptors
+from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks, nearest_other_cosine
+from wheretolook.utils.errors import MapError
 
 # Three cameras on a line, 2 m apart, that look along +y; two intrinsics. Points in front of them.
 CENTERS = np.array([[-2.0, 0.0, 1.0], [0.0, 0.0, 1.0], [2.0, 0.0, 1.0]])

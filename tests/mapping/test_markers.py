@@ -8,10 +8,10 @@ import pycolmap
 import pytest
 
 from mapping.marker_rooms import CAMERA, MARKERS, hand_held_poses, marker_room
-from wheretolook.errors import ConfigError, MapError
-from wheretolook.geometry import poses_looking_along, transform
+from wheretolook.geometry.poses import poses_looking_along, transform
 from wheretolook.mapping.markers import MAX_ERROR_PX, MAX_ERROR_SHARE, MarkerView, detect_markers, place_marker
-from wheretolook.rendering import WarpRenderer
+from wheretolook.rendering.warp_renderer import WarpRenderer
+from wheretolook.utils.errors import ConfigError, MapError
 
 COLMAP_CAMERA = pycolmap.Camera(
     model="SIMPLE_RADIAL",

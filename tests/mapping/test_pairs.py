@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from wheretolook.geometry import PinholeCamera, poses_looking_along
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.mapping.pairs import DEPTH_STRIDE, choose_pairs, shrink_depth, surface_overlap
 
 CAMERA = PinholeCamera(320, 240, 160.0)

@@ -16,9 +16,8 @@ from mapping.marker_rooms import CAMERA, MARKERS, hand_held_poses, marker_room, 
 from wheretolook import stages
 from wheretolook.cli import main
 from wheretolook.config import Experiment, ScenesConfig
-from wheretolook.dataset import Dataset
-from wheretolook.errors import ConfigError, MapError, SceneError
-from wheretolook.geometry import camera_centers
+from wheretolook.dataset.folders import Dataset
+from wheretolook.geometry.poses import camera_centers
 from wheretolook.mapping import incremental
 from wheretolook.mapping.cameras import colmap_poses
 from wheretolook.mapping.config import MapConfig
@@ -26,11 +25,12 @@ from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.mapping.photograph_config import KnownDistance, PhotographsConfig, ScaleConfig
 from wheretolook.mapping.photograph_map import map_photographs
 from wheretolook.mapping.similarity import fit_similarity
+from wheretolook.methods.visible import VisibleScorer
 from wheretolook.planning.config import ViewpointMapConfig
-from wheretolook.sampling import SampleConfig
-from wheretolook.scenes.mapped_space import MappedSpaceConfig
-from wheretolook.scoring import VisibleScorer
-from wheretolook.table import UNLABELLED, poses
+from wheretolook.space.mapped_space import MappedSpaceConfig
+from wheretolook.utils.errors import ConfigError, MapError, SceneError
+from wheretolook.viewpoints.sampling import SampleConfig
+from wheretolook.viewpoints.table import UNLABELLED, poses
 
 TRUTH = hand_held_poses()
 CENTERS = camera_centers(TRUTH)

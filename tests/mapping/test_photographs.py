@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from wheretolook.errors import ConfigError, MapError
 from wheretolook.mapping.photograph_config import PhotographsConfig
 from wheretolook.mapping.photographs import (
     list_photographs,
@@ -17,6 +16,7 @@ from wheretolook.mapping.photographs import (
     read_photograph,
     reduce_photograph,
 )
+from wheretolook.utils.errors import ConfigError, MapError
 
 ORIENTATION, EXIF_IFD, FOCAL_35MM = 0x0112, 0x8769, 0xA405
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from wheretolook.errors import ConfigError, MapError
 from wheretolook.mapping.markers import Marker
 from wheretolook.mapping.photograph_config import KnownDistance, ScaleConfig
 from wheretolook.mapping.scale import (
@@ -20,6 +19,7 @@ from wheretolook.mapping.scale import (
     scale_from_positions,
 )
 from wheretolook.mapping.similarity import fit_similarity
+from wheretolook.utils.errors import ConfigError, MapError
 
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=np.float64)
 

@@ -7,8 +7,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from wheretolook.errors import ConfigError, SceneError
 from wheretolook.mapping.walk import WalkConfig, plan_walk
+from wheretolook.utils.errors import ConfigError, SceneError
 
 SIZE = (8.0, 6.0, 2.6)
 BOUNDS = np.array([(0, 0, 0), SIZE])

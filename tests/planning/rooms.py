@@ -9,15 +9,17 @@ import numpy as np
 
 from box_scenes import ROOM, furnished_room
 from synthetic_dataset import make_landmarks
-from wheretolook.geometry import Float, PinholeCamera
-from wheretolook.grid import VoxelGrid, direction_lattice
-from wheretolook.localization_map import LocalizationMap
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.lattices import VoxelGrid, direction_lattice
+from wheretolook.geometry.poses import Float
+from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.planning import ViewpointMap, build_viewpoint_map
-from wheretolook.rendering import MeshRaycaster
-from wheretolook.scenes.free_space import FreeSpace
-from wheretolook.scoring import make_scorer
-from wheretolook.visibility import MeshOcclusion, OcclusionModel
+from wheretolook.methods.registry import make_scorer
+from wheretolook.planning.map_building import build_viewpoint_map
+from wheretolook.planning.viewpoint_map import ViewpointMap
+from wheretolook.rendering.raycasting import MeshRaycaster
+from wheretolook.space.free_space import FreeSpace
+from wheretolook.visibility.occlusion import MeshOcclusion, OcclusionModel
 
 CAMERA = PinholeCamera(160, 120, 80.0)
 GRID = VoxelGrid((0.0, 0.0, 0.0), ROOM, (5, 4, 3))

@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 
 from planning.rooms import GRID, build, joined, room_landmarks, room_map
-from wheretolook.errors import MapFormatError
-from wheretolook.planning import ViewpointMap
+from wheretolook.methods.registry import make_scorer
+from wheretolook.planning.map_building import update_viewpoint_map
 from wheretolook.planning.map_file import ARRAYS, DESCRIPTION, LAYOUT
 from wheretolook.planning.path_comparison import shares_below
-from wheretolook.scoring import make_scorer
+from wheretolook.planning.viewpoint_map import ViewpointMap
+from wheretolook.utils.errors import MapFormatError
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +61,7 @@ def test_a_loaded_map_can_be_updated_and_saved_over_itself(folder: Path) -> None
     landmarks = joined(room_landmarks(200), room_landmarks(5, seed=4, first_id=900))
     mapped = ViewpointMap.load(folder, mmap=True)
     before = mapped.n_visible.copy()
-    mapped.updated(make_scorer("bins", room_map(landmarks)))[0].save(folder)
+    update_viewpoint_map(mapped, make_scorer("bins", room_map(landmarks)))[0].save(folder)
     np.testing.assert_array_equal(mapped.n_visible, before)  # who has mapped the old files keeps them
     np.testing.assert_array_equal(ViewpointMap.load(folder).n_visible, build(landmarks).n_visible)
 

@@ -8,20 +8,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from methods.test_scorers import NO_STATISTICS, some_convolutions, some_trees
 from planning.rooms import CAMERA, DIRECTIONS, GRID, build, free_voxels, joined, occlusion, room_landmarks, room_map
-from scoring.test_scorers import NO_STATISTICS, some_convolutions, some_trees
-from wheretolook.errors import ConfigError
-from wheretolook.geometry import PinholeCamera
-from wheretolook.learning.matchability import Matchability
-from wheretolook.learning.set import SetModel
-from wheretolook.learning.set_network import MatchabilityNetwork, SetNetwork
-from wheretolook.localization_map import LocalizationMap
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.planning import ViewpointMap, build_viewpoint_map, update_viewpoint_map
+from wheretolook.methods.matchability.learn import Matchability
+from wheretolook.methods.registry import SCORERS, WEIGHTS_OF, make_scorer
+from wheretolook.methods.set.learn import SetModel
+from wheretolook.methods.set.network import MatchabilityNetwork, SetNetwork
+from wheretolook.planning.map_building import build_viewpoint_map, update_viewpoint_map
 from wheretolook.planning.path_comparison import shares_below
-from wheretolook.scoring import SCORERS, make_scorer
-from wheretolook.scoring.registry import WEIGHTS_OF
-from wheretolook.visibility import HiddenPointRemoval, NoOcclusion, OcclusionModel, StoredOcclusion
+from wheretolook.planning.viewpoint_map import ViewpointMap
+from wheretolook.utils.errors import ConfigError
+from wheretolook.visibility.hidden_points import HiddenPointRemoval
+from wheretolook.visibility.occlusion import NoOcclusion, OcclusionModel, StoredOcclusion
 
 OLD = room_landmarks(400)
 
@@ -53,7 +54,7 @@ def test_added_landmarks_change_the_voxels_that_see_them(method: str) -> None:
     added = replace(added, ids=np.arange(len(added)) * 10 + 3)
     landmarks = joined(replace(OLD, ids=OLD.ids * 10), added)
     old = build(replace(OLD, ids=OLD.ids * 10), method)
-    new, changed = old.updated(make_scorer(method, room_map(landmarks)))
+    new, changed = update_viewpoint_map(old, make_scorer(method, room_map(landmarks)))
     sees = occlusion().unoccluded(old.locations, added.points).any(axis=1)
     assert 0 < sees.sum() < len(sees)
     np.testing.assert_array_equal(changed, old.voxel_of_row[sees])
@@ -73,7 +74,7 @@ def test_hidden_landmarks_change_nothing_but_what_the_map_was_made_from() -> Non
 
 
 def test_nothing_added_changes_nothing() -> None:
-    new, changed = build(OLD).updated(make_scorer("bins", room_map(OLD)))
+    new, changed = update_viewpoint_map(build(OLD), make_scorer("bins", room_map(OLD)))
     assert len(changed) == 0
     assert_same(new, build(OLD))
 
@@ -81,7 +82,7 @@ def test_nothing_added_changes_nothing() -> None:
 def test_other_attributes_of_a_landmark_count_as_a_change() -> None:
     landmarks = replace(OLD, track_length=np.where(np.arange(400) == 7, 50, OLD.track_length).astype(np.int32))
     old = build(OLD)
-    new, changed = old.updated(make_scorer("bins", room_map(landmarks)))
+    new, changed = update_viewpoint_map(old, make_scorer("bins", room_map(landmarks)))
     sees = occlusion().unoccluded(old.locations, OLD.points[7:8])[:, 0]
     np.testing.assert_array_equal(changed, old.voxel_of_row[sees])
     assert_same(new, build(landmarks))
@@ -96,7 +97,7 @@ def test_what_can_change_any_voxel_scores_all_of_them_again(case: str) -> None:
         "shares": joined(OLD, room_landmarks(3, seed=9, first_id=1000)),  # of the number of the map's landmarks
     }[case]
     old = build(OLD, method)
-    new, changed = old.updated(make_scorer(method, room_map(landmarks)))
+    new, changed = update_viewpoint_map(old, make_scorer(method, room_map(landmarks)))
     np.testing.assert_array_equal(changed, old.voxel_of_row)
     assert_same(new, build(landmarks, method))
 
@@ -116,7 +117,7 @@ def test_every_occlusion_model_updates_exactly(name: str) -> None:
         return make_scorer("bins", room_map(of, model(of)))
 
     old = build_viewpoint_map(scorer(OLD), GRID, free_voxels(), DIRECTIONS)
-    new, changed = old.updated(scorer(landmarks))
+    new, changed = update_viewpoint_map(old, scorer(landmarks))
     assert_same(new, build_viewpoint_map(scorer(landmarks), GRID, free_voxels(), DIRECTIONS))
     assert (len(changed) == len(locations)) == (name != "stored")
 
@@ -124,20 +125,22 @@ def test_every_occlusion_model_updates_exactly(name: str) -> None:
 def test_another_method_camera_or_geometry_is_refused() -> None:
     old, landmarks = build(OLD), joined(OLD, seen_by_some())
     with pytest.raises(ConfigError, match="another scorer"):
-        old.updated(make_scorer("random", room_map(landmarks)))
+        update_viewpoint_map(old, make_scorer("random", room_map(landmarks)))
     with pytest.raises(ConfigError, match="another camera"):
-        old.updated(make_scorer("bins", LocalizationMap(landmarks, PinholeCamera(160, 120, 81.0), occlusion())))
+        update_viewpoint_map(
+            old, make_scorer("bins", LocalizationMap(landmarks, PinholeCamera(160, 120, 81.0), occlusion()))
+        )
     with pytest.raises(ConfigError, match="another occlusion"):
-        old.updated(make_scorer("bins", room_map(landmarks, NoOcclusion())))
+        update_viewpoint_map(old, make_scorer("bins", room_map(landmarks, NoOcclusion())))
     old = replace(old, scores=old.scores + np.float32(0.01))  # as of other weights
     with pytest.raises(ConfigError, match="voxel that sees none of the added"):
-        old.updated(make_scorer("bins", room_map(landmarks)))
+        update_viewpoint_map(old, make_scorer("bins", room_map(landmarks)))
 
 
 def test_derived_maps_are_not_updated() -> None:
     scorer = make_scorer("bins", room_map(joined(OLD, seen_by_some())))
     with pytest.raises(ConfigError, match=r"derived from another cannot be updated.*scores replaced by ranks"):
-        shares_below(build(OLD)).updated(scorer)
+        update_viewpoint_map(shares_below(build(OLD)), scorer)
 
 
 @pytest.mark.parametrize("method", [name for name in SCORERS if name not in WEIGHTS_OF])
@@ -166,7 +169,7 @@ def test_methods_that_have_learnt_update_as_if_built_anew(method: str, tmp_path:
         Matchability(MatchabilityNetwork(NO_STATISTICS), CAMERA).save(weights)
     before, after = (make_scorer(method, room_map(of), weights=weights) for of in (OLD, landmarks))
     old = build_viewpoint_map(before, GRID, free_voxels(), DIRECTIONS)
-    new, changed = old.updated(after)
+    new, changed = update_viewpoint_map(old, after)
     assert after.local and 0 < len(changed) < len(old.scores)
     anew = build_viewpoint_map(after, GRID, free_voxels(), DIRECTIONS)
     np.testing.assert_allclose(new.scores, anew.scores, rtol=1e-5)

@@ -10,15 +10,15 @@ import pytest
 
 from box_scenes import furnished_room
 from planning.rooms import build, room_landmarks
-from wheretolook.errors import ConfigError, SceneError
 from wheretolook.figures.paths import paths_figure
-from wheretolook.geometry import camera_centers
+from wheretolook.geometry.poses import camera_centers
 from wheretolook.planning.config import PathConfig, PathsConfig
-from wheretolook.planning.path_comparison import ComparedPaths, compare_paths, draw_pairs, shares_below
+from wheretolook.planning.path_comparison import ComparedPaths, draw_pairs, plan_pairs, shares_below
 from wheretolook.planning.path_report import summarize_paths
 from wheretolook.planning.ways import Ways
-from wheretolook.scenes.free_space import FreeSpace
-from wheretolook.table import poses
+from wheretolook.space.free_space import FreeSpace
+from wheretolook.utils.errors import ConfigError, SceneError
+from wheretolook.viewpoints.table import poses
 
 QUICK = PathsConfig(
     pairs=2, min_distance_m=1.5, height_m=(1.0, 1.4), methods=("forward", "bins"), max_turn_deg=30.0, resamples=200,
@@ -34,11 +34,11 @@ def space() -> FreeSpace:
 @pytest.fixture(scope="module")
 def compared(space: FreeSpace) -> ComparedPaths:
     bins = shares_below(build(room_landmarks(200), directions=np.asarray(_lattice())))
-    return compare_paths(draw_pairs(space, QUICK), space, {"bins": bins}, QUICK)
+    return plan_pairs(draw_pairs(space, QUICK), space, {"bins": bins}, QUICK)
 
 
 def _lattice() -> np.ndarray:
-    from wheretolook.grid import direction_lattice
+    from wheretolook.geometry.lattices import direction_lattice
 
     return direction_lattice(200)
 

@@ -8,15 +8,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from wheretolook.errors import ConfigError, PlanningError
-from wheretolook.geometry import rotation_looking_along
-from wheretolook.grid import VoxelGrid, axes_of_angles, fibonacci_sphere
+from wheretolook.geometry.lattices import VoxelGrid, axes_of_angles, fibonacci_sphere
+from wheretolook.geometry.poses import rotation_looking_along
+from wheretolook.planning.config import PathConfig
 from wheretolook.planning.path_improvement import improve
-from wheretolook.planning.path_planning import PathConfig, plan_path
+from wheretolook.planning.path_planning import plan_path
 from wheretolook.planning.route_views import turned_evenly
 from wheretolook.planning.turns import pan_tilt_angles, pan_tilt_turns_deg
 from wheretolook.planning.turns import turns_deg as turns_deg_of_cameras
 from wheretolook.planning.viewpoint_map import MapOrigin, ViewpointMap
+from wheretolook.utils.errors import ConfigError, PlanningError
 
 LOW, HIGH = np.array([0.0, 0.0, 0.5]), np.array([6.0, 4.0, 1.7])
 WALL = ((2.9, 0.0), (3.1, 3.0))  # from the floor to the ceiling, with a gap at y > 3

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from planning.rooms import DIRECTIONS, GRID, free_voxels, room_landmarks, room_map
-from wheretolook.geometry import Float
-from wheretolook.planning import refine_directions, score_directions
-from wheretolook.scoring import Scorer, make_scorer
+from wheretolook.geometry.poses import Float
+from wheretolook.methods.base import Scorer
+from wheretolook.methods.registry import make_scorer
+from wheretolook.planning.refine import refine_directions, score_directions
 
 
 class Towards(Scorer):

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from planning.rooms import GRID, build, room_landmarks
-from wheretolook.errors import PlanningError
-from wheretolook.geometry import Float, rotation_angle_deg, rotation_looking_along
-from wheretolook.grid import axes_of_angles, direction_lattice, yaw_pitch_angles
-from wheretolook.planning import TurnLimit, best_sequence, greedy_sequence, path_scores, resample_path
+from wheretolook.geometry.lattices import axes_of_angles, direction_lattice, yaw_pitch_angles
+from wheretolook.geometry.poses import Float, rotation_angle_deg, rotation_looking_along
+from wheretolook.planning.sequences import TurnLimit, best_sequence, greedy_sequence, path_scores, resample_path
+from wheretolook.utils.errors import PlanningError
 
 LATTICES = {"yaw-pitch": direction_lattice(0, "yaw-pitch"), "fibonacci": direction_lattice(300)}
 

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from planning.rooms import CAMERA, DIRECTIONS, GRID, build, free_voxels, room_landmarks, room_map
-from wheretolook.errors import ConfigError, MapError, SceneError
-from wheretolook.geometry import poses_looking_along, rotation_angle_deg, rotation_looking_along
-from wheretolook.planning import ViewChoice, ViewpointMap, build_viewpoint_map
-from wheretolook.scoring import make_scorer
+from wheretolook.geometry.poses import poses_looking_along, rotation_angle_deg, rotation_looking_along
+from wheretolook.methods.registry import make_scorer
+from wheretolook.planning.map_building import build_viewpoint_map, update_viewpoint_map
+from wheretolook.planning.viewpoint_map import ViewChoice, ViewpointMap
+from wheretolook.utils.errors import ConfigError, MapError, SceneError
 
 
 @pytest.fixture(scope="module")
@@ -194,7 +195,7 @@ def test_a_landmark_without_a_position_is_refused_by_its_id() -> None:
     with pytest.raises(MapError, match="position of landmark 107 is not finite"):
         build(replace(landmarks, points=points))
     with pytest.raises(MapError, match="position of landmark 107 is not finite"):
-        build(landmarks).updated(make_scorer("bins", room_map(replace(landmarks, points=points))))
+        update_viewpoint_map(build(landmarks), make_scorer("bins", room_map(replace(landmarks, points=points))))
 
 
 def test_interpolation_meets_the_voxels_at_their_centres(viewpoint_map: ViewpointMap) -> None:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from box_scenes import CABINET, ROOM, furnished_room, random_triangles
-from wheretolook.rendering import MeshRaycaster
 from wheretolook.rendering.open3d_renderer import raycasting_scene
+from wheretolook.rendering.raycasting import MeshRaycaster
 
 
 def open3d_rays(origins, directions):

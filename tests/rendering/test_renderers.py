@@ -12,9 +12,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from box_scenes import furnished_room, quads_mesh, random_texture, random_triangles
-from wheretolook.errors import ConfigError, SceneError
-from wheretolook.geometry import PinholeCamera, poses_looking_along, transform
-from wheretolook.rendering import Open3DRenderer, WarpRenderer
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.poses import poses_looking_along, transform
+from wheretolook.rendering.open3d_renderer import Open3DRenderer
+from wheretolook.rendering.warp_renderer import WarpRenderer
+from wheretolook.utils.errors import ConfigError, SceneError
 
 TRACING = partial(WarpRenderer, method="rays")
 RENDERERS = pytest.mark.parametrize(

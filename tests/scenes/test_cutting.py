@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from box_scenes import box_quads, quads_mesh, random_texture, random_triangles
-from wheretolook.rendering import MeshRaycaster
+from wheretolook.geometry.mesh import TexturedMesh
+from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.scenes.cutting import cut_above
-from wheretolook.scenes.mesh import TexturedMesh
 
 
 def areas(mesh: TexturedMesh) -> np.ndarray:

@@ -9,7 +9,7 @@ import pytest
 import warp as wp
 
 from wheretolook.scenes.procedural.light_kernels import direct_kernel, gather_kernel
-from wheretolook.warp_setup import start_warp, vec3_array
+from wheretolook.utils.warp import start_warp, vec3_array
 
 R2 = np.array([3242174889, 2447445414], dtype=np.uint64)
 

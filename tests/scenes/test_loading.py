@@ -13,8 +13,8 @@ from trimesh.visual import ColorVisuals, TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from box_scenes import box_quads, furnished_room, quads_mesh, random_texture
-from wheretolook.errors import ConfigError, SceneError
 from wheretolook.scenes.loading import load_mesh, save_glb
+from wheretolook.utils.errors import ConfigError, SceneError
 
 VERTICES = np.array([[0, 0, 0], [2, 0, 0], [2, 3, 0], [0, 3, 1]], dtype=np.float64)
 FACES = np.array([[0, 1, 2], [0, 2, 3]])

@@ -11,16 +11,16 @@ import pytest
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from wheretolook.errors import ConfigError, SceneError
-from wheretolook.scenes.mesh import TexturedMesh
-from wheretolook.scenes.procedural import ApartmentConfig, atlas, decor, fixtures, furniture, generate_apartment
+from wheretolook.geometry.mesh import TexturedMesh
+from wheretolook.scenes.procedural import atlas, decor, fixtures, furniture
 from wheretolook.scenes.procedural import patches as patches_module
-from wheretolook.scenes.procedural.generator import furnish_apartment
+from wheretolook.scenes.procedural.generator import ApartmentConfig, furnish_apartment, generate_apartment
 from wheretolook.scenes.procedural.materials import plain
 from wheretolook.scenes.procedural.noise import NoiseBank
 from wheretolook.scenes.procedural.plan import Plan, draw_plan
 from wheretolook.scenes.procedural.repetition import repeat_patterns
 from wheretolook.scenes.procedural.style import Style
+from wheretolook.utils.errors import ConfigError, SceneError
 
 SEEDS = (0, 1, 2)
 CONFIG = ApartmentConfig()

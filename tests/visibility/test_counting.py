@@ -8,11 +8,14 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from conftest import RandomViews
-from wheretolook.camera_models import Camera, ColmapCamera
-from wheretolook.errors import ConfigError
-from wheretolook.geometry import Float, PinholeCamera, rotation_looking_along, transform
-from wheretolook.grid import fibonacci_sphere
-from wheretolook.visibility import DevicePoints, FrustumCounter, count_plain, counting
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.colmap_camera import Camera, ColmapCamera
+from wheretolook.geometry.lattices import fibonacci_sphere
+from wheretolook.geometry.poses import Float, rotation_looking_along, transform
+from wheretolook.utils.errors import ConfigError
+from wheretolook.visibility import counting
+from wheretolook.visibility.counting import FrustumCounter, count_plain
+from wheretolook.visibility.device_points import DevicePoints
 from wheretolook.visibility.field_of_view import FieldOfView
 from wheretolook.visibility.octahedral_map import cell_centers, cells_of, octahedral_directions
 

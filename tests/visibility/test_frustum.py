@@ -6,11 +6,18 @@ import numpy as np
 import pytest
 
 from conftest import RandomViews
-from wheretolook.camera_models import ColmapCamera
-from wheretolook.errors import ConfigError
-from wheretolook.geometry import PinholeCamera, rotation_looking_along, transform
-from wheretolook.visibility import VisibleSets, visible_landmarks
-from wheretolook.visibility.frustum import MIN_DEPTH_M, _starts, in_view, visible_landmarks_plain
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.colmap_camera import ColmapCamera
+from wheretolook.geometry.poses import rotation_looking_along, transform
+from wheretolook.utils.errors import ConfigError
+from wheretolook.visibility.frustum import (
+    MIN_DEPTH_M,
+    VisibleSets,
+    _starts,
+    in_view,
+    visible_landmarks,
+    visible_landmarks_plain,
+)
 
 IDENTITY = np.eye(3)[None]
 CAMERA = PinholeCamera(640, 480, 320.0)  # in single precision its sides pass exactly through x = -z, x = z, y = -0.75 z
@@ -63,7 +70,8 @@ def test_behind_on_the_border_at_zero_depth_not_a_number(
 
 @pytest.fixture
 def count_everything():  # type: ignore[no-untyped-def]
-    from wheretolook.visibility import DevicePoints, FrustumCounter
+    from wheretolook.visibility.counting import FrustumCounter
+    from wheretolook.visibility.device_points import DevicePoints
 
     def count(camera, rotations, locations, points, device):  # type: ignore[no-untyped-def]
         on_device = DevicePoints(points, device)

@@ -9,12 +9,12 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from box_scenes import ROOM, furnished_room
-from wheretolook.errors import ConfigError, MapError, SceneError
-from wheretolook.grid import fibonacci_sphere
-from wheretolook.rendering import MeshRaycaster
-from wheretolook.visibility import MeshOcclusion
+from wheretolook.geometry.lattices import fibonacci_sphere
+from wheretolook.rendering.raycasting import MeshRaycaster
+from wheretolook.utils.errors import ConfigError, MapError, SceneError
 from wheretolook.visibility.agreement import MaskAgreement
 from wheretolook.visibility.hidden_points import HiddenPointRemoval, hull_length
+from wheretolook.visibility.occlusion import MeshOcclusion
 
 ORIGIN = np.zeros((1, 3))
 

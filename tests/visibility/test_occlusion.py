@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from wheretolook.errors import TableError
-from wheretolook.rendering import MeshRaycaster
-from wheretolook.scenes.mesh import TexturedMesh
-from wheretolook.visibility import MeshOcclusion, NoOcclusion, StoredOcclusion
+from wheretolook.geometry.mesh import TexturedMesh
+from wheretolook.rendering.raycasting import MeshRaycaster
+from wheretolook.utils.errors import TableError
+from wheretolook.visibility.occlusion import MeshOcclusion, NoOcclusion, StoredOcclusion
 
 
 def screen(size_m: float = 1.0) -> TexturedMesh:

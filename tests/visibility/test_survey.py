@@ -7,22 +7,18 @@ import pytest
 
 from box_scenes import box_quads, quads_mesh, random_texture
 from conftest import RandomViews
-from wheretolook.camera_models import ColmapCamera
-from wheretolook.errors import ConfigError, MapError, SceneError
-from wheretolook.geometry import Float, PinholeCamera, rotation_looking_along
-from wheretolook.grid import fibonacci_sphere
-from wheretolook.rendering import MeshRaycaster
-from wheretolook.scenes.mesh import TexturedMesh
-from wheretolook.visibility import (
-    DevicePoints,
-    FrustumCounter,
-    HiddenPointRemoval,
-    MeshOcclusion,
-    NoOcclusion,
-    OcclusionModel,
-    count_plain,
-    survey,
-)
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.colmap_camera import ColmapCamera
+from wheretolook.geometry.lattices import fibonacci_sphere
+from wheretolook.geometry.mesh import TexturedMesh
+from wheretolook.geometry.poses import Float, rotation_looking_along
+from wheretolook.rendering.raycasting import MeshRaycaster
+from wheretolook.utils.errors import ConfigError, MapError, SceneError
+from wheretolook.visibility.counting import FrustumCounter, count_plain
+from wheretolook.visibility.device_points import DevicePoints
+from wheretolook.visibility.hidden_points import HiddenPointRemoval
+from wheretolook.visibility.occlusion import MeshOcclusion, NoOcclusion, OcclusionModel
+from wheretolook.visibility.survey import survey
 
 
 def boxes(*quads: np.ndarray) -> TexturedMesh:

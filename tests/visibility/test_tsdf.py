@@ -7,14 +7,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from box_scenes import box_quads, quads_mesh, random_texture
-from wheretolook.camera_models import ColmapCamera
-from wheretolook.errors import ConfigError, SceneError
-from wheretolook.geometry import PinholeCamera, poses_looking_along
-from wheretolook.rendering import MeshRaycaster
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.colmap_camera import ColmapCamera
+from wheretolook.geometry.mesh import TexturedMesh
+from wheretolook.geometry.poses import poses_looking_along
+from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.rendering.types import camera_rays
-from wheretolook.scenes.mesh import TexturedMesh
-from wheretolook.visibility import MeshOcclusion
+from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.visibility.agreement import MaskAgreement
+from wheretolook.visibility.occlusion import MeshOcclusion
 from wheretolook.visibility.tsdf import DepthImage, TsdfConfig, TsdfOcclusion, TsdfVolume, estimate_blocks
 
 ROOM = np.array([4.0, 3.0, 2.5])

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.geometry import Float
+from wheretolook.geometry.poses import Float
 
 PERCENTILES = (2.5, 97.5)
 """Ends of a 95 % interval."""

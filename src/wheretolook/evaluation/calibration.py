@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.special import expit, logit
 
-from wheretolook.geometry import Float
+from wheretolook.geometry.poses import Float
 
 Good = NDArray[np.bool_]
 """Whether each view localizes, (B,)."""

@@ -9,15 +9,13 @@ from typing import Literal
 
 import numpy as np
 
-from wheretolook.errors import ConfigError
+from wheretolook.utils.errors import ConfigError
+from wheretolook.viewpoints.thresholds import THRESHOLDS, threshold_key
 from wheretolook.visibility.config import OcclusionName, check_occlusion_names
-
-THRESHOLDS = ((0.05, 0.4), (0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
-"""Error limits in metres and degrees: the Long-Term Visual Localization benchmark's and the paper's finer one."""
 
 
 def _all_methods() -> tuple[str, ...]:
-    from wheretolook.scoring.registry import OPTIONAL, SCORERS
+    from wheretolook.methods.registry import OPTIONAL, SCORERS
 
     return tuple(name for name in SCORERS if name not in OPTIONAL)
 
@@ -27,8 +25,8 @@ class EvaluateConfig:
     """Options of evaluation.
 
     Args:
-        methods: methods to compare, keys of `wheretolook.scoring.SCORERS`; if not named, all but
-            `wheretolook.scoring.registry.OPTIONAL`. Methods that have
+        methods: methods to compare, keys of `wheretolook.methods.registry.SCORERS`; if not named, all but
+            `wheretolook.methods.registry.OPTIONAL`. Methods that have
             learnt, such as "mlp" and "trees", stand for every weights file of their kind.
         weights: weights to evaluate; empty for all in the dataset's `weights` folder.
         split: whose scenes to evaluate on: "test", "val" or "train".
@@ -64,7 +62,7 @@ class EvaluateConfig:
     reference: str = ""
 
     def __post_init__(self) -> None:
-        from wheretolook.scoring.registry import SCORERS
+        from wheretolook.methods.registry import SCORERS
 
         unknown = [name for name in self.methods if name not in SCORERS]
         if unknown or not self.methods or len(set(self.methods)) < len(self.methods):
@@ -108,15 +106,3 @@ def check_heading(heading: Sequence[Sequence[float]]) -> None:
 def candidates_label(best: int) -> str:
     """Name of a candidate set in the column `candidates`: "all" for 0, else such as "best 100"."""
     return f"best {best}" if best else "all"
-
-
-def threshold_key(threshold: tuple[float, float]) -> str:
-    """Name of a pair of limits in column and metric names, such as "0.05m_0.4deg"."""
-    return f"{threshold[0]:g}m_{threshold[1]:g}deg"
-
-
-def threshold_label(key: str) -> str:
-    """What `threshold_key` gives, for people: "5 cm, 0.4°"."""
-    metres, degrees = key.removesuffix("deg").split("m_")
-    distance = f"{float(metres) * 100:g} cm" if float(metres) < 0.5 else f"{float(metres):g} m"
-    return f"{distance}, {degrees}°"

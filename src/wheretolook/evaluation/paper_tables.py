@@ -8,11 +8,13 @@ from pathlib import Path
 
 import pandas as pd
 
-from wheretolook.dataset import write_text
-from wheretolook.evaluation.config import THRESHOLDS, threshold_key, threshold_label
-from wheretolook.evaluation.report import main_rows, markdown_table, methods_of
-from wheretolook.evaluation.scores import ALL, LEARNED, RELEASED_DIVISOR, Method
-from wheretolook.figures.style import method_style
+from wheretolook.evaluation.score_table import main_rows, methods_of
+from wheretolook.evaluation.scores import RELEASED_DIVISOR
+from wheretolook.methods.names import LEARNED, Method
+from wheretolook.methods.styles import method_style
+from wheretolook.utils.files import write_text
+from wheretolook.utils.markdown import markdown_table
+from wheretolook.viewpoints.thresholds import ALL, THRESHOLDS, threshold_key, threshold_label
 
 KEYS = tuple(map(threshold_key, THRESHOLDS))
 """The paper's thresholds."""

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
-from wheretolook.geometry import Float
+from wheretolook.geometry.poses import Float
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,9 +8,12 @@ from typing import Any
 
 import pandas as pd
 
-from wheretolook.evaluation.config import threshold_label
-from wheretolook.evaluation.scores import ALL, RELEASED_DIVISOR, Method
-from wheretolook.figures.style import method_group, method_style
+from wheretolook.evaluation.score_table import main_rows, methods_of, reference_of, threshold_keys
+from wheretolook.evaluation.scores import RELEASED_DIVISOR
+from wheretolook.methods.names import Method
+from wheretolook.methods.styles import method_group, method_style
+from wheretolook.utils.markdown import markdown_table
+from wheretolook.viewpoints.thresholds import ALL, threshold_label
 
 Row = Mapping[Any, Any]
 """A row of a score table by its columns' names."""
@@ -20,31 +23,6 @@ Column = tuple[str, str, Callable[[Row], str]]
 
 SCENES_ABREAST = 8
 """Scenes in one table; more make another below."""
-
-
-def threshold_keys(scores: pd.DataFrame) -> list[str]:
-    """Thresholds of a score table, by the names its columns use."""
-    return [name.removeprefix("normalized_") for name in scores.columns if name.startswith("normalized_")
-            and not name.startswith(("normalized_low_", "normalized_high_"))]  # fmt: skip
-
-
-def main_rows(scores: pd.DataFrame, columns: Sequence[str] = ("occlusion", "candidates")) -> pd.DataFrame:
-    """Rows of a table's first occlusion model and first set of candidates; an older table may name neither."""
-    for name in columns:
-        if name in scores:
-            scores = scores[scores[name] == scores[name].iloc[0]]
-    return scores
-
-
-def methods_of(scores: pd.DataFrame) -> list[Method]:
-    """The methods of a score table with their inputs, in order."""
-    return list(dict.fromkeys(zip(scores["method"], scores["inputs"], strict=True)))
-
-
-def reference_of(scores: pd.DataFrame) -> Method | None:
-    """The method that a score table compares the others with. None if there is none."""
-    name = scores["reference"].iloc[0] if "reference" in scores else ""
-    return next((method for method in methods_of(scores) if name and " ".join(method).strip() == name), None)
 
 
 def score_markdown(scores: pd.DataFrame, title: str = "Localization score") -> str:
@@ -306,12 +284,3 @@ def _signed(value: float) -> str:
 
 def _number(value: float) -> str:
     return "–" if pd.isna(value) else f"{value:.3f}"
-
-
-def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table whose columns also line up as plain text."""
-    widths = [max(len(line[column]) for line in [header, *rows]) for column in range(len(header))]
-    lines = [header, ["-" * width for width in widths], *rows]
-    return "\n".join(
-        "| " + " | ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)) + " |" for line in lines
-    )

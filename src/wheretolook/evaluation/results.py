@@ -3,27 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from wheretolook.dataset import Dataset, SceneFolder, write_text
-from wheretolook.evaluation.config import EvaluateConfig, threshold_key
-from wheretolook.evaluation.paper_tables import write_paper_tables
-from wheretolook.evaluation.ranking import TestViews
-from wheretolook.evaluation.report import main_rows, score_markdown
-from wheretolook.evaluation.scores import ALL, Choices, Method, read_scores
-from wheretolook.evaluation.scoring import Weights
+from wheretolook.dataset.folders import Dataset, SceneFolder
+from wheretolook.evaluation.config import EvaluateConfig
+from wheretolook.evaluation.scores import Choices, read_scores
 from wheretolook.evaluation.views import CandidateSet
-from wheretolook.fisher.soft_visibility import GaussianProcessVisibility, cone_half_angle
-from wheretolook.geometry import Float
-from wheretolook.table import fingerprint
-from wheretolook.tracking import NestedRun, TrackingConfig, artifact, log, newest_run, start_run
-from wheretolook.visibility.config import OcclusionConfig
+from wheretolook.geometry.poses import Float
+from wheretolook.methods.names import Method
+from wheretolook.utils.files import fingerprint
+from wheretolook.utils.tracking import NestedRun, TrackingConfig, artifact, newest_run
+from wheretolook.viewpoints.thresholds import ALL, threshold_key
 
 SCORES_CSV, SCORES_MD, SCORES_PNG, OCCLUSION_PNG = "scores.csv", "scores.md", "scores.png", "occlusion.png"
 CALIBRATION_CSV, CALIBRATION_PNG, REGRET_PNG = "calibration.csv", "calibration.png", "regret.png"
@@ -59,104 +54,6 @@ def results_folder(dataset: Dataset, config: EvaluateConfig) -> Path:
     """Where an evaluation's files go: `<dataset>/results/`, or for scenes of another split than test a folder there."""
     folder = dataset.root / "results"
     return folder if config.split == "test" else folder / config.split
-
-
-def write_results(folder: Path, table: pd.DataFrame, calibration: pd.DataFrame, title: str) -> None:
-    """Write tables, report and figures; what belongs to an earlier evaluation goes.
-
-    Args:
-        folder: where; made when needed.
-        table: score tables of all occlusion models and candidate sets, one below the other.
-        calibration: reliability curves of learned methods, as `calibration_figure` wants them; empty without any.
-        title: of the report.
-    """
-    from wheretolook.figures.calibration import calibration_figure
-    from wheretolook.figures.occlusion import occlusion_figure
-    from wheretolook.figures.scores import regret_figure, score_figure
-    from wheretolook.figures.style import save_figure
-
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, text in ((SCORES_CSV, table.to_csv(index=False)), (SCORES_MD, score_markdown(table, title))):
-        write_text(folder / name, text)
-    variants = folder / VARIANTS_CSV
-    if variants.is_file():  # the paper's tables have a row for each of the network's inputs, which a release knows
-        known = {*zip(table["method"], table["inputs"], strict=True)}
-        others = main_rows(read_scores(variants))
-        methods = zip(others["method"], others["inputs"], strict=True)
-        others = others[[method not in known for method in methods]]
-        write_paper_tables(pd.concat([table, others], ignore_index=True), folder)
-    else:
-        write_paper_tables(table, folder)
-    save_figure(score_figure(table), folder / SCORES_PNG)
-    save_figure(regret_figure(table), folder / REGRET_PNG)
-    if table["occlusion"].nunique() > 1:
-        save_figure(occlusion_figure(table), folder / OCCLUSION_PNG)
-    else:
-        (folder / OCCLUSION_PNG).unlink(missing_ok=True)
-    if len(calibration):
-        write_text(folder / CALIBRATION_CSV, calibration.to_csv(index=False))
-        save_figure(calibration_figure(calibration), folder / CALIBRATION_PNG)
-    else:
-        for name in (CALIBRATION_CSV, CALIBRATION_PNG):
-            (folder / name).unlink(missing_ok=True)
-
-
-def log_evaluation(
-    dataset: Dataset,
-    scenes: Sequence[SceneFolder],
-    config: EvaluateConfig,
-    tracking: TrackingConfig,
-    weights: Weights,
-    views: TestViews,
-    scored: Sequence[ScoredSet],
-    occlusion: OcclusionConfig,
-    results: Path,
-) -> None:
-    """Log an evaluation: a run with the files of `results`, and in it one for each row over all scenes.
-
-    Args:
-        dataset: evaluated.
-        scenes: of the split.
-        config: of the evaluation.
-        tracking: where to log.
-        weights: of methods that have learnt.
-        views: all labelled views.
-        scored: of each occlusion model and candidate set.
-        occlusion: settings of occlusion models, logged if the configuration names any.
-        results: folder of the files.
-    """
-    params = {
-        **evaluation_params(dataset, scenes, weights),
-        **{name: value for name, value in asdict(config).items() if name not in ("weights", "methods")},
-        **(
-            {f"occlusion_{name}": value for name, value in asdict(occlusion).items() if name != "model"}
-            if config.occlusions
-            else {}
-        ),
-    }
-    if any(name.startswith("fisher") and "gp" in name for name in config.methods):
-        process = GaussianProcessVisibility.fitted(cone_half_angle(dataset.camera))
-        params |= {"gp_factors": process.n_factors, "gp_length": round(process.length, 4)}
-        params["gp_held_out_rmse"] = round(process.held_out_error(), 4)
-    positives = float(views.good[:, 0].mean())
-    metrics = {"n_locations": views.n_locations, "n_views": len(views.good), "positives": positives}
-    with (
-        TemporaryDirectory() as folder,
-        start_run(
-            tracking, f"evaluate {dataset.name}", "evaluate", params, tags={"dataset": dataset.name}
-        ) as (client, run),
-    ):  # fmt: skip
-        log(client, run, metrics=metrics)
-        for file in results.iterdir():
-            if file.is_file():
-                client.log_artifact(run, str(file))
-        for one in scored:
-            for row, nested in runs_of_rows(one.table, params):
-                chosen = _location_table(one, (row["method"], row["inputs"]), row["top_n"], scenes, config)
-                chosen.to_parquet(Path(folder) / LOCATIONS_PARQUET, index=False)
-                with start_run(tracking, nested.name, "evaluate", nested.params, parent=run) as (_, child):
-                    log(client, child, metrics=nested.metrics)
-                    client.log_artifact(child, str(Path(folder) / LOCATIONS_PARQUET))
 
 
 def evaluation_params(dataset: Dataset, scenes: Sequence[SceneFolder], weights: Iterable[Path]) -> dict[str, Any]:

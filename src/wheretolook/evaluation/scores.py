@@ -10,40 +10,18 @@ import pandas as pd
 from numpy.typing import NDArray
 from sklearn.metrics import average_precision_score, roc_auc_score
 
-from wheretolook.errors import ConfigError
 from wheretolook.evaluation.bootstrap import LocationBootstrap
 from wheretolook.evaluation.calibration import expected_calibration_error, scale_probability
-from wheretolook.evaluation.config import EvaluateConfig, threshold_key
-from wheretolook.evaluation.ranking import (
-    TestViews,
-    TopN,
-    choose_at_random,
-    choose_best,
-    choose_by_truth,
-    rank_views,
-)
-from wheretolook.geometry import Float
-
-ALL = "all"
-"""Value of the column `scene` in rows over all scenes."""
+from wheretolook.evaluation.config import EvaluateConfig
+from wheretolook.evaluation.ranking import TestViews, TopN, choose_at_random, choose_best, choose_by_truth, rank_views
+from wheretolook.geometry.poses import Float
+from wheretolook.methods.names import BEST, LEARNED, ORACLE, PROBABILITIES, Method
+from wheretolook.utils.errors import ConfigError
+from wheretolook.viewpoints.thresholds import ALL, threshold_key
 
 RELEASED_DIVISOR = 0.527
 """What the paper's released code divides every share by, whatever the threshold, the scenes and N."""
 
-Method = tuple[str, str]
-"""Name of a method and its input variant ("" if it has none)."""
-
-ORACLE: Method = ("oracle", "")
-"""The method that knows the labels."""
-
-LEARNED = "mlp"
-"""The paper's network: `LearnedScorer.name`, without loading PyTorch."""
-
-PROBABILITIES = (LEARNED, "trees", "conv", "set", "sphere")
-"""Methods whose scores are probabilities, learnt from labels."""
-
-BEST: Method = ("set", "")
-"""The method that others are compared with unless told otherwise: the best there is."""
 
 _PAIRED = ("difference", "difference_low", "difference_high", "p")
 _CALIBRATION = ("ece", "ece_scaled", "temperature")

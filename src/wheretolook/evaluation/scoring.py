@@ -11,22 +11,24 @@ import numpy as np
 import pandas as pd
 from tqdm.auto import tqdm
 
-from wheretolook.dataset import Dataset, SceneFolder
-from wheretolook.errors import TableError, WeightsError
+from wheretolook.dataset.folders import Dataset, SceneFolder
+from wheretolook.dataset.scene_occlusion import scene_occlusion
 from wheretolook.evaluation.config import EvaluateConfig
-from wheretolook.evaluation.scores import Method, reference_method
-from wheretolook.geometry import Float
+from wheretolook.evaluation.scores import reference_method
+from wheretolook.geometry.poses import Float
+from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.learning.config import MATCHABILITY, VARIANTS, weights_name
 from wheretolook.learning.weights import read_training, weights_kind
-from wheretolook.localization_map import LocalizationMap
-from wheretolook.scene_occlusion import scene_occlusion
-from wheretolook.scoring import Scorer, make_scorer
-from wheretolook.scoring.registry import WEIGHTS_OF
-from wheretolook.table import fingerprint, poses
+from wheretolook.methods.base import Scorer
+from wheretolook.methods.names import Method
+from wheretolook.methods.registry import WEIGHTS_OF, make_scorer
+from wheretolook.utils.errors import TableError, WeightsError
+from wheretolook.utils.files import fingerprint
+from wheretolook.viewpoints.table import poses
 from wheretolook.visibility.config import OcclusionConfig
 
 if TYPE_CHECKING:
-    from wheretolook.learning.training import TrainedModel
+    from wheretolook.learning.provenance import TrainedModel
 
 BLOCK = 4096
 """Views binned and scored at a time."""
@@ -66,7 +68,7 @@ def choose_weights(dataset: Dataset, config: EvaluateConfig, models: Sequence[Tr
 
 def _own_weights(dataset: Dataset) -> list[Path]:
     """The weights in the dataset's folder, which must be trained on what the dataset now holds."""
-    from wheretolook.learning.training import was_trained_on
+    from wheretolook.learning.provenance import was_trained_on
 
     named = (dataset.root / "weights" / weights_name(variant) for variant in VARIANTS)
     weights = [path for path in named if path.is_file()]

@@ -9,12 +9,12 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from wheretolook.dataset import SceneFolder
-from wheretolook.errors import TableError
+from wheretolook.dataset.folders import SceneFolder
 from wheretolook.evaluation.config import EvaluateConfig, candidates_label
 from wheretolook.evaluation.ranking import TestViews
-from wheretolook.geometry import camera_centers
-from wheretolook.table import is_good, poses
+from wheretolook.geometry.poses import camera_centers
+from wheretolook.utils.errors import TableError
+from wheretolook.viewpoints.table import is_good, poses
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +41,7 @@ def views_of(
 
     Args:
         scenes: the scenes, S.
-        tables: their viewpoints, in the same order, see `wheretolook.table.SCHEMA`.
+        tables: their viewpoints, in the same order, see `wheretolook.viewpoints.table.SCHEMA`.
         config: thresholds, and the size of the squares of locations that are resampled together.
 
     Returns:

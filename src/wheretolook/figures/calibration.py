@@ -7,8 +7,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.style import context
 
-from wheretolook.evaluation.report import main_rows, methods_of
-from wheretolook.figures.style import INK, RC, MethodStyle, method_style, new_figure
+from wheretolook.evaluation.score_table import main_rows, methods_of
+from wheretolook.figures.style import INK, RC, new_figure
+from wheretolook.methods.styles import MethodStyle, method_style
 
 _BEFORE, _AFTER = "before", "after"
 

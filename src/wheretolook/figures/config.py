@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from wheretolook.errors import ConfigError
+from wheretolook.utils.errors import ConfigError
 
 KINDS = ("png", "pdf", "svg")
 """Kinds of files that figures are written as."""

@@ -9,8 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from numpy.typing import ArrayLike
 
-from wheretolook.geometry import Float, PinholeCamera, invert_poses
-from wheretolook.rendering.dollhouse import Dollhouse
+from wheretolook.figures.house_image import Dollhouse
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.poses import Float, invert_poses
 
 BLUE, SKY, GREEN, ORANGE, VERMILION, PURPLE = "#0072B2", "#56B4E9", "#009E73", "#E69F00", "#D55E00", "#CC79A7"
 """Okabe and Ito (2008)."""

@@ -12,10 +12,10 @@ from matplotlib.figure import Figure
 from matplotlib.style import context
 from numpy.typing import NDArray
 
-from wheretolook.features import PAPER_VARIANTS
 from wheretolook.figures.dollhouse import ORANGE
 from wheretolook.figures.style import INK, PRINT, TWO_COLUMNS_IN, new_figure
-from wheretolook.geometry import Float
+from wheretolook.geometry.poses import Float
+from wheretolook.inputs.bins import PAPER_VARIANTS
 
 UNITS = {"u": "px", "v": "px", "x": "m", "y": "m", "z": "m"}
 

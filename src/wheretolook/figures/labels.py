@@ -15,10 +15,9 @@ from matplotlib.style import context
 from matplotlib.ticker import MaxNLocator, NullLocator
 from numpy.typing import NDArray
 
-from wheretolook.evaluation.config import THRESHOLDS, threshold_key, threshold_label
-from wheretolook.evaluation.scores import ALL
 from wheretolook.figures.style import INK, RC, new_figure
 from wheretolook.labelling.report import POSITIVE, LabelSummary, threshold_sentence
+from wheretolook.viewpoints.thresholds import ALL, THRESHOLDS, threshold_key, threshold_label
 
 SHADES = ("#08306b", "#2c7bb6", "#86bcdc", "#d3e4f1")
 """Of the thresholds, the finest darkest: they can be told apart in greyscale."""

@@ -9,8 +9,8 @@ from matplotlib.style import context
 from scipy.spatial import ConvexHull, cKDTree
 
 from wheretolook.figures.style import GRID, INK, RC, new_figure
-from wheretolook.geometry import Float
-from wheretolook.grid import azimuth_elevation_lattice, fibonacci_sphere, released_lattice
+from wheretolook.geometry.lattices import azimuth_elevation_lattice, fibonacci_sphere, released_lattice
+from wheretolook.geometry.poses import Float
 
 
 def covering_radius_deg(directions: Float) -> float:

@@ -15,7 +15,7 @@ from matplotlib.style import context
 from wheretolook.figures.dollhouse import BLUE, VERMILION
 from wheretolook.figures.inputs import BinnedImage, draw_counts, draw_landmarks, n_landmarks
 from wheretolook.figures.style import INK, PRINT, TWO_COLUMNS_IN, new_figure
-from wheretolook.geometry import Float
+from wheretolook.geometry.poses import Float
 
 _COLUMNS = 12  # of a hidden layer's values
 _WIDE = 10  # letters below the score
@@ -26,7 +26,7 @@ def learning_figure(image: BinnedImage, activations: Sequence[Float], channels: 
 
     Args:
         image: the view, binned.
-        activations: of the network, see `wheretolook.learning.architecture.activations`.
+        activations: of the network, see `wheretolook.methods.mlp.architecture.activations`.
         channels: names of the input's channels.
         outcome: what came of localizing the view, in words.
 

@@ -9,10 +9,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.style import context
 
-from wheretolook.evaluation.config import threshold_label
-from wheretolook.evaluation.report import main_rows, methods_of, threshold_keys
-from wheretolook.evaluation.scores import ALL, Method
-from wheretolook.figures.style import INK, RC, method_style, new_figure, rows_by_group
+from wheretolook.evaluation.score_table import main_rows, methods_of, threshold_keys
+from wheretolook.figures.style import INK, RC, new_figure
+from wheretolook.methods.names import Method
+from wheretolook.methods.styles import method_style, rows_by_group
+from wheretolook.viewpoints.thresholds import ALL, threshold_label
 
 _LABELS = {"mesh": "mesh rays", "tsdf": "TSDF", "hidden-points": "hidden-point removal", "none": "none"}
 _MARKERS = ("o", "s", "^", "D")

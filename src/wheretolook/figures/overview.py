@@ -12,7 +12,7 @@ from matplotlib.style import context
 from numpy.typing import NDArray
 
 from wheretolook.figures.style import INK, RC, new_figure
-from wheretolook.geometry import Float
+from wheretolook.geometry.poses import Float
 
 STAR = "#D55E00"
 

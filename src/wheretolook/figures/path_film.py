@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,36 +13,15 @@ from matplotlib.figure import Figure
 from matplotlib.style import context
 from numpy.typing import NDArray
 
-from wheretolook.errors import ConfigError
-from wheretolook.figures.style import INK, RC, new_figure, scorer_style
-from wheretolook.geometry import Float
-
-Pixels = NDArray[np.uint8]
+from wheretolook.figures.style import INK, RC, new_figure
+from wheretolook.geometry.poses import Float
+from wheretolook.methods.styles import scorer_style
+from wheretolook.planning.path_view import PathView, Pixels
+from wheretolook.utils.errors import ConfigError
 
 PATH, SEEN = "#CC3311", "#EE9900"
 FRAMES_PER_SECOND = 8
 STILLS = 5
-
-
-@dataclass(frozen=True, eq=False)
-class PathView:
-    """One view along a path.
-
-    Attributes:
-        position: (3,) world, metres.
-        axis: (3,) unit optical axis, world.
-        score: of the view in [0, 1]; NaN where it is not known.
-        pixels: (K, 2) of the landmarks in view.
-        size_px: width and height of the image.
-        rgb: (H, W, 3) uint8 what the camera sees; None where nothing can be rendered.
-    """
-
-    position: Float
-    axis: Float
-    score: float
-    pixels: Float
-    size_px: tuple[int, int]
-    rgb: Pixels | None
 
 
 def film_frames(views: Sequence[PathView], landmarks: Float) -> Iterator[Pixels]:

@@ -7,7 +7,8 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.style import context
 
-from wheretolook.figures.style import INK, RC, new_figure, scorer_style
+from wheretolook.figures.style import INK, RC, new_figure
+from wheretolook.methods.styles import scorer_style
 
 TITLES = {"planned": "places and views planned", "given": "views along a given path"}
 

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from wheretolook.figures.dollhouse import BLUE, VERMILION
 from wheretolook.figures.overview import View
 from wheretolook.figures.style import INK, PRINT, TWO_COLUMNS_IN, new_figure
-from wheretolook.geometry import Float
+from wheretolook.geometry.poses import Float
 
 _WIDE = 27  # letters below a view
 

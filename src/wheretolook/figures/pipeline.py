@@ -22,10 +22,11 @@ from wheretolook.figures.dollhouse import (
     frustum_corners,
     frustum_segments,
 )
+from wheretolook.figures.house_image import Dollhouse
 from wheretolook.figures.style import INK, ONE_COLUMN_IN, PRINT, TWO_COLUMNS_IN, new_figure
-from wheretolook.geometry import Float, PinholeCamera
-from wheretolook.grid import fibonacci_sphere
-from wheretolook.rendering.dollhouse import Dollhouse
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.lattices import fibonacci_sphere
+from wheretolook.geometry.poses import Float
 
 _GLYPH = 32  # directions drawn of a location
 _MARGIN_M = 0.1  # landmarks lie a little behind surfaces, too

@@ -16,10 +16,10 @@ from matplotlib.style import context
 from numpy.typing import NDArray
 
 from wheretolook.figures.dollhouse import BLUE, ORANGE, SKY, VERMILION, draw_house, draw_points, draw_segments
+from wheretolook.figures.house_image import Dollhouse
 from wheretolook.figures.style import INK, PRINT, TWO_COLUMNS_IN, new_figure
-from wheretolook.geometry import Float
-from wheretolook.grid import VoxelGrid
-from wheretolook.rendering.dollhouse import Dollhouse
+from wheretolook.geometry.lattices import VoxelGrid
+from wheretolook.geometry.poses import Float
 
 _SIGHT_LINES = 120
 _MARGIN_PX = 0.04

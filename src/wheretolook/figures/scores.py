@@ -13,10 +13,11 @@ from matplotlib.lines import Line2D
 from matplotlib.style import context
 from matplotlib.ticker import MaxNLocator
 
-from wheretolook.evaluation.config import threshold_label
-from wheretolook.evaluation.report import main_rows, methods_of, reference_of, threshold_keys
-from wheretolook.evaluation.scores import ALL, Method
-from wheretolook.figures.style import INK, RC, method_group, method_style, new_figure, rows_by_group
+from wheretolook.evaluation.score_table import main_rows, methods_of, reference_of, threshold_keys
+from wheretolook.figures.style import INK, RC, new_figure
+from wheretolook.methods.names import Method
+from wheretolook.methods.styles import method_group, method_style, rows_by_group
+from wheretolook.viewpoints.thresholds import ALL, threshold_label
 
 _OTHER_MARKERS = ("o", "D", "s", "^")
 """Of the second and further N."""

@@ -9,8 +9,9 @@ from matplotlib.figure import Figure
 from matplotlib.style import context
 from numpy.typing import NDArray
 
-from wheretolook.figures.style import INK, RC, method_style, new_figure
-from wheretolook.geometry import Float
+from wheretolook.figures.style import INK, RC, new_figure
+from wheretolook.geometry.poses import Float
+from wheretolook.methods.styles import method_style
 
 
 def viewpoint_sphere_figure(

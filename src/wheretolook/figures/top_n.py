@@ -11,11 +11,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.style import context
 
-from wheretolook.evaluation.config import threshold_label
 from wheretolook.evaluation.paper_tables import PAPER
-from wheretolook.evaluation.report import main_rows, methods_of, threshold_keys
-from wheretolook.evaluation.scores import ALL, LEARNED, ORACLE, Method
-from wheretolook.figures.style import PRINT, TWO_COLUMNS_IN, method_style, new_figure
+from wheretolook.evaluation.score_table import main_rows, methods_of, threshold_keys
+from wheretolook.figures.style import PRINT, TWO_COLUMNS_IN, new_figure
+from wheretolook.methods.names import LEARNED, ORACLE, Method
+from wheretolook.methods.styles import method_style
+from wheretolook.viewpoints.thresholds import ALL, threshold_label
 
 SHOWN: tuple[Method, ...] = (("set", ""), (LEARNED, ""), ("fisher", "trace exact"), ("bins", ""), ("random", ""))
 """Methods that are drawn where no others are asked for; the network is the first there is."""

@@ -8,8 +8,9 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.style import context
 
-from wheretolook.figures.style import RC, method_style, new_figure
+from wheretolook.figures.style import RC, new_figure
 from wheretolook.learning.config import LEARNERS
+from wheretolook.methods.styles import method_style
 
 
 def training_figure(histories: Mapping[str, pd.DataFrame]) -> Figure:

@@ -9,9 +9,10 @@ from matplotlib.colors import to_rgb
 from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.figures.dollhouse import BLUE, ORANGE, VERMILION, frustum_segments
-from wheretolook.geometry import Float, PinholeCamera
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.mesh import TexturedMesh
+from wheretolook.geometry.poses import Float
 from wheretolook.scenes.cutting import cut_above
-from wheretolook.scenes.mesh import TexturedMesh
 
 FRUSTUM_M = 0.25
 """Depth of the cameras that are drawn."""

@@ -8,12 +8,13 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from wheretolook.camera_models import Camera, ColmapCamera
 from wheretolook.fisher import exact_kernel
 from wheretolook.fisher.exact_kernel import information_kernel
 from wheretolook.fisher.information import N_NUMBERS, bearing_numbers
 from wheretolook.fisher.parts import run_in_parts
-from wheretolook.geometry import Float, split_poses
+from wheretolook.geometry.colmap_camera import Camera, ColmapCamera
+from wheretolook.geometry.poses import Float, split_poses
+from wheretolook.utils.warp import start_warp
 from wheretolook.visibility.counting import SINGLE_ROUNDING
 from wheretolook.visibility.frustum import (
     MIN_DEPTH_M,
@@ -23,7 +24,6 @@ from wheretolook.visibility.frustum import (
     offsets_from,
     visible_landmarks_plain,
 )
-from wheretolook.warp_setup import start_warp
 
 CPU_VIEWS = 128
 """Views that a thread of a CPU takes at a time: some ten milliseconds."""

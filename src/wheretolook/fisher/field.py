@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.errors import MapError
 from wheretolook.fisher.field_sums import field_sums
 from wheretolook.fisher.information import N_NUMBERS, TRACE
 from wheretolook.fisher.metrics import metric_of
 from wheretolook.fisher.soft_visibility import GaussianProcessVisibility, QuadraticVisibility, SoftVisibility
-from wheretolook.geometry import Float
+from wheretolook.geometry.poses import Float
+from wheretolook.utils.errors import MapError
 
 FORMAT_VERSION = 1
 

@@ -13,9 +13,9 @@ from wheretolook.fisher.field_kernel import numbers_kernel, process_kernel, quad
 from wheretolook.fisher.information import N_NUMBERS, bearing_numbers
 from wheretolook.fisher.parts import run_in_parts
 from wheretolook.fisher.soft_visibility import GaussianProcessVisibility, QuadraticVisibility, SoftVisibility
-from wheretolook.geometry import Float
+from wheretolook.geometry.poses import Float
+from wheretolook.utils.warp import start_warp
 from wheretolook.visibility.frustum import offsets_from
-from wheretolook.warp_setup import start_warp
 
 NEAREST_M = 1e-3
 """Landmarks nearer to a location than this are left out: their information has no bound."""

@@ -17,7 +17,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.geometry import Float
+from wheretolook.geometry.poses import Float
 
 N_NUMBERS = 15
 """Numbers that a sum of informations is kept as."""

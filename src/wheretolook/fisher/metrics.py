@@ -8,13 +8,13 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from wheretolook.errors import ConfigError
 from wheretolook.fisher import metrics_kernel
 from wheretolook.fisher.information import N_NUMBERS, TRACE, information_matrices
 from wheretolook.fisher.metrics_kernel import eigenvalues_kernel
 from wheretolook.fisher.parts import run_in_parts
-from wheretolook.geometry import Float
-from wheretolook.warp_setup import start_warp
+from wheretolook.geometry.poses import Float
+from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.warp import start_warp
 
 Metric = Literal["mineig", "logdet", "trace"]
 METRICS: tuple[str, ...] = get_args(Metric)

@@ -14,9 +14,9 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-from wheretolook.camera_models import Camera, ColmapCamera
-from wheretolook.geometry import Float
-from wheretolook.grid import fibonacci_sphere
+from wheretolook.geometry.colmap_camera import Camera, ColmapCamera
+from wheretolook.geometry.lattices import fibonacci_sphere
+from wheretolook.geometry.poses import Float
 
 
 class SoftVisibility(ABC):

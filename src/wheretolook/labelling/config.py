@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from wheretolook.errors import ConfigError
+from wheretolook.utils.errors import ConfigError
 
 
 @dataclass(frozen=True)

@@ -17,15 +17,15 @@ import numpy as np
 import pandas as pd
 from tqdm.auto import tqdm
 
-import wheretolook
-from wheretolook.dataset import write_json
-from wheretolook.errors import MapError, SceneError, StorageError, TableError
-from wheretolook.geometry import PinholeCamera
+from wheretolook.features.keypoints import ExtractorConfig
+from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.labelling.config import LabelConfig
 from wheretolook.labelling.shard import LabelledShard, SceneJob, Shard
-from wheretolook.mapping.extraction import ExtractorConfig
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.table import SCHEMA, fingerprint, read_table, sha256, write_table
+from wheretolook.utils.errors import MapError, SceneError, StorageError, TableError
+from wheretolook.utils.files import fingerprint, sha256, write_json
+from wheretolook.utils.version import VERSION
+from wheretolook.viewpoints.table import SCHEMA, read_table, write_table
 
 MANIFEST = "manifest.json"
 """In the folder of shards while work goes on, and as `labels.json` beside a finished table."""
@@ -41,7 +41,7 @@ class LabelTask:
     Attributes:
         name: of the scene.
         job: what workers need.
-        table: its viewpoints, see `wheretolook.table.SCHEMA`.
+        table: its viewpoints, see `wheretolook.viewpoints.table.SCHEMA`.
         shards: folder for finished shards.
     """
 
@@ -58,7 +58,7 @@ class LabelledScene:
     Attributes:
         task: what was asked.
         table: the viewpoints with status, error_m, error_deg and n_inliers; the paper's label y follows from them by
-            `wheretolook.table.is_good`. If the job stores matches, also `wheretolook.table.MATCH_FIELDS`.
+            `viewpoints.table.is_good`. If the job stores matches, also `viewpoints.table.MATCH_FIELDS`.
         manifest: what the labels were made with: versions, settings, fingerprints, and each shard's name and content.
         seconds: workers' time in each step, of the shards made in this run.
     """
@@ -84,7 +84,7 @@ def label_viewpoints(
     """Render every viewpoint of one scene, localize its image and measure the error: `label_scenes` for one scene.
 
     Args:
-        table: viewpoints, see `wheretolook.table.SCHEMA`.
+        table: viewpoints, see `wheretolook.viewpoints.table.SCHEMA`.
         mesh: file of the scene's mesh.
         landmarks: file of the map's landmarks, with descriptors.
         camera: intrinsics of the viewpoints.
@@ -161,7 +161,7 @@ def label_scenes(
 @cache
 def versions() -> dict[str, str]:
     """Versions of what decides a label."""
-    found = {"wheretolook": wheretolook.__version__}
+    found = {"wheretolook": VERSION}
     for package in ("pycolmap", "opencv-python-headless", "warp-lang", "numpy", "torch"):
         try:
             found[package] = version(package)

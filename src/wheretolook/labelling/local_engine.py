@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 
-from wheretolook.errors import WorkerError
 from wheretolook.labelling.shard import LabelledShard, Shard, ShardWorker
-from wheretolook.worker_processes import end_with_parent, spawning
+from wheretolook.utils.errors import WorkerError
+from wheretolook.utils.workers import end_with_parent, spawning
 
 MAX_DEATHS = 3
 """A shard whose worker was killed so often is given up."""

@@ -9,13 +9,15 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from wheretolook.errors import MapError
-from wheretolook.geometry import Float, PinholeCamera
+from wheretolook.features.extraction import KeypointExtractor
+from wheretolook.features.keypoints import ExtractorConfig, Keypoints, quantize_descriptors
+from wheretolook.features.matching import DescriptorMatcher, Matches, match
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.poses import Float
 from wheretolook.labelling.config import LocalizerConfig
-from wheretolook.labelling.matching import DescriptorMatcher, Matches, match
-from wheretolook.mapping.extraction import ExtractorConfig, KeypointExtractor, Keypoints, quantize_descriptors
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.table import LOCALIZED, NO_POSE, TOO_FEW_MATCHES
+from wheretolook.utils.errors import MapError
+from wheretolook.viewpoints.table import LOCALIZED, NO_POSE, TOO_FEW_MATCHES
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,8 +20,8 @@ from typing import Any
 
 import pandas as pd
 
-from wheretolook.errors import ConfigError, WhereToLookError, WorkerError
 from wheretolook.labelling.shard import LabelledShard, SceneJob, Shard, ShardWorker
+from wheretolook.utils.errors import ConfigError, WhereToLookError, WorkerError
 
 MAX_RETRIES = 5
 """How often Ray starts a shard again whose process or machine was lost."""

@@ -10,14 +10,10 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from wheretolook.dataset import Dataset, SceneFolder, Split, write_text
-from wheretolook.errors import TableError
-from wheretolook.evaluation.config import THRESHOLDS, threshold_key, threshold_label
-from wheretolook.evaluation.report import markdown_table
-from wheretolook.evaluation.scores import ALL
-from wheretolook.geometry import Float, camera_centers
-from wheretolook.table import LOCALIZED, NO_POSE, TOO_FEW_MATCHES, is_good, poses
-from wheretolook.tracking import TrackingConfig, log, start_run
+from wheretolook.geometry.poses import Float, camera_centers
+from wheretolook.utils.markdown import markdown_table
+from wheretolook.viewpoints.table import LOCALIZED, NO_POSE, TOO_FEW_MATCHES, Split, is_good, poses
+from wheretolook.viewpoints.thresholds import ALL, THRESHOLDS, threshold_key, threshold_label
 
 LABELS_CSV, LABELS_MD, LABELS_PNG = "labels.csv", "labels.md", "labels.png"
 """Files of a report on labels, in `<dataset>/results/` and as artifacts of its run."""
@@ -79,7 +75,7 @@ def label_summary(tables: Mapping[str, pd.DataFrame], splits: Mapping[str, Split
     """Summarize the labels of scenes.
 
     Args:
-        tables: viewpoints of each scene by its name, see `wheretolook.table.SCHEMA`; at least one, none empty.
+        tables: viewpoints of each scene by its name, see `viewpoints.table.SCHEMA`; at least one, none empty.
         splits: split of each scene.
 
     Raises:
@@ -235,65 +231,9 @@ def _visible_label(low: float, high: float) -> str:
     return f"{low:,.0f}" if high == low + 1 else f"{low:,.0f}–{high - 1:,.0f}"
 
 
-def log_labels(
-    dataset: Dataset, tracking: TrackingConfig = TrackingConfig(), seconds: Mapping[str, float] | None = None
-) -> LabelSummary:
-    """Summarize the labels of a dataset, write `<dataset>/results/labels.csv`, `.md` and `.png`, and log an MLflow run.
-
-    The run is of stage "label"; its metrics are the numbers of `LabelSummary.shares` over all scenes and, with the
-    split's name in front, over each split.
-
-    Args:
-        dataset: labelled scenes.
-        tracking: where to log.
-        seconds: how long each stage took, by its name, logged as metrics `seconds_<name>`.
-
-    Raises:
-        TableError: there is no scene, a scene has no viewpoints, or one of them has no label.
-    """
-    from wheretolook.figures.labels import label_figure
-    from wheretolook.figures.style import save_figure
-
-    if not dataset.scenes:
-        raise TableError("the dataset has no scene", path=dataset.root, fix="Run the scenes stage.")
-    tables = {scene.name: _labelled_table(scene) for scene in dataset.scenes}
-    summary = label_summary(tables, {scene.name: scene.split for scene in dataset.scenes})
-    folder = dataset.root / "results"
-    markdown = label_markdown(summary, f"Labels of {dataset.name}")
-    for name, text in ((LABELS_CSV, summary.shares.to_csv(index=False)), (LABELS_MD, markdown)):
-        write_text(folder / name, text)
-    save_figure(label_figure(summary), folder / LABELS_PNG)
-
-    params = {
-        "dataset": dataset.name,
-        "dataset_fingerprint": dataset.fingerprint(),
-        "scenes": " ".join(scene.name for scene in dataset.scenes),
-    }
-    metrics = {f"seconds_{name}": value for name, value in (seconds or {}).items()}
-    for row in summary.shares[summary.shares["scene"] == ALL].to_dict("records"):
-        prefix = "" if row["split"] == ALL else f"{row['split']}_"
-        metrics |= {f"{prefix}{name}": value for name, value in row.items() if name not in ("scene", "split")}
-    with start_run(tracking, f"label {dataset.name}", "label", params, tags={"dataset": dataset.name}) as (client, run):
-        log(client, run, metrics=metrics)
-        for name in (LABELS_CSV, LABELS_MD, LABELS_PNG):
-            client.log_artifact(run, str(folder / name))
-    return summary
-
-
 def _labels() -> list[str]:
     """The thresholds for people, in their order."""
     return [threshold_label(threshold_key(threshold)) for threshold in THRESHOLDS]
-
-
-def _labelled_table(scene: SceneFolder) -> pd.DataFrame:
-    table = scene.read_table()
-    if table.empty:
-        raise TableError("the table has no viewpoints", path=scene.table, fix="Run the sample stage again.")
-    try:
-        is_good(table)
-    except TableError as error:
-        raise TableError(error.problem, path=scene.table, value=error.value, fix=error.fix) from None
-    return table
 
 
 def _band_lines(bands: pd.DataFrame, name: Any) -> list[list[str]]:

@@ -11,17 +11,18 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from wheretolook.errors import WhereToLookError, WorkerError
-from wheretolook.geometry import Float, PinholeCamera, pose_error
+from wheretolook.features.keypoints import ExtractorConfig
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.poses import Float, pose_error
 from wheretolook.labelling.config import LocalizerConfig
 from wheretolook.labelling.pipeline import Step, run_pipeline
-from wheretolook.mapping.extraction import ExtractorConfig
-from wheretolook.table import MATCH_FIELDS, poses
-from wheretolook.worker_processes import use_one_core
+from wheretolook.utils.errors import WhereToLookError, WorkerError
+from wheretolook.utils.workers import use_one_core
+from wheretolook.viewpoints.table import MATCH_FIELDS, poses
 
 if TYPE_CHECKING:
     from wheretolook.labelling.localizer import Localization, Localizer
-    from wheretolook.rendering import Renderer
+    from wheretolook.rendering.types import Renderer
 
 BATCH = 8
 """Viewpoints that go through the steps together."""
@@ -41,7 +42,7 @@ class SceneJob:
         extractor: what the map was made with.
         device: where images are rendered, keypoints extracted and descriptors matched; "cuda" is spread over all GPUs
             there are.
-        store_matches: whether labelled rows get the columns of `wheretolook.table.MATCH_FIELDS`.
+        store_matches: whether labelled rows get the columns of `wheretolook.viewpoints.table.MATCH_FIELDS`.
     """
 
     mesh: Path
@@ -95,7 +96,7 @@ class ShardWorker:
 
         Args:
             job: their scene.
-            rows: viewpoints, see `wheretolook.table.SCHEMA`.
+            rows: viewpoints, see `wheretolook.viewpoints.table.SCHEMA`.
             tick: called with the number of viewpoints just finished.
 
         Raises:
@@ -120,7 +121,7 @@ class ShardWorker:
     def _open(self, job: SceneJob) -> tuple[Renderer, Localizer]:
         from wheretolook.labelling.localizer import Localizer
         from wheretolook.mapping.landmarks import Landmarks
-        from wheretolook.rendering import WarpRenderer
+        from wheretolook.rendering.warp_renderer import WarpRenderer
         from wheretolook.scenes.loading import load_mesh
 
         if self._scene is None or self._scene[0] != job:
@@ -154,7 +155,7 @@ def label_rows(
 
     Returns:
         The table with status, error_m, error_deg and n_inliers filled in, and with `store_matches` the columns of
-        `wheretolook.table.MATCH_FIELDS`. Those it had before, of earlier labels, go in any case.
+        `wheretolook.viewpoints.table.MATCH_FIELDS`. Those it had before, of earlier labels, go in any case.
     """
     true_poses = poses(table)
 

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
-from wheretolook.errors import ConfigError
-from wheretolook.features import CHANNELS, INPUT_VARIANTS, PAPER_VARIANTS, Layout
+from wheretolook.inputs.bins import CHANNELS, INPUT_VARIANTS, PAPER_VARIANTS, Layout
+from wheretolook.learning.fitting_config import FittingConfig
+from wheretolook.methods.conv.config import ConvConfig
+from wheretolook.methods.matchability.config import MatchabilityConfig
+from wheretolook.methods.set.config import SetConfig
+from wheretolook.methods.sphere.config import SphereConfig
+from wheretolook.methods.trees.config import TreesConfig
+from wheretolook.utils.errors import ConfigError
 
 RELEASED = "released"
 """The variant that trains as the paper's released code does, on the inputs of "2d+3d"."""
@@ -53,205 +58,6 @@ RELEASED_OPTIONS: dict[str, Any] = {
 }
 """Options of the released code where they can differ from the paper's; batch size (128 there) and epochs stay as
 configured."""
-
-
-@dataclass(frozen=True)
-class TreesConfig:
-    """Options of boosted trees (scikit-learn's HistGradientBoostingClassifier).
-
-    Args:
-        max_trees: rounds of boosting; those up to the best validation average precision are kept.
-        learning_rate: shrinkage of each tree.
-        max_leaves: leaves of a tree.
-        min_leaf: viewpoints of a leaf.
-        l2: penalty on the leaves' values.
-    """
-
-    max_trees: int = 400
-    learning_rate: float = 0.06
-    max_leaves: int = 31
-    min_leaf: int = 50
-    l2: float = 1.0
-
-    def __post_init__(self) -> None:
-        if self.max_trees < 1 or self.max_leaves < 2 or self.min_leaf < 1:
-            raise ConfigError(
-                "trees need max_trees >= 1, max_leaves >= 2 and min_leaf >= 1",
-                value=(self.max_trees, self.max_leaves, self.min_leaf),
-            )
-        if not self.learning_rate > 0 or not self.l2 >= 0:
-            raise ConfigError(
-                "trees need a positive learning_rate and no negative l2", value=(self.learning_rate, self.l2)
-            )
-
-
-@dataclass(frozen=True)
-class FittingConfig:
-    """Options of every network but the paper's: Adam, its rate falling to zero by a cosine, all views as they are.
-
-    The weights kept are those of the epoch with the best validation average precision; the probabilities are then
-    calibrated on the validation views (Platt scaling).
-
-    Args:
-        epochs: passes over the training viewpoints.
-        batch_size: viewpoints a step.
-        learning_rate: Adam's initial rate.
-        l2: factor of the sum of squared weights.
-    """
-
-    epochs: int = 20
-    batch_size: int = 512
-    learning_rate: float = 2e-3
-    l2: float = 1e-5
-
-    def __post_init__(self) -> None:
-        if self.epochs < 1 or self.batch_size < 1:
-            raise ConfigError("epochs and batch_size must be at least 1", value=(self.epochs, self.batch_size))
-        if not self.learning_rate > 0 or not self.l2 >= 0:
-            raise ConfigError("learning_rate must be positive and l2 not negative", value=(self.learning_rate, self.l2))
-
-
-def _check_hidden(names: tuple[str, ...]) -> None:
-    from wheretolook.attributes import ATTRIBUTES  # PyTorch takes seconds to load
-
-    if unknown := [name for name in names if name not in ATTRIBUTES]:
-        known = f"There are {', '.join(ATTRIBUTES)}."
-        raise ConfigError("hidden names an attribute that there is not", value=unknown[0], fix=known)
-
-
-def _check_enlarged(factor: float) -> None:
-    if not 1 <= factor < math.inf:
-        raise ConfigError("scenes can be enlarged by a factor of 1 or more", value=factor)
-
-
-@dataclass(frozen=True)
-class MatchabilityConfig(FittingConfig):
-    """Options of the probability that a landmark in view is found.
-
-    Args:
-        landmarks: landmarks of a view to learn from, at most, chosen at random.
-        width: units of each of two hidden layers.
-        hidden: attributes (`wheretolook.attributes.ATTRIBUTES`) not to look at, to see what each is worth.
-        enlarged: greatest factor by which scenes come larger or smaller in training; 1 leaves them as they are.
-    """
-
-    epochs: int = 6
-    batch_size: int = 256
-    landmarks: int = 64
-    width: int = 48
-    hidden: tuple[str, ...] = ()
-    enlarged: float = 3.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _check_enlarged(self.enlarged)
-        if self.landmarks < 1 or self.width < 1:
-            raise ConfigError("landmarks and width must be at least 1", value=(self.landmarks, self.width))
-        if self.hidden:
-            _check_hidden(self.hidden)
-
-
-@dataclass(frozen=True)
-class SetConfig(FittingConfig):
-    """Options of the network over the set of landmarks in view.
-
-    With few training views, batches get smaller and epochs more (`wheretolook.learning.set.of_size`).
-
-    Args:
-        landmarks: landmarks of a view that a training step looks at, at most, chosen at random.
-        width: units of the layers that look at single landmarks.
-        pooled: numbers that attention pools beside what the landmarks are expected to tell of the pose.
-        head: units of the layers that decide.
-        dropout: share of the deciding layers' units dropped.
-        from_matchability: start from `weights/matchability.safetensors` where the dataset has it.
-        hidden: attributes (`wheretolook.attributes.ATTRIBUTES`) not to look at, to see what each is worth.
-        enlarged: greatest factor by which scenes come larger or smaller in training; 1 leaves them as they are.
-    """
-
-    epochs: int = 8
-    batch_size: int = 1024
-    learning_rate: float = 3e-3
-    landmarks: int = 192
-    width: int = 48
-    pooled: int = 8
-    head: int = 48
-    dropout: float = 0.1
-    from_matchability: bool = True
-    hidden: tuple[str, ...] = ()
-    enlarged: float = 3.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _check_enlarged(self.enlarged)
-        if min(self.landmarks, self.width, self.head) < 1 or self.pooled < 0 or not 0 <= self.dropout < 1:
-            raise ConfigError(
-                "a set network needs landmarks, width and head >= 1, pooled >= 0 and a dropout below 1",
-                value=(self.landmarks, self.width, self.head, self.pooled, self.dropout),
-            )
-        if self.hidden:
-            _check_hidden(self.hidden)
-
-
-@dataclass(frozen=True)
-class ConvConfig(FittingConfig):
-    """Options of the convolutional network over the bins.
-
-    Args:
-        epochs, batch_size, learning_rate, l2: see `FittingConfig`.
-        widths: channels after each convolution; every one but the first halves the sides of the grid.
-        dropout: share of pooled values dropped in training.
-        bins: bins along each side of the image.
-    """
-
-    widths: tuple[int, ...] = (32, 64, 128, 128)
-    dropout: float = 0.2
-    bins: int = 30
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not self.widths or min(self.widths) < 1:
-            raise ConfigError(
-                "convolutions must be at least one channel wide, and there must be one", value=self.widths
-            )
-        if not 0 <= self.dropout < 1 or self.bins < 1:
-            raise ConfigError(
-                "a convolutional network needs bins >= 1 and a dropout from 0 to less than 1",
-                value=(self.bins, self.dropout),
-            )
-
-
-@dataclass(frozen=True)
-class SphereConfig(FittingConfig):
-    """Options of "sphere"; a batch holds whole locations with about `batch_size` viewpoints in all.
-
-    Args:
-        points: landmarks of a location at most, spread evenly over those in free sight.
-        cameras: mapping cameras at most, spread evenly over all.
-        width: of tokens and queries; a multiple of `heads`.
-        heads: of attention.
-        layers: blocks of attention among the tokens.
-        dropout: share of values dropped in the blocks of attention.
-    """
-
-    epochs: int = 30
-    batch_size: int = 1024
-    learning_rate: float = 5e-4
-    points: int = 512
-    cameras: int = 128
-    width: int = 96
-    heads: int = 4
-    layers: int = 2
-    dropout: float = 0.1
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in ("points", "cameras", "width", "heads", "layers"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"sphere needs {name} of at least 1", value=getattr(self, name))
-        if self.width % self.heads:
-            raise ConfigError("sphere needs a width that is a multiple of heads", value=(self.width, self.heads))
-        if not 0 <= self.dropout < 1:
-            raise ConfigError("dropout must be at least 0 and less than 1", value=self.dropout)
 
 
 @dataclass(frozen=True)
@@ -382,10 +188,10 @@ def weights_name(variant: str) -> str:
 
 
 def inputs_of(variant: str) -> str:
-    """The key in `wheretolook.features.INPUT_VARIANTS` of what a variant looks at."""
+    """The key in `wheretolook.inputs.bins.INPUT_VARIANTS` of what a variant looks at."""
     return "2d+3d" if variant == RELEASED else variant
 
 
 def needs_landmark_channels(variant: str) -> bool:
-    """Whether a variant of the paper's network looks at more than `wheretolook.features.CHANNELS`."""
+    """Whether a variant of the paper's network looks at more than `wheretolook.inputs.bins.CHANNELS`."""
     return not {*INPUT_VARIANTS[inputs_of(variant)]} <= {*CHANNELS}

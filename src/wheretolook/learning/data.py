@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from wheretolook.dataset import Dataset, SceneFolder
-from wheretolook.errors import ConfigError, TableError
-from wheretolook.features import ALL_CHANNELS, CHANNELS
+from wheretolook.dataset.folders import Dataset, SceneFolder
+from wheretolook.inputs.bins import ALL_CHANNELS, CHANNELS, InputStatistics
 from wheretolook.learning.config import TrainConfig
-from wheretolook.learning.network import InputStatistics
-from wheretolook.table import UNLABELLED, fingerprint, is_good, poses
+from wheretolook.utils.errors import ConfigError, TableError
+from wheretolook.utils.files import fingerprint
+from wheretolook.viewpoints.table import UNLABELLED, is_good, poses
 
 BLOCK = 4096
 """Views binned at a time."""
@@ -143,7 +143,7 @@ def load_views(
 
 
 def labelled_rows(scene: SceneFolder, matches: bool = False) -> pd.DataFrame:
-    """The labelled viewpoints of a scene, on request with their matches; see `wheretolook.table.read_table`.
+    """The labelled viewpoints of a scene, on request with their matches; see `wheretolook.viewpoints.table.read_table`.
 
     Raises:
         TableError: there is no table, no labelled viewpoint, or the matches are asked for but not stored.

@@ -22,10 +22,10 @@ from lightning.pytorch.strategies import DDPStrategy
 from torch.multiprocessing.spawn import ProcessException
 from tqdm.auto import tqdm
 
-from wheretolook.errors import ConfigError, WorkerError
 from wheretolook.learning.classifier import ViewpointClassifier
 from wheretolook.learning.config import TrainConfig
-from wheretolook.tracking import TrackingConfig, client
+from wheretolook.utils.errors import ConfigError, WorkerError
+from wheretolook.utils.tracking import TrackingConfig, client
 
 if TYPE_CHECKING:
     from mlflow.entities import Metric

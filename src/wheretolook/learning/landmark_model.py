@@ -8,11 +8,11 @@ from typing import Any, ClassVar, Self
 
 from torch import nn
 
-from wheretolook.attributes import ATTRIBUTES
-from wheretolook.errors import ConfigError, WeightsError
-from wheretolook.geometry import PinholeCamera
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.inputs.landmarks_in_view import ATTRIBUTES
 from wheretolook.learning.landmark_views import AttributeStatistics
 from wheretolook.learning.weights import check_kind, read_weights, write_weights
+from wheretolook.utils.errors import ConfigError, WeightsError
 
 
 class LandmarkModel:

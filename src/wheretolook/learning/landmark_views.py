@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from wheretolook.attributes import ATTRIBUTES, LandmarkDescriber, ViewLandmarks
-from wheretolook.dataset import Dataset, SceneFolder
+from wheretolook.dataset.folders import Dataset, SceneFolder
+from wheretolook.inputs.landmarks_in_view import ATTRIBUTES, LandmarkDescriber, ViewLandmarks
 from wheretolook.learning.config import TrainConfig
 from wheretolook.learning.data import Batch, has_room, labelled_rows, training_scenes, validation_views
 from wheretolook.learning.fit import home_device
 from wheretolook.learning.learner import Task
-from wheretolook.table import LOCALIZED, is_good, poses
+from wheretolook.viewpoints.table import LOCALIZED, is_good, poses
 
 DISTANCES = [ATTRIBUTES.index(name) for name in ("distance", "mapped_distance")]
 """Attributes that are logarithms of distances: those that change when a scene is enlarged."""
@@ -201,7 +201,7 @@ def _joined(blocks: Sequence[LandmarkViews]) -> LandmarkViews:
 
 
 class LandmarkLoader:
-    """Batches of views for `wheretolook.learning.set_network.SetNetwork`: a window of each view's landmarks.
+    """Batches of views for `wheretolook.methods.set.network.SetNetwork`: a window of each view's landmarks.
 
     With several processes, every one cuts the same batches and keeps its share of each; a share can be empty.
 

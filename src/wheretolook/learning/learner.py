@@ -13,7 +13,7 @@ from lightning.pytorch import LightningDataModule
 from numpy.typing import NDArray
 from torch import nn
 
-from wheretolook.dataset import Dataset
+from wheretolook.dataset.folders import Dataset
 from wheretolook.learning.classifier import ViewpointClassifier
 from wheretolook.learning.config import TrainConfig
 from wheretolook.learning.fit import EpochRecord, RunLog, fit

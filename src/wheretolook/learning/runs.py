@@ -9,8 +9,9 @@ from typing import Any
 
 import pandas as pd
 
-from wheretolook.dataset import Dataset, write_text
-from wheretolook.tracking import TrackingConfig, artifact, client, finished_runs
+from wheretolook.dataset.folders import Dataset
+from wheretolook.utils.files import write_text
+from wheretolook.utils.tracking import TrackingConfig, artifact, client, finished_runs
 
 HISTORY_CSV = "history.csv"
 """Artifact of a train run: a row an epoch."""

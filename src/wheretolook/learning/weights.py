@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +12,9 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from wheretolook.errors import ConfigError, WeightsError
-from wheretolook.geometry import PinholeCamera
+from wheretolook.inputs.bins import InputStatistics
 from wheretolook.learning.config import MATCHABILITY
-from wheretolook.learning.network import InputStatistics, NetworkSpec, ViewpointNetwork
+from wheretolook.utils.errors import WeightsError
 
 FORMAT_VERSION = 1
 """Version of the layout of the metadata."""
@@ -26,20 +24,6 @@ MLP = "mlp"
 
 METADATA_KEY = "wheretolook"
 """Key of the JSON text in the header of the file."""
-
-
-def save_classifier(network: ViewpointNetwork, path: str | Path, training: Mapping[str, Any] | None = None) -> None:
-    """Write weights, specification and input statistics as one safetensors file, atomically.
-
-    The same network gives the same bytes.
-
-    Args:
-        network: what to write.
-        path: file to write; its folder is made when needed.
-        training: what else to keep about the training (JSON values), such as the dataset's fingerprint.
-    """
-    header = {**asdict(network.spec), "training": dict(training or {})}
-    write_weights(path, network.layers.state_dict(), header)
 
 
 def write_weights(path: str | Path, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> None:
@@ -67,28 +51,6 @@ def check_kind(path: str | Path, header: Mapping[str, Any], kind: str) -> None:
             f"these weights are not of {kind}", path=path, value=header.get("kind", MLP),
             fix=f"Give weights of {kind}, or train them.",
         )  # fmt: skip
-
-
-def load_classifier(path: str | Path, device: str = "cpu") -> ViewpointNetwork:
-    """Read what `save_classifier` wrote, ready to score (dropout off).
-
-    Args:
-        path: a safetensors file.
-        device: torch device of the network.
-
-    Raises:
-        WeightsError: the file is missing, damaged, foreign, of another version, or does not fit its own description.
-    """
-    tensors, header = read_weights(Path(path))
-    check_kind(path, header, MLP)
-    network = ViewpointNetwork(_spec(Path(path), header))
-    try:
-        network.layers.load_state_dict(tensors)
-    except RuntimeError as error:
-        raise WeightsError(
-            f"the weights do not fit the network they describe: {error}", path=path, fix="Train again."
-        ) from error
-    return network.to(device).eval().requires_grad_(False)
 
 
 def read_training(path: str | Path) -> dict[str, Any]:
@@ -173,19 +135,3 @@ def read_weights(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
 def stored_statistics(stored: Mapping[str, Any]) -> InputStatistics:
     """Input statistics from a header."""
     return InputStatistics(tuple(stored["channels"]), tuple(stored["mean"]), tuple(stored["std"]))
-
-
-def _spec(path: Path, header: dict[str, Any]) -> NetworkSpec:
-    try:
-        return NetworkSpec(
-            variant=header["variant"],
-            camera=PinholeCamera(**header["camera"]),
-            statistics=stored_statistics(header["statistics"]),
-            bins=int(header["bins"]),
-            layout=header["layout"],
-            hidden=tuple(header["hidden"]),
-            dropout=float(header["dropout"]),
-            input_dropout=float(header["input_dropout"]),
-        )
-    except (KeyError, TypeError, ValueError, ConfigError) as error:
-        raise WeightsError(f"damaged description in the header: {error}", path=path, fix="Train again.") from error

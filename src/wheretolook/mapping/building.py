@@ -16,20 +16,23 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from wheretolook.errors import MapError
-from wheretolook.geometry import PinholeCamera, poses_looking_along
+from wheretolook.features.extraction import KeypointExtractor
+from wheretolook.features.keypoints import Keypoints
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.mesh import TexturedMesh
+from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.mapping.cameras import CAMERAS_FILE, colmap_poses, save_mapping_poses
 from wheretolook.mapping.config import MapConfig
-from wheretolook.mapping.extraction import KeypointExtractor, Keypoints
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
 from wheretolook.mapping.pairs import choose_pairs, shrink_depth, surface_overlap
-from wheretolook.mapping.processes import Processes
 from wheretolook.mapping.triangulation import image_name, triangulate_known_poses
 from wheretolook.mapping.walk import FreeSpaceQueries, plan_walk
-from wheretolook.scenes.mesh import TexturedMesh
+from wheretolook.utils.errors import MapError
+from wheretolook.utils.processes import Processes
 
 if TYPE_CHECKING:
-    from wheretolook.rendering import MeshRaycaster, Renderer
+    from wheretolook.rendering.raycasting import MeshRaycaster
+    from wheretolook.rendering.types import Renderer
 
 _RENDER_BATCH = 4
 LANDMARKS_FILE, REPORT_FILE, DATABASE_FILE, IMAGES_FOLDER = "landmarks.npz", "report.json", "database.db", "images"
@@ -282,7 +285,7 @@ def _surface_distance_cm(
     landmarks: Landmarks, mesh: TexturedMesh, raycaster: MeshRaycaster | None
 ) -> NDArray[np.float64]:
     if raycaster is None:
-        from wheretolook.rendering import MeshRaycaster
+        from wheretolook.rendering.raycasting import MeshRaycaster
 
         raycaster = MeshRaycaster(mesh)
     farthest_m = float(np.linalg.norm(mesh.bounds[1] - mesh.bounds[0]))

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from wheretolook.errors import MapError
-from wheretolook.geometry import Float
+from wheretolook.geometry.poses import Float
 from wheretolook.mapping.colmap_model import MODEL_FILES, read_model
+from wheretolook.utils.errors import MapError
 
 if TYPE_CHECKING:
     import pycolmap

@@ -3,35 +3,21 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.errors import MapError
+from wheretolook.utils.colmap import quiet_colmap
+from wheretolook.utils.errors import MapError
 
 MODEL_FILES = ("cameras", "images", "points3D")
 _REBUILD = "Copy or build the model again."
 # Bytes an entry needs at least: an empty name, no 2D points, no track, a rig of one sensor, a frame of one image.
 _LEAST_BYTES = {"images.bin": 73, "rigs.bin": 8, "frames.bin": 68}
 _POINT_BYTES = 51  # id, position, colour, error, track length; the track's elements follow
-
-
-@contextmanager
-def quiet_colmap(least: Literal["WARNING", "ERROR"] = "WARNING") -> Iterator[None]:
-    """Silence COLMAP's log below a level: it would tear the progress bars."""
-    import pycolmap
-
-    level = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = max(level, getattr(pycolmap.logging.Level, least).value)
-    try:
-        yield
-    finally:
-        pycolmap.logging.minloglevel = level
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from wheretolook.errors import ConfigError
-from wheretolook.mapping.extraction import ExtractorConfig
+from wheretolook.features.keypoints import ExtractorConfig
 from wheretolook.mapping.photograph_config import PhotographsConfig
 from wheretolook.mapping.walk import WalkConfig
+from wheretolook.utils.errors import ConfigError
 
 
 @dataclass(frozen=True)

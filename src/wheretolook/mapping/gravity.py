@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from wheretolook.geometry import Float
+from wheretolook.geometry.poses import Float
 
 _ITERATIONS = 50
 _SOFT = np.sin(np.radians(0.5))  # residuals below count like this one, so that weights stay finite

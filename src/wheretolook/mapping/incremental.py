@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from wheretolook.errors import MapError
-from wheretolook.mapping.colmap_model import quiet_colmap, read_model
-from wheretolook.mapping.extraction import ExtractorConfig, KeypointExtractor
+from wheretolook.features.extraction import KeypointExtractor
+from wheretolook.features.keypoints import ExtractorConfig
+from wheretolook.mapping.colmap_model import read_model
 from wheretolook.mapping.photographs import (
     PhotographCameras,
     list_photographs,
@@ -26,8 +26,10 @@ from wheretolook.mapping.photographs import (
     read_photograph,
     reduce_photograph,
 )
-from wheretolook.mapping.processes import Processes
 from wheretolook.mapping.triangulation import Stored, fill_database, match_pairs, stored_keypoints
+from wheretolook.utils.colmap import quiet_colmap
+from wheretolook.utils.errors import MapError
+from wheretolook.utils.processes import Processes
 
 _LEAST_IMAGES = 3  # of a model: two photographs alone fix no camera
 _VERSION = 1  # of what is kept of the steps

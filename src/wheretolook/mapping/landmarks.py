@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from numpy.typing import DTypeLike, NDArray
 
-from wheretolook.errors import MapError
+from wheretolook.features.keypoints import quantize_descriptors, unit_descriptors
 from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 from wheretolook.mapping.colmap_model import ModelArrays, model_arrays, read_descriptors, read_model
-from wheretolook.mapping.extraction import quantize_descriptors, unit_descriptors
+from wheretolook.utils.errors import MapError
 
 if TYPE_CHECKING:
     import pycolmap

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.geometry import Float
+from wheretolook.geometry.poses import Float
 
 _ROUNDS = 3
 _SAMPLES = 32  # along an edge

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.errors import ConfigError, MapError
-from wheretolook.geometry import Float, camera_centers
+from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.mapping.marker_corners import refine_corners
+from wheretolook.utils.errors import ConfigError, MapError
 
 if TYPE_CHECKING:
     import pycolmap

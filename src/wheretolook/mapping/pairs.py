@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.geometry import PinholeCamera, camera_centers, transform
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.poses import camera_centers, transform
 
 _SAMPLES_ACROSS = 16  # surface points taken from an image, in x
 DEPTH_STRIDE = 4

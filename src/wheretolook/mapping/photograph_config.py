@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from math import inf
 from pathlib import Path
 
-from wheretolook.errors import ConfigError
+from wheretolook.utils.errors import ConfigError
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 from tqdm.auto import tqdm
 
-from wheretolook.errors import ConfigError, MapError
-from wheretolook.geometry import Float
+from wheretolook.geometry.poses import Float
 from wheretolook.mapping.building import (
     DATABASE_FILE,
     LANDMARKS_FILE,
@@ -31,7 +30,6 @@ from wheretolook.mapping.landmarks import load_colmap_landmarks
 from wheretolook.mapping.markers import Marker, MarkerView, detect_markers, marker_detector, place_marker
 from wheretolook.mapping.photograph_config import KnownDistance, ScaleConfig
 from wheretolook.mapping.photographs import photograph_cameras, read_photograph
-from wheretolook.mapping.processes import Processes
 from wheretolook.mapping.scale import (
     MapScale,
     read_marker_table,
@@ -42,6 +40,8 @@ from wheretolook.mapping.scale import (
 )
 from wheretolook.mapping.similarity import Similarity
 from wheretolook.mapping.triangulation import color_points
+from wheretolook.utils.errors import ConfigError, MapError
+from wheretolook.utils.processes import Processes
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.camera_models import ColmapCamera
-from wheretolook.errors import ConfigError, MapError
-from wheretolook.mapping.colmap_model import quiet_colmap
+from wheretolook.geometry.colmap_camera import ColmapCamera
 from wheretolook.mapping.photograph_config import PhotographsConfig
+from wheretolook.utils.colmap import quiet_colmap
+from wheretolook.utils.errors import ConfigError, MapError
 
 if TYPE_CHECKING:
     import pycolmap

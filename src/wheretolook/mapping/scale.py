@@ -12,10 +12,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from wheretolook.errors import ConfigError, MapError
-from wheretolook.geometry import Float
+from wheretolook.geometry.poses import Float
 from wheretolook.mapping.markers import Marker
 from wheretolook.mapping.similarity import Similarity, fit_similarity
+from wheretolook.utils.errors import ConfigError, MapError
 
 Source = Literal["markers", "distance", "positions", "unknown"]
 REPORT_FILE = "report.json"

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from wheretolook.errors import MapError
-from wheretolook.geometry import Float
+from wheretolook.geometry.poses import Float
+from wheretolook.utils.errors import MapError
 
 _FLAT = 1e-6  # ratio of standard deviations below which points lie on a line
 

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from wheretolook.geometry import PinholeCamera
-from wheretolook.mapping.colmap_model import quiet_colmap
-from wheretolook.mapping.extraction import Keypoints, quantize_descriptors
-from wheretolook.mapping.processes import Processes
+from wheretolook.features.keypoints import Keypoints, quantize_descriptors
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.utils.colmap import quiet_colmap
+from wheretolook.utils.processes import Processes
 
 _PAIRS_AT_A_TIME = 64  # of a process; also a step of the progress bar
 

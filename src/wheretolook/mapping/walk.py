@@ -10,13 +10,13 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
 
-from wheretolook.errors import ConfigError, SceneError
+from wheretolook.utils.errors import ConfigError, SceneError
 
 Float = NDArray[np.float64]
 
 
 class FreeSpaceQueries(Protocol):
-    """What a walk asks of free space, see `wheretolook.scenes.free_space.FreeSpace`."""
+    """What a walk asks of free space, see `wheretolook.space.free_space.FreeSpace`."""
 
     def is_free(self, points: Any) -> NDArray[np.bool_]: ...
 

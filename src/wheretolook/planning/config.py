@@ -7,8 +7,8 @@ from math import inf, isfinite
 from pathlib import Path
 from typing import Literal
 
-from wheretolook.errors import ConfigError
-from wheretolook.grid import Lattice
+from wheretolook.geometry.lattices import Lattice
+from wheretolook.utils.errors import ConfigError
 
 
 @dataclass(frozen=True)

@@ -10,16 +10,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
-from wheretolook.camera_models import Camera, ColmapCamera
-from wheretolook.errors import ConfigError, MapError, SceneError
-from wheretolook.geometry import Float, rotation_looking_along
-from wheretolook.grid import VoxelGrid
-from wheretolook.localization_map import LocalizationMap
+from wheretolook.geometry.colmap_camera import Camera, ColmapCamera
+from wheretolook.geometry.lattices import VoxelGrid
+from wheretolook.geometry.poses import Float, rotation_looking_along
+from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.methods.base import Scorer
 from wheretolook.planning.refine import score_directions
 from wheretolook.planning.viewpoint_map import MapOrigin, ViewpointMap
-from wheretolook.scoring.base import Scorer
-from wheretolook.visibility import StoredOcclusion, survey
+from wheretolook.utils.errors import ConfigError, MapError, SceneError
+from wheretolook.visibility.occlusion import StoredOcclusion
+from wheretolook.visibility.survey import survey
 
 VIEWS_AT_ONCE = 16_384
 """Views handed to the scorer at a time, whole locations: enough for a GPU, and the progress bar moves."""
@@ -47,7 +48,7 @@ def build_viewpoint_map(
     Args:
         scorer: any method; it knows its map, and so landmarks, camera, occlusion and device.
         grid: voxels of the world.
-        free: where a camera can be: ids of voxels, (L,), such as `wheretolook.sampling.free_locations` finds, or a mask
+        free: where a camera can be: ids of voxels, (L,), such as `viewpoints.sampling.free_locations` finds, or a mask
             of all voxels, (V,) bool.
         directions: (D, 3) optical axes in the world, of any length, such as `direction_lattice` gives.
         lattice: their name, to be told to readers.

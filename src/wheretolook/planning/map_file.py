@@ -6,7 +6,7 @@ import glob
 import json
 import shutil
 import tempfile
-from dataclasses import asdict
+from collections.abc import Mapping
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.dataset import write_json, write_text
-from wheretolook.errors import MapFormatError
-from wheretolook.grid import VoxelGrid
-from wheretolook.planning.viewpoint_map import MapOrigin, ViewpointMap
+from wheretolook.geometry.lattices import VoxelGrid
+from wheretolook.utils.errors import MapFormatError
+from wheretolook.utils.files import write_json, write_text
 
 FORMAT, VERSION = "wheretolook viewpoint map", 1
 
@@ -37,7 +36,7 @@ ARRAYS = {
 _OLD = "old"
 """Where a map that is being replaced lies in the hidden folder of the one who saves."""
 
-_REBUILD = "Build it anew with `wheretolook viewpoint-map`, or get the folder again."
+REBUILD = "Build it anew with `wheretolook viewpoint-map`, or get the folder again."
 
 _TEXT = """\
 A viewpoint map, version {version}: where to point a camera so that it knows where it is.
@@ -89,7 +88,7 @@ IN C++, the best direction at a point (for little-endian machines):
 
 TO UPDATE
   landmark_ids and landmark_digests (of each landmark's position, and of its attributes: the first 8 bytes of BLAKE2b)
-  tell `ViewpointMap.updated` which landmarks were added; a planner has no use for them.
+  tell `update_viewpoint_map` which landmarks were added; a planner has no use for them.
 """
 
 _MEANINGS = {
@@ -103,30 +102,32 @@ _MEANINGS = {
 }
 
 
-def save_viewpoint_map(viewpoint_map: ViewpointMap, folder: str | Path) -> None:
+def write_map(
+    folder: str | Path, grid: VoxelGrid, origin: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]
+) -> None:
     """Write a folder; one that holds a viewpoint map and nothing else is replaced once the new one is complete.
 
     The same map gives the same bytes. The layout is described in the folder's own `LAYOUT.txt`. The new map is made in
     a hidden folder beside it, `.<name>.<some letters>`, where the old one is put until the new one has its place.
-    Whoever is killed at that moment leaves both there, and `load_viewpoint_map` says where.
+    Whoever is killed at that moment leaves both there, and `read_map` says where.
+
+    Args:
+        folder: of the map.
+        grid: voxels of the world.
+        origin: fields of `MapOrigin`, without `derived`.
+        arrays: those of `ARRAYS`, by name.
 
     Raises:
-        MapFormatError: the folder holds something else, or something beside a map; or the map was derived from another
-            (`MapOrigin.derived`).
+        MapFormatError: the folder holds something else, or something beside a map.
     """
     folder = Path(folder).resolve()  # which has a name, also for "."
-    if viewpoint_map.origin.derived:
-        raise MapFormatError(
-            "a map derived from another is for planners and not to be saved", path=folder,
-            value=viewpoint_map.origin.derived, fix="Save the map it was derived from.",
-        )  # fmt: skip
     _refuse_something_else(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
     work = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     new, old = work / "new", work / _OLD
     try:
         new.mkdir()
-        _write(viewpoint_map, new)
+        _write(new, grid, origin, arrays)
         if folder.exists():
             folder.rename(old)
         new.rename(folder)
@@ -155,34 +156,31 @@ def _refuse_something_else(folder: Path) -> None:
         )  # fmt: skip
 
 
-def _write(viewpoint_map: ViewpointMap, folder: Path) -> None:
+def _write(folder: Path, grid: VoxelGrid, origin: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> None:
     checksums = {}
     for name, (kind, _) in ARRAYS.items():
-        np.save(folder / f"{name}.npy", np.ascontiguousarray(getattr(viewpoint_map, name), dtype=kind))
+        np.save(folder / f"{name}.npy", np.ascontiguousarray(arrays[name], dtype=kind))
         checksums[f"{name}.npy"] = _sha256(folder / f"{name}.npy")
-    grid = viewpoint_map.grid
-    n_rows, n_directions = viewpoint_map.scores.shape
+    n_rows, n_directions = arrays["scores"].shape
     files = "\n".join(
         f"  {name + '.npy':<20}{np.dtype(kind).name:<9}({shape + ')':<7}{_MEANINGS[name]}"
         for name, (kind, shape) in ARRAYS.items()
     )
     write_text(folder / LAYOUT, _TEXT.format(version=VERSION, files=files))
-    origin = asdict(viewpoint_map.origin)
-    del origin["derived"]  # of what is saved, nothing is
     content = {
         "format": FORMAT,
         "version": VERSION,
         "grid": {name: [*map(float, getattr(grid, name))] for name in ("lower", "upper")}
         | {"shape": [*map(int, grid.shape)]},
-        "sizes": {"V": len(grid), "L": n_rows, "D": n_directions, "N": len(viewpoint_map.landmark_ids)},
-        "origin": origin,
+        "sizes": {"V": len(grid), "L": n_rows, "D": n_directions, "N": len(arrays["landmark_ids"])},
+        "origin": dict(origin),
         "sha256": checksums,
     }
     write_json(folder / DESCRIPTION, content)
 
 
-def load_viewpoint_map(folder: str | Path, mmap: bool = False) -> ViewpointMap:
-    """Read what `save_viewpoint_map` wrote.
+def read_map(folder: str | Path, mmap: bool = False) -> tuple[VoxelGrid, dict[str, Any], dict[str, NDArray[Any]]]:
+    """Read what `write_map` wrote: grid, origin and arrays.
 
     Args:
         folder: of the map.
@@ -196,33 +194,30 @@ def load_viewpoint_map(folder: str | Path, mmap: bool = False) -> ViewpointMap:
     path = folder / DESCRIPTION
     if not path.is_file():
         raise MapFormatError(
-            "there is no viewpoint map in this folder", path=folder, fix=_left_behind(folder) or _REBUILD
+            "there is no viewpoint map in this folder", path=folder, fix=_left_behind(folder) or REBUILD
         )
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         found = content.get("format"), content.get("version")
     except (OSError, ValueError, AttributeError) as error:
-        raise MapFormatError(f"damaged description: {error}", path=path, fix=_REBUILD) from error
+        raise MapFormatError(f"damaged description: {error}", path=path, fix=REBUILD) from error
     if found != (FORMAT, VERSION):
-        raise MapFormatError(f"not a viewpoint map of version {VERSION}", path=path, value=found, fix=_REBUILD)
+        raise MapFormatError(f"not a viewpoint map of version {VERSION}", path=path, value=found, fix=REBUILD)
     try:
         corners = content["grid"]
         grid = VoxelGrid(tuple(corners["lower"]), tuple(corners["upper"]), tuple(corners["shape"]))
-        origin, sizes, checksums = MapOrigin(**content["origin"]), dict(content["sizes"]), dict(content["sha256"])
+        origin, sizes, checksums = (dict(content[name]) for name in ("origin", "sizes", "sha256"))
         expected = {
             name: tuple(int(sizes.get(side, side)) for side in shape.split(", ")) for name, (_, shape) in ARRAYS.items()
         }
     except Exception as error:  # any value may be damaged
-        raise MapFormatError(f"damaged description: {error}", path=path, fix=_REBUILD) from error
-    arrays: dict[str, Any] = {}
+        raise MapFormatError(f"damaged description: {error}", path=path, fix=REBUILD) from error
+    arrays: dict[str, NDArray[Any]] = {}
     for name, shape in expected.items():
         arrays[name] = _read(folder / f"{name}.npy", ARRAYS[name][0], shape, mmap)
         if not mmap and _sha256(folder / f"{name}.npy") != checksums.get(f"{name}.npy"):
-            raise MapFormatError("damaged: the checksum differs", path=folder / f"{name}.npy", fix=_REBUILD)
-    try:
-        return ViewpointMap(grid=grid, origin=origin, **arrays)
-    except ValueError as error:
-        raise MapFormatError(f"the arrays do not fit together: {error}", path=folder, fix=_REBUILD) from error
+            raise MapFormatError("damaged: the checksum differs", path=folder / f"{name}.npy", fix=REBUILD)
+    return grid, origin, arrays
 
 
 def _left_behind(folder: Path) -> str:
@@ -234,16 +229,16 @@ def _left_behind(folder: Path) -> str:
 
 def _read(path: Path, kind: str, shape: tuple[int, ...], mmap: bool) -> NDArray[Any]:
     if not path.is_file():
-        raise MapFormatError("this file is missing", path=path, fix=_REBUILD)
+        raise MapFormatError("this file is missing", path=path, fix=REBUILD)
     try:
         # the plain array over the mapped memory: NumPy's class for it is slow to index
         array = np.asarray(np.load(path, mmap_mode="r" if mmap else None, allow_pickle=False))
     except Exception as error:  # a damaged header raises many kinds of errors
-        raise MapFormatError(f"not a readable array: {error}", path=path, fix=_REBUILD) from error
+        raise MapFormatError(f"not a readable array: {error}", path=path, fix=REBUILD) from error
     if array.shape != shape or array.dtype != np.dtype(kind) or not array.flags.c_contiguous:
         raise MapFormatError(
             f"not an array of {np.dtype(kind).name} of shape {shape}", path=path, value=(array.dtype.name, array.shape),
-            fix=_REBUILD,
+            fix=REBUILD,
         )  # fmt: skip
     return array
 

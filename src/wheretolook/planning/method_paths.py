@@ -8,19 +8,21 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from wheretolook.dataset import Dataset, SceneFolder
-from wheretolook.figures.path_film import PathView
-from wheretolook.geometry import PinholeCamera, poses_looking_along
-from wheretolook.localization_map import LocalizationMap
+from wheretolook.dataset.folders import Dataset, SceneFolder
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.poses import poses_looking_along
+from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.planning.config import PlanConfig
 from wheretolook.planning.path_comparison import FORWARD
-from wheretolook.planning.path_planning import PlannedPath, check_ends, plan_path
+from wheretolook.planning.path_planning import check_ends, plan_path
+from wheretolook.planning.path_view import PathView
 from wheretolook.planning.planner_map import check_methods, planner_map
+from wheretolook.planning.route_views import PlannedPath
 from wheretolook.planning.scene_map import weights_for
-from wheretolook.rendering import WarpRenderer
-from wheretolook.scenes.free_space import FreeSpace
-from wheretolook.scenes.mapped_space import MappedSpace
-from wheretolook.visibility import OcclusionModel
+from wheretolook.rendering.warp_renderer import WarpRenderer
+from wheretolook.space.free_space import FreeSpace
+from wheretolook.space.mapped_space import MappedSpace
+from wheretolook.visibility.occlusion import OcclusionModel
 
 
 def plan_by_methods(

@@ -10,16 +10,17 @@ import numpy as np
 import pandas as pd
 from tqdm.auto import tqdm
 
-from wheretolook.errors import PlanningError, SceneError
-from wheretolook.geometry import Float, poses_looking_along
-from wheretolook.planning.config import PathsConfig
-from wheretolook.planning.path_planning import PathConfig, PlannedPath, plan_path
+from wheretolook.geometry.poses import Float, poses_looking_along
+from wheretolook.planning.config import PathConfig, PathsConfig
+from wheretolook.planning.path_planning import plan_path
+from wheretolook.planning.route_views import PlannedPath
 from wheretolook.planning.sequences import TurnLimit, ViewSequence, best_sequence, greedy_sequence, resample_path
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.planning.ways import Ways
-from wheretolook.scenes.free_space import FreeSpace
-from wheretolook.scenes.mapped_space import MappedSpace
-from wheretolook.table import pose_columns
+from wheretolook.space.free_space import FreeSpace
+from wheretolook.space.mapped_space import MappedSpace
+from wheretolook.utils.errors import PlanningError, SceneError
+from wheretolook.viewpoints.table import pose_columns
 
 FORWARD = "forward"
 """The method that needs no map: the shortest path, looking ahead."""
@@ -48,7 +49,7 @@ class ComparedPaths:
         `length_m`, `turn_deg`, `n_views`, `promised`, the mean score of its views by the method's own map (NaN for
         "forward"), and `found_by` (`PlannedPath.found_by`).
     views: a row for each view along them: pair, task, method, waypoint, score, and
-            `wheretolook.table.POSE_COLUMNS`.
+            `wheretolook.viewpoints.table.POSE_COLUMNS`.
     """
 
     paths: pd.DataFrame
@@ -104,7 +105,7 @@ def shares_below(viewpoint_map: ViewpointMap) -> ViewpointMap:
     return replace(viewpoint_map, scores=shares.astype(np.float32), origin=origin)
 
 
-def compare_paths(
+def plan_pairs(
     pairs: Float, space: FreeSpace | MappedSpace, maps: Mapping[str, ViewpointMap], config: PathsConfig,
     progress: str | None = None,
 ) -> ComparedPaths:  # fmt: skip

@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.geometry import Float
+from wheretolook.geometry.poses import Float
 
 STEPS_M = (0.05, 1.0)
 """Least and greatest typical distance by which a corner is moved."""

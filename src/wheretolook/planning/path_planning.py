@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
-from wheretolook.errors import PlanningError
-from wheretolook.geometry import Float
-from wheretolook.grid import axes_of_angles
+from wheretolook.geometry.lattices import axes_of_angles
+from wheretolook.geometry.poses import Float
 from wheretolook.planning.config import PathConfig
 from wheretolook.planning.path_improvement import improve
 from wheretolook.planning.route_views import (
@@ -27,6 +26,7 @@ from wheretolook.planning.route_views import (
 )
 from wheretolook.planning.turns import check_axis
 from wheretolook.planning.viewpoint_map import ViewpointMap
+from wheretolook.utils.errors import PlanningError
 
 __all__ = ["PathConfig", "PlannedPath", "Space", "plan_path"]
 
@@ -48,7 +48,7 @@ STARTS = 12
 
 
 class Space(Protocol):
-    """Where a camera may be: `wheretolook.scenes.free_space.FreeSpace`, or anything that answers the same."""
+    """Where a camera may be: `wheretolook.space.free_space.FreeSpace`, or anything that answers the same."""
 
     def is_free(self, points: ArrayLike) -> NDArray[np.bool_]:
         """Whether a camera may be at points (N, 3) m; (N,)."""

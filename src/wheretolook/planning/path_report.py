@@ -10,11 +10,11 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from wheretolook.evaluation.report import markdown_table
 from wheretolook.planning.config import PathsConfig
 from wheretolook.planning.path_comparison import FORWARD
-from wheretolook.table import LOCALIZED
-from wheretolook.tracking import NestedRun, TrackingConfig, log_nested, start_run
+from wheretolook.utils.markdown import markdown_table
+from wheretolook.utils.tracking import NestedRun, TrackingConfig, log_nested, start_run
+from wheretolook.viewpoints.table import LOCALIZED
 
 PATHS_CSV, PATHS_MD, PATHS_PNG = "paths.csv", "paths.md", "paths.png"
 """Files of a comparison, in `<dataset>/results/` and as artifacts of its run."""

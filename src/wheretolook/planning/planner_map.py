@@ -5,19 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-from wheretolook.dataset import Dataset, SceneFolder
-from wheretolook.errors import ConfigError
-from wheretolook.evaluation.scores import PROBABILITIES
-from wheretolook.grid import Lattice
+from wheretolook.dataset.folders import Dataset, SceneFolder
+from wheretolook.geometry.lattices import Lattice
+from wheretolook.methods.names import PROBABILITIES
+from wheretolook.methods.registry import WEIGHTS_OF, check_method
 from wheretolook.planning.borrowing import with_borrowed_views
 from wheretolook.planning.config import ViewpointMapConfig
 from wheretolook.planning.path_comparison import shares_below
 from wheretolook.planning.scene_map import scene_viewpoint_map
 from wheretolook.planning.viewpoint_map import ViewpointMap
-from wheretolook.scenes.free_space import FreeSpace
-from wheretolook.scenes.mapped_space import MappedSpace
-from wheretolook.scoring.registry import WEIGHTS_OF, check_method
-from wheretolook.visibility import OcclusionModel
+from wheretolook.space.free_space import FreeSpace
+from wheretolook.space.mapped_space import MappedSpace
+from wheretolook.utils.errors import ConfigError
+from wheretolook.visibility.occlusion import OcclusionModel
 
 
 def planner_map(

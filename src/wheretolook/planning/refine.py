@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.geometry import Float, poses_looking_along
+from wheretolook.geometry.poses import Float, poses_looking_along
+from wheretolook.methods.base import Scorer
 from wheretolook.planning.turns import angles_to_axis_deg
-from wheretolook.scoring.base import Scorer
 
 COMPASS = np.stack([np.cos(np.arange(8) * np.pi / 4), np.sin(np.arange(8) * np.pi / 4)], axis=1)
 """Steps (8, 2) in the plane that touches the sphere at the current axis."""

@@ -8,13 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.errors import PlanningError
-from wheretolook.geometry import Float
-from wheretolook.grid import axes_of_angles
+from wheretolook.geometry.lattices import axes_of_angles
+from wheretolook.geometry.poses import Float
 from wheretolook.planning.config import PathConfig
 from wheretolook.planning.sequences import TurnLimit, best_sequence
 from wheretolook.planning.turns import pan_tilt_angles
 from wheretolook.planning.viewpoint_map import ViewpointMap
+from wheretolook.utils.errors import PlanningError
 
 LIMIT_STEP_DEG = 0.5
 """Limits on turns are rounded down to multiples of this, so that routes of about the same length share one."""

@@ -5,25 +5,25 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from wheretolook.dataset import RELEASE, Dataset, SceneFolder
-from wheretolook.errors import ConfigError, WeightsError
-from wheretolook.geometry import PinholeCamera
-from wheretolook.grid import VoxelGrid, direction_lattice
+from wheretolook.dataset.folders import RELEASE, Dataset, SceneFolder
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.lattices import VoxelGrid, direction_lattice
+from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.learning.config import MATCHABILITY
-from wheretolook.learning.training import was_trained_on
+from wheretolook.learning.provenance import was_trained_on
 from wheretolook.learning.weights import read_record, read_training, read_weights, weights_kind
-from wheretolook.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.methods.base import Scorer
+from wheretolook.methods.field_of_view import same_field_of_view
+from wheretolook.methods.registry import WEIGHTS_OF, load_scorer, make_scorer
 from wheretolook.planning.config import ViewpointMapConfig
 from wheretolook.planning.map_building import build_viewpoint_map
 from wheretolook.planning.viewpoint_map import ViewpointMap
-from wheretolook.sampling import free_locations
-from wheretolook.scenes.free_space import FreeSpace
-from wheretolook.scenes.mapped_space import MappedSpace
-from wheretolook.scoring import Scorer, load_scorer, make_scorer
-from wheretolook.scoring.learned import same_field_of_view
-from wheretolook.scoring.registry import WEIGHTS_OF
-from wheretolook.visibility import OcclusionModel
+from wheretolook.space.free_space import FreeSpace
+from wheretolook.space.mapped_space import MappedSpace
+from wheretolook.utils.errors import ConfigError, WeightsError
+from wheretolook.viewpoints.sampling import free_locations
+from wheretolook.visibility.occlusion import OcclusionModel
 
 
 def scene_viewpoint_map(

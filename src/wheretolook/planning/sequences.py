@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.errors import PlanningError
-from wheretolook.geometry import Float, rotation_looking_along
+from wheretolook.geometry.poses import Float, rotation_looking_along
 from wheretolook.planning.turns import check_axis, pan_tilt_turns_deg, turns_deg, turns_from_deg, within
 from wheretolook.planning.viewpoint_map import ViewpointMap
+from wheretolook.utils.errors import PlanningError
 
 SPACING_M = 0.2
 """Between waypoints, as in the Active Localization Benchmark."""

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.geometry import Float, rotation_looking_along
+from wheretolook.geometry.poses import Float, rotation_looking_along
 
 TOLERANCE_DEG = 1e-5
 """An angle that exceeds its limit by no more than this is within it: 20 degrees are at most 20, rounding or not."""

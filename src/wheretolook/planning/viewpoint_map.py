@@ -6,21 +6,20 @@ A query does the arithmetic of a perfect hash and reads a few numbers, so it tak
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.geometry import Float, rotation_looking_along
-from wheretolook.grid import VoxelGrid
+from wheretolook.geometry.lattices import VoxelGrid
+from wheretolook.geometry.poses import Float, rotation_looking_along
+from wheretolook.planning.map_file import ARRAYS, DESCRIPTION, REBUILD, read_map, write_map
 from wheretolook.planning.turns import angles_to_axis_deg, check_axis, turns_from_deg, within
-
-if TYPE_CHECKING:
-    from wheretolook.scoring.base import Scorer
+from wheretolook.utils.errors import MapFormatError
 
 Point = Sequence[float] | NDArray[Any]
 
@@ -95,7 +94,7 @@ class ViewpointMap:
     smooth between centres. Outside the grid, and in voxels that are not free, there is no camera to turn: queries of
     one point then return None, batches say `found = False`. What is not finite raises a ValueError.
 
-    `wheretolook.planning.build_viewpoint_map` makes one.
+    `wheretolook.planning.map_building.build_viewpoint_map` makes one.
 
     Attributes:
         grid: V voxels of the world, metres, z up.
@@ -139,22 +138,42 @@ class ViewpointMap:
 
     @classmethod
     def load(cls, folder: str | Path, mmap: bool = False) -> ViewpointMap:
-        """Read what `save` wrote, see `wheretolook.planning.map_file.load_viewpoint_map`."""
-        from wheretolook.planning.map_file import load_viewpoint_map
+        """Read what `save` wrote.
 
-        return load_viewpoint_map(folder, mmap)
+        Args:
+            folder: of the map.
+            mmap: map the files into memory, read-only, and read only what is asked for; see `map_file.read_map`.
+
+        Raises:
+            MapFormatError: there is no map, it is damaged, or of another version.
+        """
+        grid, origin, arrays = read_map(folder, mmap)
+        try:
+            return cls(grid=grid, origin=MapOrigin(**origin), **arrays)
+        except TypeError as error:
+            problem, path = f"damaged description: {error}", Path(folder) / DESCRIPTION
+            raise MapFormatError(problem, path=path, fix=REBUILD) from error
+        except ValueError as error:
+            problem = f"the arrays do not fit together: {error}"
+            raise MapFormatError(problem, path=Path(folder), fix=REBUILD) from error
 
     def save(self, folder: str | Path) -> None:
-        """Write a folder that needs no Python to be read, see `wheretolook.planning.map_file.save_viewpoint_map`."""
-        from wheretolook.planning.map_file import save_viewpoint_map
+        """Write a folder that needs no Python to be read, see `wheretolook.planning.map_file.write_map`.
 
-        save_viewpoint_map(self, folder)
-
-    def updated(self, scorer: Scorer, progress: str | None = None) -> tuple[ViewpointMap, NDArray[np.int64]]:
-        """The map with landmarks added, see `wheretolook.planning.map_building.update_viewpoint_map`."""
-        from wheretolook.planning.map_building import update_viewpoint_map
-
-        return update_viewpoint_map(self, scorer, progress)
+        Raises:
+            MapFormatError: the folder holds something else, or something beside a map; or the map was derived from
+                another (`MapOrigin.derived`).
+        """
+        origin = asdict(self.origin)
+        if derived := origin.pop("derived"):
+            fix = "Save the map it was derived from."
+            raise MapFormatError(
+                "a map derived from another is for planners and not to be saved",
+                path=Path(folder),
+                value=derived,
+                fix=fix,
+            )
+        write_map(folder, self.grid, origin, {name: getattr(self, name) for name in ARRAYS})
 
     @property
     def voxel_of_row(self) -> NDArray[np.int64]:

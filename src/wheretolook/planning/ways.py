@@ -8,9 +8,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from wheretolook.geometry import Float
-from wheretolook.scenes.free_space import FreeSpace
-from wheretolook.scenes.mapped_space import MappedSpace
+from wheretolook.geometry.poses import Float
+from wheretolook.space.free_space import FreeSpace
+from wheretolook.space.mapped_space import MappedSpace
 
 MOST = 200_000
 """Places of a grid."""

@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.geometry import PinholeCamera
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.mesh import TexturedMesh
+from wheretolook.geometry.poses import check_poses
 from wheretolook.rendering.textures import MAX_ANISOTROPY, build_pyramids, texel_gradients
-from wheretolook.rendering.types import Rendering, camera_rays, check_poses
-from wheretolook.scenes.mesh import TexturedMesh
+from wheretolook.rendering.types import Rendering, camera_rays
 
 Float = NDArray[np.floating[Any]]
 

@@ -11,10 +11,10 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
+from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.rendering import ray_kernels
 from wheretolook.rendering.ray_kernels import cast_kernel, clear_kernel, distance_kernel, unoccluded_kernel
-from wheretolook.scenes.mesh import TexturedMesh
-from wheretolook.warp_setup import start_warp, vec3_array, warp_mesh
+from wheretolook.utils.warp import start_warp, vec3_array
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,3 +167,11 @@ class MeshRaycaster:
             device=self.device,
         )
         return clear.numpy().astype(np.bool_)
+
+
+def warp_mesh(mesh: TexturedMesh, device: str) -> wp.Mesh:
+    """The mesh with its bounding volume hierarchy on a device. Warp must have been started."""
+    return wp.Mesh(
+        points=wp.array(mesh.vertices, dtype=wp.vec3, device=device),
+        indices=wp.array(np.ascontiguousarray(mesh.triangles).reshape(-1), dtype=wp.int32, device=device),
+    )

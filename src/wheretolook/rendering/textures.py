@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.errors import SceneError
-from wheretolook.scenes.mesh import TexturedMesh
+from wheretolook.geometry.mesh import TexturedMesh
+from wheretolook.utils.errors import SceneError
 
 # Longest to shortest axis of a pixel's footprint on the texture up to which the long axis is covered by several samples
 # instead of by a coarser mip level. 8 keeps floors and walls seen at a slant sharp across the slant.

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.geometry import PinholeCamera
+from wheretolook.geometry.camera import PinholeCamera
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,16 +34,6 @@ class Renderer(Protocol):
     def render(self, camera: PinholeCamera, cam_from_world: ArrayLike) -> Rendering:
         """Render the poses `cam_from_world` (B, 3, 4) with one camera. Raises ValueError on another shape or NaN."""
         ...
-
-
-def check_poses(cam_from_world: ArrayLike) -> NDArray[np.float64]:
-    """The poses as float64 (B, 3, 4). Raises ValueError on another shape or on values that are not finite."""
-    poses = np.asarray(cam_from_world, dtype=np.float64)
-    if poses.ndim != 3 or poses.shape[1:] != (3, 4):
-        raise ValueError(f"cam_from_world must have shape (B, 3, 4), got {poses.shape}")
-    if not np.isfinite(poses).all():
-        raise ValueError("cam_from_world has NaN or infinite entries")
-    return poses
 
 
 def camera_rays(

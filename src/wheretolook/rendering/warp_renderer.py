@@ -8,14 +8,16 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.errors import ConfigError, SceneError
-from wheretolook.geometry import PinholeCamera
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.mesh import TexturedMesh
+from wheretolook.geometry.poses import check_poses
 from wheretolook.rendering.raster_kernels import project_kernel, raster_kernel, shade_kernel
+from wheretolook.rendering.raycasting import warp_mesh
 from wheretolook.rendering.textures import build_pyramids, texel_gradients
 from wheretolook.rendering.trace_kernel import TILE, Appearance, trace_kernel
-from wheretolook.rendering.types import Rendering, camera_rays, check_poses
-from wheretolook.scenes.mesh import TexturedMesh
-from wheretolook.warp_setup import start_warp, vec3_array, warp_mesh
+from wheretolook.rendering.types import Rendering, camera_rays
+from wheretolook.utils.errors import ConfigError, SceneError
+from wheretolook.utils.warp import start_warp, vec3_array
 
 Method = Literal["rays", "raster"]
 

@@ -15,9 +15,9 @@ import trimesh
 from numpy.typing import NDArray
 from PIL import Image
 
-from wheretolook.errors import ConfigError, SceneError
-from wheretolook.scenes.mesh import TexturedMesh
+from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.scenes.texture_references import check_texture_references
+from wheretolook.utils.errors import ConfigError, SceneError
 
 # Rotations that turn the named axis of a file into the world's z axis.
 _Z_UP_FROM = {

@@ -10,7 +10,7 @@ import struct
 from pathlib import Path
 from typing import Any
 
-from wheretolook.errors import SceneError
+from wheretolook.utils.errors import SceneError
 
 _READABLE = ("image/png", "image/jpeg", "image/webp")
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from math import inf
 from typing import Literal, get_args
 
-from wheretolook.errors import ConfigError
+from wheretolook.utils.errors import ConfigError
 from wheretolook.visibility.hidden_points import DEFAULT_RADIUS
 
 OcclusionName = Literal["mesh", "tsdf", "hidden-points", "none"]

@@ -8,9 +8,11 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.camera_models import Camera, ColmapCamera
-from wheretolook.errors import ConfigError
-from wheretolook.geometry import Float, PinholeCamera
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.colmap_camera import Camera, ColmapCamera
+from wheretolook.geometry.poses import Float
+from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.warp import start_warp
 from wheretolook.visibility import counting_kernel, pixel_kernel
 from wheretolook.visibility.counting_kernel import (
     SortedLandmarks,
@@ -31,7 +33,6 @@ from wheretolook.visibility.frustum import (
 )
 from wheretolook.visibility.pixel_kernel import count_pixels_kernel
 from wheretolook.visibility.sphere_cells import SphereCells, choose_size
-from wheretolook.warp_setup import start_warp
 
 SINGLE_ROUNDING = 5e-7
 """Bound on the relative error of a product of two vectors of three float32, with room to spare (3 * 2^-24)."""

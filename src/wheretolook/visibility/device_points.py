@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.warp_setup import start_warp, vec3_array
+from wheretolook.utils.warp import start_warp, vec3_array
 
 MORTON_BITS = 10
 """Bits along each axis of the curve that landmarks are ordered by."""

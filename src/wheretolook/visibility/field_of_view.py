@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from wheretolook.camera_models import ColmapCamera
-from wheretolook.geometry import Float
+from wheretolook.geometry.colmap_camera import ColmapCamera
+from wheretolook.geometry.poses import Float
 from wheretolook.visibility.octahedral_map import cell_centers, cells_of
 
 TABLE_SIZE = 1024

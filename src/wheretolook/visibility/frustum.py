@@ -16,11 +16,12 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.camera_models import Camera, ColmapCamera
-from wheretolook.errors import ConfigError
-from wheretolook.geometry import Float, PinholeCamera, split_poses
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.colmap_camera import Camera, ColmapCamera
+from wheretolook.geometry.poses import Float, split_poses
+from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.warp import start_warp
 from wheretolook.visibility.frustum_kernel import collect_kernel
-from wheretolook.warp_setup import start_warp
 
 MIN_DEPTH_M = 2.0**-10
 """A pinhole does not see what is nearer to its image plane than this (about a millimetre), or behind it."""

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, cKDTree
 
-from wheretolook.errors import ConfigError, MapError, SceneError
-from wheretolook.geometry import Float
+from wheretolook.geometry.poses import Float
+from wheretolook.utils.errors import ConfigError, MapError, SceneError
 from wheretolook.visibility.occlusion import OcclusionModel
 
 DEFAULT_RADIUS = 50.0

@@ -15,9 +15,9 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from wheretolook.errors import ConfigError, MapError, SceneError, TableError
-from wheretolook.geometry import Float
-from wheretolook.grid import fibonacci_sphere
+from wheretolook.geometry.lattices import fibonacci_sphere
+from wheretolook.geometry.poses import Float
+from wheretolook.utils.errors import ConfigError, MapError, SceneError, TableError
 from wheretolook.visibility.device_points import DevicePoints
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.geometry import Float
+from wheretolook.geometry.poses import Float
 
 
 def octahedral_directions(u: ArrayLike, v: ArrayLike) -> Float:

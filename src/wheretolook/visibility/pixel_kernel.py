@@ -7,13 +7,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from wheretolook.visibility.counting_kernel import (
-    SortedLandmarks,
-    border_runs,
-    entries_of,
-    inside_runs,
-    near_entries,
-)
+from wheretolook.visibility.counting_kernel import SortedLandmarks, border_runs, entries_of, inside_runs, near_entries
 from wheretolook.visibility.frustum_kernel import in_view, pixel_of
 
 wp.set_module_options({"fuse_fp": False})  # for `pixel_of`

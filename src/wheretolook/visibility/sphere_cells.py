@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wheretolook.camera_models import Camera, ColmapCamera
-from wheretolook.geometry import Float
+from wheretolook.geometry.colmap_camera import Camera, ColmapCamera
+from wheretolook.geometry.poses import Float
 from wheretolook.visibility.field_of_view import FieldOfView
 from wheretolook.visibility.frustum import frustum_sides
 from wheretolook.visibility.octahedral_map import cell_centers, octahedral_directions

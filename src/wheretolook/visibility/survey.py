@@ -13,8 +13,8 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
-from wheretolook.camera_models import Camera
-from wheretolook.errors import ConfigError, SceneError
+from wheretolook.geometry.colmap_camera import Camera
+from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.visibility.counting import FrustumCounter
 from wheretolook.visibility.counting_kernel import pack_kernel
 from wheretolook.visibility.device_points import DevicePoints

@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from wheretolook.camera_models import Camera
-from wheretolook.errors import ConfigError, SceneError
-from wheretolook.geometry import Float
+from wheretolook.geometry.colmap_camera import Camera
+from wheretolook.geometry.mesh import TexturedMesh
+from wheretolook.geometry.poses import Float
 from wheretolook.rendering.raycasting import MeshRaycaster
-from wheretolook.scenes.mesh import TexturedMesh
+from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.visibility.occlusion import MeshOcclusion
 
 BLOCK_VOXELS = 8

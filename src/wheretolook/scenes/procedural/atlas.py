@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.errors import SceneError
 from wheretolook.scenes.procedural.materials import Material
 from wheretolook.scenes.procedural.noise import Canvas, Image, NoiseBank
 from wheretolook.scenes.procedural.patches import Patch
+from wheretolook.utils.errors import SceneError
 
 LEVELS = 14
 """Brightness steps of materials that share one piece of texture."""

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.errors import ConfigError
-from wheretolook.scenes.mesh import TexturedMesh
+from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.scenes.procedural import atlas, lighting
 from wheretolook.scenes.procedural.furnishing import furnish
 from wheretolook.scenes.procedural.layout import Lamp
@@ -20,6 +19,7 @@ from wheretolook.scenes.procedural.plan import Plan, draw_plan
 from wheretolook.scenes.procedural.repetition import repeat_patterns
 from wheretolook.scenes.procedural.shell import build_shell
 from wheretolook.scenes.procedural.style import Style
+from wheretolook.utils.errors import ConfigError
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from wheretolook.scenes.procedural.layout import Lamp
 from wheretolook.scenes.procedural.light_kernels import direct_kernel, gather_kernel
 from wheretolook.scenes.procedural.patches import Patch, Surface
-from wheretolook.warp_setup import start_warp, vec3_array
+from wheretolook.utils.warp import start_warp, vec3_array
 
 Float = NDArray[np.floating[Any]]
 

@@ -1,0 +1,169 @@
+"""Where a dataset keeps its files: `<data>/<dataset>/<scene>/`, and which scene belongs to which split."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.poses import Float
+from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.mapping.cameras import CAMERAS_FILE, colmap_poses, holds_model, load_mapping_poses
+from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.utils.errors import ConfigError, TableError
+from wheretolook.utils.files import fingerprint, write_json
+from wheretolook.viewpoints.table import Split, read_table
+from wheretolook.visibility.occlusion import StoredOcclusion
+
+RELEASE = "release"
+"""Name of the dataset, beside all others, that ships with its weights."""
+
+
+@dataclass(frozen=True)
+class SceneFolder:
+    """Files of one scene.
+
+    Attributes:
+        folder: `<data>/<dataset>/<scene>`.
+        split: the split the whole scene belongs to.
+    """
+
+    folder: Path
+    split: Split
+
+    @property
+    def name(self) -> str:
+        """Name of the scene."""
+        return self.folder.name
+
+    @property
+    def mesh(self) -> Path:
+        """Textured mesh, GLB, metres, z up."""
+        return self.folder / "mesh.glb"
+
+    @property
+    def map(self) -> Path:
+        """Folder of the COLMAP model, with `landmarks.npz` and `cameras.npz` beside it."""
+        return self.folder / "map"
+
+    @property
+    def landmarks(self) -> Path:
+        """Landmarks with their attributes."""
+        return self.map / "landmarks.npz"
+
+    @property
+    def mapping_cameras(self) -> Path:
+        """Poses of the mapping images."""
+        return self.map / CAMERAS_FILE
+
+    @property
+    def table(self) -> Path:
+        """Table of viewpoints."""
+        return self.folder / "viewpoints.parquet"
+
+    @property
+    def label_manifest(self) -> Path:
+        """What the labels were made with: versions, settings, fingerprints, shards."""
+        return self.folder / "labels.json"
+
+    @property
+    def occlusion(self) -> Path:
+        """Which landmark each sampled location has a free line of sight to."""
+        return self.folder / "occlusion.npz"
+
+    def read_table(self, matches: bool = False) -> pd.DataFrame:
+        """The scene's viewpoints, on request with their matches; see `wheretolook.viewpoints.table.read_table`."""
+        return read_table(self.table, matches)
+
+    def mapping_poses(self) -> Float | None:
+        """Poses cam_from_world (M, 3, 4) float32 of the mapping images; None if neither their file nor a model is left.
+
+        Maps made before there was such a file have a COLMAP model, which tells the same.
+
+        Raises:
+            MapError: the file or the model is damaged.
+        """
+        if self.mapping_cameras.is_file():
+            return load_mapping_poses(self.mapping_cameras)
+        return colmap_poses(self.map).astype(np.float32) if holds_model(self.map) else None
+
+    def localization_map(self, camera: PinholeCamera, device: str = "cpu") -> LocalizationMap:
+        """The scene's map with the occlusion stored for its sampled locations; the mesh is not needed."""
+        landmarks, occlusion = Landmarks.load(self.landmarks), StoredOcclusion.load(self.occlusion)
+        return LocalizationMap(landmarks, camera, occlusion, device, self.mapping_poses())
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A folder of scenes with one camera.
+
+    Attributes:
+        root: `<data>/<dataset>`.
+        camera: intrinsics of every viewpoint.
+        scenes: all scenes in the order they were made.
+    """
+
+    root: Path
+    camera: PinholeCamera
+    scenes: tuple[SceneFolder, ...]
+
+    @property
+    def name(self) -> str:
+        """Name of the dataset."""
+        return self.root.name
+
+    def split(self, split: Split) -> tuple[SceneFolder, ...]:
+        """Scenes of one split."""
+        return tuple(scene for scene in self.scenes if scene.split == split)
+
+    def scene(self, name: str) -> SceneFolder:
+        """The scene of a name.
+
+        Raises:
+            ConfigError: there is none.
+        """
+        for scene in self.scenes:
+            if scene.name == name:
+                return scene
+        fix = f"There are {', '.join(scene.name for scene in self.scenes)}."
+        raise ConfigError("there is no such scene", path=self.root, value=name, fix=fix)
+
+    def fingerprint(self) -> str:
+        """16 hexadecimal digits that change with any scene's table, landmarks or occlusion."""
+        digest = hashlib.sha256()
+        for scene in self.scenes:
+            parts = [fingerprint(path) for path in (scene.table, scene.landmarks, scene.occlusion) if path.is_file()]
+            digest.update("".join([scene.name, scene.split, *parts]).encode())
+        return digest.hexdigest()[:16]
+
+    def save(self) -> None:
+        """Write `dataset.json`, which makes the folder a dataset."""
+        content = {
+            "camera": asdict(self.camera),
+            "scenes": [{"name": scene.name, "split": scene.split} for scene in self.scenes],
+        }
+        write_json(self.root / "dataset.json", content)
+
+    @classmethod
+    def load(cls, root: Path) -> Dataset:
+        """Read a dataset folder.
+
+        Raises:
+            TableError: there is no valid `dataset.json`.
+        """
+        path = root / "dataset.json"
+        try:
+            content = json.loads(path.read_text())
+            scenes = tuple(SceneFolder(root / scene["name"], scene["split"]) for scene in content["scenes"])
+            return cls(root, PinholeCamera(**content["camera"]), scenes)
+        except FileNotFoundError as error:
+            raise TableError("this folder is no dataset", path=path, fix="Run the scenes stage first.") from error
+        except (ValueError, KeyError, TypeError) as error:
+            raise TableError(
+                f"damaged dataset description: {error}", path=path, fix="Run the scenes stage again."
+            ) from error

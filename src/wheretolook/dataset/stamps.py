@@ -1,0 +1,57 @@
+"""What each stage of a scene was made from, `<scene>/stages.json`: by it a later run knows what it can reuse."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+from wheretolook.dataset.folders import SceneFolder
+from wheretolook.utils.files import write_json
+
+STAGES = ("scenes", "map", "sample", "label")
+"""Stages that work scene by scene, in order."""
+
+
+def stage_key(stage: str, parts: list[Any]) -> str:
+    """16 hexadecimal digits that change with what a stage works from."""
+    text = json.dumps([stage, parts], sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def read_stamp(scene: SceneFolder, stage: str) -> str | None:
+    """The key a stage was finished with; None if it was not."""
+    return _read(scene).get(stage)
+
+
+def write_stamp(scene: SceneFolder, stage: str, key: str) -> None:
+    """Record a finished stage. The scene's later stages worked on what is now replaced: their stamps go."""
+    earlier = STAGES[: STAGES.index(stage)]
+    stamps = {name: stamp for name, stamp in _read(scene).items() if name in earlier}
+    write_json(_path(scene), {**stamps, stage: key})
+
+
+def forget_stamp(scene: SceneFolder, stage: str) -> None:
+    """Take a stage's stamp away, and those of later ones."""
+    earlier = STAGES[: STAGES.index(stage)]
+    stamps = _read(scene)
+    kept = {name: stamp for name, stamp in stamps.items() if name in earlier}
+    if kept != stamps:
+        write_json(_path(scene), kept)
+
+
+def is_done(scene: SceneFolder, stage: str, key: str, *results: Path) -> bool:
+    """Whether a stage was finished with this key and its results are still there."""
+    return read_stamp(scene, stage) == key and all(result.exists() for result in results)
+
+
+def _path(scene: SceneFolder) -> Path:
+    return scene.folder / "stages.json"
+
+
+def _read(scene: SceneFolder) -> dict[str, str]:
+    try:
+        return dict(json.loads(_path(scene).read_text()))
+    except (OSError, ValueError):
+        return {}

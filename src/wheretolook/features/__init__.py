@@ -1,0 +1,1 @@
+"""Keypoints and their descriptors: extraction and matching."""

@@ -1,0 +1,1 @@
+"""Poses, cameras, lattices of directions and voxels, meshes."""

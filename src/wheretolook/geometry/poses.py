@@ -1,0 +1,114 @@
+"""Camera model, poses, projection and rotation angles.
+
+Conventions: world in metres, z up. Camera x right, y down, z forward (OpenCV, COLMAP). Pixel (0.5, 0.5) is the centre
+of the top-left pixel, as in COLMAP. Poses are `cam_from_world` matrices (..., 3, 4) in float64; quaternions are wxyz.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Float = NDArray[np.floating[Any]]
+
+
+def transform(cam_from_world: ArrayLike, points: ArrayLike) -> Float:
+    """Apply poses (..., 3, 4) to points (N, 3). Returns (..., N, 3) in the target frame."""
+    pose = np.asarray(cam_from_world, dtype=np.float64)
+    return np.asarray(points, dtype=np.float64) @ np.swapaxes(pose[..., :3], -1, -2) + pose[..., None, :, 3]
+
+
+def invert_poses(poses: ArrayLike) -> Float:
+    """Invert rigid transforms (..., 3, 4): cam_from_world to world_from_cam and back."""
+    poses = np.asarray(poses, dtype=np.float64)
+    rotation = np.swapaxes(poses[..., :3], -1, -2)
+    return np.concatenate([rotation, -rotation @ poses[..., 3:]], axis=-1)
+
+
+def camera_centers(cam_from_world: ArrayLike) -> Float:
+    """Camera centres in the world, (..., 3) metres, of poses (..., 3, 4)."""
+    return invert_poses(cam_from_world)[..., 3]
+
+
+def split_poses(cam_from_world: ArrayLike) -> tuple[Float, Float]:
+    """Rotations (..., 3, 3) and camera centres (..., 3) in metres of cam_from_world poses (..., 3, 4)."""
+    poses = np.asarray(cam_from_world, dtype=np.float64)
+    return poses[..., :3], camera_centers(poses)
+
+
+def rotation_looking_along(directions: ArrayLike) -> Float:
+    """Rotations of cameras that look along the given world directions and do not roll.
+
+    The image's x axis is horizontal and its y axis points down as far as it can (world z is up). Looking straight up or
+    down leaves the roll free: the image's x axis is then world x when looking down, and the limit is taken along +y.
+
+    Args:
+        directions: (..., 3), need not be of unit length.
+
+    Returns:
+        (..., 3, 3) cam_from_world rotations; their rows are the camera's axes in the world.
+    """
+    forward = np.asarray(directions, dtype=np.float64)
+    forward = forward / np.linalg.norm(forward, axis=-1, keepdims=True)
+    right = np.stack([forward[..., 1], -forward[..., 0], np.zeros_like(forward[..., 0])], axis=-1)
+    length = np.linalg.norm(right, axis=-1, keepdims=True)
+    vertical = length < 1e-9
+    right = np.where(vertical, (1.0, 0.0, 0.0), right / np.where(vertical, 1.0, length))
+    return np.stack([right, np.cross(forward, right), forward], axis=-2)
+
+
+def poses_looking_along(locations: ArrayLike, directions: ArrayLike) -> Float:
+    """cam_from_world poses (..., 3, 4) of cameras at `locations` (..., 3) m looking along `directions` (..., 3)."""
+    rotation = rotation_looking_along(directions)
+    center = np.asarray(locations, dtype=np.float64)
+    return np.concatenate([rotation, -rotation @ center[..., None]], axis=-1)
+
+
+def quaternion_from_rotation(rotation: ArrayLike) -> Float:
+    """Unit quaternions wxyz (..., 4), w >= 0, of rotation matrices (..., 3, 3)."""
+    from scipy.spatial.transform import Rotation
+
+    matrix = np.asarray(rotation, dtype=np.float64)
+    quat = Rotation.from_matrix(matrix.reshape(-1, 3, 3)).as_quat(canonical=True, scalar_first=True)
+    return quat.reshape(*matrix.shape[:-2], 4)
+
+
+def rotation_from_quaternion(quaternion_wxyz: ArrayLike) -> Float:
+    """Rotation matrices (..., 3, 3) of quaternions wxyz (..., 4), normalized first."""
+    from scipy.spatial.transform import Rotation
+
+    quat = np.asarray(quaternion_wxyz, dtype=np.float64)
+    matrix = Rotation.from_quat(quat.reshape(-1, 4), scalar_first=True).as_matrix()
+    return matrix.reshape(*quat.shape[:-1], 3, 3)
+
+
+def rotation_angle_deg(rotation_a: ArrayLike, rotation_b: ArrayLike) -> Float:
+    """Angle of the rotation between (..., 3, 3) and (..., 3, 3), in degrees, in [0, 180].
+
+    Taken from the chord |A - B|_F = 2 sqrt(2) sin(angle / 2), which is accurate at small angles where arccos of the
+    trace is not.
+    """
+    chord = np.linalg.norm(np.asarray(rotation_a) - np.asarray(rotation_b), axis=(-2, -1))
+    return np.degrees(2 * np.arcsin(np.clip(chord / (2 * np.sqrt(2)), 0, 1)))
+
+
+def pose_error(cam_from_world_a: ArrayLike, cam_from_world_b: ArrayLike) -> tuple[Float, Float]:
+    """Distance between camera centres (m) and angle between orientations (deg) of two batches of poses (..., 3, 4).
+
+    The error measure of the Long-Term Visual Localization benchmark (Sattler et al., CVPR 2018), which the paper uses.
+    """
+    a, b = np.asarray(cam_from_world_a, dtype=np.float64), np.asarray(cam_from_world_b, dtype=np.float64)
+    error_m = np.linalg.norm(camera_centers(a) - camera_centers(b), axis=-1)
+    return error_m, rotation_angle_deg(a[..., :3], b[..., :3])
+
+
+def check_poses(cam_from_world: ArrayLike) -> NDArray[np.float64]:
+    """The poses as float64 (B, 3, 4). Raises ValueError on another shape or on values that are not finite."""
+    poses = np.asarray(cam_from_world, dtype=np.float64)
+    if poses.ndim != 3 or poses.shape[1:] != (3, 4):
+        raise ValueError(f"cam_from_world must have shape (B, 3, 4), got {poses.shape}")
+    if not np.isfinite(poses).all():
+        raise ValueError("cam_from_world has NaN or infinite entries")
+    return poses

@@ -1,0 +1,344 @@
+"""The network's input: visible landmarks averaged in the cells of a grid over the image (paper, Sec. 3.3 "Data").
+
+Every landmark a viewpoint sees falls into one of 30 x 30 bins by its pixel. A bin holds the mean of its landmarks'
+channels; an empty bin holds zero *in place*. The paper says so; its released code instead drops empty bins and moves
+the filled ones to the front, so that an input has no fixed place in the image. That layout is kept as "compact".
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.colmap_camera import Camera, ColmapCamera
+from wheretolook.geometry.poses import Float, split_poses
+from wheretolook.inputs.bins_kernel import bin_kernel, count_bins_kernel
+from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
+from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.warp import start_warp
+from wheretolook.visibility.frustum import (
+    MIN_DEPTH_M,
+    VisibleSets,
+    frustum_sides,
+    in_view,
+    offsets_from,
+    pixels_of,
+    rotate,
+)
+
+if TYPE_CHECKING:
+    from wheretolook.mapping.landmarks import Landmarks
+import torch
+from torch import Tensor
+
+CHANNELS = ("u", "v", "x", "y", "z")
+"""Channels of every landmark: pixel (u, v) and position (x, y, z) in the camera frame in metres."""
+
+LANDMARK_CHANNELS = ("mapped_angle", "distance_ratio", *MAP_ATTRIBUTES)
+"""Channels of what landmarks are like, on request only: two of `inputs.landmarks_in_view.POSE_ATTRIBUTES`, and what the
+map knows. A bin's mean is NaN where one of its landmarks' values is not known."""
+
+ALL_CHANNELS = CHANNELS + LANDMARK_CHANNELS
+
+PAPER_VARIANTS: dict[str, tuple[str, ...]] = {
+    "2d": ("u", "v"),
+    "2d+z": ("u", "v", "z"),
+    "2d+3d": ("u", "v", "x", "y", "z"),
+}
+"""The paper's inputs by name: 1,800, 2,700 and 4,500 values at 30 x 30 bins (its "4220" is a stale number)."""
+
+INPUT_VARIANTS: dict[str, tuple[str, ...]] = {**PAPER_VARIANTS, "2d+3d+landmark": ALL_CHANNELS}
+"""All inputs of the paper's network by name: the paper's own, and with what landmarks are like."""
+
+Layout = Literal["in_place", "compact"]
+
+GPU_LANES = 32
+"""Threads that share a view on a GPU where bins are only counted."""
+
+
+@dataclass(frozen=True, eq=False)
+class BinnedViews:
+    """Landmarks of a batch of views, binned.
+
+    Attributes:
+        means: (B, C, bins, bins) float32, mean of each channel over a bin's landmarks, zero where there are none, NaN
+            where a landmark's value is not known. Rows go down the image, columns right.
+        counts: (B, bins, bins) int32, landmarks in each bin.
+        channels: names of the C channels.
+    """
+
+    means: NDArray[np.float32]
+    counts: NDArray[np.int32]
+    channels: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def n_visible(self) -> NDArray[np.int32]:
+        """Landmarks each view sees, (B,)."""
+        return self.counts.sum((1, 2), dtype=np.int32)
+
+    @property
+    def n_filled(self) -> NDArray[np.int32]:
+        """Bins with at least one landmark, (B,)."""
+        return (self.counts > 0).sum((1, 2), dtype=np.int32)
+
+    def select(self, channels: tuple[str, ...]) -> BinnedViews:
+        """The same views with only the named channels, in the order asked for.
+
+        Raises:
+            ConfigError: a channel is not there.
+        """
+        unknown = [name for name in channels if name not in self.channels]
+        if unknown:
+            raise ConfigError("unknown input channel", value=unknown[0], fix=f"There are {', '.join(self.channels)}.")
+        return BinnedViews(self.means[:, [self.channels.index(name) for name in channels]], self.counts, channels)
+
+
+def arrange(means: NDArray[np.float32], filled: NDArray[np.bool_], layout: Layout) -> NDArray[np.float32]:
+    """Lay out bins for a network with a flat input.
+
+    Args:
+        means: (B, C, bins, bins), empty bins zero.
+        filled: (B, bins, bins).
+        layout: "in_place" keeps every bin where it is; "compact" moves the filled bins to the front in row-major order,
+            as the released code does.
+
+    Returns:
+        (B, C, bins, bins).
+    """
+    if layout == "in_place":
+        return means
+    if layout != "compact":
+        raise ConfigError("unknown bin layout", value=layout, fix="Use in_place or compact.")
+    flat = means.reshape(*means.shape[:2], -1)
+    order = np.argsort(~filled.reshape(len(filled), -1), axis=1, kind="stable")
+    return np.take_along_axis(flat, order[:, None, :], axis=2).reshape(means.shape)
+
+
+def bin_views(
+    camera: Camera,
+    cam_from_world: Float,
+    points: Float,
+    visible: VisibleSets,
+    location_rows: NDArray[np.integer[Any]],
+    bins: int = 30,
+    device: str = "cpu",
+    block_bytes: int = 1 << 30,
+    landmarks: Landmarks | None = None,
+) -> BinnedViews:
+    """Bin the visible landmarks of every view, with all of `CHANNELS` or, on request, of `ALL_CHANNELS`.
+
+    Args:
+        camera: pinhole, or any COLMAP model (which is projected by COLMAP on the CPU).
+        cam_from_world: (B, 3, 4).
+        points: (N, 3) landmarks in metres.
+        visible: landmarks not occluded from each of L locations.
+        location_rows: (B,) row of each view's location in `visible`.
+        bins: bins along each side of the image.
+        device: "cpu" or a CUDA device; one thread a view, so that sums do not depend on the order of threads.
+        block_bytes: views are worked through in blocks of about this many bytes.
+        landmarks: whose the points are; with them the bins also have `LANDMARK_CHANNELS`, for about three times the
+            memory.
+    """
+    if isinstance(camera, ColmapCamera):
+        return bin_views_plain(camera, cam_from_world, points, visible, location_rows, bins, landmarks)
+    device = start_warp(device)
+    channels = CHANNELS if landmarks is None else ALL_CHANNELS
+    n_views, n_channels = len(cam_from_world), len(channels)
+    means = np.empty((n_views, n_channels, bins, bins), dtype=np.float32)
+    counts = np.empty((n_views, bins, bins), dtype=np.int32)
+    block = max(1, block_bytes // (bins * bins * (n_channels + 1) * 4))
+    points_on_device: Any = wp.array(np.asarray(points, dtype=np.float64), dtype=wp.vec3d, device=device)
+    directions: Any = wp.empty(0, dtype=wp.vec3, device=device)
+    attributes: Any = wp.empty((0, len(MAP_ATTRIBUTES)), dtype=wp.float32, device=device)
+    if landmarks is not None:
+        directions = wp.array(landmarks.mapping_direction, dtype=wp.vec3, device=device)
+        attributes = wp.array(landmarks.attributes(), dtype=wp.float32, device=device)
+    starts: Any = wp.array(visible.starts, dtype=wp.int32, device=device)
+    indices: Any = wp.array(visible.indices, dtype=wp.int32, device=device)
+    for begin in range(0, n_views, block):
+        rows = slice(begin, min(begin + block, n_views))
+        rotations, centers = split_poses(cam_from_world[rows])
+        shape = (len(centers), bins * bins)
+        block_means = wp.zeros((shape[0], n_channels, shape[1]), dtype=wp.float32, device=device)
+        block_counts = wp.zeros(shape, dtype=wp.int32, device=device)
+        wp.launch(
+            bin_kernel,
+            dim=len(centers),
+            inputs=[
+                *_of_views(camera, rotations, centers, location_rows[rows], device),
+                points_on_device, directions, attributes, starts, indices,
+                *_of_camera(camera, bins), bins,
+            ],
+            outputs=[block_means, block_counts],
+            device=device,
+        )  # fmt: skip
+        means[rows] = block_means.numpy().reshape(-1, n_channels, bins, bins)
+        counts[rows] = block_counts.numpy().reshape(-1, bins, bins)
+    return BinnedViews(means, counts, channels)
+
+
+def count_bins(
+    camera: Camera,
+    cam_from_world: Float,
+    points: Float,
+    visible: VisibleSets,
+    location_rows: NDArray[np.integer[Any]],
+    bins: int = 30,
+    device: str = "cpu",
+    block_bytes: int = 1 << 30,
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """`BinnedViews.n_visible` and `BinnedViews.n_filled` of views, (B,) each, without binning anything else.
+
+    Args:
+        camera, cam_from_world, points, visible, location_rows, bins: as for `bin_views`, the plain twin of this.
+        device: "cpu" or a CUDA device.
+        block_bytes: views are worked through in blocks of about this many bytes.
+    """
+    if isinstance(camera, ColmapCamera):
+        binned = bin_views_plain(camera, cam_from_world, points, visible, location_rows, bins)
+        return binned.n_visible, binned.n_filled
+    device = start_warp(device)
+    lanes = GPU_LANES if device != "cpu" else 1
+    n_visible, n_filled = (np.empty(len(cam_from_world), dtype=np.int32) for _ in range(2))
+    block = max(1, block_bytes // (bins * bins * 4))
+    points_on_device: Any = wp.array(np.asarray(points, dtype=np.float64), dtype=wp.vec3d, device=device)
+    starts: Any = wp.array(visible.starts, dtype=wp.int32, device=device)
+    indices: Any = wp.array(visible.indices, dtype=wp.int32, device=device)
+    for begin in range(0, len(cam_from_world), block):
+        rows = slice(begin, min(begin + block, len(cam_from_world)))
+        rotations, centers = split_poses(cam_from_world[rows])
+        counted = [wp.zeros(len(centers), dtype=wp.int32, device=device) for _ in range(2)]
+        wp.launch(
+            count_bins_kernel,
+            dim=(len(centers), lanes),
+            inputs=[
+                *_of_views(camera, rotations, centers, location_rows[rows], device),
+                points_on_device, starts, indices,
+                *_of_camera(camera, bins), bins, lanes,
+                wp.zeros((len(centers), bins * bins), dtype=wp.int32, device=device),
+            ],
+            outputs=counted,
+            device=device,
+        )  # fmt: skip
+        n_visible[rows], n_filled[rows] = (one.numpy() for one in counted)
+    return n_visible, n_filled
+
+
+def _of_views(
+    camera: PinholeCamera, rotations: Float, centers: Float, location_rows: NDArray[np.integer[Any]], device: str
+) -> list[Any]:
+    """What both kernels are told of the views."""
+    return [
+        wp.array(frustum_sides(camera, rotations), dtype=wp.vec3, device=device),
+        wp.array(rotations.astype(np.float32), dtype=wp.mat33, device=device),
+        wp.array(centers, dtype=wp.vec3d, device=device),
+        wp.array(np.asarray(location_rows, dtype=np.int32), dtype=wp.int32, device=device),
+    ]
+
+
+def _of_camera(camera: PinholeCamera, bins: int) -> list[Any]:
+    """What both kernels are told of the camera."""
+    values = (camera.focal_px, camera.cx, camera.cy, bins / camera.width, bins / camera.height, MIN_DEPTH_M)
+    return [wp.float64(value) for value in values]
+
+
+def bin_views_plain(
+    camera: Camera,
+    cam_from_world: Float,
+    points: Float,
+    visible: VisibleSets,
+    location_rows: NDArray[np.integer[Any]],
+    bins: int = 30,
+    landmarks: Landmarks | None = None,
+) -> BinnedViews:
+    """What `bin_views` computes, in NumPy."""
+    channels = CHANNELS if landmarks is None else ALL_CHANNELS
+    attributes = None if landmarks is None else landmarks.attributes()
+    n_views, n_cells = len(cam_from_world), bins * bins
+    means = np.zeros((n_views, len(channels), n_cells), dtype=np.float32)
+    counts = np.zeros((n_views, n_cells), dtype=np.int32)
+    rows = zip(*split_poses(cam_from_world), location_rows, strict=True)
+    for view, (rotation, center, location) in enumerate(rows):
+        in_sight = visible[int(location)]
+        offsets = offsets_from(center, points[in_sight])
+        inside = in_view(camera, rotation[None], offsets)[0]
+        offsets, in_sight = offsets[inside], in_sight[inside]
+        seen = rotate(rotation.astype(np.float32), offsets)
+        pixels = pixels_of(camera, seen)
+        scale = np.array([bins / camera.width, bins / camera.height])
+        column, row = np.clip((pixels * scale).astype(int), 0, bins - 1).T
+        cell = row * bins + column
+        counts[view] = np.bincount(cell, minlength=n_cells)
+        columns = [*pixels.T, *seen.T]
+        if landmarks is not None and attributes is not None:
+            distance = np.linalg.norm(offsets.astype(np.float64), axis=1)
+            along = (offsets.astype(np.float64) * landmarks.mapping_direction[in_sight]).sum(1)
+            of_map = attributes[in_sight]
+            ratio = np.log(distance) - of_map[:, MAP_ATTRIBUTES.index("mapped_distance")]
+            columns += [along / distance, ratio, *of_map.T]
+        for channel, values in enumerate(columns):
+            total = np.bincount(cell, weights=values, minlength=n_cells)
+            means[view, channel] = total / np.maximum(counts[view], 1)
+    return BinnedViews(means.reshape(n_views, -1, bins, bins), counts.reshape(n_views, bins, bins), channels)
+
+
+STATISTICS_BLOCK = 256
+"""Views worked through at a time when statistics are taken: few enough for a processor's cache."""
+
+
+@dataclass(frozen=True)
+class InputStatistics:
+    """Mean and standard deviation of each kind of input over the filled bins of the training views.
+
+    Attributes:
+        channels: names of the channels, as in `wheretolook.inputs.bins.ALL_CHANNELS`.
+        mean: mean of each channel, in its unit (such as pixels or metres), over the values that are known.
+        std: standard deviation of each channel, in its unit; 1 where it would be 0. Infinite where no value is known,
+            so that a network does not look at a channel that it has never seen.
+    """
+
+    channels: tuple[str, ...]
+    mean: tuple[float, ...]
+    std: tuple[float, ...]
+
+    @classmethod
+    def of(cls, means: Tensor, filled: Tensor, rows: Tensor, channels: tuple[str, ...] = CHANNELS) -> InputStatistics:
+        """Statistics over the filled bins of some views.
+
+        Args:
+            means: (B, C, bins, bins) binned views, empty bins zero, NaN where a value is not known.
+            filled: (B, bins, bins) bool.
+            rows: views to use, (n,) int64.
+            channels: names of the C channels.
+        """
+        rows = rows.to(means.device)
+        total = torch.zeros(len(channels), dtype=torch.float64, device=means.device)
+        n_filled, unknown = torch.zeros_like(total), torch.zeros_like(total)
+        for block in rows.split(STATISTICS_BLOCK):  # empty bins are zero: they add nothing to the sum
+            values = means[block]
+            n_filled += filled[block].sum()
+            unknown += values.isnan().sum((0, 2, 3))
+            total += values.nan_to_num_().sum((0, 2, 3), dtype=torch.float64)
+        count = (n_filled - unknown).clamp(min=1)
+        mean = total / count
+        squares = torch.zeros_like(total)
+        for block in rows.split(STATISTICS_BLOCK):  # a second pass: no cancellation between large numbers
+            centred = (means[block] - mean.float()[:, None, None]) * filled[block][:, None]
+            squares += centred.nan_to_num_().square_().sum((0, 2, 3), dtype=torch.float64)
+        std = (squares / count).sqrt()
+        std = torch.where(std > 0, std, 1.0)
+        std = torch.where((n_filled > 0) & (unknown == n_filled), torch.inf, std)
+        return cls(channels, tuple(mean.tolist()), tuple(std.tolist()))
+
+    def select(self, channels: tuple[str, ...]) -> InputStatistics:
+        """Statistics of some channels."""
+        index = [self.channels.index(name) for name in channels]
+        return InputStatistics(channels, tuple(self.mean[i] for i in index), tuple(self.std[i] for i in index))

@@ -1,0 +1,1 @@
+"""Methods that score viewpoints, all with the same interface (`Scorer`)."""

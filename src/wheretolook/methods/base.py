@@ -1,0 +1,110 @@
+"""What every method of scoring viewpoints has in common."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wheretolook.geometry.poses import Float
+from wheretolook.inputs.bins import ALL_CHANNELS, CHANNELS, BinnedViews
+from wheretolook.inputs.localization_map import LocalizationMap
+
+BLOCK = 4096
+"""Views scored at a time: about 80 MB of bins."""
+
+
+class Scorer(ABC):
+    """A method that says how well a camera would localize: the paper's f_P(R, t) -> [0, 1].
+
+    A scorer is built from a map, the camera that will look, and whatever else the method needs. It answers for any
+    batch of poses:
+
+    - The score of a pose depends on the pose alone: not on its place in the batch, nor on the other poses.
+    - Higher is better. Scores lie in [0, 1] where the method allows; only their order counts for choosing a view.
+    - The same scorer gives the same scores to the same poses.
+
+    A new method is one file with a subclass, registered in `methods.registry.SCORERS`. One that needs binned
+    landmarks derives from `BinnedScorer` instead.
+
+    Attributes:
+        name: short name of the method, as in tables and on the command line.
+        inputs: input variant of a learned method, "" for others.
+        local: whether a score depends on no landmarks but those with a free line of sight from the view's location. A
+            viewpoint map then need not be built anew where added landmarks are hidden. False where it is not known.
+    """
+
+    name: ClassVar[str]
+    inputs: str = ""
+    local: bool = False
+
+    def __init__(self, localization_map: LocalizationMap) -> None:
+        self.localization_map = localization_map
+
+    @abstractmethod
+    def score(self, cam_from_world: Float) -> Float:
+        """Score poses (B, 3, 4). Returns (B,) float64, finite."""
+
+    def score_binned(self, cam_from_world: Float, binned: BinnedViews) -> Float:
+        """Score poses whose landmarks have been binned already, so that several methods share the binning.
+
+        Args:
+            cam_from_world: (B, 3, 4).
+            binned: the same views, as `localization_map.bin_views` bins them, with all of `CHANNELS`.
+
+        Returns:
+            (B,) float64, the same as `score` gives.
+        """
+        return self.score(cam_from_world)
+
+
+class BinnedScorer(Scorer):
+    """A method that scores a view by its binned landmarks alone.
+
+    Args:
+        localization_map: the map.
+        bins: bins along each side of the image.
+        landmark_channels: whether it asks what the landmarks are like (`ALL_CHANNELS`, not `CHANNELS`).
+    """
+
+    def __init__(self, localization_map: LocalizationMap, bins: int = 30, landmark_channels: bool = False) -> None:
+        super().__init__(localization_map)
+        self.bins, self.landmark_channels = bins, landmark_channels
+
+    def score(self, cam_from_world: Float) -> Float:
+        """Score poses (B, 3, 4). Returns (B,) float64."""
+        scores = np.empty(len(cam_from_world))
+        for begin in range(0, len(scores), BLOCK):
+            poses = cam_from_world[begin : begin + BLOCK]
+            binned = self.localization_map.bin_views(poses, self.bins, self.landmark_channels)
+            scores[begin : begin + BLOCK] = self.score_bins(binned)
+        return scores
+
+    def score_binned(self, cam_from_world: Float, binned: BinnedViews) -> Float:
+        """Score binned views; views with another number of bins, or without channels it needs, are binned again."""
+        wanted = ALL_CHANNELS if self.landmark_channels else CHANNELS
+        if binned.counts.shape[-1] != self.bins or not {*wanted} <= {*binned.channels}:
+            return self.score(cam_from_world)
+        return self.score_bins(binned)
+
+    @abstractmethod
+    def score_bins(self, binned: BinnedViews) -> Float:
+        """Score binned views with all channels that it asks for. Returns (B,) float64, finite."""
+
+
+class CountingScorer(BinnedScorer):
+    """A method that scores a view by how many landmarks and filled bins there are."""
+
+    def score(self, cam_from_world: Float) -> Float:
+        """Score poses (B, 3, 4). Returns (B,) float64."""
+        return self.score_counts(*self.localization_map.count_bins(cam_from_world, self.bins))
+
+    def score_bins(self, binned: BinnedViews) -> Float:
+        """Score binned views (B,)."""
+        return self.score_counts(binned.n_visible, binned.n_filled)
+
+    @abstractmethod
+    def score_counts(self, n_visible: NDArray[np.int32], n_filled: NDArray[np.int32]) -> Float:
+        """Score views by their landmarks and filled bins, (B,) each. Returns (B,) float64, finite."""

@@ -1,0 +1,26 @@
+"""Reprojections with bins: landmarks spread over much of the image win."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wheretolook.geometry.poses import Float
+from wheretolook.methods.base import CountingScorer
+
+
+class BinsScorer(CountingScorer):
+    """Share of the image's bins with a visible landmark in them (paper, Sec. 4.1, "reprojection with bins").
+
+    Among views with as many filled bins, the one that sees more landmarks scores higher, by less than one bin is worth.
+    """
+
+    name: ClassVar[str] = "bins"
+    local = True
+
+    def score_counts(self, n_visible: NDArray[np.int32], n_filled: NDArray[np.int32]) -> Float:
+        """(B,) in [0, 1)."""
+        visible = n_visible.astype(np.float64)
+        return (n_filled + visible / (1 + visible)) / (self.bins**2 + 1)

@@ -1,0 +1,36 @@
+"""Options of the convolutional network."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from wheretolook.learning.fitting_config import FittingConfig
+from wheretolook.utils.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class ConvConfig(FittingConfig):
+    """Options of the convolutional network over the bins.
+
+    Args:
+        epochs, batch_size, learning_rate, l2: see `FittingConfig`.
+        widths: channels after each convolution; every one but the first halves the sides of the grid.
+        dropout: share of pooled values dropped in training.
+        bins: bins along each side of the image.
+    """
+
+    widths: tuple[int, ...] = (32, 64, 128, 128)
+    dropout: float = 0.2
+    bins: int = 30
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.widths or min(self.widths) < 1:
+            raise ConfigError(
+                "convolutions must be at least one channel wide, and there must be one", value=self.widths
+            )
+        if not 0 <= self.dropout < 1 or self.bins < 1:
+            raise ConfigError(
+                "a convolutional network needs bins >= 1 and a dropout from 0 to less than 1",
+                value=(self.bins, self.dropout),
+            )

@@ -1,0 +1,67 @@
+"""The camera looks where the robot goes."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from wheretolook.geometry.poses import Float, camera_centers, check_poses
+from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.methods.base import Scorer
+from wheretolook.methods.random import uniform
+
+
+class ForwardScorer(Scorer):
+    """Views by how near they look to a heading: the classical camera that knows nothing of the map (paper, Sec. 4.3).
+
+    Args:
+        localization_map: not looked at.
+        heading: where the robot drives to, in the world: (3,) everywhere, of any length but zero; or (W, 3) waypoints
+            of a path in metres, W > 1, for the direction of the leg that is nearest to the camera. None for a
+            horizontal heading drawn for each location.
+        seed: of the headings that are drawn.
+
+    Raises:
+        ValueError: a heading is zero or not finite, or two waypoints in a row are the same.
+    """
+
+    name: ClassVar[str] = "forward"
+    local = True
+
+    def __init__(self, localization_map: LocalizationMap, heading: ArrayLike | None = None, seed: int = 0) -> None:
+        super().__init__(localization_map)
+        self.seed = seed
+        self._starts, self._legs = np.empty((0, 3)), np.empty((0, 3))
+        if heading is not None:
+            given = np.asarray(heading, dtype=np.float64)
+            legs = given[None] if given.ndim == 1 else np.diff(given, axis=0)
+            lengths = np.linalg.norm(legs, axis=-1)
+            if (
+                given.shape[-1:] != (3,)
+                or given.ndim > 2
+                or not len(legs)
+                or not np.all((lengths > 0) & (lengths < np.inf))
+            ):
+                raise ValueError(
+                    f"a heading is a direction (3,) of finite length, or a path (W, 3) of such, got {given}"
+                )
+            self._starts, self._legs = (np.zeros((1, 3)) if given.ndim == 1 else given[:-1]), legs
+
+    def headings(self, centers: ArrayLike) -> Float:
+        """The headings (B, 3), of unit length, of camera centres (B, 3)."""
+        at = np.asarray(centers, dtype=np.float64)
+        if len(self._legs) == 0:
+            angle = 2 * np.pi * uniform(at, self.seed)
+            return np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=-1)
+        along = np.einsum("bwi,wi->bw", at[:, None] - self._starts, self._legs) / (self._legs**2).sum(-1)
+        nearest = self._starts + np.clip(along, 0, 1)[..., None] * self._legs
+        leg = np.argmin(np.linalg.norm(at[:, None] - nearest, axis=-1), axis=1)
+        return np.asarray((self._legs / np.linalg.norm(self._legs, axis=-1, keepdims=True))[leg])
+
+    def score(self, cam_from_world: Float) -> Float:
+        """(B,) in [0, 1]: half of one plus the cosine between optical axis and heading."""
+        poses = check_poses(cam_from_world)
+        cosines = np.einsum("bi,bi->b", poses[:, 2, :3], self.headings(camera_centers(poses)))
+        return np.asarray((1 + np.clip(cosines, -1, 1)) / 2)

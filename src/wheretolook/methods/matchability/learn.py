@@ -1,0 +1,136 @@
+"""Learning whether a landmark in view will be found by the localizer."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from math import ceil, log
+from typing import ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from wheretolook.learning.config import MATCHABILITY
+from wheretolook.learning.data import Batch
+from wheretolook.learning.landmark_model import LandmarkModel
+from wheretolook.learning.landmark_views import DISTANCES, LandmarkDataModule
+from wheretolook.learning.learner import Learnt, Task, class_counts, fit_network, predict
+from wheretolook.learning.platt import fit_platt
+from wheretolook.methods.set.network import MatchabilityNetwork
+
+
+class Matchability(LandmarkModel):
+    """The probability that a landmark in view is found, from how it was mapped and where it is seen from."""
+
+    kind: ClassVar[str] = MATCHABILITY
+    network_class: ClassVar[type[nn.Module]] = MatchabilityNetwork
+
+    def log_odds(self, values: Tensor) -> Tensor:
+        """Calibrated log-odds (E,) of landmarks (E, len(ATTRIBUTES)) on the network's device."""
+        with torch.inference_mode():
+            logits: Tensor = self.network(values)
+            return self.scale * logits + self.offset
+
+
+class LandmarkBatches:
+    """Batches of landmarks in view, and whether each was found; several processes share out each batch.
+
+    Args:
+        values: (E, len(ATTRIBUTES)).
+        found: (E,) bool.
+        rows: which of them, (n,).
+        batch_size: landmarks a batch, over all processes.
+        shuffle_seed: seed of their order; None goes through them in order.
+        rank: number of this process.
+        world_size: number of processes.
+        enlarged: shuffled landmarks come from 1 / enlarged to enlarged times as far; see
+            `wheretolook.learning.landmark_views.LandmarkLoader`.
+    """
+
+    def __init__(
+        self,
+        values: Tensor,
+        found: Tensor,
+        rows: Tensor,
+        batch_size: int,
+        shuffle_seed: int | None = None,
+        rank: int = 0,
+        world_size: int = 1,
+        enlarged: float = 1.0,
+    ) -> None:
+        self.enlarged = enlarged
+        self.values, self.found, self.rows, self.batch_size = values, found, rows.to(values.device), batch_size
+        self.shuffle_seed, self.rank, self.world_size, self._pass = shuffle_seed, rank, world_size, 0
+
+    def __len__(self) -> int:
+        return ceil(len(self.rows) / self.batch_size)
+
+    def __iter__(self) -> Iterator[Batch]:
+        rows = self.rows
+        if self.shuffle_seed is not None:
+            generator = torch.Generator(rows.device).manual_seed(1_000_003 * self.shuffle_seed + self._pass)
+            self._pass += 1  # another order every time
+            rows = rows[torch.randperm(len(rows), generator=generator, device=rows.device)]
+        for part in rows.split(self.batch_size):
+            share = part.tensor_split(self.world_size)[self.rank]
+            values = self.values[share].float()
+            if self.shuffle_seed is not None and self.enlarged > 1:
+                growth = torch.rand(len(part), generator=generator, device=rows.device) * 2 - 1
+                growth = growth.tensor_split(self.world_size)[self.rank]
+                values[:, DISTANCES] += log(self.enlarged) * growth[:, None]
+            yield Batch((values,), self.found[share].float(), len(part))
+
+
+class MatchabilityData(LandmarkDataModule):
+    """Landmarks in view of a dataset's labelled viewpoints, whose matches are stored.
+
+    Args:
+        task: what to learn from.
+
+    Raises:
+        TableError: no train scene, no labels, or no stored matches.
+    """
+
+    def __init__(self, task: Task) -> None:
+        super().__init__(task, task.config.matchability.landmarks, matches=True)
+
+    @property
+    def found(self) -> Tensor:
+        """Whether the localizer found each entry's landmark, (E,) bool."""
+        assert self.views.found is not None
+        return self.views.found
+
+    def entries(self, rows: Tensor) -> Tensor:
+        """Entries (n,) of the landmarks of some views."""
+        chosen = torch.zeros(len(self.views), dtype=torch.bool)
+        chosen[rows] = True
+        return torch.nonzero(chosen.repeat_interleave(self.views.starts.cpu().diff()))[:, 0]
+
+    def train_dataloader(self) -> LandmarkBatches:
+        """Shuffled landmarks of the training views."""
+        return self._loader(self.train_rows, 1, self.config.seed)
+
+    def val_dataloader(self) -> LandmarkBatches:
+        """Landmarks of the validation views, in order."""
+        return self._loader(self.val_rows, 8)
+
+    def _loader(self, rows: Tensor, batches: int, shuffle_seed: int | None = None) -> LandmarkBatches:
+        size = batches * self.config.batch_size * self.config.matchability.landmarks
+        return LandmarkBatches(
+            self.views.values, self.found, self.entries(rows), size, shuffle_seed, *self.share,
+            self.config.matchability.enlarged,
+        )  # fmt: skip
+
+
+def learn_matchability(task: Task) -> Learnt:
+    """The probability of being found, from the matches that are stored with a dataset's labels.
+
+    Raises:
+        TableError: no train scene, no labels, or no stored matches.
+    """
+    data = MatchabilityData(task)
+    options = task.config.matchability
+    network = MatchabilityNetwork(data.statistics, options.width, options.hidden)
+    metrics, history = fit_network(network, data, task)
+    logits, found = predict(network, data)
+    counts = class_counts(train=data.found.cpu()[data.entries(data.train_rows)].numpy(), val=found)
+    return Learnt(Matchability(network, task.dataset.camera, *fit_platt(logits, found)), metrics, counts, history)

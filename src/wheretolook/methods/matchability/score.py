@@ -1,0 +1,149 @@
+"""What a view can be expected to find: landmarks weighted by the probability that the localizer finds them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import ClassVar
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from wheretolook.fisher.metrics import METRICS, metric_of
+from wheretolook.geometry.poses import Float, check_poses
+from wheretolook.inputs.landmarks_in_view import LandmarkDescriber, ViewLandmarks, image_cells
+from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.methods.base import Scorer
+from wheretolook.methods.field_of_view import check_field_of_view, naming
+from wheretolook.methods.matchability.learn import Matchability
+from wheretolook.methods.set.network import expected_parts
+from wheretolook.utils.errors import ConfigError
+
+BINS = 30
+"""Bins along each side of the image, of which those expected to hold a found landmark are counted."""
+
+INLIERS, FILLED = "inliers", "bins"
+
+
+class Expectation:
+    """What the views of a map can be expected to find, shared by all scorers that are made of it.
+
+    Args:
+        localization_map: landmarks, camera and occlusion.
+        matchability: trained for cameras of the same field of view.
+    """
+
+    _of_maps: ClassVar[WeakKeyDictionary[LocalizationMap, dict[str, Expectation]]] = WeakKeyDictionary()
+
+    def __init__(self, localization_map: LocalizationMap, matchability: Matchability) -> None:
+        check_field_of_view(matchability.camera, localization_map.camera)
+        # not the map itself: who is its only owner could never go
+        self.matchability, self.camera = matchability, localization_map.camera
+        self._poses: Float = np.empty((0, 3, 4))
+        self._sums: Float = np.empty((0, 17))
+
+    @classmethod
+    def of_map(cls, localization_map: LocalizationMap, weights: str | Path) -> Expectation:
+        """The one of a map and a weights file.
+
+        Raises:
+            WeightsError: the file cannot be used, or was trained for another field of view than the map's camera.
+        """
+        known = cls._of_maps.setdefault(localization_map, {})
+        if str(weights) not in known:
+            with naming(weights):
+                known[str(weights)] = cls(localization_map, Matchability.load(weights, localization_map.device))
+        return known[str(weights)]
+
+    def sums(self, describer: LandmarkDescriber, cam_from_world: Float) -> Float:
+        """What views can be expected to find.
+
+        Args:
+            describer: of the map.
+            cam_from_world: (B, 3, 4).
+
+        Returns:
+            (B, 17): landmarks expected to be found; their information on the pose, 15 numbers (see
+            `wheretolook.fisher.information`, in the camera's axes); bins expected to hold one that is found.
+        """
+        cam_from_world = check_poses(cam_from_world)
+        if not np.array_equal(cam_from_world, self._poses):  # several methods ask for the same block of views
+            sums = np.empty((len(cam_from_world), 17))
+            for rows, described, _ in describer.in_blocks(cam_from_world):
+                log_odds = self.matchability.log_odds(described.values)
+                parts = expected_parts(described.values, log_odds)[:, :16].double()
+                sums[rows, :16] = torch.segment_reduce(parts, "sum", lengths=described.counts, initial=0.0).cpu()
+                sums[rows, 16] = self._filled(described, log_odds).cpu()
+            self._poses, self._sums = cam_from_world.copy(), sums
+        return self._sums
+
+    def _filled(self, described: ViewLandmarks, log_odds: Tensor) -> Tensor:
+        """Bins expected to hold at least one landmark that is found, each found or not on its own, (B,)."""
+        cells = described.views * BINS**2 + image_cells(described, self.camera, BINS)
+        missed = torch.zeros(len(described) * BINS**2, dtype=torch.float64, device=cells.device)
+        missed.index_add_(0, cells, torch.nn.functional.logsigmoid(-log_odds).double())
+        return (1 - missed.exp()).view(len(described), -1).sum(1)
+
+
+class ExpectedScorer(Scorer):
+    """Landmarks in view, each by its learned chance of being found; or the bins of the image expected to hold one.
+
+    Args:
+        localization_map: the map.
+        weights: of a matchability model.
+        kind: "inliers", the share of the map's landmarks expected to be found; "bins", the share of the image's bins
+            expected to hold one that is.
+
+    Raises:
+        WeightsError: the weights cannot be used, or were trained for another field of view than the map's camera.
+        ConfigError: no such kind.
+    """
+
+    name: ClassVar[str] = "expected"
+
+    def __init__(self, localization_map: LocalizationMap, weights: str | Path, kind: str) -> None:
+        super().__init__(localization_map)
+        if kind not in (INLIERS, FILLED):
+            raise ConfigError("unknown expectation", value=kind, fix=f"There are {INLIERS} and {FILLED}.")
+        self.inputs = kind
+        self.local = kind == FILLED  # the share of the map's landmarks falls with every landmark that is added
+        self._expectation = Expectation.of_map(localization_map, weights)
+        self._describer = LandmarkDescriber(localization_map)
+
+    def score(self, cam_from_world: Float) -> Float:
+        """(B,) in [0, 1]."""
+        sums = self._expectation.sums(self._describer, cam_from_world)
+        if self.inputs == FILLED:
+            return sums[:, 16] / BINS**2
+        return sums[:, 0] / max(1, len(self.localization_map.landmarks))
+
+
+class ExpectedFisherScorer(Scorer):
+    """Expected Fisher information of the pose, each landmark in view weighted by its learned chance of being found.
+
+    Args:
+        localization_map: the map.
+        weights: of a matchability model.
+        metric: "mineig", "logdet" or "trace".
+
+    Raises:
+        WeightsError: the weights cannot be used, or were trained for another field of view than the map's camera.
+        ConfigError: no such metric.
+    """
+
+    name: ClassVar[str] = "fisher"
+    local = True
+
+    def __init__(self, localization_map: LocalizationMap, weights: str | Path, metric: str) -> None:
+        super().__init__(localization_map)
+        if metric not in METRICS:
+            raise ConfigError("unknown metric of information", value=metric, fix=f"There are {', '.join(METRICS)}.")
+        self.metric, self.inputs = metric, f"{metric} expected"
+        self._expectation = Expectation.of_map(localization_map, weights)
+        self._describer = LandmarkDescriber(localization_map)
+
+    def score(self, cam_from_world: Float) -> Float:
+        """(B,), not bounded by 1."""
+        numbers = self._expectation.sums(self._describer, cam_from_world)[:, 1:16]
+        return metric_of(numbers, self.metric, device=self.localization_map.device)

@@ -1,0 +1,1 @@
+"""The paper's network: an MLP over binned landmarks."""

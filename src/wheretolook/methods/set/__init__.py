@@ -1,0 +1,1 @@
+"""A network over the set of landmarks in view."""

@@ -1,0 +1,253 @@
+"""Networks over the landmarks that a view sees: whether each will be found, and whether the view localizes."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import batch_norm
+
+from wheretolook.inputs.landmarks_in_view import ATTRIBUTES, POSE_ATTRIBUTES, ViewLandmarks
+from wheretolook.learning.landmark_views import AttributeStatistics
+
+PRIOR = 1e-3
+"""Information on every coordinate of a pose before anything is seen: keeps the covariance finite (1/m^2 and 1/rad^2
+for a bearing's noise of one radian)."""
+
+LIKELY = -2.0
+"""Log-odds of being found that an untrained network gives a landmark: about one in eight, as in real views."""
+
+_PLACES = torch.tensor([
+    [0, 1, 2, 0, 8, 7],
+    [1, 3, 4, 8, 0, 6],
+    [2, 4, 5, 7, 6, 0],
+    [0, 8, 7, 9, 10, 11],
+    [8, 0, 6, 10, 12, 13],
+    [7, 6, 0, 11, 13, 14],
+])  # fmt: skip
+_SIGNS = torch.tensor([
+    [1, 1, 1, 0, 1, -1],
+    [1, 1, 1, -1, 0, 1],
+    [1, 1, 1, 1, -1, 0],
+    [0, -1, 1, 1, 1, 1],
+    [1, 0, -1, 1, 1, 1],
+    [-1, 1, 0, 1, 1, 1],
+])  # fmt: skip
+"""Which of the 15 numbers stands where in an information matrix, and its sign, 0 where none does."""
+
+
+def bearing_numbers(values: Tensor) -> Tensor:
+    """Information of each landmark on the pose, `wheretolook.fisher.information.bearing_numbers` in the camera's axes.
+
+    Args:
+        values: (..., len(ATTRIBUTES)).
+
+    Returns:
+        (..., 15).
+    """
+    across, down, log_distance = (values[..., ATTRIBUTES.index(name)] for name in ("across", "down", "distance"))
+    bearing = torch.stack([across, down, torch.ones_like(across)], -1)
+    bearing = bearing / bearing.norm(dim=-1, keepdim=True)
+    inverse = (-log_distance).exp()[..., None]
+    x, y, z = bearing.unbind(-1)
+    plane = torch.stack([1 - x * x, -x * y, -x * z, 1 - y * y, -y * z, 1 - z * z], -1)
+    return torch.cat([plane * inverse**2, bearing * inverse, plane], -1)
+
+
+def information_matrices(numbers: Tensor) -> Tensor:
+    """`wheretolook.fisher.information.information_matrices` of sums (..., 15), shift first, turn second."""
+    places, signs = _layout(numbers.device)
+    return numbers[..., places] * signs
+
+
+@cache
+def _layout(device: torch.device) -> tuple[Tensor, Tensor]:
+    with torch.inference_mode(False):  # what is made in that mode cannot be trained with later
+        return _PLACES.to(device), _SIGNS.to(device)
+
+
+class StandardAttributes(nn.Module):
+    """What is known of landmarks, standardized; what is not known becomes 0, the mean of its kind.
+
+    Args:
+        statistics: of the training views.
+        hidden: names of attributes not to look at, which are 0 always.
+    """
+
+    mean: Tensor
+    scale: Tensor
+
+    def __init__(self, statistics: AttributeStatistics, hidden: tuple[str, ...] = ()) -> None:
+        super().__init__()
+        scale = [0.0 if name in hidden else 1 / std for name, std in zip(ATTRIBUTES, statistics.std, strict=True)]
+        # these follow from the description that is stored beside the weights: persistent=False
+        self.register_buffer("mean", torch.tensor(statistics.mean), persistent=False)
+        self.register_buffer("scale", torch.tensor(scale), persistent=False)
+
+    def forward(self, values: Tensor) -> Tensor:
+        """(..., len(ATTRIBUTES))."""
+        return ((values - self.mean) * self.scale).nan_to_num(nan=0.0)
+
+
+class MatchabilityNetwork(nn.Module):
+    """The probability that a landmark in view is found: matched, and an inlier of the pose.
+
+    Args:
+        statistics: of the training views.
+        width: units of each of two hidden layers.
+        hidden: names of attributes not to look at.
+
+    Attributes:
+        options: the arguments after the statistics, by name.
+    """
+
+    def __init__(self, statistics: AttributeStatistics, width: int = 48, hidden: tuple[str, ...] = ()) -> None:
+        super().__init__()
+        self.statistics, self.options = statistics, {"width": width, "hidden": hidden}
+        self.input = StandardAttributes(statistics, hidden)
+        last = nn.Linear(width, 1)
+        nn.init.constant_(last.bias, LIKELY)
+        self.layers = nn.Sequential(
+            nn.Linear(len(ATTRIBUTES), width), nn.ReLU(), nn.Linear(width, width), nn.ReLU(), last
+        )
+
+    def forward(self, values: Tensor) -> Tensor:
+        """Log-odds (...,) of landmarks (..., len(ATTRIBUTES))."""
+        return self.layers(self.input(values)).squeeze(-1)
+
+
+class SetNetwork(nn.Module):
+    """Scores a view by the set of landmarks it sees, without bins.
+
+    Each landmark has a probability of being found. Weighted by it, the landmarks' Fisher information sums up to the
+    information that the view can be expected to have on its pose, and its inverse to the expected covariance: how far
+    off position and orientation will be, which is what a label asks. So the probability is the attention by which
+    landmarks are pooled; on request further attention pools what else there may be to know of them. All of it are sums
+    over landmarks, so a random sample of them scaled up serves in training.
+
+    Args:
+        statistics: of the training views.
+        width: units of the layers that look at single landmarks.
+        pooled: numbers that further attention pools.
+        head: units of the layers that decide.
+        dropout: share of the deciding layers' units dropped in training.
+        hidden: names of attributes not to look at. Of "across", "down" and "distance" the information remains.
+
+    Attributes:
+        options: the arguments after the statistics, by name.
+    """
+
+    def __init__(
+        self, statistics: AttributeStatistics, width: int = 48, pooled: int = 0, head: int = 48, dropout: float = 0.1,
+        hidden: tuple[str, ...] = (),
+    ) -> None:  # fmt: skip
+        super().__init__()
+        self.statistics = statistics
+        self.options = {"width": width, "pooled": pooled, "head": head, "dropout": dropout, "hidden": hidden}
+        self.matchability = MatchabilityNetwork(statistics, width, hidden)
+        self.attention = None
+        if pooled:
+            self.attention = nn.Sequential(
+                StandardAttributes(statistics, hidden), nn.Linear(len(ATTRIBUTES), width), nn.ReLU(),
+                nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 1 + pooled),
+            )  # fmt: skip
+        self.standard = nn.BatchNorm1d(len(EXPECTED) + 1 + pooled)
+        n_features = self.standard.num_features
+        self.linear = nn.Linear(n_features, 1)
+        self.decide = nn.Sequential(
+            nn.Linear(n_features, head), nn.ReLU(), nn.Dropout(dropout), nn.Linear(head, head), nn.ReLU(),
+            nn.Linear(head, 1),
+        )  # fmt: skip
+
+    def forward(self, values: Tensor, taken: Tensor, visible: Tensor, axis_height: Tensor) -> Tensor:
+        """Logits (B,) from samples of each view's landmarks.
+
+        Args:
+            values: (B, K, len(ATTRIBUTES)).
+            taken: (B,) int64, how many of the K are the view's.
+            visible: (B,) landmarks it sees in all.
+            axis_height: (B,) z of the optical axis in the world.
+        """
+        there = torch.arange(values.shape[1], device=values.device) < taken[:, None]
+        sums = (self.parts(values) * there[..., None]).sum(1)
+        return self.logits(sums * (visible / taken.clamp(min=1))[:, None], visible, axis_height)
+
+    def score(self, landmarks: ViewLandmarks, visible: Tensor, axis_height: Tensor) -> Tensor:
+        """Logits (B,) from landmarks of each view, of those it sees in all (B,), and its height of the axis (B,)."""
+        sums = torch.segment_reduce(self.parts(landmarks.values), "sum", lengths=landmarks.counts, initial=0.0)
+        return self.logits(sums * (visible / landmarks.counts.clamp(min=1))[:, None], visible, axis_height)
+
+    def parts(self, values: Tensor) -> Tensor:
+        """What each landmark (..., len(ATTRIBUTES)) adds to its view's sums, (..., D)."""
+        expected = expected_parts(values, self.matchability(values))
+        if self.attention is None:
+            return expected
+        attended = self.attention(values)
+        weight = attended[..., :1].clamp(-8, 8).exp()
+        return torch.cat([expected, weight, weight * attended[..., 1:]], -1)
+
+    def logits(self, sums: Tensor, visible: Tensor, axis_height: Tensor) -> Tensor:
+        """Logits (B,) from the sums over each view's landmarks (B, D)."""
+        features = [expected_statistics(sums[:, :N_EXPECTED], visible), axis_height[:, None]]
+        if self.attention is not None:
+            features.append(sums[:, N_EXPECTED + 1 :] / (sums[:, N_EXPECTED : N_EXPECTED + 1] + 1e-6))
+        joined = torch.cat(features, 1)
+        if self.training and len(joined) < 2:  # one view has no spread of its own; a process's share may be empty
+            standard = self.standard
+            joined = batch_norm(joined, standard.running_mean, standard.running_var, standard.weight, standard.bias)
+        else:
+            joined = self.standard(joined)
+        return (self.linear(joined) + self.decide(joined)).squeeze(-1)
+
+
+N_EXPECTED = 1 + 15 + 5
+"""Numbers that `expected_parts` gives of a landmark."""
+
+EXPECTED = (
+    "log_expected_inliers", "log_visible", "expected_share", "log_position_variance", "log_orientation_variance",
+    "log_det_information", "log_variance_x", "log_variance_y", "log_variance_z", "log_spread",
+)  # fmt: skip
+"""What `expected_statistics` gives of a view: the logarithms of one plus the landmarks expected to be found and of one
+plus those visible; the former's share; logarithms of the expected variance of the position (its trace), of the
+orientation, of the determinant of the information, of the variance along each axis of the camera; and of the area of
+the image that the landmarks expected to be found spread over (the determinant of their second moment)."""
+
+
+def expected_parts(values: Tensor, log_odds: Tensor) -> Tensor:
+    """What each landmark adds to the sums that `expected_statistics` takes.
+
+    Args:
+        values: (..., len(ATTRIBUTES)).
+        log_odds: (...,) of being found.
+
+    Returns:
+        (..., N_EXPECTED).
+    """
+    found = log_odds.sigmoid()[..., None]
+    across, down = (values[..., POSE_ATTRIBUTES.index(name), None] for name in ("across", "down"))
+    moments = torch.cat([across, down, across * across, across * down, down * down], -1)
+    return torch.cat([found, found * bearing_numbers(values), found * moments], -1)
+
+
+def expected_statistics(sums: Tensor, visible: Tensor) -> Tensor:
+    """`EXPECTED`, (B, len(EXPECTED)), of views by sums of `expected_parts` (B, N_EXPECTED), and landmarks seen (B,)."""
+    inliers, moments = sums[:, 0], sums[:, 16:] / (sums[:, :1] + 1e-6)
+    # in double precision: the covariance is an inverse
+    information = information_matrices(sums[:, 1:16].double()) + PRIOR * torch.eye(6, device=sums.device).double()
+    factor = torch.linalg.cholesky(information)
+    unit = torch.eye(6, dtype=factor.dtype, device=factor.device).expand_as(factor)
+    # not by `cholesky_inverse`, which takes the matrices of a batch one by one on a GPU
+    variances = torch.linalg.solve_triangular(factor, unit, upper=False).square().sum(-2)
+    log_det = 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    across, down = moments[:, 0], moments[:, 1]
+    spread = (moments[:, 2] - across**2) * (moments[:, 4] - down**2) - (moments[:, 3] - across * down) ** 2
+    return torch.cat(
+        [
+            torch.stack([inliers.log1p(), visible.float().log1p(), inliers / visible.clamp(min=1)], 1),
+            torch.stack([variances[:, :3].sum(1).log(), variances[:, 3:].sum(1).log(), log_det], 1).float(),
+            variances[:, :3].log().float(),
+            (spread.clamp(min=0) + 1e-4).log()[:, None],
+        ],
+        1,
+    )

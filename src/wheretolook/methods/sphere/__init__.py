@@ -1,0 +1,1 @@
+"""A network that scores all directions at a location at once, in the manner of ActLoc."""

@@ -1,0 +1,263 @@
+"""Locations as a network of the whole sphere sees them, and batches of their labelled viewpoints."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from math import ceil
+from pathlib import Path
+
+import numpy as np
+import torch
+from lightning.pytorch import LightningDataModule
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
+from tqdm.auto import tqdm
+
+from wheretolook.dataset.folders import Dataset, SceneFolder
+from wheretolook.geometry.poses import Float, split_poses
+from wheretolook.inputs.localization_map import LocalizationMap, shared_locations
+from wheretolook.learning.config import TrainConfig
+from wheretolook.learning.data import Batch, has_room, labelled_rows
+from wheretolook.mapping.cameras import CAMERAS_FILE
+from wheretolook.methods.sphere.config import SphereConfig
+from wheretolook.utils.errors import MapError
+from wheretolook.viewpoints.table import is_good, poses
+
+FEATURES = (
+    *(f"offset_{axis}" for axis in "xyz"), *(f"towards_{axis}" for axis in "xyz"), *(f"looks_{axis}" for axis in "xyz"),
+    "log_distance", "log_landmarks", "is_landmark", "is_camera",
+)  # fmt: skip
+"""Of a token: the offset from the location, world axes, in units of `OFFSET_M`, and its unit direction; the viewing
+direction of a camera; log(1 + distance in metres); log(1 + landmarks with a free line of sight from the location); and
+what it is. The first token of a location is neither: it stands for all landmarks and holds their number."""
+
+TOWARDS = slice(3, 6)
+"""The features that are the unit direction."""
+
+TURNING = 9
+"""The first features, three vectors, which turn with the world."""
+
+OFFSET_M = 4.0
+"""Unit of offsets: ActLoc crops the world at so many metres."""
+
+BLOCK = 256
+"""Locations whose lines of sight are asked for at a time."""
+
+
+class LocationDescriber:
+    """Tells a network of locations: their landmarks with a free line of sight, and the mapping cameras.
+
+    Of more landmarks or cameras than wanted, evenly spread ones are taken, in the order of their ids.
+
+    Args:
+        localization_map: the map, with its mapping cameras.
+        config: how many landmarks and cameras at most.
+        path: of the mapping cameras, for the error.
+
+    Raises:
+        MapError: the map has no mapping cameras.
+    """
+
+    def __init__(
+        self, localization_map: LocalizationMap, config: SphereConfig, path: Path = Path("map") / CAMERAS_FILE
+    ) -> None:
+        if localization_map.mapping_poses is None:
+            raise MapError(
+                "it is not known where the map's images were taken from", path=path,
+                fix="Run the map stage again, copy the release anew, or use `LocalizationMap.from_colmap`.",
+            )  # fmt: skip
+        self.localization_map, self.config = localization_map, config
+        rotations, self._centers = split_poses(_spread(localization_map.mapping_poses, config.cameras))
+        self._looks = rotations[:, 2]
+
+    def describe(self, locations: Float) -> Iterator[Tensor]:
+        """Tokens (T, len(FEATURES)) float32, on the CPU, of each location (L, 3) m in turn; T differs, but is not 0."""
+        points = self.localization_map.landmarks.points
+        for begin in range(0, len(locations), BLOCK):
+            block = np.asarray(locations, dtype=np.float64)[begin : begin + BLOCK]
+            for location, free in zip(block, self.localization_map.occlusion.unoccluded(block, points), strict=True):
+                yield self._tokens(location, points[free])
+
+    def _tokens(self, location: Float, points: Float) -> Tensor:
+        seen = _spread(points, self.config.points)
+        offsets = np.concatenate([np.zeros((1, 3)), seen - location, self._centers - location])
+        distance, cameras = np.linalg.norm(offsets, axis=1), 1 + len(seen)
+        tokens = np.zeros((len(offsets), len(FEATURES)), dtype=np.float32)
+        tokens[:, :3] = offsets / OFFSET_M
+        tokens[:, 3:6] = offsets / np.maximum(distance, 1e-9)[:, None]
+        tokens[cameras:, 6:9] = self._looks
+        tokens[:, 9], tokens[:, 10] = np.log1p(distance), np.log1p(len(points))
+        tokens[1:cameras, 11], tokens[cameras:, 12] = 1, 1
+        return torch.from_numpy(tokens)
+
+
+def _spread(rows: Float, at_most: int) -> Float:
+    """So many rows at most, evenly spread."""
+    if len(rows) <= at_most:
+        return rows
+    return rows[np.linspace(0, len(rows) - 1, at_most).round().astype(np.int64)]
+
+
+@dataclass(frozen=True, eq=False)
+class SphereViews:
+    """Labelled viewpoints and the locations that they share: about 33 kB a location at 640 tokens.
+
+    Attributes:
+        tokens: (L, T, len(FEATURES)) float32, zero where there is none.
+        padding: (L, T) bool, True where there is none.
+        rows: (B,) int64, location of each view.
+        axes: (B, 3) float32, its optical axis in the world.
+        labels: (B,) float32, 1 where it localizes.
+        scene: (B,) int64, number of each view's scene in the order given.
+        location: (B,) int64, location_id of each view, unique only within its scene.
+    """
+
+    tokens: Tensor
+    padding: Tensor
+    rows: Tensor
+    axes: Tensor
+    labels: Tensor
+    scene: NDArray[np.int64]
+    location: NDArray[np.int64]
+
+    def to(self, device: torch.device | str) -> SphereViews:
+        """The same views with what a network takes on a device."""
+        on_device = {name: getattr(self, name).to(device) for name in ("tokens", "padding", "axes", "labels")}
+        return replace(self, **on_device)
+
+    @property
+    def n_bytes(self) -> int:
+        """Memory the tensors take."""
+        return sum(tensor.nbytes for tensor in (self.tokens, self.padding, self.axes, self.labels))
+
+
+def load_sphere_views(
+    dataset: Dataset, scenes: Sequence[SceneFolder], config: TrainConfig, device: str = "cpu", progress: bool = True
+) -> SphereViews:
+    """Read the labelled viewpoints of some scenes and describe their locations.
+
+    Args:
+        dataset: gives the camera.
+        scenes: of the dataset.
+        config: options of "sphere", limits of a positive label.
+        device: of the maps. The views come back on the CPU.
+        progress: show a progress bar.
+
+    Raises:
+        TableError: a scene has no table or no labelled viewpoint, or its occlusion does not fit.
+        MapError: a scene has no landmarks, or its mapping cameras are not known.
+    """
+    tables = [labelled_rows(scene) for scene in scenes]
+    tokens: list[Tensor] = []
+    rows: list[NDArray[np.int64]] = []
+    axes: list[Float] = []
+    for scene, table in zip(scenes, tables, strict=True):
+        cam_from_world = poses(table)
+        locations, row = shared_locations(cam_from_world)
+        rows.append(row + len(tokens))
+        axes.append(cam_from_world[:, 2, :3])
+        localization_map = scene.localization_map(dataset.camera, device)
+        describer = LocationDescriber(localization_map, config.sphere, scene.mapping_cameras)
+        bar = tqdm(describer.describe(locations), f"describe {scene.name}", len(locations), disable=not progress)
+        tokens += bar
+    counts = torch.tensor([len(one) for one in tokens])
+    good = [is_good(table, config.max_error_m, config.max_error_deg) for table in tables]
+    return SphereViews(
+        pad_sequence(tokens, batch_first=True),
+        torch.arange(int(counts.max())) >= counts[:, None],
+        torch.from_numpy(np.concatenate(rows)),
+        torch.from_numpy(np.concatenate(axes).astype(np.float32)),
+        torch.from_numpy(np.concatenate(good).astype(np.float32)),
+        np.repeat(np.arange(len(tables)), [len(table) for table in tables]),
+        np.concatenate([table["location_id"].to_numpy(np.int64) for table in tables]),
+    )
+
+
+class LocationLoader:
+    """Iterates over batches of whole locations, so that each is encoded once for all of its views.
+
+    With several processes, every one cuts the same batches and keeps its share of each, whole locations again; a share
+    can be empty.
+
+    Args:
+        views: the views.
+        chosen: which of them, (n,) int64.
+        batch_size: views a batch, over all processes, on average.
+        shuffle_seed: every pass has its own order of locations, the same in every run; None keeps theirs.
+        rank: number of this process.
+        world_size: number of processes.
+    """
+
+    def __init__(
+        self,
+        views: SphereViews,
+        chosen: NDArray[np.int64],
+        batch_size: int,
+        shuffle_seed: int | None = None,
+        rank: int = 0,
+        world_size: int = 1,
+    ) -> None:
+        self.views, self.shuffle_seed, self.rank, self.world_size = views, shuffle_seed, rank, world_size
+        rows = views.rows.numpy()[chosen]
+        self._by_location = chosen[np.argsort(rows, kind="stable")]
+        self._locations, self._counts = np.unique(rows, return_counts=True)
+        self._starts = np.cumsum(self._counts) - self._counts
+        self._at_a_time = max(1, round(batch_size * len(self._locations) / max(1, len(chosen))))
+        self._passes = 0
+
+    def __len__(self) -> int:
+        return ceil(len(self._locations) / self._at_a_time)
+
+    def __iter__(self) -> Iterator[Batch]:
+        order = np.arange(len(self._locations))
+        if self.shuffle_seed is not None:
+            order = np.random.default_rng([self.shuffle_seed, self._passes]).permutation(order)
+            self._passes += 1
+        device = self.views.tokens.device
+        for begin in range(0, len(order), self._at_a_time):
+            batch = order[begin : begin + self._at_a_time]
+            share = np.array_split(batch, self.world_size)[self.rank]
+            counts = self._counts[share]
+            rows = np.repeat(np.arange(len(share)), counts)
+            place = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
+            views = torch.from_numpy(self._by_location[self._starts[share][rows] + place]).to(device)
+            at = torch.from_numpy(self._locations[share]).to(device)
+            of_location = self.views.tokens[at], self.views.padding[at]
+            inputs = (*of_location, torch.from_numpy(rows).to(device), self.views.axes[views])
+            yield Batch(inputs, self.views.labels[views], int(self._counts[batch].sum()))
+
+
+class SphereDataModule(LightningDataModule):
+    """Views of a dataset in batches of whole locations.
+
+    Args:
+        views: of train and val scenes.
+        held_out: (B,) True where a view is for validation.
+        config: batch size, seed.
+    """
+
+    def __init__(self, views: SphereViews, held_out: NDArray[np.bool_], config: TrainConfig) -> None:
+        super().__init__()
+        self.views, self.config = views, config
+        self.train_rows, self.val_rows = np.flatnonzero(~held_out), np.flatnonzero(held_out)
+
+    def setup(self, stage: str | None = None) -> None:
+        """Bring the views to the device that trains, if it has room for them."""
+        if self.trainer is not None:
+            device = self.trainer.strategy.root_device
+            if device != self.views.tokens.device and has_room(device, self.views.n_bytes):
+                self.views = self.views.to(device)
+
+    def train_dataloader(self) -> LocationLoader:
+        """Shuffled batches of the training views."""
+        return self._loader(self.train_rows, self.config.seed)
+
+    def val_dataloader(self) -> LocationLoader:
+        """Batches of the validation views, in order."""
+        return self._loader(self.val_rows)
+
+    def _loader(self, chosen: NDArray[np.int64], shuffle_seed: int | None = None) -> LocationLoader:
+        rank, world_size = (0, 1) if self.trainer is None else (self.trainer.global_rank, self.trainer.world_size)
+        return LocationLoader(self.views, chosen, self.config.batch_size, shuffle_seed, rank, world_size)

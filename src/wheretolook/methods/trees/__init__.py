@@ -1,0 +1,1 @@
+"""Boosted trees on pooled statistics of the landmarks in view."""

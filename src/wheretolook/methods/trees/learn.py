@@ -1,0 +1,273 @@
+"""Boosted trees on pooled statistics of the visible landmarks: the strong simple learner."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from tqdm.auto import tqdm
+
+from wheretolook.dataset.folders import Dataset, SceneFolder
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.inputs.landmarks_in_view import POOLED, LandmarkDescriber, pool
+from wheretolook.learning.config import TREES
+from wheretolook.learning.data import check_classes, labelled_rows, training_scenes, validation_views
+from wheretolook.learning.fit import home_device
+from wheretolook.learning.learner import Learnt, Task, class_counts
+from wheretolook.learning.platt import fit_platt
+from wheretolook.learning.weights import check_kind, read_weights, write_weights
+from wheretolook.methods.trees.config import TreesConfig
+from wheretolook.utils.errors import ConfigError, WeightsError
+from wheretolook.viewpoints.table import is_good, poses
+
+BLOCK = 4096
+"""Views described at a time: some million landmarks."""
+
+
+@dataclass(frozen=True, eq=False)
+class BoostedTrees:
+    """T trees of M nodes in all, as arrays.
+
+    Attributes:
+        camera: whose views they have learnt from.
+        roots: (T,) int64, node of each tree's root.
+        feature: (M,) int64, which of `POOLED` a node asks for.
+        threshold: (M,) float64; values up to it go left.
+        missing_left: (M,) bool, whether a value that is not known goes left.
+        left, right: (M,) int64, next nodes; a leaf's are itself.
+        value: (M,) float64, of leaves, zero elsewhere.
+        depth: steps from a root to the deepest leaf.
+        baseline: log-odds without trees.
+        scale, offset: what turns the sum into calibrated log-odds: scale * sum + offset.
+    """
+
+    camera: PinholeCamera
+    roots: Tensor
+    feature: Tensor
+    threshold: Tensor
+    missing_left: Tensor
+    left: Tensor
+    right: Tensor
+    value: Tensor
+    depth: int
+    baseline: float
+    scale: float = 1.0
+    offset: float = 0.0
+
+    @classmethod
+    def of_sklearn(cls, model: Any, camera: PinholeCamera, n_trees: int) -> BoostedTrees:
+        """The first trees of a fitted HistGradientBoostingClassifier of two classes."""
+        parts: dict[str, list[NDArray[Any]]] = {name: [] for name in _ARRAYS}
+        start, depth = 0, 0
+        for (predictor,) in model._predictors[:n_trees]:
+            nodes = predictor.nodes
+            own, leaf = np.arange(len(nodes)) + start, nodes["is_leaf"].astype(bool)
+            parts["roots"].append(np.array([start]))
+            parts["feature"].append(np.where(leaf, 0, nodes["feature_idx"]).astype(np.int64))
+            parts["threshold"].append(np.where(leaf, 0.0, nodes["num_threshold"]))
+            parts["missing_left"].append(nodes["missing_go_to_left"].astype(bool))
+            for side in ("left", "right"):
+                parts[side].append(np.where(leaf, own, nodes[side].astype(np.int64) + start))
+            parts["value"].append(np.where(leaf, nodes["value"], 0.0))
+            start, depth = start + len(nodes), max(depth, int(nodes["depth"].max()))
+        arrays: dict[str, Any] = {name: torch.from_numpy(np.concatenate(part)) for name, part in parts.items()}
+        return cls(camera, **arrays, depth=depth, baseline=float(np.ravel(model._baseline_prediction)[0]))
+
+    def to(self, device: str) -> BoostedTrees:
+        """The same trees on a device."""
+        return replace(self, **{name: getattr(self, name).to(device) for name in _ARRAYS})
+
+    def logits(self, pooled: Tensor) -> Tensor:
+        """Calibrated log-odds (B,) float64 of views described by `POOLED`, (B, len(POOLED)), on the trees' device."""
+        return self.scale * self.raw_logits(pooled) + self.offset
+
+    def raw_logits(self, pooled: Tensor) -> Tensor:
+        """Log-odds before calibration, (B,) float64: the sum of the trees."""
+        pooled = pooled.double()
+        nodes = self.roots.expand(len(pooled), -1)
+        for _ in range(self.depth):
+            values = pooled.gather(1, self.feature[nodes])
+            goes_left = torch.where(values.isnan(), self.missing_left[nodes], values <= self.threshold[nodes])
+            nodes = torch.where(goes_left, self.left[nodes], self.right[nodes])
+        return self.value[nodes].sum(1) + self.baseline
+
+    def save(self, path: Path, training: dict[str, Any] | None = None) -> None:
+        """Write one safetensors file, atomically. The same trees give the same bytes.
+
+        Args:
+            path: file to write; its folder is made when needed.
+            training: what else to keep about the training (JSON values).
+        """
+        header = {
+            "kind": TREES, "features": list(POOLED), "camera": asdict(self.camera),
+            **{name: getattr(self, name) for name in _NUMBERS}, "training": training or {},
+        }  # fmt: skip
+        narrow = {"roots": torch.int32, "left": torch.int32, "right": torch.int32, "feature": torch.uint8}
+        narrow["missing_left"] = torch.uint8
+        arrays = {name: getattr(self, name) for name in _ARRAYS}
+        write_weights(path, {name: one.to(narrow.get(name, one.dtype)) for name, one in arrays.items()}, header)
+
+    @classmethod
+    def load(cls, path: str | Path) -> BoostedTrees:
+        """Read what `save` wrote.
+
+        Raises:
+            WeightsError: the file is missing, damaged, foreign, of another kind, or its trees are none.
+        """
+        tensors, header = read_weights(Path(path))
+        check_kind(path, header, TREES)
+        fix = "Train again, or give weights of trees."
+        if header.get("features") != list(POOLED):
+            raise WeightsError("these trees ask for other statistics of a view", path=path, fix=fix)
+        try:
+            numbers = {name: header[name] for name in _NUMBERS}
+            camera = PinholeCamera(**header["camera"])
+            arrays = {name: tensors[name] for name in _ARRAYS}
+        except (KeyError, TypeError, ConfigError) as error:
+            raise WeightsError(f"damaged description of trees: {error}", path=path, fix=fix) from error
+        arrays |= {name: arrays[name].long() for name in ("roots", "feature", "left", "right")}
+        arrays["missing_left"] = arrays["missing_left"].bool()
+        n_nodes = len(arrays["value"])
+        inside = all(
+            len(one) == 0 or (int(one.min()) >= 0 and int(one.max()) < bound)
+            for one, bound in (
+                *((arrays[name], n_nodes) for name in ("roots", "left", "right")), (arrays["feature"], len(POOLED)),
+            )
+        )  # fmt: skip
+        if not inside or len({len(arrays[name]) for name in _ARRAYS if name != "roots"}) != 1:
+            raise WeightsError("the trees lead out of their own arrays", path=path, fix=fix)
+        return cls(camera, **arrays, **numbers)
+
+
+_ARRAYS = ("roots", "feature", "threshold", "missing_left", "left", "right", "value")
+_NUMBERS = ("depth", "baseline", "scale", "offset")
+
+
+@dataclass(frozen=True, eq=False)
+class PooledViews:
+    """Labelled viewpoints described by `POOLED`.
+
+    Attributes:
+        values: (B, len(POOLED)) float32.
+        labels: (B,) bool, whether the viewpoint localizes.
+        scene: (B,) int64, number of each view's scene in the order given.
+        location: (B,) int64, location_id of each view, unique only within its scene.
+    """
+
+    values: NDArray[np.float32]
+    labels: NDArray[np.bool_]
+    scene: NDArray[np.int64]
+    location: NDArray[np.int64]
+
+    def only(self, mask: NDArray[np.bool_]) -> PooledViews:
+        """The views where `mask` (B,) is set."""
+        return PooledViews(self.values[mask], self.labels[mask], self.scene[mask], self.location[mask])
+
+
+def load_pooled(
+    dataset: Dataset,
+    scenes: Sequence[SceneFolder],
+    limits: tuple[float, float],
+    device: str = "cpu",
+    progress: bool = True,
+) -> PooledViews:
+    """Describe the labelled viewpoints of some scenes.
+
+    Args:
+        dataset: gives the camera.
+        scenes: of the dataset.
+        limits: metres and degrees of a positive label.
+        device: "cpu" or a CUDA device.
+        progress: show a progress bar.
+
+    Raises:
+        TableError: a scene has no table or no labelled viewpoint, or its occlusion does not fit.
+        MapError: a scene has no landmarks.
+    """
+    values: list[NDArray[np.float32]] = []
+    labels: list[NDArray[np.bool_]] = []
+    location: list[NDArray[np.int64]] = []
+    tables = [(scene, labelled_rows(scene)) for scene in scenes]
+    with tqdm(
+        total=sum(len(table) for _, table in tables), desc="pool views", unit="view", disable=not progress
+    ) as bar:
+        for scene, table in tables:
+            describer = LandmarkDescriber(scene.localization_map(dataset.camera, device))
+            cam_from_world = poses(table)
+            for begin in range(0, len(table), BLOCK):
+                block = cam_from_world[begin : begin + BLOCK]
+                values.append(pool(describer.describe(block), block, dataset.camera).cpu().numpy())
+                bar.update(len(block))
+            labels.append(is_good(table, *limits))
+            location.append(table["location_id"].to_numpy(np.int64))
+    scene_numbers = np.repeat(np.arange(len(scenes)), [len(part) for part in labels])
+    return PooledViews(np.concatenate(values), np.concatenate(labels), scene_numbers, np.concatenate(location))
+
+
+def learn_trees(task: Task) -> Learnt:
+    """Boosted trees from a dataset's train scenes; see `fit_trees`.
+
+    Raises:
+        TableError: no train scene, no labels, or labels of one class only.
+    """
+    dataset, config = task.dataset, task.config
+    limits = config.max_error_m, config.max_error_deg
+    views = load_pooled(dataset, training_scenes(dataset), limits, home_device(config), task.progress)
+    held_out = validation_views(dataset, views.scene, views.location, config)
+    train, val = views.only(~held_out), views.only(held_out)
+    for name, side in (("training", train), ("validation", val)):
+        check_classes(name, side.labels, dataset, config)
+    trees, metrics = fit_trees(train, val, dataset.camera, config.trees, config.seed)
+    return Learnt(trees, metrics, class_counts(train=train.labels, val=val.labels))
+
+
+def fit_trees(
+    train: PooledViews, val: PooledViews, camera: PinholeCamera, config: TreesConfig, seed: int = 0
+) -> tuple[BoostedTrees, dict[str, float]]:
+    """Boost trees, keep as many as order the validation views best, and calibrate their sum on these.
+
+    Args:
+        train: to learn from.
+        val: of other scenes.
+        camera: of both.
+        config: options.
+        seed: of scikit-learn's choice of bins.
+
+    Returns:
+        The trees, and their metrics on the validation views.
+    """
+    from sklearn.ensemble import HistGradientBoostingClassifier
+    from sklearn.metrics import average_precision_score, log_loss, roc_auc_score
+
+    values = train.values.astype(np.float64)
+    values[:, np.isnan(values).all(0)] = 0  # scikit-learn takes no column of which nothing is known
+    model = HistGradientBoostingClassifier(
+        max_iter=config.max_trees, learning_rate=config.learning_rate, max_leaf_nodes=config.max_leaves,
+        min_samples_leaf=config.min_leaf, l2_regularization=config.l2, early_stopping=False, random_state=seed,
+    ).fit(values, train.labels)  # fmt: skip
+    every = max(1, config.max_trees // 40)
+    stages = model.staged_decision_function(val.values.astype(np.float64))
+    precision = {
+        number: float(average_precision_score(val.labels, logits.reshape(-1)))
+        for number, logits in enumerate(stages, start=1)
+        if number % every == 0 or number == config.max_trees
+    }
+    kept = max(precision, key=lambda number: precision[number])
+    trees = BoostedTrees.of_sklearn(model, camera, kept)
+    raw = trees.raw_logits(torch.from_numpy(val.values)).numpy()
+    scale, offset = fit_platt(raw, val.labels)
+    trees = replace(trees, scale=scale, offset=offset)
+    logits = trees.logits(torch.from_numpy(val.values))
+    probabilities = logits.sigmoid().numpy()
+    return trees, {
+        "n_trees": float(kept),
+        "val_average_precision": precision[kept],
+        "val_roc_auc": float(roc_auc_score(val.labels, raw)),
+        "val_bce": float(log_loss(val.labels, probabilities)),
+    }

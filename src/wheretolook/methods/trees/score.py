@@ -1,0 +1,57 @@
+"""The score of boosted trees, which know what landmarks are like."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from wheretolook.geometry.poses import Float, check_poses
+from wheretolook.inputs.landmarks_in_view import LandmarkDescriber, pool
+from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.methods.base import BLOCK, Scorer
+from wheretolook.methods.field_of_view import check_field_of_view, naming
+from wheretolook.methods.trees.learn import BoostedTrees
+
+
+class TreesScorer(Scorer):
+    """Boosted trees on where the visible landmarks lie and how they were mapped: the probability that a view localizes.
+
+    Args:
+        localization_map: the map.
+        trees: trained for cameras of the same field of view.
+
+    Raises:
+        WeightsError: trained for another field of view than the map's camera.
+    """
+
+    name: ClassVar[str] = "trees"
+    local = True
+
+    def __init__(self, localization_map: LocalizationMap, trees: BoostedTrees) -> None:
+        super().__init__(localization_map)
+        check_field_of_view(trees.camera, localization_map.camera)
+        self.trees = trees.to(localization_map.device)
+        self._describer = LandmarkDescriber(localization_map)
+
+    @classmethod
+    def load(cls, weights: str | Path, localization_map: LocalizationMap) -> TreesScorer:
+        """Build a scorer from a weights file that the train stage wrote.
+
+        Raises:
+            WeightsError: the file cannot be used, or was trained for another field of view than the map's camera.
+        """
+        trees = BoostedTrees.load(weights)
+        with naming(weights):
+            return cls(localization_map, trees)
+
+    def score(self, cam_from_world: Float) -> Float:
+        """(B,) probabilities in [0, 1]."""
+        cam_from_world = check_poses(cam_from_world)
+        scores = np.empty(len(cam_from_world))
+        for begin in range(0, len(scores), BLOCK):
+            block = cam_from_world[begin : begin + BLOCK]
+            pooled = pool(self._describer.describe(block), block, self.localization_map.camera)
+            scores[begin : begin + BLOCK] = self.trees.logits(pooled).sigmoid().cpu().numpy()
+        return scores

@@ -1,0 +1,21 @@
+"""The most visible landmarks win."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wheretolook.geometry.poses import Float
+from wheretolook.methods.base import CountingScorer
+
+
+class VisibleScorer(CountingScorer):
+    """Share of the map's landmarks that a view sees (paper, Sec. 3.2)."""
+
+    name: ClassVar[str] = "visible"
+
+    def score_counts(self, n_visible: NDArray[np.int32], n_filled: NDArray[np.int32]) -> Float:
+        """(B,) in [0, 1]."""
+        return n_visible / max(1, len(self.localization_map.landmarks.points))

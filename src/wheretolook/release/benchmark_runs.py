@@ -1,0 +1,56 @@
+"""Measured times of the visibility check as an MLflow run: `tests/benchmarks/bench_visibility.py` takes them."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import pandas as pd
+
+from wheretolook.utils.tracking import TrackingConfig, log, start_run
+
+RUNTIMES_CSV, SCALING_CSV = "runtimes.csv", "scaling.csv"
+"""Tables for `wheretolook.figures.runtimes`: times at the paper's size, and how time and memory grow."""
+
+
+def log_runtimes(
+    tracking: TrackingConfig, sizes: pd.DataFrame, growth: pd.DataFrame, tags: Mapping[str, str] | None = None,
+    file: Path | None = None,
+) -> str:  # fmt: skip
+    """Log measured times: a run of the stage "benchmark" with both tables and their figures.
+
+    Args:
+        tracking: where to log.
+        sizes: as `wheretolook.figures.runtimes.runtime_figure` wants it.
+        growth: as `scaling_figure` wants it; may be empty.
+        tags: further tags.
+        file: that `sizes` were read from, to be logged to the byte.
+
+    Returns:
+        Id of the run.
+    """
+    from wheretolook.figures.runtimes import runtime_figure, scaling_figure
+    from wheretolook.figures.style import save_figure
+
+    metrics = {}
+    for row in sizes.dropna(subset="median_s").to_dict("records"):
+        name = f"{row['what']} {row['device'].split(':')[0]} {row['threads']} threads s"
+        metrics["".join(letter for letter in name if letter.isalnum() or letter == " ")] = float(row["median_s"])
+    machines = " + ".join(dict.fromkeys(map(str, sizes["name"])))
+    with (
+        TemporaryDirectory() as folder,
+        start_run(tracking, "visibility runtimes", "benchmark", {"machines": machines}, tags=tags) as (client, run),
+    ):
+        log(client, run, metrics=metrics)
+        if file is None:
+            sizes.to_csv(Path(folder) / RUNTIMES_CSV, index=False)
+        else:
+            shutil.copyfile(file, Path(folder) / RUNTIMES_CSV)
+        save_figure(runtime_figure(sizes), Path(folder) / "runtimes.png")
+        if len(growth):
+            growth.to_csv(Path(folder) / SCALING_CSV, index=False)
+            save_figure(scaling_figure(growth), Path(folder) / "visibility-scaling.png")
+        client.log_artifacts(run, folder)
+    return run

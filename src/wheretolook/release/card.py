@@ -1,0 +1,379 @@
+"""The card of a release, in Markdown: what it holds, how it was made and how well it does, from the files there."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import yaml
+
+from wheretolook.dataset.folders import Dataset
+from wheretolook.evaluation.report import score_markdown
+from wheretolook.evaluation.results import SCORES_CSV, VARIANTS_CSV
+from wheretolook.evaluation.scores import read_scores
+from wheretolook.labelling.report import POSITIVE, label_summary
+from wheretolook.learning.config import LEARNERS, NETWORKS, weights_name
+from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.methods.styles import method_style
+from wheretolook.release.copy import CARD, SHELF, read_about, size_text, sizes
+from wheretolook.utils.errors import TableError, WeightsError
+from wheretolook.utils.files import sha256, write_text
+from wheretolook.utils.markdown import markdown_table
+from wheretolook.viewpoints.thresholds import ALL, THRESHOLDS, threshold_key, threshold_label
+from wheretolook.visibility.occlusion import StoredOcclusion
+
+GENERALIZATION_CSV, GENERALIZATION_MD = "generalization.csv", "generalization.md"
+"""In `results/`: scores on other datasets, as `scores.csv` with the columns `dataset` and `weights_sha256` (of the
+shipped weights at that time; rows with others are not shown), and where those datasets come from."""
+
+_HOW_TO_USE = """\
+```python
+from pathlib import Path
+
+from wheretolook import load_scorer
+from wheretolook.dataset.folders import Dataset
+from wheretolook.viewpoints.table import poses
+
+dataset = Dataset.load(Path("{root}"))
+scene = dataset.split("test")[0]
+scorer = load_scorer("{root}/weights", scene.localization_map(dataset.camera))
+scores = scorer.score(poses(scene.read_table()))  # one for each viewpoint, in [0, 1]
+```"""
+
+_TABLES = """\
+Each `<scene>/viewpoints.parquet` is a table for `pandas.read_parquet`, a row a viewpoint: `viewpoint_id`, \
+`location_id`, `direction_id`; the rotation cam_from_world as a quaternion `qw qx qy qz`, and the camera's centre in \
+the world, `x_m y_m z_m` (the translation is -R c; `wheretolook.viewpoints.table.read_table` gives it as `tx ty tz` \
+instead); `n_visible` landmarks and `visibility_rank` among the directions of the location; `status` (localized, \
+too_few_matches, no_pose), `error_m`, `error_deg`, `n_inliers`. World in metres, z up; camera x right, y down, z \
+forward. `map/landmarks.npz` holds the landmarks (`wheretolook.mapping.landmarks.Landmarks`), `occlusion.npz` which of \
+them each location has a free line of sight to (`wheretolook.visibility.occlusion.StoredOcclusion`)."""
+
+_CAMERAS = "`map/cameras.npz` holds the poses cam_from_world of the images that the map was made from."
+
+
+def write_card(release: Dataset) -> Path:
+    """Write `<release>/README.md` from what lies in the release's folder. The same files give the same bytes.
+
+    Returns:
+        The card's path.
+
+    Raises:
+        WeightsError: not exactly one of the paper's networks ships, or a record of training is missing.
+        TableError: there are no scores, or no labels.
+        ConfigError: the description of the release is missing or damaged.
+        StorageError: the release is too large.
+    """
+    path = release.root / CARD
+    write_text(path, release_card(release))
+    return path
+
+
+def release_card(release: Dataset) -> str:
+    """The card. Raises as `write_card`."""
+    from wheretolook.learning.provenance import training_fingerprint
+    from wheretolook.learning.weights import best_weights, read_record, read_training
+
+    about, weights = read_about(release), _network(release)
+    best = best_weights(weights.parent)
+    training, record = read_training(weights), read_record(weights)
+    tables = {scene.name: scene.read_table() for scene in release.scenes}
+    shares = label_summary(tables, {scene.name: scene.split for scene in release.scenes}).shares
+    everything = shares.iloc[-1]
+    source, config = about["source"], f"configs/{release.name}.yaml"
+    root = f"data/{release.name}"
+    results = release.root / "results"
+    if not (results / SCORES_CSV).is_file():
+        raise TableError("there are no scores", path=results / SCORES_CSV, fix="Run the evaluate stage.")
+    variant = _label(training["variant"])
+    shipped = f"{variant}, half precision"
+    if best != weights:
+        shipped = f"{_label(read_training(best)['variant'])}; and of the paper's best network, {shipped}"
+
+    lines = [f"# {source}: tables, landmarks and weights"]
+    lines += [
+        f"{everything['n_views']:,} labelled viewpoints at {everything['n_locations']:,} locations of "
+        f"{len(release.scenes)} scenes, the landmarks they were localized against, and the weights of the best scorer "
+        f"trained on them ({shipped}). Enough to train and to evaluate; meshes, COLMAP models "
+        "and descriptors are left out, so nothing here can be labelled anew without making the scenes again.",
+        f"```sh\nwheretolook evaluate --config {config}   # the scores below, in minutes on two cores, no GPU\n```",
+        _HOW_TO_USE.format(root=root),
+        "## Scores",
+        f"On the test scenes, of which nothing was learnt. The weights are {_names(release)}.",
+        _demoted(score_markdown(read_scores(results / SCORES_CSV), f"Localization score on {source}")),
+    ]
+    if (results / VARIANTS_CSV).is_file():
+        lines += [
+            "## Scores of all that was trained",
+            "Before what ships was chosen by its validation metrics (see Training), in full precision.",
+            _demoted(score_markdown(read_scores(results / VARIANTS_CSV), f"Localization score on {source}")),
+        ]
+    if (results / GENERALIZATION_CSV).is_file():
+        others = read_scores(results / GENERALIZATION_CSV)
+        others = others[others["weights_sha256"] == sha256(best)].drop(columns="weights_sha256")
+        if len(others):
+            lines += ["## Scores on other datasets", "Scenes neither trained nor validated on."]
+        if len(others) and (results / GENERALIZATION_MD).is_file():
+            lines += [(results / GENERALIZATION_MD).read_text()]
+        for name, part in others.groupby("dataset", sort=False):
+            lines += [_demoted(score_markdown(part.drop(columns="dataset"), f"Localization score on {name}"))]
+    lines += [
+        "## Data",
+        _scenes_text(about["settings"]["scenes"]),
+        _label_table(release, shares),
+        f"Shares in % of viewpoints that localize within the limits; the label is the first, "
+        f"{threshold_label(threshold_key(THRESHOLDS[0]))}. Settings of `configs/{source}.yaml` that are not the "
+        "defaults (all of them are in `release.json`):",
+        f"```yaml\n{_changed_settings(about['settings'])}```",
+        *_label_text(release),
+        _TABLES,
+        *([_CAMERAS] if all(scene.mapping_cameras.is_file() for scene in release.scenes) else []),
+        "## Training",
+        _training_text(weights, training, record, shares),
+        _variant_table(weights, training),
+        *_learner_text(weights.parent),
+        "Validation metrics are those of the epoch kept, before the weights were rounded to half precision; the scores "
+        "above are of the weights as they ship.",
+        "## To make it again",
+        "```sh\n"
+        f"for stage in scenes map sample label; do wheretolook $stage --config configs/{source}.yaml; done\n"
+        f"rm {root}/weights/mlp-*  # matchability stays: it has learnt from matches, which a release does not hold\n"
+        f"wheretolook release --config configs/{source}.yaml   # tables and landmarks\n"
+        f"wheretolook train --config {config}   # what else ships: by the options under Training\n"
+        f"wheretolook release --config {config}   # chooses the weights, evaluates them, writes this page\n"
+        "```",
+        "## Licence",
+        _licence(about["settings"]["scenes"]),
+        "## Fingerprints",
+        markdown_table(
+            ["what", "fingerprint"],
+            [
+                ["dataset", release.fingerprint()],
+                ["its train and val scenes", training_fingerprint(release)],
+                [f"{source}, from which it was made", about["source_fingerprint"]],
+                *([f"weights/{path.name}, SHA-256", sha256(path)] for path in _weights(release)),
+            ],
+        ),
+        f"Version {about['code_version']} of the code. Sizes without text: {_size_text(release)}.",
+    ]
+    return "\n\n".join(part.strip("\n") for part in lines) + "\n"
+
+
+def _weights(release: Dataset) -> list[Path]:
+    """All weights that ship."""
+    return sorted((release.root / "weights").glob("*.safetensors"))
+
+
+def _names(release: Dataset) -> str:
+    names = [path.name for path in _weights(release)]
+    return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
+
+
+def _network(release: Dataset) -> Path:
+    """The weights of the paper's network."""
+    named = [release.root / "weights" / weights_name(variant) for variant in NETWORKS]
+    found = [path for path in _weights(release) if path in named]
+    if len(found) != 1:
+        raise WeightsError(
+            "a release ships the weights of one of the paper's networks", path=release.root / "weights",
+            value=[path.name for path in found], fix=f"Run `wheretolook release --config configs/{release.name}.yaml`.",
+        )  # fmt: skip
+    return found[0]
+
+
+def _label(variant: str) -> str:
+    """Name of a variant for people."""
+    return method_style(variant).label if variant in LEARNERS else method_style("mlp", variant).label
+
+
+def _demoted(markdown: str) -> str:
+    """The same text, its headings two levels lower."""
+    return re.sub(r"^#", "###", markdown, flags=re.MULTILINE)
+
+
+def _scenes_text(scenes: Mapping[str, Any]) -> str:
+    generated = scenes["train"] + scenes["val"] + scenes["test"]
+    parts = []
+    if generated:
+        first = scenes["seed"]
+        parts.append(f"{generated} generated apartments with seeds {first} to {first + generated - 1}")
+    if scenes["meshes"]:
+        parts.append(f"{len(scenes['meshes'])} meshes made by others")
+    return f"{' and '.join(parts).capitalize()}. A scene belongs to one split."
+
+
+def _label_table(release: Dataset, shares: pd.DataFrame) -> str:
+    landmarks = {scene: len(Landmarks.load(scene.landmarks)) for scene in release.scenes}
+    lines = []
+    for row in shares.to_dict("records"):
+        n_landmarks = sum(
+            n
+            for scene, n in landmarks.items()
+            if row["scene"] in (ALL, scene.name) and row["split"] in (ALL, scene.split)
+        )
+        counts = [f"{n:,}" for n in (n_landmarks, row["n_locations"], row["n_views"])]
+        lines.append([row["scene"], row["split"], *counts, *[f"{100 * row[column]:.1f}" for column in POSITIVE]])
+    limits = [threshold_label(threshold_key(threshold)) for threshold in THRESHOLDS]
+    return markdown_table(["scene", "split", "landmarks", "locations", "viewpoints", *limits], lines)
+
+
+def _changed_settings(settings: Mapping[str, Any]) -> str:
+    """Settings that differ from the defaults, as YAML."""
+    from wheretolook.config import Experiment
+
+    defaults = json.loads(json.dumps(asdict(Experiment()), default=str))
+    changed = _difference(settings, defaults)
+    return yaml.safe_dump(changed, sort_keys=False, default_flow_style=None, width=110)
+
+
+def _difference(values: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
+    changed = {}
+    for name, value in values.items():
+        default = defaults.get(name)
+        if isinstance(value, dict) and isinstance(default, dict):
+            value = _difference(value, default)
+            if value:
+                changed[name] = value
+        elif value != default:
+            changed[name] = value
+    return changed
+
+
+def _label_text(release: Dataset) -> list[str]:
+    """What localized the viewpoints, if the scenes say so."""
+    manifests = [_json(scene.label_manifest) for scene in release.scenes if scene.label_manifest.is_file()]
+    if not manifests:
+        return []
+    versions = {
+        package: " and ".join(sorted({manifest["versions"].get(package, "unknown") for manifest in manifests}))
+        for package in manifests[0]["versions"]
+    }
+    first = manifests[0]
+    return [
+        f"Keypoints: {_pairs(first['extractor'])}. Localizer: {_pairs(first['localizer'])}. Labelled with "
+        f"{_pairs(versions)}."
+    ]
+
+
+def _training_text(weights: Path, training: Mapping[str, Any], record: Mapping[str, Any], shares: pd.DataFrame) -> str:
+    config = training["config"]
+    n_views = {row["split"]: row["n_views"] for row in shares[shares["scene"] == ALL].to_dict("records")}
+    validated = (
+        f"validated on the {n_views['val']:,} of the val scenes"
+        if "val" in n_views
+        else f"{100 * config['val_fraction']:g} % of each scene's locations held out for validation"
+    )
+    return (
+        f"From the {n_views['train']:,} viewpoints of the train scenes, {validated}. Of the "
+        f"paper's networks {weights.name}, which ships, had the best validation average precision. Kept is epoch "
+        f"{record['metrics']['epoch'] + 1:.0f} of at most {config['epochs']}. "
+        f"Options: {_pairs({name: value for name, value in config.items() if name != 'epochs'})}."
+    )
+
+
+def _variant_table(weights: Path, training: Mapping[str, Any]) -> str:
+    """Validation metrics of the shipped network and of the others that were trained the same way."""
+    records = [_json(weights.with_suffix(".json"))]
+    for path in sorted((weights.parent / SHELF).glob("*.json")):
+        record = _json(path)
+        about = record["about"]
+        if about["variant"] != training["variant"] and {**about, "variant": training["variant"]} == training:
+            records.append(record)
+    names = [name for name in records[0]["metrics"] if name.startswith("val_")]
+    lines = [
+        [
+            _label(record["about"]["variant"]),
+            "yes" if number == 0 else "no",
+            f"{record['metrics']['epoch'] + 1:.0f}",
+            *[f"{record['metrics'].get(name, float('nan')):.4f}" for name in names],
+        ]
+        for number, record in enumerate(records)
+    ]
+    header = ["network", "ships", "epoch", *[name.removeprefix("val_").replace("_", " ") for name in names]]
+    return markdown_table(header, lines)
+
+
+def _learner_text(folder: Path) -> list[str]:
+    """Options and validation metrics of what was trained beside the paper's network, if anything was."""
+    from wheretolook.learning.weights import read_record
+
+    places = {True: folder, False: folder / SHELF}
+    records = [
+        (ships, read_record(place / weights_name(variant)))
+        for variant in LEARNERS
+        for ships, place in places.items()
+        if (place / weights_name(variant)).with_suffix(".json").is_file()
+    ]
+    if not records:
+        return []
+    lines = [
+        [
+            _label(record["about"]["variant"]),
+            "yes" if ships else "no",
+            *[f"{record['metrics'].get(f'val_{name}', float('nan')):.4f}" for name in _LEARNER_METRICS],
+        ]
+        for ships, record in records
+    ]
+    header = ["beside it", "ships", *[name.replace("_", " ") for name in _LEARNER_METRICS]]
+    options = [
+        f"{_label(variant)}: {_pairs(record['about']['config'][variant])}, seed {record['about']['config']['seed']}."
+        for ships, record in records
+        if ships and (variant := record["about"]["variant"]) in record["about"]["config"]
+    ]
+    further = [
+        f"{_label(record['about']['variant'])}: {', '.join(record['about']['also'])}."
+        for _, record in records
+        if record["about"].get("also")
+    ]
+    return [
+        "Learnt from the same viewpoints, with what is known of each landmark (matchability: whether the localizer "
+        "finds a landmark, from the stored matches; its metrics are of landmarks, not of viewpoints):",
+        markdown_table(header, lines),
+        "Options of those that ship. " + " ".join(options),
+        *(["From further datasets beside this one: " + " ".join(further)] if further else []),
+    ]
+
+
+_LEARNER_METRICS = ("average_precision", "roc_auc", "bce")
+
+
+def _licence(scenes: Mapping[str, Any]) -> str:
+    text = "Apache-2.0, as the project: tables, landmarks and weights."
+    if scenes["meshes"]:
+        names = ", ".join(mesh["name"] for mesh in scenes["meshes"])
+        text += f" Of scenes made by others ({names}) the licences of their meshes hold as well."
+    return text
+
+
+def _size_text(release: Dataset) -> str:
+    parts = sizes(release.root)
+    n_views = sum(len(scene.read_table()) for scene in release.scenes)
+    n_landmarks = sum(len(Landmarks.load(scene.landmarks)) for scene in release.scenes)
+    n_locations = sum(len(StoredOcclusion.load(scene.occlusion).locations) for scene in release.scenes)
+    return (
+        f"{size_text({name: size for name, size in parts.items() if size and name != 'text'})}; "
+        f"{parts['tables'] / n_views:.1f} bytes a viewpoint, {parts['landmarks'] / n_landmarks:.1f} a landmark, "
+        f"{parts['occlusion'] / n_locations:.0f} a location"
+    )
+
+
+def _pairs(values: Mapping[str, Any]) -> str:
+    return ", ".join(f"{name} {_value(value)}" for name, value in values.items())
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return " × ".join(map(str, value))
+    return "none" if value is None else str(value)
+
+
+def _json(path: Path) -> dict[str, Any]:
+    try:
+        return dict(json.loads(path.read_text()))
+    except (OSError, ValueError, TypeError) as error:
+        raise TableError(f"a description is missing or damaged: {error}", path=path, fix="Get it anew.") from error

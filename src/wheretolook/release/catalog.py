@@ -1,0 +1,406 @@
+"""Which figure or table of the paper is drawn from which logged run, and what to run where there is none.
+
+Another item is another entry of `ITEMS`: its name, what it is in the paper, the run and file that it needs, the command
+that makes that run, and a function from `Source` to a figure, or to texts by their files' endings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+import pandas as pd
+from matplotlib.figure import Figure
+
+from wheretolook.dataset.folders import Dataset
+from wheretolook.evaluation.calibration import read_calibration
+from wheretolook.evaluation.report import score_markdown
+from wheretolook.evaluation.results import CALIBRATION_CSV, SCORES_CSV
+from wheretolook.evaluation.scores import read_scores
+from wheretolook.figures.config import FiguresConfig
+from wheretolook.figures.style import save_figure
+from wheretolook.inputs.bins import PAPER_VARIANTS
+from wheretolook.learning.config import weights_name
+from wheretolook.learning.runs import HISTORY_CSV, histories
+from wheretolook.planning.path_report import PATHS_CSV
+from wheretolook.release.benchmark_runs import RUNTIMES_CSV, SCALING_CSV
+from wheretolook.release.copy import is_release, read_about
+from wheretolook.utils.errors import ConfigError, MissingRunError, WhereToLookError
+from wheretolook.utils.files import write_text
+from wheretolook.utils.markdown import markdown_table
+from wheretolook.utils.tracking import TrackingConfig, client, finished_runs
+
+if TYPE_CHECKING:
+    from mlflow.entities import Run
+
+    from wheretolook.methods.base import Scorer
+    from wheretolook.methods.mlp.score import LearnedScorer
+    from wheretolook.release.showcase import Showcase
+
+Texts = Mapping[str, str]
+"""A table: its text by the ending of its file, such as "md"."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """What an item is drawn from.
+
+    Attributes:
+        dataset: that the figures are about.
+        tracking: the store.
+        runs: those that the item needs, the newest of each kind; none for items that need no run.
+    """
+
+    dataset: Dataset
+    tracking: TrackingConfig
+    runs: tuple[Run, ...]
+
+    def file(self, name: str) -> Path:
+        """An artifact of the first run."""
+        return Path(self.runs[0].info.artifact_uri) / name
+
+    def scores(self) -> pd.DataFrame:
+        """The score table of an evaluation."""
+        return read_scores(self.file(SCORES_CSV))
+
+
+@dataclass(frozen=True)
+class Item:
+    """A figure or a table.
+
+    Attributes:
+        name: of its files.
+        paper: what it is in the paper, such as "Table 2"; "" if the paper has none.
+        what: it shows, in a few words.
+        notebook: that shows it.
+        draw: makes it.
+        stage: tag of the run that it needs; "" for none.
+        file: artifact that the run must have.
+        command: makes such a run; {config} stands for the dataset's configuration, {source} for that of the dataset
+            with meshes: of a release, the one that it was copied from.
+        params: parameters that the run must have; "{dataset}" stands for the dataset's name.
+        of_release: whether only a release has it: it shows a scene made anew from its seed, or other datasets' results.
+        of_source: whether a run of the dataset that a release was copied from serves, too.
+    """
+
+    name: str
+    paper: str
+    what: str
+    notebook: str
+    draw: Callable[[Source], Figure | Texts]
+    stage: str = "evaluate"
+    file: str = SCORES_CSV
+    command: str = "wheretolook evaluate --config {config}"
+    params: tuple[tuple[str, str], ...] = (("dataset", "{dataset}"),)
+    of_release: bool = False
+    of_source: bool = False
+
+    def runs(self, dataset: Dataset, tracking: TrackingConfig) -> tuple[Run, ...]:
+        """The newest run of those that it can be drawn from; of train runs the newest of each variant."""
+        found: dict[str, Run] = {}
+        for name in (dataset.name, *([_source_of(dataset)] if self.of_source else [])):
+            params = {key: value.format(dataset=name) for key, value in self.params}
+            for run in finished_runs(tracking, self.stage, params=params, file=self.file) if self.stage else ():
+                found.setdefault(run.data.params.get("variant", ""), run)
+        return tuple(found.values())
+
+    def command_for(self, dataset: Dataset) -> str:
+        """What to run to make what is missing."""
+        return self.command.format(config=f"configs/{dataset.name}.yaml", source=f"configs/{_source_of(dataset)}.yaml")
+
+
+def _source_of(dataset: Dataset) -> str:
+    """Name of the dataset that a release was copied from; of another, its own."""
+    return str(read_about(dataset)["source"]) if is_release(dataset) else dataset.name
+
+
+def _scores(source: Source) -> Figure:
+    from wheretolook.figures.scores import score_figure
+
+    return score_figure(source.scores())
+
+
+def _score_table(source: Source) -> Texts:
+    scores = source.scores()
+    return {"md": score_markdown(scores), "csv": scores.to_csv(index=False)}
+
+
+def _regret(source: Source) -> Figure:
+    from wheretolook.figures.scores import regret_figure
+
+    return regret_figure(source.scores())
+
+
+def _occlusion(source: Source) -> Figure:
+    from wheretolook.figures.occlusion import occlusion_figure
+
+    return occlusion_figure(source.scores())
+
+
+def _top_n(source: Source) -> Figure:
+    from wheretolook.figures.top_n import top_n_figure
+
+    return top_n_figure(source.scores())
+
+
+def _calibration(source: Source) -> Figure:
+    from wheretolook.figures.calibration import calibration_figure
+
+    return calibration_figure(read_calibration(source.file(CALIBRATION_CSV)))
+
+
+def _training(source: Source) -> Figure:
+    from wheretolook.figures.training import training_figure
+
+    return training_figure(histories(source.tracking, source.dataset.name))
+
+
+def _architecture(source: Source) -> Texts:
+    from wheretolook.release.paper_architecture import paper_architecture_table
+
+    by_variant = {run.data.params["variant"]: run.data.params for run in source.runs}
+    networks = [by_variant[variant] for variant in reversed(PAPER_VARIANTS) if variant in by_variant]
+    if not networks:
+        raise MissingRunError("none of the paper's networks was trained")
+    table = paper_architecture_table(networks[0])  # that of most inputs, the paper's proposal
+    return {
+        "md": markdown_table(list(table.columns), table.to_numpy().tolist()) + "\n",
+        "csv": table.to_csv(index=False),
+        "tex": table.to_latex(index=False),
+    }
+
+
+def _paper_table(name: str) -> Callable[[Source], Texts]:
+    return lambda source: {ending: source.file(f"table_{name}.{ending}").read_text() for ending in ("md", "csv", "tex")}
+
+
+def _paths(source: Source) -> Figure:
+    from wheretolook.figures.paths import paths_figure
+
+    return paths_figure(pd.read_csv(source.file(PATHS_CSV)))
+
+
+def _runtimes(source: Source) -> Figure:
+    from wheretolook.figures.runtimes import runtime_figure
+
+    return runtime_figure(pd.read_csv(source.file(RUNTIMES_CSV)))
+
+
+def _scaling(source: Source) -> Figure:
+    from wheretolook.figures.runtimes import scaling_figure
+
+    return scaling_figure(pd.read_csv(source.file(SCALING_CSV)))
+
+
+def _lattices(source: Source) -> Figure:
+    from wheretolook.figures.lattices import fibonacci_figure
+
+    return fibonacci_figure()
+
+
+@lru_cache(maxsize=1)
+def _showcase(root: Path) -> Showcase:
+    from wheretolook.release.showcase import open_showcase
+
+    return open_showcase(Dataset.load(root))
+
+
+def _shown(source: Source, weights: str = "") -> tuple[Showcase, Scorer, int]:
+    """The first test scene of a release, a scorer of it, and a place where looking matters."""
+    from wheretolook.methods.registry import load_scorer
+
+    showcase = _showcase(source.dataset.root)
+    scorer = load_scorer(source.dataset.root / "weights" / weights, showcase.localization_map)
+    return showcase, scorer, showcase.instructive_location()
+
+
+def _pipeline(source: Source) -> Figure:
+    from wheretolook.figures.pipeline import pipeline_figure
+    from wheretolook.release.showcase_figures import pipeline_of
+
+    return pipeline_figure(pipeline_of(*_shown(source)))
+
+
+def _learning(source: Source) -> Figure:
+    from wheretolook.figures.learning import learning_figure
+    from wheretolook.release.showcase_figures import learning_of
+
+    showcase, scorer, location = _shown(source, weights_name("2d+z"))
+    return learning_figure(*learning_of(showcase, cast("LearnedScorer", scorer), location).drawn)
+
+
+def _sampling(source: Source) -> Figure:
+    from wheretolook.figures.sampling import sampling_figure
+    from wheretolook.release.showcase_figures import sampling_of
+
+    showcase = _showcase(source.dataset.root)
+    return sampling_figure(sampling_of(showcase, showcase.instructive_location()))
+
+
+def _inputs(source: Source) -> Figure:
+    from wheretolook.figures.inputs import inputs_figure
+    from wheretolook.release.showcase_figures import learning_of
+
+    showcase, scorer, location = _shown(source, weights_name("2d+z"))
+    return inputs_figure(learning_of(showcase, cast("LearnedScorer", scorer), location).image)
+
+
+def _peaks(source: Source) -> Figure:
+    from wheretolook.figures.peaks import peaks_figure
+    from wheretolook.release.showcase_figures import peaks_of
+
+    return peaks_figure(*peaks_of(*_shown(source)).drawn)
+
+
+def _planning(source: Source) -> Figure:
+    from wheretolook.figures.path_film import methods_figure
+    from wheretolook.release.showcase_figures import planned_views
+
+    showcase = _showcase(source.dataset.root)
+    return methods_figure(planned_views(showcase, source.dataset), showcase.localization_map.landmarks.points)
+
+
+_TRAIN = "wheretolook train --config {config}"
+_BENCH = "python tests/benchmarks/bench_visibility.py{} --out cpu.json && python tests/benchmarks/bench_visibility.py" \
+    " --draw cpu.json --log"  # fmt: skip
+_LOG_RELEASE = "wheretolook log-release --config {config}"
+_OTHERS = (("dataset", "interiors"),)
+
+_SET, _PAPERS, _WIDEST = ((("dataset", "{dataset}"), ("variant", variant)) for variant in ("set", "2d+z", "2d+3d"))
+_TRAIN_SET, _TRAIN_WIDEST = (
+    "wheretolook train --config configs/release-set.yaml",
+    f"{_TRAIN} --train.variants '[2d+3d]'",
+)
+
+ITEMS: tuple[Item, ...] = (
+    Item("pipeline", "Fig. 1", "from a map to the camera that is turned", "01_pipeline", _pipeline, "train", "",
+         _TRAIN_SET, _SET, of_release=True),
+    Item("learning", "Fig. 2", "a view on its way through the network", "03_inputs", _learning, "train", "", _TRAIN,
+         _PAPERS, of_release=True),
+    Item("viewpoint_generation", "Fig. 3", "voxels, directions, occlusion", "02_sampling", _sampling, "", "",
+         _LOG_RELEASE, of_release=True),
+    Item("spherical_sampling", "Fig. 4", "lattices of directions", "02_sampling", _lattices, "", ""),
+    Item("architecture", "Table 1", "layers of the network", "04_training", _architecture, "train", "", _TRAIN_WIDEST,
+         _WIDEST),
+    Item("table_vs_others", "Table 2", "all methods", "05_tables", _paper_table("vs_others"),
+         file="table_vs_others.md"),
+    Item("planning", "Fig. 5", "the same way by three methods", "07_planning", _planning, "train", "", _TRAIN_SET,
+         _SET, of_release=True),
+    Item("paths", "Fig. 5", "planned paths that localize", "07_planning", _paths, "paths", PATHS_CSV,
+         "wheretolook compare-paths --config {source}", of_source=True),
+    Item("runtimes", "Fig. 6", "times of the visibility check", "08_runtimes", _runtimes, "benchmark", RUNTIMES_CSV,
+         _BENCH.format(""), ()),
+    Item("table_input_variants", "Table 3", "inputs of the network", "05_tables", _paper_table("input_variants"),
+         file="table_input_variants.md"),
+    Item("top_n", "Fig. 7", "several viewpoints of a location", "06_top_n", _top_n),
+    Item("inputs", "", "from an image to an input", "03_inputs", _inputs, "train", "", _TRAIN, _PAPERS,
+         of_release=True),
+    Item("peaks", "", "what the network looks at", "04_training", _peaks, "train", "", _TRAIN_SET, _SET,
+         of_release=True),
+    Item("training", "", "learning curves", "04_training", _training, "train", HISTORY_CSV, _TRAIN),
+    Item("calibration", "", "whether probabilities mean what they say", "04_training", _calibration,
+         file=CALIBRATION_CSV),
+    Item("scores", "", "all methods at all thresholds", "05_tables", _scores),
+    Item("score_table", "", "all that an evaluation tells", "05_tables", _score_table),
+    Item("regret", "", "what each method loses", "05_tables", _regret),
+    Item("occlusion", "", "what seeing through walls changes", "05_tables", _occlusion),
+    Item("regret_interiors", "", "what each loses on scenes by others", "05_tables", _regret, command=_LOG_RELEASE,
+         params=_OTHERS, of_release=True),
+    Item("visibility_scaling", "", "how time and memory grow", "08_runtimes", _scaling, "benchmark", SCALING_CSV,
+         _BENCH.format(" --scaling"), ()),
+)  # fmt: skip
+"""The paper's in its order, then those that it has none of."""
+
+
+def catalog_text() -> str:
+    """The catalog for people: name, paper's item, what it shows, notebook, stage of its run."""
+    rows = [[item.name, item.paper or "–", item.what, item.notebook, item.stage or "–"] for item in ITEMS]
+    return markdown_table(["name", "paper", "shows", "notebook", "run"], rows)
+
+
+def draw_item(item: Item, dataset: Dataset, tracking: TrackingConfig) -> tuple[Figure | Texts, tuple[str, ...]] | None:
+    """An item and the ids of the runs it was drawn from; None if the store has no such run."""
+    source = Source(dataset, tracking, item.runs(dataset, tracking))
+    if item.stage and not source.runs:
+        return None
+    return item.draw(source), tuple(run.info.run_id for run in source.runs)
+
+
+def check_names(config: FiguresConfig) -> None:
+    """Check that there are all the items that are asked for.
+
+    Raises:
+        ConfigError: there is no item of such a name.
+    """
+    unknown = set(config.only) - {item.name for item in ITEMS}
+    if unknown:
+        raise ConfigError("unknown figure", value=sorted(unknown), fix="`wheretolook figures --list` names them.")
+
+
+def write_items(
+    dataset: Dataset, tracking: TrackingConfig, config: FiguresConfig = FiguresConfig(),
+    say: Callable[[str], None] = print,
+) -> dict[str, str]:  # fmt: skip
+    """Write all items, those of a figure as several kinds of files, and attach them to their runs.
+
+    The files tell the runs that they were drawn from: figures in their metadata (`wheretolook.figures.style.note_of`),
+    Markdown and TeX in a comment.
+
+    Args:
+        dataset: that the figures are about.
+        tracking: the store.
+        config: options.
+        say: told what was written, and what is missing.
+
+    Returns:
+        For each item that could not be made, the command to run first.
+
+    Raises:
+        ConfigError: there is no item of such a name.
+    """
+    check_names(config)
+    out, missing = config.out or dataset.root / "results" / "figures", {}
+    for item in ITEMS:
+        if config.only and item.name not in config.only:
+            continue
+        if item.of_release and not is_release(dataset):
+            if item.name in config.only:
+                missing[item.name] = "wheretolook figures --config configs/release.yaml"
+            say(f"{item.name}: only releases have it")
+            continue
+        reason = "no such run"
+        try:
+            drawn = draw_item(item, dataset, tracking)
+        except WhereToLookError as error:
+            drawn, reason = None, str(error)
+        if drawn is None and reason != "no such run":
+            missing[item.name] = reason
+            say(f"{item.name}: {reason}")
+            continue
+        if drawn is None:
+            missing[item.name] = item.command_for(dataset)
+            say(f"{item.name}: {reason}; first: {missing[item.name]}")
+            continue
+        content, ids = drawn
+        files = _write(item.name, content, f"runs: {', '.join(ids)} ({item.stage})" if ids else "", out, config.kinds)
+        for run_id in ids:
+            for file in files:
+                client(tracking).log_artifact(run_id, str(file), "figures")
+        say(f"{item.name}: -> {', '.join(str(file) for file in files)}")
+    return missing
+
+
+def _write(name: str, content: Figure | Texts, note: str, out: Path, kinds: tuple[str, ...]) -> list[Path]:
+    if isinstance(content, Figure):
+        files = [out / f"{name}.{kind}" for kind in kinds]
+        for file in files:
+            save_figure(content, file, note)
+        return files
+    out.mkdir(parents=True, exist_ok=True)
+    comments = {"md": f"\n<!-- {note} -->\n", "tex": f"% {note}\n"} if note else {}
+    for ending, text in content.items():
+        write_text(out / f"{name}.{ending}", text + comments.get(ending, ""))
+    return [out / f"{name}.{ending}" for ending in content]

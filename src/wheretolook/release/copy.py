@@ -1,0 +1,263 @@
+"""A release: a labelled dataset small enough to travel with the code, weights trained on it, and a card about both.
+
+A release is a dataset folder of its own. It has neither meshes nor COLMAP models nor descriptors, so it cannot be
+labelled anew, but it is read, trained on and evaluated as any other.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from wheretolook.dataset.folders import Dataset, SceneFolder
+from wheretolook.learning.config import MATCHABILITY, NETWORKS, RELEASED, VARIANTS, weights_name
+from wheretolook.mapping.cameras import CAMERAS_FILE, save_mapping_poses
+from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.utils.errors import ConfigError, StorageError, TableError, WeightsError
+from wheretolook.utils.files import sha256, write_json
+from wheretolook.utils.version import VERSION
+from wheretolook.viewpoints.table import write_table
+from wheretolook.visibility.occlusion import StoredOcclusion
+
+if TYPE_CHECKING:
+    from wheretolook.config import Experiment
+
+ABOUT = "release.json"
+"""What a release was made from; the file that makes a dataset one."""
+
+CARD = "README.md"
+
+SHELF = "others"
+"""Folder beside the shipped weights for those of other variants. Only their records ship."""
+
+MAX_BYTES = 16_000_000
+"""A release is smaller than this."""
+
+
+def is_release(dataset: Dataset) -> bool:
+    """Whether a dataset is a release."""
+    return (dataset.root / ABOUT).is_file()
+
+
+def copy_dataset(dataset: Dataset, experiment: Experiment) -> Dataset:
+    """Write a compact copy of a labelled dataset to `<data>/<release_name>/`. The same dataset gives the same bytes.
+
+    Tables are written compact (`viewpoints.table.COMPACT_SCHEMA`), without matches, landmarks without descriptors and
+    in half precision, the mapping images' poses if they are known, and what labels were made with without the list of
+    shards. Weights and results that lie there
+    stay; the card and the scores of networks that do not ship go if the data changed.
+
+    Args:
+        dataset: what to copy.
+        experiment: the settings it was made with, and the folder of all datasets.
+
+    Returns:
+        The copy.
+
+    Raises:
+        ConfigError: the release's folder holds another dataset, or a release of another one.
+        TableError, MapError: a scene's table, landmarks or occlusion are missing or damaged.
+    """
+    root = experiment.data / experiment.release_name
+    before = _release_of(root, dataset.name)
+    fingerprint = None if before is None else before.fingerprint()
+    copied = [(scene, SceneFolder(root / scene.name, scene.split)) for scene in dataset.scenes]
+    for scene, copy in copied:
+        copy.map.mkdir(parents=True, exist_ok=True)
+        write_table(scene.read_table(), copy.table, compact=True)
+        Landmarks.load(scene.landmarks).save(copy.landmarks, compact=True)
+        StoredOcclusion.load(scene.occlusion).save(copy.occlusion)
+        if (mapping_poses := scene.mapping_poses()) is None:
+            copy.mapping_cameras.unlink(missing_ok=True)
+        else:
+            save_mapping_poses(mapping_poses, copy.mapping_cameras)
+        copy.label_manifest.unlink(missing_ok=True)
+        if scene.label_manifest.is_file():
+            write_json(copy.label_manifest, _manifest(scene.label_manifest))
+    about = {
+        "source": dataset.name,
+        "source_fingerprint": dataset.fingerprint(),
+        "code_version": VERSION,
+        "settings": _settings(experiment),
+    }
+    write_json(root / ABOUT, about)
+    release = Dataset(root, dataset.camera, tuple(copy for _, copy in copied))
+    release.save()
+    if before is not None:
+        for scene in before.scenes:
+            if scene.name not in {copy.name for copy in release.scenes}:
+                shutil.rmtree(scene.folder, ignore_errors=True)
+    if release.fingerprint() != fingerprint:
+        for outdated in (CARD, "results/variants.csv"):
+            (root / outdated).unlink(missing_ok=True)
+    return release
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What of the weights in a release's folder ships.
+
+    Attributes:
+        network: the paper's network with the inputs of the best validation average precision.
+        best: the weights with the best one of all, which a user gets who names none; may be the network.
+        shelved: the rest.
+        precision: validation average precision of all by their file's name without its ending.
+    """
+
+    network: Path
+    best: Path
+    shelved: tuple[Path, ...]
+    precision: dict[str, float]
+
+
+def trained_weights(release: Dataset) -> list[Path]:
+    """Weights in a release's folder, one for each variant trained but matchability, which is no scorer by itself."""
+    named = (release.root / "weights" / weights_name(variant) for variant in VARIANTS if variant != MATCHABILITY)
+    return [path for path in named if path.is_file()]
+
+
+def choose_weights_to_ship(release: Dataset) -> Choice:
+    """Choose by the best validation average precision.
+
+    Raises:
+        WeightsError: there are no weights of the paper's network, or weights or their record do not fit the release.
+    """
+    from wheretolook.learning.provenance import was_trained_on
+    from wheretolook.learning.weights import read_record, read_training
+
+    folder = release.root / "weights"
+    fix = f"Run `wheretolook train --config configs/{release.name}.yaml`."
+    precision: dict[Path, float] = {}
+    for path in trained_weights(release):
+        record, training = read_record(path), read_training(path)
+        if record["about"] != training or not was_trained_on(release, training):
+            raise WeightsError("these weights were not trained on this release", path=path, fix=fix)
+        precision[path] = float(record["metrics"]["val_average_precision"])
+    if not precision:
+        raise WeightsError("there are no weights to ship", path=folder, fix=fix)
+    networks = [folder / weights_name(variant) for variant in NETWORKS if variant != RELEASED]  # to compare with
+    networks = [path for path in networks if path in precision]
+    if not networks:
+        raise WeightsError("there are no weights to ship of the paper's network", path=folder, fix=fix)
+    network = max(networks, key=lambda path: precision[path])
+    best = max(
+        (path for path in precision if path == network or path not in [folder / weights_name(v) for v in NETWORKS]),
+        key=lambda path: precision[path],
+    )
+    shelved = tuple(path for path in precision if path not in (network, best))
+    return Choice(network, best, shelved, {path.stem: value for path, value in precision.items()})
+
+
+def ship_weights(release: Dataset) -> Choice:
+    """Choose what ships; store the weights of the paper's network in half precision, put the rest on the shelf.
+
+    The shelf is `weights/others/`, where no evaluation finds them. A matchability model stays where it is: methods that
+    weight landmarks need it. Done again, nothing changes.
+
+    Raises:
+        WeightsError: as `choose_weights_to_ship`.
+    """
+    from wheretolook.learning.weights import read_record, read_training
+    from wheretolook.methods.mlp.weights import load_classifier, save_classifier
+
+    choice, folder = choose_weights_to_ship(release), release.root / "weights"
+    for path in choice.shelved:
+        (folder / SHELF).mkdir(exist_ok=True)
+        for file in (path, path.with_suffix(".json")):
+            os.replace(file, folder / SHELF / file.name)
+    record = read_record(choice.network)
+    save_classifier(load_classifier(choice.network).half(), choice.network, read_training(choice.network))
+    write_json(choice.network.with_suffix(".json"), {**record, "weights_sha256": sha256(choice.network)})
+    return choice
+
+
+def sizes(root: Path, weights: bool = True) -> dict[str, int]:
+    """Bytes of what ships of a release, by kind of file. Figures and shelved weights do not ship.
+
+    Args:
+        root: folder of the release.
+        weights: whether to count the weights; before they are chosen there may be several.
+
+    Raises:
+        StorageError: it is not smaller than `MAX_BYTES`.
+    """
+    kinds = {
+        "viewpoints.parquet": "tables", "landmarks.npz": "landmarks", CAMERAS_FILE: "cameras",
+        "occlusion.npz": "occlusion",
+    }  # fmt: skip
+    parts = dict.fromkeys((*kinds.values(), "weights", "text"), 0)
+    for path in root.rglob("*"):
+        shelved = path.suffix == ".safetensors" and (path.parent.name == SHELF or not weights)
+        drawn = path.suffix in (".png", ".partial") or path.parent == root / "results" / "figures"
+        if path.is_file() and not shelved and not drawn:
+            parts["weights" if path.suffix == ".safetensors" else kinds.get(path.name, "text")] += path.stat().st_size
+    if sum(parts.values()) >= MAX_BYTES:
+        raise StorageError(
+            f"the release is not smaller than {MAX_BYTES / 1e6:.0f} MB", path=root, value=size_text(parts),
+            fix="Label fewer viewpoints or scenes, or map with fewer landmarks.",
+        )  # fmt: skip
+    return parts
+
+
+def size_text(parts: Mapping[str, int]) -> str:
+    """Sizes for people: "tables 4.81 MB, ..., in all 13.20 MB"."""
+    return ", ".join(f"{name} {size / 1e6:.2f} MB" for name, size in {**parts, "in all": sum(parts.values())}.items())
+
+
+def read_about(release: Dataset) -> dict[str, Any]:
+    """What a release was made from: source, source_fingerprint, code_version and settings.
+
+    Raises:
+        ConfigError: the file is missing or damaged.
+    """
+    path = release.root / ABOUT
+    try:
+        about = dict(json.loads(path.read_text()))
+        return {name: about[name] for name in ("source", "source_fingerprint", "code_version", "settings")}
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise ConfigError(
+            f"not the description of a release: {error}", path=path, fix="Run `wheretolook release` on its source."
+        ) from error
+
+
+def _release_of(root: Path, source: str) -> Dataset | None:
+    """The release that lies at `root`, which must be of the same source; None if there is nothing yet."""
+    if not (root / "dataset.json").is_file():
+        return None
+    release, fix = Dataset.load(root), "Move it elsewhere first."
+    if not is_release(release):
+        raise ConfigError("this dataset is no release and would be overwritten", path=root, fix=fix)
+    found = read_about(release)["source"]
+    if found != source:
+        raise ConfigError(f"here lies the release of another dataset than {source}", path=root, value=found, fix=fix)
+    return release
+
+
+def _manifest(path: Path) -> dict[str, Any]:
+    """What labels were made with, but for the shards, of which there are thousands, and the matches, which stay."""
+    try:
+        content = json.loads(path.read_text())
+        return {name: value for name, value in content.items() if name not in ("shards", "store_matches")}
+    except (ValueError, AttributeError) as error:
+        raise TableError(
+            f"not what the label stage wrote: {error}", path=path, fix="Remove it, or label the scene again."
+        ) from error
+
+
+def _settings(experiment: Experiment) -> dict[str, Any]:
+    """Settings that decide what a dataset holds, as JSON values. Meshes go by name: paths mean nothing elsewhere."""
+    meshes = [{"name": mesh.scene_name, "split": mesh.split, "up": mesh.up} for mesh in experiment.scenes.meshes]
+    settings = {
+        "camera": asdict(experiment.camera),
+        "scenes": {**asdict(experiment.scenes), "meshes": meshes},
+        "map": asdict(experiment.map),
+        "occlusion": asdict(experiment.occlusion),
+        "sample": asdict(experiment.sample),
+        "label": {"localizer": asdict(experiment.label.localizer)},
+    }
+    return dict(json.loads(json.dumps(settings, default=str)))

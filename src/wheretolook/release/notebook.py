@@ -1,0 +1,52 @@
+"""Where notebooks find the release and the tracking store, from whichever folder they are opened in."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from wheretolook.dataset.folders import RELEASE, Dataset
+from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.tracking import TrackingConfig
+
+RELEASE_VARIABLE, STORE_VARIABLE = "WHERETOLOOK_RELEASE", "WHERETOLOOK_MLRUNS"
+"""Environment variables that name the folders of a release and of a store, instead of the ones that are found."""
+
+
+def open_release() -> Dataset:
+    """The dataset that ships: the folder that `WHERETOLOOK_RELEASE` names, or the nearest `data/release` upwards.
+
+    Raises:
+        ConfigError: there is none. TableError: it is damaged.
+    """
+    here, named = Path.cwd(), os.environ.get(RELEASE_VARIABLE)
+    places = [Path(named)] if named else [folder / "data" / RELEASE for folder in (here, *here.parents)]
+    for place in places:
+        if (place / "dataset.json").is_file():
+            return Dataset.load(place)
+    fix = f"Open the notebook inside a checkout, or name its folder in {RELEASE_VARIABLE}."
+    raise ConfigError("there is no release here or in a folder above", path=places[0], fix=fix)
+
+
+def find_store() -> TrackingConfig:
+    """The store that `WHERETOLOOK_MLRUNS` names, or the nearest `mlruns` upwards, be it empty."""
+    here, named = Path.cwd(), os.environ.get(STORE_VARIABLE)
+    folders = [folder / "mlruns" for folder in (here, *here.parents)]
+    nearest = next((folder for folder in folders if folder.is_dir()), folders[0])
+    return TrackingConfig(named or str(nearest))
+
+
+def open_store(release: Dataset | None = None) -> TrackingConfig:
+    """The store of `find_store` with the runs of a release in it: logged now if it lacks them, which takes seconds.
+
+    Args:
+        release: that of `open_release` if not given.
+
+    Raises:
+        ConfigError: there is no release. TableError: it is damaged.
+    """
+    from wheretolook.release.runs import log_release
+
+    tracking = find_store()
+    log_release(open_release() if release is None else release, tracking, print)
+    return tracking

@@ -1,0 +1,249 @@
+"""What a release holds as MLflow runs: notebooks, figures and MLflow's UI then work on a fresh clone at once.
+
+A release ships the tables of its evaluation, the records of its training and what studies found, but no MLflow store.
+Here they are logged as the stages log them, once: a run with the same file as its artifact is found again.
+"""
+
+from __future__ import annotations
+
+import fcntl
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import pandas as pd
+
+from wheretolook.dataset.folders import Dataset
+from wheretolook.evaluation.results import SCORES_CSV, evaluation_params, runs_of_rows
+from wheretolook.evaluation.scores import read_scores
+from wheretolook.learning.config import VARIANTS, weights_name
+from wheretolook.learning.runs import HISTORY_CSV, TRAINING_CSV, log_history, params_of, records
+from wheretolook.planning.path_report import PATHS_CSV, log_paths
+from wheretolook.release.benchmark_runs import RUNTIMES_CSV, SCALING_CSV, log_runtimes
+from wheretolook.release.card import GENERALIZATION_CSV
+from wheretolook.utils.tracking import NestedRun, TrackingConfig, client, finished_runs, log, log_nested, start_run
+from wheretolook.viewpoints.table import UNLABELLED, is_good
+from wheretolook.viewpoints.thresholds import ALL
+
+LEARNERS_CSV = "learners.csv"
+"""In a release's `results/`: how all learners do on scenes of validation, test and others, a row for each seed."""
+
+TAGS = {"logged_from": "release"}
+"""Of runs that were not computed where they are logged."""
+
+Say = Callable[[str], None]
+
+
+@dataclass
+class ReleaseRuns:
+    """Ids of the runs of a release in a store.
+
+    Attributes:
+        evaluate: by the dataset evaluated on, the release first.
+        train: by the variant.
+        learners: the comparison of learners; None if the release has none, as with what follows.
+        paths: planned paths.
+        benchmark: measured times.
+        new: how many of all these were logged now.
+    """
+
+    evaluate: dict[str, str] = field(default_factory=dict)
+    train: dict[str, str] = field(default_factory=dict)
+    learners: str | None = None
+    paths: str | None = None
+    benchmark: str | None = None
+    new: int = 0
+
+
+def log_release(dataset: Dataset, tracking: TrackingConfig, say: Say = lambda text: None) -> ReleaseRuns:
+    """Log what a release holds, as far as the store does not have it yet.
+
+    What an earlier call left half done, because it was killed, is deleted first; of several calls at once one waits for
+    the other.
+
+    Args:
+        dataset: a release with its results.
+        tracking: the store; made if there is none.
+        say: told what was logged.
+
+    Returns:
+        The runs, those found again too.
+    """
+    with _alone(tracking):
+        _forget_halves(tracking)
+        return _log_missing(dataset, tracking, say)
+
+
+@contextmanager
+def _alone(tracking: TrackingConfig) -> Iterator[None]:
+    """While another process logs a release into the store, wait."""
+    tracking.root.mkdir(parents=True, exist_ok=True)
+    with open(tracking.root / ".release.lock", "w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def _forget_halves(tracking: TrackingConfig) -> None:
+    """Delete runs that were being logged from a release when something ended it, and those nested in them."""
+    mlflow = client(tracking)
+    experiment = mlflow.get_experiment_by_name(tracking.experiment)
+    if experiment is None:
+        return
+
+    def matching(condition: str) -> list[str]:
+        found = mlflow.search_runs([experiment.experiment_id], condition, max_results=10_000)
+        return [str(run.info.run_id) for run in found]
+
+    tagged = " and ".join(f"tags.{name} = '{value}'" for name, value in TAGS.items())
+    for half in matching(f"{tagged} and attributes.status != 'FINISHED'"):
+        for run_id in (*matching(f"tags.`mlflow.parentRunId` = '{half}'"), half):
+            mlflow.delete_run(run_id)
+
+
+def _log_missing(dataset: Dataset, tracking: TrackingConfig, say: Say) -> ReleaseRuns:
+    runs, results = ReleaseRuns(), dataset.root / "results"
+
+    def keep(name: str, found: str | None, make: Callable[..., str], *arguments: Any) -> str:
+        if found is not None:
+            return found
+        say(f"logging {name}")
+        runs.new += 1
+        return make(*arguments, tracking)
+
+    if (scores := results / SCORES_CSV).is_file():
+        found = _found(tracking, "evaluate", SCORES_CSV, scores.read_bytes())
+        runs.evaluate[dataset.name] = keep("the evaluation", found, _log_scores, dataset)
+    if (others := results / GENERALIZATION_CSV).is_file():
+        for key, rows in read_scores(others).groupby("dataset", sort=False):
+            name, table = str(key), rows.drop(columns=["dataset", "weights_sha256"]).reset_index(drop=True)
+            found = _found(tracking, "evaluate", SCORES_CSV, table.to_csv(index=False).encode())
+            runs.evaluate[name] = keep(f"the evaluation on {name}", found, _log_others, name, table, dataset)
+    training = results / TRAINING_CSV
+    histories = dict(iter(pd.read_csv(training).groupby("variant"))) if training.is_file() else {}
+    for path, record in records(dataset.root / "weights").items():
+        variant = record["about"]["variant"]
+        history = histories.get(variant)
+        found = _train_run(tracking, path, record, history is not None)
+        runs.train[variant] = keep(f"the training of {variant}", found, _log_training, path, record, history)
+    for file, stage, log_file in (
+        (LEARNERS_CSV, "learners", _log_learners),
+        (PATHS_CSV, "paths", _log_paths),
+        (RUNTIMES_CSV, "benchmark", _log_benchmark),
+    ):
+        if (results / file).is_file():
+            found = _found(tracking, stage, file, (results / file).read_bytes())
+            setattr(runs, stage, keep(file, found, log_file, dataset))
+    return runs
+
+
+def _found(tracking: TrackingConfig, stage: str, name: str, content: bytes) -> str | None:
+    """Id of the newest run of a stage that has this file as an artifact."""
+    for run in finished_runs(tracking, stage, file=name):
+        if (Path(run.info.artifact_uri) / name).read_bytes() == content:
+            return str(run.info.run_id)
+    return None
+
+
+def _train_run(tracking: TrackingConfig, path: Path, record: dict[str, Any], with_history: bool) -> str | None:
+    """The run that trained these weights, or the one that was logged from their record."""
+    variant = record["about"]["variant"]
+    for run in finished_runs(tracking, "train", params={"variant": variant}, file=HISTORY_CSV if with_history else ""):
+        logged = Path(run.info.artifact_uri) / path.name
+        if run.info.run_id == record["run_id"] or (logged.is_file() and logged.read_bytes() == path.read_bytes()):
+            return str(run.info.run_id)
+    return None
+
+
+def _log_scores(dataset: Dataset, tracking: TrackingConfig) -> str:
+    """The evaluation on the release's own test scenes, as `wheretolook evaluate` logs it, but for single locations."""
+    results, scenes = dataset.root / "results", dataset.split("test")
+    table = read_scores(results / SCORES_CSV)
+    named = (dataset.root / "weights" / weights_name(variant) for variant in VARIANTS)
+    params = {**evaluation_params(dataset, scenes, [path for path in named if path.is_file()]), **_choices(table)}
+    views = pd.concat([scene.read_table() for scene in scenes])
+    views = views[views["status"] != UNLABELLED]
+    metrics = {"n_views": float(len(views)), "positives": float(is_good(views).mean())}
+    files = [path for path in results.iterdir() if path.is_file() and path.suffix != ".png"]
+    return _log_evaluation(dataset.name, table, params, metrics, files, tracking)
+
+
+def _log_others(name: str, table: pd.DataFrame, dataset: Dataset, tracking: TrackingConfig) -> str:
+    """An evaluation on another dataset, which does not ship."""
+    scenes = " ".join(scene for scene in table["scene"].unique() if scene != ALL)
+    params = {"dataset": name, "scenes": scenes, "weights": f"of {dataset.name}", **_choices(table)}
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / SCORES_CSV
+        path.write_bytes(table.to_csv(index=False).encode())
+        return _log_evaluation(name, table, params, {}, [path], tracking)
+
+
+def _choices(table: pd.DataFrame) -> dict[str, Any]:
+    """What of an evaluation's options its table tells."""
+    return {name: tuple(table[name].unique().tolist()) for name in ("top_n", "occlusion", "candidates")} | {
+        "reference": table["reference"].iloc[0]
+    }
+
+
+def _log_evaluation(
+    name: str, table: pd.DataFrame, params: dict[str, Any], metrics: dict[str, float], files: list[Path],
+    tracking: TrackingConfig,
+) -> str:  # fmt: skip
+    tags = {**TAGS, "dataset": name}
+    metrics |= {"n_locations": float(table.loc[table["scene"] == ALL, "n_locations"].iloc[0])}
+    with start_run(tracking, f"evaluate {name}", "evaluate", params, tags=tags) as (mlflow, run):
+        log(mlflow, run, metrics=metrics)
+        for path in files:
+            mlflow.log_artifact(run, str(path))
+        log_nested(tracking, run, "evaluate", [nested for _, nested in runs_of_rows(table, params)], TAGS)
+    return run
+
+
+def _log_training(path: Path, record: dict[str, Any], history: pd.DataFrame | None, tracking: TrackingConfig) -> str:
+    """A train run without its weights, which lie in the release."""
+    about = record["about"]
+    tags = {**TAGS, "trained_as": str(record["run_id"])}
+    with start_run(tracking, f"train {about['variant']}", "train", params_of(about), tags=tags) as (mlflow, run):
+        log(mlflow, run, metrics={f"kept_{name}": value for name, value in record["metrics"].items()})
+        mlflow.log_artifact(run, str(path))
+        if history is not None:
+            history = history.drop(columns="variant").dropna(axis=1, how="all")
+            log_history(tracking, run, history)
+            mlflow.log_text(run, history.to_csv(index=False), HISTORY_CSV)
+    return run
+
+
+def _log_learners(dataset: Dataset, tracking: TrackingConfig) -> str:
+    """The comparison of learners: nested, one run for each, what it learnt from, and seed."""
+    path = dataset.root / "results" / LEARNERS_CSV
+    table = pd.read_csv(path, dtype=str, keep_default_na=False)
+    nested = []
+    for key, rows in table.groupby(["learner", "learnt_from", "seed"], sort=False):
+        numbers: dict[str, float] = {}
+        for measure in ("average_precision", "roc_auc", "ece", "regret"):
+            values = pd.to_numeric(rows[measure])
+            numbers |= {
+                f"{measure}_{split}": float(mean) for split, mean in values.groupby(rows["split"]).mean().items()
+            }
+            numbers |= {f"{measure}/{scene}": float(one) for scene, one in zip(rows["scene"], values, strict=True)}
+        named = dict(zip(("learner", "learnt_from", "seed"), map(str, key), strict=True))
+        nested.append(NestedRun(" ".join(filter(None, named.values())), {"dataset": dataset.name, **named}, numbers))
+    about = {"dataset": dataset.name}
+    with start_run(tracking, f"learners {dataset.name}", "learners", about, tags=TAGS) as (mlflow, run):
+        mlflow.log_artifact(run, str(path))
+        log_nested(tracking, run, "learners", nested, TAGS)
+    return run
+
+
+def _log_paths(dataset: Dataset, tracking: TrackingConfig) -> str:
+    results = dataset.root / "results"
+    return log_paths({"dataset": dataset.name}, pd.read_csv(results / PATHS_CSV), results, tracking, TAGS)
+
+
+def _log_benchmark(dataset: Dataset, tracking: TrackingConfig) -> str:
+    results = dataset.root / "results"
+    times, scaling = results / RUNTIMES_CSV, results / SCALING_CSV
+    growth = pd.read_csv(scaling) if scaling.is_file() else pd.DataFrame()
+    return log_runtimes(tracking, pd.read_csv(times), growth, TAGS, times)

@@ -1,0 +1,1 @@
+"""Where a camera can be: by a mesh, by depth images, by photographs."""

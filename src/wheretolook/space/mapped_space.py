@@ -1,0 +1,108 @@
+"""Where a camera can be in a scene without a mesh: near where the map's images were taken, clear of landmarks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
+
+from wheretolook.geometry.poses import Float
+from wheretolook.utils.errors import ConfigError, MapError
+
+STEP_M = 0.02
+"""Distance of the points of a way that must be near mapping cameras."""
+
+_OUTLIERS = 0.01  # share of landmarks left out at either end of each axis: a wrong one may lie anywhere
+
+
+@dataclass(frozen=True)
+class MappedSpaceConfig:
+    """What counts as free where there is no mesh. Landmarks do not say what is empty, but cameras were where they were.
+
+    Args:
+        max_camera_distance_m: greatest distance to the nearest position of a mapping camera.
+        clearance_m: least distance to any landmark.
+    """
+
+    max_camera_distance_m: float = 0.75
+    clearance_m: float = 0.25
+
+    def __post_init__(self) -> None:
+        if not self.max_camera_distance_m > 0 or not self.clearance_m >= 0:
+            raise ConfigError(
+                "the distance to cameras must be positive, the clearance not negative",
+                value=(self.max_camera_distance_m, self.clearance_m),
+            )
+
+
+class MappedSpace:
+    """Tests locations against a map's landmarks and cameras.
+
+    Args:
+        landmarks: (N, 3) metres.
+        cameras: (M, 3) metres, where the map's images were taken.
+        config: what counts as free.
+
+    Attributes:
+        bounds: (2, 3) metres: the box around the cameras, wider by the distance they allow, within the box around
+            landmarks (all but the outermost per cent along each axis) and cameras.
+
+    Raises:
+        MapError: there are no landmarks or no cameras.
+    """
+
+    def __init__(self, landmarks: ArrayLike, cameras: ArrayLike, config: MappedSpaceConfig | None = None) -> None:
+        self.config = config or MappedSpaceConfig()
+        points, centers = (np.asarray(values, dtype=np.float64).reshape(-1, 3) for values in (landmarks, cameras))
+        if not len(points) or not len(centers):
+            raise MapError("the map has no landmarks or no cameras", value=(len(points), len(centers)),
+                           fix="Run the map stage again.")  # fmt: skip
+        self._landmarks, self._cameras = cKDTree(points), cKDTree(centers)
+        reach, lowest, highest = self.config.max_camera_distance_m, centers.min(0), centers.max(0)
+        low, high = np.quantile(points, (_OUTLIERS, 1 - _OUTLIERS), axis=0)
+        self.bounds: Float = np.stack(
+            [
+                np.maximum(lowest - reach, np.minimum(low, lowest)),
+                np.minimum(highest + reach, np.maximum(high, highest)),
+            ]
+        )
+
+    def is_free(self, points: ArrayLike) -> NDArray[np.bool_]:
+        """Whether a camera can be at points (N, 3) metres; (N,)."""
+        at = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+        free = ((at >= self.bounds[0]) & (at <= self.bounds[1])).all(axis=1)
+        free &= self._cameras.query(at)[0] <= self.config.max_camera_distance_m
+        free &= self._landmarks.query(at)[0] >= self.config.clearance_m
+        return free
+
+    def segments_are_free(self, a: ArrayLike, b: ArrayLike) -> NDArray[np.bool_]:
+        """Whether a camera can move straight from a (N, 3) to b (N, 3) metres.
+
+        Both ends must be free, no landmark may lie within the clearance of the way, and the way must stay near mapping
+        cameras (looked at every 2 cm).
+
+        Returns:
+            (N,) bool.
+        """
+        ends = (np.asarray(points, dtype=np.float64).reshape(-1, 3) for points in (a, b))
+        start, end = np.broadcast_arrays(*ends)
+        free = self.is_free(start) & self.is_free(end)
+        for n in np.flatnonzero(free):
+            free[n] = self._is_clear(start[n], end[n]) and self._stays_near_cameras(start[n], end[n])
+        return free
+
+    def _is_clear(self, start: Float, end: Float) -> bool:
+        along = end - start
+        length = float(np.linalg.norm(along))
+        reach = length / 2 + self.config.clearance_m
+        near = self._landmarks.data[self._landmarks.query_ball_point((start + end) / 2, reach)]
+        share = np.clip((near - start) @ along / max(length**2, 1e-24), 0, 1)
+        distance = np.linalg.norm(near - start - share[:, None] * along, axis=1)
+        return bool((distance >= self.config.clearance_m).all())
+
+    def _stays_near_cameras(self, start: Float, end: Float) -> bool:
+        steps = max(2, int(np.ceil(np.linalg.norm(end - start) / STEP_M)) + 1)
+        points = start + np.linspace(0, 1, steps)[:, None] * (end - start)
+        return bool((self._cameras.query(points)[0] <= self.config.max_camera_distance_m).all())

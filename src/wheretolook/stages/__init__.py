@@ -1,0 +1,33 @@
+"""The stages, one function each, for Python, notebooks and the command line alike.
+
+A stage works through the scenes of an experiment and leaves its result on disk with a stamp that says what it was made
+from. Called again, it reuses what is there if its settings and inputs are the same, and otherwise makes it anew.
+"""
+
+from wheretolook.stages.compare_paths import compare_paths
+from wheretolook.stages.evaluate import evaluate
+from wheretolook.stages.figures import figures
+from wheretolook.stages.label import label
+from wheretolook.stages.log_release import log_release
+from wheretolook.stages.map import make_maps
+from wheretolook.stages.plan import plan
+from wheretolook.stages.release import release
+from wheretolook.stages.sample import sample
+from wheretolook.stages.scenes import make_scenes
+from wheretolook.stages.train import train
+from wheretolook.stages.viewpoint_map import viewpoint_map
+
+__all__ = [
+    "compare_paths",
+    "evaluate",
+    "figures",
+    "label",
+    "log_release",
+    "make_maps",
+    "make_scenes",
+    "plan",
+    "release",
+    "sample",
+    "train",
+    "viewpoint_map",
+]

@@ -1,0 +1,32 @@
+"""The figures stage: every figure and table, drawn from logged runs."""
+
+from __future__ import annotations
+
+from wheretolook.config import Experiment
+from wheretolook.dataset.folders import Dataset
+from wheretolook.stages.inputs import Say
+from wheretolook.stages.log_release import log_release
+from wheretolook.utils.errors import MissingRunError
+
+
+def figures(experiment: Experiment, say: Say = print) -> Dataset:
+    """Draw every figure and table from logged runs; those of a release are logged first.
+
+    Raises:
+        MissingRunError: some of the paper's, or of those named, could not be made for want of a run; the others were.
+        ConfigError: there is no figure of such a name. TableError: there is no dataset.
+    """
+    from wheretolook.release.catalog import ITEMS, check_names, write_items
+    from wheretolook.release.copy import is_release
+
+    check_names(experiment.figures)
+    dataset = Dataset.load(experiment.root)
+    if is_release(dataset):
+        log_release(experiment, say, attach=False)
+    missing = write_items(dataset, experiment.tracking, experiment.figures, say)
+    wanted = experiment.figures.only or [item.name for item in ITEMS if item.paper]
+    needed = {name: command for name, command in missing.items() if name in wanted}
+    if needed:
+        fix = "Run " + "; ".join(dict.fromkeys(needed.values()))
+        raise MissingRunError("not all figures could be drawn", value=", ".join(needed), fix=fix)
+    return dataset

@@ -1,0 +1,108 @@
+"""What a stage asks of what earlier ones left: is it there, is it of these settings, is it what it was."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from wheretolook.config import Experiment
+from wheretolook.dataset.folders import Dataset, SceneFolder
+from wheretolook.dataset.stamps import read_stamp
+from wheretolook.utils.errors import ConfigError, MapError, SceneError, TableError
+from wheretolook.utils.files import fingerprint
+
+if TYPE_CHECKING:
+    from wheretolook.features.keypoints import ExtractorConfig
+
+Say = Callable[[str], None]
+"""Told in a line what a stage has done."""
+
+Tick = Callable[[float], None]
+"""Told how much of a stage's work is done: 1 a scene, or 1 in all for stages that do not go scene by scene."""
+
+
+def dataset_after(experiment: Experiment, needs: str) -> Dataset:
+    """The dataset, once the stage that is needed has been through all of its scenes with what they now hold.
+
+    Raises:
+        ConfigError: it was made with another camera, or is a release where meshes and maps are needed.
+        TableError: there is none, or the stage has not been run.
+    """
+    dataset = Dataset.load(experiment.root)
+    if needs != "label":
+        refuse_release(experiment.root)
+    if dataset.camera != experiment.camera:
+        raise ConfigError(
+            "the dataset was made with another camera", path=experiment.root, value=dataset.camera,
+            fix="Run the scenes stage with this configuration, or give the experiment another name.",
+        )  # fmt: skip
+    for scene in dataset.scenes:
+        if read_stamp(scene, needs) is None:
+            raise TableError(
+                f"the {needs} stage has not been run for this scene, or not since an earlier stage remade its input",
+                path=scene.folder, fix=f"Run `wheretolook {needs}`.",
+            )  # fmt: skip
+    return dataset
+
+
+def refuse_release(root: Path) -> None:
+    """Raise a ConfigError if a release lies there."""
+    from wheretolook.release.copy import ABOUT
+
+    if (root / ABOUT).is_file():
+        raise ConfigError(
+            "a release has no meshes and maps, and would be lost if they were made anew", path=root,
+            fix="Use it with train, evaluate and release alone, or give the experiment another name.",
+        )  # fmt: skip
+
+
+@contextmanager
+def naming_scene(path: Path) -> Iterator[None]:
+    """Add the scene's file to errors of those who know only its content."""
+    try:
+        yield
+    except (SceneError, MapError) as error:
+        if error.path is not None:
+            raise
+        raise type(error)(error.problem, path=path, value=error.value, fix=error.fix) from error
+
+
+def extractor_of(scene: SceneFolder) -> ExtractorConfig:
+    """The keypoint extractor the map was made with: queries must use the same.
+
+    Raises:
+        MapError: the map's report is missing or damaged.
+    """
+    from wheretolook.features.keypoints import ExtractorConfig
+
+    path = scene.map / "report.json"
+    try:
+        return ExtractorConfig(**json.loads(path.read_text())["config"]["extractor"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise MapError("the map's report is missing or damaged", path=path, fix="Run the map stage again.") from error
+
+
+def existing(path: Path, error: type[SceneError] | type[MapError], stage: str) -> str:
+    """Fingerprint of a file that an earlier stage makes; without it, the error given, naming the stage."""
+    if not path.is_file():
+        raise error("this file is missing", path=path, fix=f"Run the {stage} stage first.")
+    return fingerprint(path)
+
+
+def mesh_fingerprint(path: Path) -> str:
+    """A mesh file changes when its size or date does; it may be gigabytes.
+
+    Raises:
+        SceneError: there is no such file.
+    """
+    if not path.exists():
+        raise SceneError("there is no such mesh", path=path, fix="Check the path.")
+    files = [path]
+    if path.is_dir():
+        files = sorted(file for file in path.iterdir() if file.is_file())
+    elif path.suffix.lower() != ".glb":  # materials and textures lie beside it
+        files = sorted(file for file in path.parent.iterdir() if file.is_file())
+    return " ".join(f"{file.resolve()}:{file.stat().st_size}:{file.stat().st_mtime_ns}" for file in files)

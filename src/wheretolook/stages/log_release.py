@@ -1,0 +1,46 @@
+"""The log-release stage: what a release ships, logged as MLflow runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from wheretolook.config import Experiment
+from wheretolook.dataset.folders import Dataset
+from wheretolook.figures.config import FiguresConfig
+from wheretolook.stages.inputs import Say
+from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.tracking import ui_command
+
+QUICK = ("top_n", "table_vs_others", "table_input_variants", "training", "calibration", "scores", "regret", "paths",
+         "runtimes")  # fmt: skip
+"""Figures and tables that need no scene, and so only seconds."""
+
+
+def log_release(experiment: Experiment, say: Say = print, attach: bool = True) -> Dataset:
+    """Log what a release holds as MLflow runs, as far as the store lacks them.
+
+    Args:
+        experiment: names the release and the store.
+        say: told what was logged.
+        attach: whether to attach figures and tables to new runs.
+
+    Raises:
+        ConfigError: the dataset is no release. TableError: there is none.
+    """
+    from wheretolook.release.catalog import write_items
+    from wheretolook.release.copy import is_release
+    from wheretolook.release.runs import log_release as log_runs
+
+    dataset = Dataset.load(experiment.root)
+    if not is_release(dataset):
+        fix = "Its runs are logged by the stages themselves; a release is made by `wheretolook release`."
+        raise ConfigError("this dataset is no release", path=experiment.root, fix=fix)
+    runs = log_runs(dataset, experiment.tracking, say)
+    if runs.new and attach:
+        say("attaching figures and tables")
+        with TemporaryDirectory() as folder:
+            config = FiguresConfig(Path(folder), QUICK, ("png",))
+            write_items(dataset, experiment.tracking, config, lambda text: None)
+    say(f"{runs.new} runs are new; all runs: {ui_command(experiment.tracking)}")
+    return dataset

@@ -1,0 +1,66 @@
+"""The release stage: a compact copy of a labelled dataset, and its card."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+
+from wheretolook.config import Experiment
+from wheretolook.dataset.folders import Dataset
+from wheretolook.dataset.stamps import read_stamp, write_stamp
+from wheretolook.stages.evaluate import evaluate
+from wheretolook.stages.inputs import Say, Tick, dataset_after
+
+
+def release(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> Dataset:
+    """Publish a labelled dataset: a compact copy of it, `<data>/<release_name>/`, and in the end its card.
+
+    For any dataset but a release this makes the copy. For the copy itself, once networks are trained on it, it chooses
+    the weights that ship, evaluates them and writes the card. Either can be done again.
+
+    Raises:
+        WeightsError: no weights, or such that do not fit the release.
+        StorageError: it is not smaller than 16 MB.
+        ConfigError: another dataset lies where the copy belongs.
+    """
+    from wheretolook.evaluation.results import SCORES_CSV, VARIANTS_CSV
+    from wheretolook.learning.runs import keep_histories
+    from wheretolook.learning.weights import weights_kind
+    from wheretolook.release.card import write_card
+    from wheretolook.release.copy import (
+        choose_weights_to_ship,
+        copy_dataset,
+        is_release,
+        ship_weights,
+        size_text,
+        sizes,
+        trained_weights,
+    )
+
+    dataset = dataset_after(experiment, "label")
+    if not is_release(dataset):
+        copy = copy_dataset(dataset, experiment)
+        for scene, source in zip(copy.scenes, dataset.scenes, strict=True):
+            stamp = read_stamp(source, "label")
+            assert stamp is not None  # `_dataset` has seen it
+            write_stamp(scene, "label", stamp)
+        say(f"{len(copy.scenes)} scenes -> {copy.root}: {size_text(sizes(copy.root, weights=False))}")
+        say("next: train on it, then `wheretolook release` with its own configuration")
+        return copy
+    # on the CPU, as those who have no GPU will do it
+    on_cpu = replace(experiment, device="cpu", evaluate=replace(experiment.evaluate, weights=()))
+    results = dataset.root / "results"
+    if choose_weights_to_ship(dataset).shelved:  # all that were trained, before only the best are left
+        methods = tuple(dict.fromkeys(weights_kind(path) for path in trained_weights(dataset)))
+        evaluate(replace(on_cpu, evaluate=replace(on_cpu.evaluate, methods=methods, reference="")), say)
+        shutil.copyfile(results / SCORES_CSV, results / VARIANTS_CSV)
+    choice = ship_weights(dataset)
+    compared = ", ".join(f"{name} {value:.4f}" for name, value in choice.precision.items())
+    say(f"validation average precision: {compared}")
+    say(f"the paper's network that ships, in half precision: {choice.network}; the best of all: {choice.best}")
+    keep_histories(dataset, experiment.tracking)
+    sizes(dataset.root)  # too large? then before the evaluation
+    evaluate(on_cpu, say, tick)
+    say(f"the card -> {write_card(dataset)}")
+    say(size_text(sizes(dataset.root)))
+    return dataset

@@ -1,0 +1,61 @@
+"""The scenes stage: a textured mesh for every scene."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from wheretolook.config import Experiment
+from wheretolook.dataset.folders import Dataset, SceneFolder
+from wheretolook.dataset.stamps import is_done, read_stamp, stage_key, write_stamp
+from wheretolook.stages.inputs import Say, Tick, mesh_fingerprint, refuse_release
+from wheretolook.utils.errors import SceneError
+from wheretolook.viewpoints.table import Split
+
+
+def make_scenes(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> Dataset:
+    """Stage 1: a textured mesh for every scene, `<scene>/mesh.glb`, and the dataset's description.
+
+    Raises:
+        SceneError: a mesh of one's own cannot be used, or two scenes have the same name.
+        ConfigError: the dataset's folder holds a release.
+    """
+    from wheretolook.scenes.loading import load_mesh, save_glb
+    from wheretolook.scenes.procedural.generator import generate_apartment
+
+    config, root = experiment.scenes, experiment.root
+    refuse_release(root)
+    numbers: dict[Split, int] = {"train": config.train, "val": config.val, "test": config.test}
+    splits = [split for split, number in numbers.items() for _ in range(number)]
+    sources: dict[SceneFolder, Callable[[], Any]] = {}
+    keys: dict[SceneFolder, Any] = {}
+    for index, split in enumerate(splits):
+        seed = config.seed + index
+        scene = SceneFolder(root / f"apartment-{seed:03d}", split)
+        sources[scene] = partial(generate_apartment, config.apartment, seed, device=experiment.warp_device)
+        keys[scene] = [config.apartment.key(), seed]
+    for source in config.meshes:
+        scene = SceneFolder(root / source.scene_name, source.split)
+        if scene.name in {other.name for other in sources}:
+            raise SceneError("two scenes have the same name", path=source.path, value=scene.name, fix="Give it a name.")
+        sources[scene] = partial(load_mesh, source.path, up=source.up)
+        keys[scene] = [mesh_fingerprint(source.path), source.up]
+
+    for scene, make in sources.items():
+        key = stage_key("scenes", keys[scene])
+        if not is_done(scene, "scenes", key, scene.mesh):
+            mesh = make()
+            scene.folder.mkdir(parents=True, exist_ok=True)
+            save_glb(mesh, scene.mesh)
+            write_stamp(scene, "scenes", key)
+            say(f"{scene.name}: {len(mesh.triangles):,} triangles -> {scene.mesh}")
+        else:
+            say(f"{scene.name}: reusing {scene.mesh}")
+        tick(1)
+    dataset = Dataset(root, experiment.camera, tuple(sources))
+    if (root / "dataset.json").is_file() and Dataset.load(root).camera != experiment.camera:
+        for scene in dataset.scenes:  # what was made with another camera is no longer valid
+            write_stamp(scene, "scenes", read_stamp(scene, "scenes") or "")
+    dataset.save()
+    return dataset

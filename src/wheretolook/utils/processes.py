@@ -1,0 +1,75 @@
+"""Work spread over processes, a few items ahead of the results."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections import deque
+from collections.abc import Callable, Generator, Iterable
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from itertools import islice
+from types import TracebackType
+from typing import TypeVar
+
+from wheretolook.utils.errors import WorkerError
+from wheretolook.utils.workers import end_with_parent, spawning, use_one_core
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+class Processes:
+    """Processes of one thread each, spawned when first needed and ended with the block.
+
+    Args:
+        workers: how many; 1 works in this process.
+    """
+
+    def __init__(self, workers: int) -> None:
+        self.workers = workers
+        context = multiprocessing.get_context("spawn")
+        self._pool = ProcessPoolExecutor(workers, context, initializer=_start_worker) if workers > 1 else None
+
+    def __enter__(self) -> Processes:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        if self._pool is not None:
+            self._pool.shutdown()
+
+    def map(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Generator[Result, None, None]:
+        """Apply a function, defined at the top of a module, to items that are read a few ahead of what is returned.
+
+        Yields:
+            Results in the order of the items.
+
+        Raises:
+            WorkerError: a process was killed.
+        """
+        if self._pool is None:
+            yield from map(function, items)
+            return
+        source, pending = iter(items), deque[Future[Result]]()
+        try:
+            while True:
+                for item in islice(source, 4 * self.workers - len(pending)):
+                    with spawning():
+                        pending.append(self._pool.submit(function, item))
+                if not pending:
+                    return
+                yield pending.popleft().result()
+        except BrokenProcessPool as error:
+            raise WorkerError(
+                "a process was killed, probably for lack of memory", value=f"{self.workers} workers",
+                fix="Lower label.workers and run again.",
+            ) from error  # fmt: skip
+        finally:
+            for future in pending:
+                future.cancel()
+
+
+def _start_worker() -> None:
+    end_with_parent()
+    use_one_core()

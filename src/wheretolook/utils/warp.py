@@ -1,0 +1,63 @@
+"""Starting Warp and putting a mesh on a device."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from ctypes.util import find_library
+from functools import cache
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike
+
+from wheretolook.utils.errors import ConfigError
+
+
+@cache  # looking for a driver takes 14 ms
+def start_warp(device: str = "cpu") -> str:
+    """Initialize Warp without its banner and check that a device exists.
+
+    Called when something is built on a device, never on import, so that worker processes start Warp themselves.
+
+    Args:
+        device: "cpu", "cuda" or "cuda:<index>".
+
+    Returns:
+        The device's full name, such as "cuda:0".
+
+    Raises:
+        ConfigError: if this machine has no such device.
+    """
+    wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
+    with _without_driver_warning():
+        wp.init()
+    try:
+        return str(wp.get_device(device))
+    except (ValueError, RuntimeError) as error:
+        available = ", ".join(str(found) for found in wp.get_devices())
+        raise ConfigError("no such device", value=device, fix=f"Use one of: {available}") from error
+
+
+@contextmanager
+def _without_driver_warning() -> Iterator[None]:
+    """On a machine without a GPU, keep Warp's native library from writing so into every worker's progress bar."""
+    if find_library("cuda") is not None:
+        yield
+        return
+    sys.stderr.flush()
+    stderr, null = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, 2)
+    try:
+        yield
+    finally:
+        os.dup2(stderr, 2)
+        os.close(stderr)
+        os.close(null)
+
+
+def vec3_array(points: ArrayLike, device: str) -> wp.array:
+    """Points (N, 3) as a float32 array of vectors on a device."""
+    return wp.array(np.ascontiguousarray(points, dtype=np.float32).reshape(-1, 3), dtype=wp.vec3, device=device)

@@ -1,0 +1,1 @@
+"""The table of viewpoints: rows, sampling, and what a label is."""

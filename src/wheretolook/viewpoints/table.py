@@ -1,0 +1,215 @@
+"""The table of viewpoints: one Parquet file a scene, one row a viewpoint, joined by ids and never by file order.
+
+A compact table holds the same rows in a third of the space; `read_table` reads both alike. Which landmarks a view
+matched can be stored beside its label, see `MATCH_FIELDS`.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from wheretolook.geometry.poses import Float, camera_centers, quaternion_from_rotation, rotation_from_quaternion
+from wheretolook.utils.errors import TableError
+
+Split = Literal["train", "val", "test"]
+"""What the viewpoints of a scene are for."""
+
+POSE_COLUMNS = ("qw", "qx", "qy", "qz", "tx", "ty", "tz")
+CENTER_COLUMNS = ("x_m", "y_m", "z_m")
+
+SCHEMA = pa.schema(
+    [
+        ("viewpoint_id", pa.int64()),
+        ("location_id", pa.int32()),
+        ("direction_id", pa.int32()),
+        *[(name, pa.float64()) for name in POSE_COLUMNS],
+        ("n_visible", pa.int32()),
+        ("visibility_rank", pa.int32()),
+        ("status", pa.string()),
+        ("error_m", pa.float32()),
+        ("error_deg", pa.float32()),
+        ("n_inliers", pa.int32()),
+    ]
+)
+"""Columns of `viewpoints.parquet`. The pose is cam_from_world (quaternion wxyz, translation in metres), rank 0 is the
+direction that sees most landmarks at its location. Until a viewpoint is labelled its status is "unlabelled"; afterwards
+it is "localized", "too_few_matches" or "no_pose". Errors are of the pose RANSAC found, if it found one, even if it had
+too few inliers to be believed ("no_pose"); otherwise they are NaN."""
+
+COMPACT_SCHEMA = pa.schema(
+    [
+        pa.field(CENTER_COLUMNS[POSE_COLUMNS[4:].index(field.name)], field.type)
+        if field.name in POSE_COLUMNS[4:]
+        else field
+        for field in SCHEMA
+    ]
+)
+"""Columns of a compact table: in place of the translation, which differs in every row, the camera's centre in the world
+(metres), which the viewpoints of a location share. The translation follows: t = -R c."""
+
+MATCH_FIELDS = pa.schema([("matched_rows", pa.list_(pa.int32())), ("inlier_rows", pa.list_(pa.int32()))])
+"""Two ragged columns that a table may have besides those of `SCHEMA`, if labelling was asked for them: the landmarks
+that were matched in each view, and those of them that agree with the pose found, as rows of the scene's
+`landmarks.npz`, ascending. A view without matches has two empty lists. Compact tables leave them out."""
+
+CENTER_DECIMALS = 12
+"""Decimals of a metre that are kept of centres; those of a location, each computed from its pose, differ by less."""
+
+_BY_VALUE = ("viewpoint_id", "error_m", "error_deg")  # all other columns repeat few values: they go by dictionary
+_COMPACT_FORMAT = {
+    "compression_level": 19,
+    "use_dictionary": [name for name in COMPACT_SCHEMA.names if name not in _BY_VALUE],
+    "column_encoding": dict(
+        zip(_BY_VALUE, ("DELTA_BINARY_PACKED", "BYTE_STREAM_SPLIT", "BYTE_STREAM_SPLIT"), strict=True)
+    ),
+}
+
+UNLABELLED, LOCALIZED, TOO_FEW_MATCHES, NO_POSE = "unlabelled", "localized", "too_few_matches", "no_pose"
+
+
+def poses(table: pd.DataFrame) -> Float:
+    """cam_from_world poses (B, 3, 4) of a table's rows."""
+    rotation = rotation_from_quaternion(table[list(POSE_COLUMNS[:4])].to_numpy(np.float64))
+    return np.concatenate([rotation, table[list(POSE_COLUMNS[4:])].to_numpy(np.float64)[..., None]], axis=-1)
+
+
+def pose_columns(cam_from_world: Float) -> dict[str, Float]:
+    """Pose columns, by name, of poses (B, 3, 4)."""
+    values = np.concatenate([quaternion_from_rotation(cam_from_world[..., :3]), cam_from_world[..., 3]], axis=-1)
+    return dict(zip(POSE_COLUMNS, values.T, strict=True))
+
+
+def is_good(table: pd.DataFrame, max_error_m: float = 0.05, max_error_deg: float = 0.4) -> np.ndarray:
+    """Labels: True where the viewpoint was localized with both errors strictly under their limits. (B,)
+
+    Raises:
+        TableError: some row has no label yet.
+    """
+    unlabelled = int((table["status"] == UNLABELLED).sum())
+    if unlabelled:
+        raise TableError("viewpoints without labels", value=unlabelled, fix="Run the label stage (it resumes).")
+    good = (table["status"] == LOCALIZED) & (table["error_m"] < max_error_m) & (table["error_deg"] < max_error_deg)
+    return good.to_numpy()
+
+
+def outcome_in_words(label: pd.Series) -> str:
+    """What came of localizing a row of a table; empty if it was not tried."""
+    status = str(label["status"])
+    if status == UNLABELLED:
+        return ""
+    if status != LOCALIZED:
+        return status.replace("_", " ")
+    if label["error_m"] < 1:
+        return f"pose found, {100 * label['error_m']:.1f} cm and {label['error_deg']:.2f}° off"
+    return f"wrong pose found, {label['error_m']:.1f} m and {label['error_deg']:.0f}° off"
+
+
+def outcome_in_brief(label: pd.Series) -> str:
+    """The same for narrow pictures: the error of the pose that was found, if one was."""
+    if str(label["status"]) != LOCALIZED:
+        return outcome_in_words(label)
+    if label["error_m"] < 1:
+        return f"{100 * label['error_m']:.1f} cm, {label['error_deg']:.2f}° off"
+    return f"{label['error_m']:.1f} m, {label['error_deg']:.0f}° off"
+
+
+def write_table(table: pd.DataFrame, path: Path, compact: bool = False) -> None:
+    """Write a table atomically as zstd Parquet with checksums. The same rows give the same bytes.
+
+    Args:
+        table: viewpoints, see `SCHEMA`; with both columns of `MATCH_FIELDS`, these are written, too.
+        path: file to write; its folder is made when needed.
+        compact: write `COMPACT_SCHEMA`, about 18 bytes a row; read back, poses agree to 1e-12 and all else exactly.
+            `MATCH_FIELDS` are left out.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".partial")
+    schema, options = (COMPACT_SCHEMA, _COMPACT_FORMAT) if compact else (SCHEMA, {})
+    if compact:
+        table = table.assign(**dict(zip(CENTER_COLUMNS, _shared_centers(table).T, strict=True)))
+    elif set(MATCH_FIELDS.names) <= set(table.columns):
+        schema = pa.schema([*SCHEMA, *MATCH_FIELDS])
+    content = pa.Table.from_pandas(table, schema=schema, preserve_index=False)
+    content = content.replace_schema_metadata(None)  # it tells of the data frame, not of the rows
+    try:
+        pq.write_table(content, partial, compression="zstd", write_page_checksum=True, **options)
+    except OSError:
+        partial.unlink(missing_ok=True)
+        raise
+    os.replace(partial, path)
+
+
+def _shared_centers(table: pd.DataFrame) -> Float:
+    """Camera centres (B, 3) in metres, the very same numbers for all viewpoints of a location."""
+    centers = camera_centers(poses(table))
+    _, first, rows = np.unique(table["location_id"], return_index=True, return_inverse=True)
+    shared = centers[first][rows]
+    apart = np.abs(shared - centers) > 0.5 * 10.0**-CENTER_DECIMALS  # if a location has several, they stay
+    return np.round(np.where(apart, centers, shared), CENTER_DECIMALS) + 0.0  # no negative zero
+
+
+def read_table(path: Path, matches: bool = False) -> pd.DataFrame:
+    """Read a table of viewpoints, compact or not.
+
+    Args:
+        path: file to read.
+        matches: read `MATCH_FIELDS`, too.
+
+    Returns:
+        The columns of `SCHEMA`. With `matches` also those of `MATCH_FIELDS`: in each row two int32 arrays, (M,) of the
+        landmarks matched and (I,) of the inliers among them.
+
+    Raises:
+        TableError: the file is missing, truncated, no Parquet file, or lacks columns; also those of `MATCH_FIELDS`, if
+            they are asked for.
+    """
+    if not path.is_file():
+        raise TableError("there is no table of viewpoints", path=path, fix="Run the sample stage first.")
+    try:
+        with pq.ParquetFile(path, page_checksum_verification=True) as file:
+            names = file.schema_arrow.names  # who does not ask for the matches need not wait for them
+            table = file.read([name for name in names if matches or name not in MATCH_FIELDS.names])
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
+        raise TableError(
+            f"not a readable Parquet file: {error}",
+            path=path,
+            fix="It may be truncated: get it anew, or delete it and run the stage that writes it.",
+        ) from error
+    compact = any(name in names for name in CENTER_COLUMNS)
+    schema, columns = (COMPACT_SCHEMA, CENTER_COLUMNS) if compact else (SCHEMA, POSE_COLUMNS[4:])
+    missing = [name for name in schema.names if name not in names]
+    if missing:
+        raise TableError("columns are missing", path=path, value=missing, fix="Run the sample stage again.")
+    if matches:
+        schema = pa.schema([*schema, *MATCH_FIELDS])
+        if missing := [name for name in MATCH_FIELDS.names if name not in names]:
+            fix = "Label again with `--label.store_matches true`; compact tables never hold them."
+            raise TableError("it is not stored which landmarks were matched", path=path, value=missing, fix=fix)
+    try:
+        frame: pd.DataFrame = table.select(schema.names).cast(schema).to_pandas()
+    except pa.ArrowException as error:
+        raise TableError(f"columns of another type: {error}", path=path, fix="Run the sample stage again.") from error
+    length = np.linalg.norm(frame[list(POSE_COLUMNS[:4])].to_numpy(), axis=1)
+    position = frame[list(columns)].to_numpy()
+    bad = ~(np.abs(length - 1) < 1e-6) | ~np.isfinite(position).all(1)
+    if bad.any():
+        row = int(np.argmax(bad))
+        raise TableError(
+            "a pose is no rigid transform",
+            path=path,
+            value=[float(frame[name].iloc[row]) for name in (*POSE_COLUMNS[:4], *columns)],
+            fix="The file is damaged: run the sample stage again.",
+        )
+    if compact:
+        rotation = rotation_from_quaternion(frame[list(POSE_COLUMNS[:4])].to_numpy())
+        translation = -(rotation @ position[..., None])[..., 0]
+        frame = frame.assign(**dict(zip(POSE_COLUMNS[4:], translation.T, strict=True)))
+        frame = frame[[*SCHEMA.names, *(MATCH_FIELDS.names if matches else [])]]
+    return frame

@@ -1,0 +1,22 @@
+"""Limits of the pose error below which a viewpoint counts as localized."""
+
+from __future__ import annotations
+
+THRESHOLDS = ((0.05, 0.4), (0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
+"""Error limits in metres and degrees: the Long-Term Visual Localization benchmark's and the paper's finer one."""
+
+
+def threshold_key(threshold: tuple[float, float]) -> str:
+    """Name of a pair of limits in column and metric names, such as "0.05m_0.4deg"."""
+    return f"{threshold[0]:g}m_{threshold[1]:g}deg"
+
+
+def threshold_label(key: str) -> str:
+    """What `threshold_key` gives, for people: "5 cm, 0.4°"."""
+    metres, degrees = key.removesuffix("deg").split("m_")
+    distance = f"{float(metres) * 100:g} cm" if float(metres) < 0.5 else f"{float(metres):g} m"
+    return f"{distance}, {degrees}°"
+
+
+ALL = "all"
+"""Value of the column `scene` in rows over all scenes."""

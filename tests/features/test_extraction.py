@@ -1,0 +1,146 @@
+"""Keypoints at known places, unit descriptors, and the same answer every time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pycolmap
+import pytest
+
+from wheretolook.features.extraction import KeypointExtractor
+from wheretolook.features.keypoints import ExtractorConfig, quantize_descriptors, unit_descriptors
+from wheretolook.utils.errors import ConfigError
+
+METHODS = ("colmap", "opencv")
+
+
+def blob(x: float, y: float, sigma: float) -> np.ndarray:
+    """A Gaussian blob centred at (x, y), where (0.5, 0.5) is the centre of the top-left pixel."""
+    rows, columns = np.mgrid[:120, :160] + 0.5
+    grey = 60 + 150 * np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2 * sigma**2))
+    return np.repeat(np.rint(grey).astype(np.uint8)[..., None], 3, axis=2)
+
+
+def textured_image(seed: int = 0) -> np.ndarray:
+    from scipy.ndimage import gaussian_filter
+
+    rng = np.random.default_rng(seed)
+    image = sum(3 * s * gaussian_filter(rng.normal(0, 30, (240, 320, 3)), (s, s, 0)) for s in (1.5, 3, 6))
+    return np.clip(128 + image, 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("place", [(80.5, 60.5), (80.3, 60.7), (51.9, 70.2)])
+@pytest.mark.parametrize("sigma", [3.0, 6.0])
+def test_blob_is_found_where_it_is(method, place, sigma):
+    # A high threshold leaves out the faint ring that the blob's rounding to grey values makes.
+    keypoints = KeypointExtractor(ExtractorConfig(method=method, peak_threshold=0.05)).extract(blob(*place, sigma))
+    assert len(keypoints) >= 1
+    assert np.abs(keypoints.pixels - place).max() < 0.1
+    # A Gaussian of standard deviation s responds most at scale s in scale space (Lindeberg 1998), in 2D.
+    assert np.abs(keypoints.scales_px / sigma - 1).max() < 0.2
+
+
+def test_both_methods_find_the_same_keypoints():
+    image = textured_image()
+    colmap, opencv = (KeypointExtractor(ExtractorConfig(method=m)).extract(image) for m in METHODS)
+    assert len(colmap) > 100 and len(opencv) > 100
+    apart = np.linalg.norm(colmap.pixels[:, None] - opencv.pixels[None], axis=-1)
+    nearest = apart.argmin(1)
+    close = apart.min(1) < 0.3
+    assert close.mean() > 0.7
+    # The descriptors of a keypoint agree too, up to the two implementations' smoothing and orientation.
+    cosine = (colmap.descriptors[close] * opencv.descriptors[nearest[close]]).sum(1)
+    assert np.median(cosine) > 0.9
+    assert abs(np.median(colmap.pixels[close] - opencv.pixels[nearest[close]], axis=0)).max() < 0.03
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_descriptors_are_unit_length_and_nonnegative(method):
+    keypoints = KeypointExtractor(ExtractorConfig(method=method)).extract(textured_image())
+    assert keypoints.pixels.dtype == keypoints.descriptors.dtype == np.float32
+    assert keypoints.descriptors.shape == (len(keypoints), 128)
+    np.testing.assert_allclose(np.linalg.norm(keypoints.descriptors, axis=1), 1, atol=1e-6)
+    assert keypoints.descriptors.min() >= 0
+
+
+def test_colmap_method_gives_the_keypoints_of_colmaps_own_feature_extraction(tmp_path):
+    """Over an image file, through COLMAP's C++ pipeline, which does its own reading and conversion to grey."""
+    from PIL import Image
+
+    (tmp_path / "images").mkdir()
+    image = textured_image(1)
+    Image.fromarray(image).save(tmp_path / "images" / "a.png")
+    options = pycolmap.FeatureExtractionOptions()
+    options.sift.first_octave = 0
+    pycolmap.extract_features(
+        str(tmp_path / "database.db"),
+        str(tmp_path / "images"),
+        extraction_options=options,
+        device=pycolmap.Device.cpu,
+    )
+    with pycolmap.Database.open(str(tmp_path / "database.db")) as database:
+        pixels = np.asarray(database.read_keypoints(1))[:, :2]
+        descriptors = database.read_descriptors(1).data
+    config = ExtractorConfig(method="colmap", first_octave=0, max_keypoints=100_000)
+    ours = KeypointExtractor(config).extract(image)
+    mine = np.column_stack([ours.pixels, quantize_descriptors(ours.descriptors)])
+    theirs = np.column_stack([pixels.astype(np.float32), descriptors])
+    assert len(mine) == len(theirs)
+    np.testing.assert_array_equal(mine[np.lexsort(mine.T)], theirs[np.lexsort(theirs.T)])
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_cap_keeps_the_first_of_the_full_order(method):
+    image = textured_image()
+    everything = KeypointExtractor(ExtractorConfig(method=method, max_keypoints=100_000)).extract(image)
+    few = KeypointExtractor(ExtractorConfig(method=method, max_keypoints=50)).extract(image)
+    assert len(everything) > 100 and len(few) == 50
+    np.testing.assert_array_equal(few.pixels, everything.pixels[:50])
+    np.testing.assert_array_equal(few.descriptors, everything.descriptors[:50])
+    if method == "colmap":
+        assert (np.diff(everything.scales_px) <= 0).all()
+
+
+def test_first_octave_minus_one_adds_small_keypoints():
+    image = textured_image()
+    for method in METHODS:
+        coarse, fine = (
+            KeypointExtractor(ExtractorConfig(method=method, first_octave=o)).extract(image) for o in (0, -1)
+        )
+        assert len(fine) > 1.5 * len(coarse)
+        assert fine.scales_px.min() < 0.75 * coarse.scales_px.min()
+
+
+@pytest.mark.parametrize("method", ["opencv", pytest.param("colmap", marks=pytest.mark.slow)])
+def test_same_image_same_keypoints_in_any_process(method):
+    images = [textured_image(seed) for seed in range(5)]
+    extractor = KeypointExtractor(ExtractorConfig(method=method))
+    here = list(extractor.extract_many(images, workers=1))
+    there = list(extractor.extract_many(iter(images), workers=2))
+    again = [KeypointExtractor(ExtractorConfig(method=method)).extract(image) for image in images]
+    for a, b, c in zip(here, there, again, strict=True):
+        assert a.pixels.tobytes() == b.pixels.tobytes() == c.pixels.tobytes()
+        assert a.descriptors.tobytes() == b.descriptors.tobytes() == c.descriptors.tobytes()
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_plain_image_has_no_keypoints(method):
+    keypoints = KeypointExtractor(ExtractorConfig(method=method)).extract(np.full((60, 80, 3), 90, np.uint8))
+    assert keypoints.pixels.shape == (0, 2) and keypoints.descriptors.shape == (0, 128)
+
+
+def test_quantized_descriptors_survive_the_round_trip():
+    descriptors = KeypointExtractor().extract(textured_image()).descriptors
+    stored = quantize_descriptors(descriptors)
+    assert stored.dtype == np.uint8
+    np.testing.assert_array_equal(quantize_descriptors(unit_descriptors(stored)), stored)
+    np.testing.assert_array_equal(unit_descriptors(np.zeros((2, 128), np.uint8)), 0)
+    assert quantize_descriptors(np.eye(2)).max() == 255
+
+
+def test_bad_settings_and_images_are_refused():
+    for settings in ({"method": "orb"}, {"first_octave": 1}, {"max_keypoints": 0}, {"peak_threshold": 0.0}):
+        with pytest.raises(ConfigError):
+            ExtractorConfig(**settings)
+    with pytest.raises(ValueError):
+        KeypointExtractor().extract(np.zeros((10, 10), np.uint8))

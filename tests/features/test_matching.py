@@ -1,0 +1,175 @@
+"""Matching against its plain twin, exactly: all sizes, extremes, blocks, devices, and CPUs without VNNI."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from wheretolook.features import matching
+from wheretolook.features.keypoints import quantize_descriptors, unit_descriptors
+from wheretolook.features.matching import DescriptorMatcher, match, nearest_two_plain
+
+Descriptors = NDArray[np.uint8]
+
+
+def random_descriptors(n: int, seed: int = 0) -> Descriptors:
+    return np.random.default_rng(seed).integers(0, 256, (n, 128), dtype=np.uint8)
+
+
+def extreme_descriptors(n: int, seed: int = 0) -> Descriptors:
+    """Nothing but 0 and 255, so that sums are as large as they get; the first row is all 255, the second all 0."""
+    values = 255 * np.random.default_rng(seed).integers(0, 2, (n, 128), dtype=np.uint8)
+    values[:1], values[1:2] = 255, 0
+    return values
+
+
+def sift_like_descriptors(n: int, seed: int = 0) -> Descriptors:
+    """RootSIFT of length 512: many small values and a few large ones."""
+    histograms = np.random.default_rng(seed).exponential(size=(n, 128)) ** 2
+    return quantize_descriptors(unit_descriptors(np.sqrt(histograms)))
+
+
+def views_of(landmarks: Descriptors, n: int, noise: float, seed: int = 1) -> Descriptors:
+    """Descriptors of keypoints that see landmarks chosen at random, some of them chosen twice."""
+    rng = np.random.default_rng(seed)
+    seen = unit_descriptors(landmarks[rng.integers(0, len(landmarks), n)])
+    return quantize_descriptors(unit_descriptors(np.abs(seen + rng.normal(size=seen.shape) * noise)))
+
+
+KINDS = pytest.mark.parametrize("make", [random_descriptors, extreme_descriptors, sift_like_descriptors])
+
+
+def assert_nearest_two(device: str, queries: Descriptors, landmarks: Descriptors) -> None:
+    rows, nearest, second = DescriptorMatcher(landmarks, device).nearest_two(queries)
+    assert rows.dtype == nearest.dtype == second.dtype == np.int64
+    assert rows.shape == nearest.shape == second.shape == (len(queries),)
+    plain_rows, plain_nearest, plain_second = nearest_two_plain(queries, landmarks)
+    np.testing.assert_array_equal(nearest, plain_nearest)
+    np.testing.assert_array_equal(second, plain_second)
+    apart = plain_nearest > plain_second  # of several equally near, any may be named
+    np.testing.assert_array_equal(rows[apart], plain_rows[apart])
+    of_named = (queries.astype(np.int64) * landmarks[rows]).sum(1)
+    np.testing.assert_array_equal(of_named, plain_nearest)
+
+
+@KINDS
+def test_nearest_two_agree_with_their_twin_at_every_size(device: str, make) -> None:  # type: ignore[no-untyped-def]
+    for n in [*range(2, 71), 5_000]:
+        assert_nearest_two(device, make(40, seed=n + 1), make(n, seed=n))
+
+
+@KINDS
+def test_no_keypoint_and_one(device: str, make) -> None:  # type: ignore[no-untyped-def]
+    for n in (2, 64, 300):
+        assert_nearest_two(device, make(1, seed=1), make(n))
+        assert [len(part) for part in DescriptorMatcher(make(n), device).nearest_two(make(0))] == [0, 0, 0]
+
+
+@pytest.mark.parametrize("n", [1, 63, 64, 65, 127, 128, 129, 500])
+def test_blocks_leave_no_seam(device: str, n: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Blocks of 64, or of one where a product of more does not fit."""
+    for block in (64, 1):
+        monkeypatch.setattr(matching, "_PRODUCT_BYTES", dict.fromkeys(("cpu", "cuda"), 4 * 320 * block))
+        assert_nearest_two(device, sift_like_descriptors(n, seed=1), sift_like_descriptors(300))
+
+
+def test_both_nearest_may_lie_in_one_group_or_in_two(device: str) -> None:
+    landmarks = np.zeros((200, 128), dtype=np.uint8)
+    query = np.full((1, 128), 100, dtype=np.uint8)
+    for first, second in ((3, 4), (4, 3), (31, 32), (199, 0), (0, 199), (64, 95), (130, 67)):
+        landmarks[:] = 1
+        landmarks[first], landmarks[second] = 90, 80
+        rows, best, next_best = DescriptorMatcher(landmarks, device).nearest_two(query)
+        assert (rows[0], best[0], next_best[0]) == (first, 128 * 9000, 128 * 8000)
+
+
+def lowe(queries: Descriptors, landmarks: Descriptors, max_ratio: float) -> dict[int, int]:
+    """Keypoint to landmark, by brute force: ratio of distances, and of each landmark its nearest keypoint."""
+    found: dict[int, tuple[int, int]] = {}
+    for keypoint, query in enumerate(queries.astype(np.int64)):
+        squared = np.maximum(2 * (512**2 - landmarks.astype(np.int64) @ query), 0)
+        nearest, second = np.argsort(squared, kind="stable")[:2]
+        if squared[nearest] < max_ratio**2 * squared[second]:
+            found[nearest] = min(found.get(nearest, (2**62, 0)), (squared[nearest], keypoint))
+    return {keypoint: landmark for landmark, (_, keypoint) in found.items()}
+
+
+@pytest.mark.parametrize("max_ratio", [0.6, 0.85, 1.0])
+def test_matches_pass_lowes_test_and_take_each_landmark_once(device: str, max_ratio: float) -> None:
+    landmarks = sift_like_descriptors(300)
+    landmarks[10] = landmarks[11]  # twins never match: their keypoints are as near to the one as to the other
+    queries = np.concatenate([views_of(landmarks, 200, noise) for noise in (0.0, 0.02, 0.06)])
+    ((keypoints, rows),) = match(DescriptorMatcher(landmarks, device), [queries], max_ratio)
+    assert dict(zip(keypoints.tolist(), rows.tolist(), strict=True)) == lowe(queries, landmarks, max_ratio)
+    assert 100 < len(rows) < len(queries)
+    assert (np.diff(keypoints) > 0).all() and len(set(rows)) == len(rows) and not {10, 11} & set(rows)
+
+
+def test_several_images_at_once_are_matched_as_one_by_one(device: str) -> None:
+    landmarks = sift_like_descriptors(1000)
+    images = [views_of(landmarks, n, 0.03, seed=n) for n in (70, 0, 1, 500, 0)]
+    matcher = DescriptorMatcher(landmarks, device)
+    together = match(matcher, images, 0.85)
+    assert len(together) == len(images) and len(together[3][0]) > 100
+    for image, found in zip(images, together, strict=True):
+        ((keypoints, rows),) = match(matcher, [image], 0.85)
+        np.testing.assert_array_equal(found[0], keypoints)
+        np.testing.assert_array_equal(found[1], rows)
+
+
+@pytest.mark.parametrize("n_landmarks", [0, 1])
+def test_without_a_second_landmark_nothing_matches(device: str, n_landmarks: int) -> None:
+    landmarks = sift_like_descriptors(n_landmarks)
+    matcher = DescriptorMatcher(landmarks, device)
+    for queries in (sift_like_descriptors(5), sift_like_descriptors(0)):
+        for keypoints, rows in match(matcher, [queries, queries], 1.0):
+            assert len(keypoints) == len(rows) == 0
+
+
+def test_nothing_to_match(device: str) -> None:
+    matcher = DescriptorMatcher(sift_like_descriptors(50), device)
+    assert match(matcher, [], 0.85) == []
+    assert [len(rows) for _, rows in match(matcher, [sift_like_descriptors(0)] * 2, 0.85)] == [0, 0]
+
+
+def run_python(code: str, **environment: str) -> str:
+    path = os.pathsep.join(sys.path)
+    run = subprocess.run(
+        [sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": path, **environment}, capture_output=True
+    )
+    assert run.returncode == 0, run.stderr.decode()
+    return run.stdout.decode().strip()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("instructions", ["AVX2", "AVX512_CORE"])
+def test_a_cpu_whose_byte_products_saturate_finds_the_same(instructions: str) -> None:
+    """oneDNN is told to leave out this CPU's newer instructions."""
+    code = (
+        "from features import test_matching as tests\n"
+        "for make in (tests.random_descriptors, tests.extreme_descriptors, tests.sift_like_descriptors):\n"
+        "    for n, k in ((3, 1), (64, 17), (70, 5), (1000, 300)):\n"
+        "        tests.assert_nearest_two('cpu', make(k, seed=1), make(n))\n"
+        "print('done')\n"
+    )
+    assert run_python(code, ONEDNN_MAX_CPU_ISA=instructions) == "done"
+
+
+def test_a_thread_keeps_to_the_cores_it_was_told() -> None:
+    """Of four cores, to which OpenMP would start three threads from each thread that multiplies."""
+    code = (
+        "import os, threading, torch\n"
+        "from features.test_matching import DescriptorMatcher, random_descriptors\n"
+        "torch.set_num_threads(1)\n"
+        "matcher = DescriptorMatcher(random_descriptors(5000))\n"
+        "before = len(os.listdir('/proc/self/task'))\n"
+        "thread = threading.Thread(target=matcher.nearest_two, args=(random_descriptors(500),))\n"
+        "thread.start(), thread.join()\n"
+        "print(len(os.listdir('/proc/self/task')) - before)\n"
+    )
+    assert int(run_python(code, OMP_NUM_THREADS="4")) <= 1  # the thread itself, if it is not yet gone

@@ -1,0 +1,191 @@
+"""`WarpSift` against OpenCV, its twin, and against itself: the same bits every time, whatever the batch."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+import warp as wp
+from scipy.ndimage import gaussian_filter
+from scipy.spatial import KDTree
+
+from wheretolook.features.extraction import KeypointExtractor
+from wheretolook.features.keypoints import ExtractorConfig, Keypoints
+from wheretolook.features.warp_sift import WarpSift
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.poses import poses_looking_along
+from wheretolook.rendering.warp_renderer import WarpRenderer
+from wheretolook.scenes.procedural.generator import ApartmentConfig, generate_apartment
+from wheretolook.space.free_space import FreeSpace
+from wheretolook.utils.errors import ConfigError
+
+EVERYTHING = ExtractorConfig(max_keypoints=100_000)
+
+
+def texture(seed: int, rows: int = 240, columns: int = 320) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    image = sum(2 * s * gaussian_filter(rng.normal(0, 30, (rows, columns)), s) for s in (0.7, 1.5, 4, 10))
+    return np.clip(128 + image, 0, 255).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def renders() -> np.ndarray:
+    """Views in an apartment, (4, 240, 320) uint8."""
+    config = ApartmentConfig(n_rooms=3, texture_size=2048, light_rays=4, light_spacing_m=0.5)
+    mesh, rng = generate_apartment(config, 1), np.random.default_rng(2)
+    free = FreeSpace(mesh)
+    eyes = rng.uniform(*mesh.bounds, (1000, 3)) * (1, 1, 0) + (0, 0, 1.4)
+    eyes = eyes[free.is_free(eyes)][:4]
+    looks = rng.normal(size=(4, 3)) * (1, 1, 0.2)
+    rgb = WarpRenderer(mesh).render(PinholeCamera(320, 240, 160.0), poses_looking_along(eyes, looks)).rgb
+    return np.rint(rgb @ (0.2126, 0.7152, 0.0722)).astype(np.uint8)
+
+
+def opencv(grey: np.ndarray, config: ExtractorConfig) -> Keypoints:
+    return KeypointExtractor(config).extract(np.repeat(grey[..., None], 3, axis=2))
+
+
+def assert_same(first: list[Keypoints], second: list[Keypoints]) -> None:
+    assert len(first) == len(second)
+    for a, b in zip(first, second, strict=True):
+        assert a.pixels.tobytes() == b.pixels.tobytes()
+        assert a.scales_px.tobytes() == b.scales_px.tobytes()
+        assert a.descriptors.tobytes() == b.descriptors.tobytes()
+
+
+def best_match(a: Keypoints, b: Keypoints) -> np.ndarray:
+    """For each keypoint of a, the highest cosine to one of b at its place (0.1 px) and scale (2 %), or NaN."""
+    best = np.full(len(a), np.nan)
+    for row, near in enumerate(KDTree(b.pixels).query_ball_point(a.pixels, 0.1)):
+        same = [k for k in near if abs(b.scales_px[k] / a.scales_px[row] - 1) < 0.02]
+        if same:
+            best[row] = (b.descriptors[same] @ a.descriptors[row]).max()
+    return best
+
+
+def assert_agree(ours: Keypoints, theirs: Keypoints) -> None:
+    for a, b in ((ours, theirs), (theirs, ours)):
+        cosine = best_match(a, b)
+        assert np.mean(np.isfinite(cosine)) >= 0.97
+        cosine = cosine[np.isfinite(cosine)]
+        assert np.median(cosine) > 0.999 and np.quantile(cosine, 0.01) > 0.98
+
+
+@pytest.mark.parametrize("view", range(4))
+def test_agrees_with_opencv_on_renders(view, renders, device):
+    theirs = opencv(renders[view], EVERYTHING)
+    (ours,) = WarpSift(EVERYTHING, device).extract_many(renders[view][None])
+    assert len(theirs) > 50
+    assert_agree(ours, theirs)
+
+
+@pytest.mark.parametrize("shape", [(240, 320), (171, 237), (30, 301), (12, 90)])
+def test_agrees_with_opencv_on_textures_of_any_shape(shape, device):
+    image = texture(0, *shape)
+    theirs = opencv(image, EVERYTHING)
+    (ours,) = WarpSift(EVERYTHING, device).extract_many(image[None])
+    assert len(theirs) > 1
+    assert_agree(ours, theirs)
+
+
+@pytest.mark.parametrize("settings", [{"first_octave": 0}, {"peak_threshold": 0.04}, {"edge_threshold": 2.0}])
+def test_agrees_with_opencv_whatever_the_settings(settings, device):
+    config, image = ExtractorConfig(max_keypoints=100_000, **settings), texture(1, 160, 200)
+    theirs = opencv(image, config)
+    (ours,) = WarpSift(config, device).extract_many(image[None])
+    assert 20 < len(theirs) < 0.8 * len(opencv(image, EVERYTHING))
+    assert_agree(ours, theirs)
+
+
+def test_orientations_and_responses_are_opencvs(device):
+    image = texture(2, 160, 200)
+    found = cv2.SIFT.create(0, 3, 3 * EVERYTHING.peak_threshold, 10.0, 1.6, enable_precise_upscale=True).detect(image)
+    theirs = np.array([(*k.pt, k.size / 2, k.response, k.angle) for k in found])
+    sift = WarpSift(EVERYTHING, device)
+    assert len(sift.extract_many(image[None])[0]) == pytest.approx(len(theirs), rel=0.03)
+    table, place, angle, _ = sift._turn(sift._space, np.unique(sift._space.find()))
+    ours = np.column_stack([table[place], angle])
+    assert ours[:, 4].min() >= 0 and ours[:, 4].max() < 360
+    for a, b in ((ours, theirs), (theirs, ours)):
+        off = np.abs(a[:, None] - b)
+        turn = np.minimum(off[..., 4], 360 - off[..., 4])
+        same = (np.hypot(off[..., 0], off[..., 1]) < 0.1) & (off[..., 2] < 0.02 * a[:, None, 2]) & (turn < 1)
+        assert same.any(1).mean() >= 0.97
+        assert np.median(off[..., 3][same]) < 1e-4 * EVERYTHING.peak_threshold
+
+
+def test_an_image_gives_the_same_bits_in_any_batch_and_every_time(device):
+    images = np.stack([texture(seed, 100, 120) for seed in range(8)])
+    images[3] = 90
+    sift = WarpSift(EVERYTHING, device)
+    alone = [sift.extract_many(image[None])[0] for image in images]
+    assert min(len(a) for a in np.delete(np.array(alone, object), 3)) > 50 and len(alone[3]) == 0
+    assert_same(sift.extract_many(images), alone)
+    assert_same(sift.extract_many(images[5:]), alone[5:])
+    assert_same(WarpSift(EVERYTHING, device).extract_many(images), alone)
+    small_blocks = WarpSift(EVERYTHING, device, block_bytes=3 * 100 * 120 * 4 * 6 * 6)
+    assert_same(small_blocks.extract_many(images), alone)
+    assert small_blocks._space.n_images < len(images)
+    on_device = wp.array(images, dtype=wp.uint8, device=sift.device)
+    assert_same(sift.extract_many(on_device), alone)
+    assert_same(sift.extract_many(on_device[2:5]), alone[2:5])
+
+
+def test_results_outlive_the_next_call(device):
+    sift = WarpSift(EVERYTHING, device)
+    first = sift.extract_many(texture(0, 60, 80)[None])
+    kept = [Keypoints(k.pixels.copy(), k.descriptors.copy(), k.scales_px.copy()) for k in first]
+    sift.extract_many(texture(1, 60, 80)[None])
+    assert_same(first, kept)
+
+
+def test_more_extrema_than_the_list_holds(device):
+    images = np.stack([texture(seed, 60, 80) for seed in range(2)])
+    sift = WarpSift(EVERYTHING, device)
+    first = sift.extract_many(images)
+    sift._space.keys = wp.empty(7, dtype=wp.int64, device=sift.device)
+    assert_same(sift.extract_many(images), first)
+    assert len(sift._space.keys) > 7
+
+
+def test_agrees_with_opencv_on_noise(device):
+    noise = np.random.default_rng(0).integers(0, 256, (120, 160), dtype=np.uint8)
+    assert_agree(WarpSift(EVERYTHING, device).extract_many(noise[None])[0], opencv(noise, EVERYTHING))
+
+
+def test_cap_keeps_the_first_of_the_full_order(device):
+    images = np.stack([texture(seed, 100, 120) for seed in range(3)])
+    everything = WarpSift(EVERYTHING, device).extract_many(images)
+    few = WarpSift(ExtractorConfig(max_keypoints=40), device).extract_many(images)
+    first = [Keypoints(k.pixels[:40], k.descriptors[:40], k.scales_px[:40]) for k in everything]
+    assert_same(few, first)
+    theirs = opencv(images[0], ExtractorConfig(max_keypoints=40))
+    assert np.median(np.abs(few[0].pixels - theirs.pixels)) < 0.01
+
+
+def test_descriptors_are_unit_length_and_nonnegative(device):
+    (keypoints,) = WarpSift(EVERYTHING, device).extract_many(texture(0, 100, 120)[None])
+    assert keypoints.pixels.dtype == keypoints.descriptors.dtype == keypoints.scales_px.dtype == np.float32
+    assert keypoints.pixels.shape == (len(keypoints), 2) and keypoints.descriptors.shape == (len(keypoints), 128)
+    np.testing.assert_allclose(np.linalg.norm(keypoints.descriptors, axis=1), 1, atol=1e-6)
+    assert keypoints.descriptors.min() >= 0
+
+
+@pytest.mark.parametrize("shape", [(1, 60, 80), (3, 5, 200), (2, 1, 1), (0, 60, 80)])
+def test_nothing_to_see(shape, device):
+    found = WarpSift(EVERYTHING, device).extract_many(np.full(shape, 90, np.uint8))
+    assert [k.pixels.shape for k in found] == [(0, 2)] * shape[0]
+    assert [k.descriptors.shape for k in found] == [(0, 128)] * shape[0]
+
+
+def test_what_is_no_batch_of_grey_images_is_refused(device):
+    sift = WarpSift(EVERYTHING, device)
+    for bad in (np.zeros((20, 20), np.uint8), np.zeros((1, 20, 20), np.float32), np.zeros((1, 20, 20, 3), np.uint8)):
+        with pytest.raises(ValueError):
+            sift.extract_many(bad)
+    with pytest.raises(ValueError):
+        sift.extract_many(wp.zeros((1, 20, 20), dtype=wp.float32, device=sift.device))
+    with pytest.raises(ValueError):
+        sift.extract_many(np.zeros((1, 20, 9000), np.uint8))
+    with pytest.raises(ConfigError):
+        WarpSift(EVERYTHING, "cuda:99")

@@ -1,0 +1,82 @@
+"""Cameras of COLMAP's models against pycolmap and OpenCV."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.colmap_camera import ColmapCamera
+from wheretolook.utils.errors import ConfigError, MapError
+
+
+def test_opencv_model_projects_as_opencv() -> None:
+    params = (300.0, 310.0, 330.0, 235.0, -0.2, 0.05, 1e-3, -1e-3)
+    camera = ColmapCamera("OPENCV", 640, 480, params)
+    points = np.random.default_rng(0).uniform((-1, -0.7, 1), (1, 0.7, 2), (200, 3))
+    matrix = np.array([[params[0], 0, params[2]], [0, params[1], params[3]], [0, 0, 1]])
+    expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, np.array(params[4:]))
+    seen = camera.sees(points)
+    assert seen.mean() > 0.9
+    np.testing.assert_allclose(camera.project(points)[seen], expected[seen, 0], atol=1e-9)
+
+
+def test_a_pinhole_of_colmap_is_our_pinhole() -> None:
+    ours, colmap = PinholeCamera(640, 480, 320.0), ColmapCamera("SIMPLE_PINHOLE", 640, 480, (320.0, 320.0, 240.0))
+    points = np.random.default_rng(0).normal(size=(5000, 3))
+    in_front = points[:, 2] > 1e-3
+    np.testing.assert_array_equal(colmap.sees(points), in_front & ours.in_image(ours.project(points)))
+
+
+def test_distortion_that_turns_back_does_not_bring_the_side_into_view() -> None:
+    """With k1 = -0.25 the image of a ray 61 degrees off the axis falls left of the image's edge again."""
+    import pycolmap
+
+    params = [320.0, 320.0, 240.0, -0.25, 0.0]
+    ray = np.array([[np.tan(np.radians(61)), 0, 1]])
+    raw = pycolmap.Camera(model="RADIAL", width=640, height=480, params=params).img_from_cam(ray)
+    camera = ColmapCamera("RADIAL", 640, 480, tuple(params))
+    assert 0 < raw[0, 0] < 640 and not camera.sees(ray)[0]
+    assert camera.sees(np.array([[np.tan(np.radians(45)), 0, 1]]))[0]
+
+
+def test_a_panorama_sees_everything_and_a_fisheye_what_is_in_its_image() -> None:
+    directions = np.random.default_rng(0).normal(size=(1000, 3))
+    assert ColmapCamera("EQUIRECTANGULAR", 640, 320, (640.0, 320.0)).sees(directions).all()
+    fisheye = ColmapCamera("SIMPLE_FISHEYE", 400, 400, (200 / np.radians(70), 200.0, 200.0))
+    off_axis = np.degrees(np.arccos(directions[:, 2] / np.linalg.norm(directions, axis=1)))
+    along_x = np.array([[np.sin(np.radians(a)), 0, np.cos(np.radians(a))] for a in (0, 69.9, 70.1)])
+    assert fisheye.sees(along_x).tolist() == [True, True, False]
+    assert not fisheye.sees(directions[off_axis > 100]).any()
+
+
+def test_not_a_number_and_the_centre_are_not_seen() -> None:
+    camera = ColmapCamera("OPENCV", 640, 480, (300.0, 300.0, 320.0, 240.0, 0.0, 0.0, 0.0, 0.0))
+    assert camera.sees(np.array([[0, 0, 0], [np.nan, 0, 1], [0, 0, np.inf], [0, 0, -1], [0, 0, 1.0]])).tolist() == [
+        False, False, False, False, True,
+    ]  # fmt: skip
+
+
+def test_the_camera_of_a_map(tmp_path: Path) -> None:
+    import pycolmap
+
+    model = pycolmap.Reconstruction()
+    model.add_camera(pycolmap.Camera(model="RADIAL", width=640, height=480, params=[1, 2, 3, 4, 5], camera_id=1))
+    model.write(tmp_path)
+    assert ColmapCamera.of_map(tmp_path) == ColmapCamera("RADIAL", 640, 480, (1.0, 2.0, 3.0, 4.0, 5.0))
+    model.add_camera(pycolmap.Camera(model="SIMPLE_PINHOLE", width=64, height=48, params=[1, 2, 3], camera_id=2))
+    model.write(tmp_path)
+    with pytest.raises(MapError, match="2"):
+        ColmapCamera.of_map(tmp_path)
+    with pytest.raises(MapError, match="nowhere"):
+        ColmapCamera.of_map(tmp_path / "nowhere")
+
+
+def test_unknown_models_and_wrong_parameters_are_named() -> None:
+    with pytest.raises(ConfigError, match="PLENOPTIC"):
+        ColmapCamera("PLENOPTIC", 640, 480, (1.0,))
+    with pytest.raises(ConfigError, match="fx, fy, cx, cy, k1, k2, p1, p2"):
+        ColmapCamera("OPENCV", 640, 480, (300.0,))

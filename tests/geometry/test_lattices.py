@@ -1,0 +1,104 @@
+"""The voxel grid and the direction lattices against values known from elsewhere."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from wheretolook.geometry.lattices import (
+    VoxelGrid,
+    axes_of_angles,
+    azimuth_elevation_lattice,
+    direction_lattice,
+    fibonacci_sphere,
+    released_lattice,
+    yaw_pitch_angles,
+)
+from wheretolook.utils.errors import ConfigError
+
+
+def covering_radius_deg(directions: np.ndarray) -> float:
+    """Largest angle from any direction to the nearest of the lattice, over 200,000 random probes."""
+    probes = np.random.default_rng(0).normal(size=(200_000, 3))
+    probes /= np.linalg.norm(probes, axis=1, keepdims=True)
+    chord, _ = cKDTree(directions).query(probes)
+    return float(np.degrees(2 * np.arcsin(chord.max() / 2)))
+
+
+def nearest_gaps_deg(directions: np.ndarray) -> np.ndarray:
+    chord, _ = cKDTree(directions).query(directions, k=2)
+    return np.degrees(2 * np.arcsin(chord[:, 1] / 2))
+
+
+def test_fibonacci_covers_the_sphere_three_times_finer_than_the_released_lattice() -> None:
+    assert covering_radius_deg(fibonacci_sphere(500)) == pytest.approx(6.9, abs=0.1)
+    assert covering_radius_deg(released_lattice(500)) == pytest.approx(20.3, abs=0.4)
+
+
+def test_nearest_neighbour_spread() -> None:
+    fibonacci, released = nearest_gaps_deg(fibonacci_sphere(500)), nearest_gaps_deg(released_lattice(500))
+    assert (fibonacci.min(), fibonacci.max()) == pytest.approx((7.9, 9.0), abs=0.06)
+    assert (released.min(), released.max()) == pytest.approx((0.33, 16.2), abs=0.06)
+
+
+def test_share_of_steep_directions() -> None:
+    assert np.mean(np.abs(fibonacci_sphere(500)[:, 2]) > 0.9) == pytest.approx(0.100, abs=0.002)
+    assert np.mean(np.abs(released_lattice(500)[:, 2]) > 0.9) == pytest.approx(0.288, abs=0.002)
+
+
+@pytest.mark.parametrize("lattice", ["fibonacci", "azimuth-elevation", "released"])
+@pytest.mark.parametrize("n", [1, 2, 50, 500])
+def test_lattices_are_distinct_unit_vectors(lattice: str, n: int) -> None:
+    directions = direction_lattice(n, lattice)  # type: ignore[arg-type]
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-12)
+    assert len(np.unique(directions.round(9), axis=0)) == len(directions)
+
+
+def test_azimuth_elevation_steps_are_equal() -> None:
+    directions = azimuth_elevation_lattice(512)  # 16 rows of 32
+    elevation = np.unique(np.degrees(np.arcsin(directions[:, 2])).round(6))
+    assert len(directions) == 512
+    np.testing.assert_allclose(np.diff(elevation), 180 / 16)
+
+
+def test_the_benchmarks_yaws_and_pitches() -> None:
+    directions = direction_lattice(500, "yaw-pitch")
+    assert directions.shape == (108, 3)
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1)
+    assert len(np.unique(directions.round(9), axis=0)) == 108
+    pitches = np.degrees(np.arcsin(directions[:, 2])).round(9)
+    assert np.unique(pitches).tolist() == [-60, -40, -20, 0, 20, 40]
+    yaws = np.degrees(np.arctan2(directions[:, 1], directions[:, 0])).round(6) % 360
+    assert np.unique(yaws % 360).tolist() == list(range(0, 360, 20))
+    np.testing.assert_allclose(axes_of_angles([[0, 0], [90, 0], [0, 90]]), np.eye(3), atol=1e-15)
+    np.testing.assert_allclose(axes_of_angles(yaw_pitch_angles()), directions)
+
+
+def test_centres_and_ids_are_inverse() -> None:
+    grid = VoxelGrid.over([[-1, 0, 2], [3, 2, 5]], (8, 4, 3))
+    assert len(grid) == 96
+    np.testing.assert_allclose(grid.centers()[0], [-0.75, 0.25, 2.5])
+    np.testing.assert_array_equal(grid.location_ids(grid.centers()), np.arange(96))
+
+
+def test_any_world_point_finds_its_voxel() -> None:
+    grid = VoxelGrid.over([[-1, 0, 2], [3, 2, 5]], (8, 4, 3))
+    points = np.random.default_rng(0).uniform([-1, 0, 2], [3, 2, 5], (1000, 3))
+    centers = grid.centers()[grid.location_ids(points)]
+    assert np.all(np.abs(points - centers) <= grid.voxel_m / 2 + 1e-12)
+
+
+def test_points_outside_have_no_voxel_and_the_upper_face_has_one() -> None:
+    grid = VoxelGrid.over([[0, 0, 0], [1, 1, 1]], (2, 2, 2))
+    points = [[-1e-9, 0.5, 0.5], [0.5, 1.1, 0.5], [np.nan, 0.5, 0.5], [1, 1, 1], [0, 0, 0]]
+    np.testing.assert_array_equal(grid.location_ids(points), [-1, -1, -1, 7, 0])
+
+
+def test_bad_grids_are_refused() -> None:
+    with pytest.raises(ConfigError, match="lower < upper"):
+        VoxelGrid.over([[0, 0, 0], [1, 0, 1]])
+    with pytest.raises(ConfigError, match="at least one voxel"):
+        VoxelGrid.over([[0, 0, 0], [1, 1, 1]], (8, 0, 8))
+    with pytest.raises(ConfigError, match="at least one direction"):
+        fibonacci_sphere(0)

@@ -1,0 +1,102 @@
+"""Poses, projection and errors against SciPy, pycolmap and closed forms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pycolmap
+import pytest
+from scipy.spatial.transform import Rotation
+
+from wheretolook.geometry import poses as geo
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.utils.errors import ConfigError
+
+
+def random_poses(n: int, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return np.concatenate([Rotation.random(n, rng=rng).as_matrix(), rng.normal(size=(n, 3, 1))], axis=-1)
+
+
+def test_projection_agrees_with_pycolmap() -> None:
+    camera = PinholeCamera(640, 480, 320.0)
+    colmap = pycolmap.Camera(model="SIMPLE_PINHOLE", width=640, height=480, params=[320.0, 320.0, 240.0])
+    points = np.random.default_rng(0).uniform([-2, -2, 0.5], [2, 2, 6], (100, 3))
+    np.testing.assert_allclose(camera.project(points), colmap.img_from_cam(points), atol=1e-9)
+
+
+def test_image_borders() -> None:
+    camera = PinholeCamera(4, 2, 1.0)
+    pixels = [[0, 0], [3.999, 1.999], [4, 1], [1, 2], [-1e-9, 1], [np.nan, 1]]
+    assert camera.in_image(pixels).tolist() == [True, True, False, False, False, False]
+
+
+def test_inverse_and_centres() -> None:
+    poses = random_poses(20)
+    points = np.random.default_rng(1).normal(size=(7, 3))
+    there = geo.transform(poses, points)
+    back = np.stack([geo.transform(inverse, x) for inverse, x in zip(geo.invert_poses(poses), there, strict=True)])
+    np.testing.assert_allclose(back, np.broadcast_to(points, back.shape), atol=1e-12)
+    centers = geo.camera_centers(poses)
+    np.testing.assert_allclose(np.einsum("bij,bj->bi", poses[..., :3], centers) + poses[..., 3], 0, atol=1e-12)
+
+
+def test_quaternions_agree_with_pycolmap_and_scipy() -> None:
+    rotation = random_poses(50)[..., :3]
+    quaternion = geo.quaternion_from_rotation(rotation)
+    for q, r in zip(quaternion, rotation, strict=True):
+        np.testing.assert_allclose(pycolmap.Rotation3d(np.roll(q, -1)).matrix(), r, atol=1e-12)
+    assert (quaternion[:, 0] >= 0).all()
+    np.testing.assert_allclose(geo.rotation_from_quaternion(2 * quaternion), rotation, atol=1e-12)
+
+
+def test_looking_along_keeps_the_horizon_level_and_down_down() -> None:
+    directions = np.random.default_rng(2).normal(size=(200, 3))
+    rotation = geo.rotation_looking_along(directions)
+    np.testing.assert_allclose(
+        rotation @ np.swapaxes(rotation, 1, 2), np.broadcast_to(np.eye(3), rotation.shape), atol=1e-12
+    )
+    np.testing.assert_allclose(np.linalg.det(rotation), 1)
+    np.testing.assert_allclose(
+        rotation[:, 2], directions / np.linalg.norm(directions, axis=1, keepdims=True), atol=1e-12
+    )
+    np.testing.assert_allclose(rotation[:, 0, 2], 0, atol=1e-12)
+    assert (rotation[:, 1, 2] < 0).all()
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_looking_straight_up_and_down_is_a_rotation(sign: int) -> None:
+    rotation = geo.rotation_looking_along([0, 0, 2.0 * sign])
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(rotation) == pytest.approx(1)
+    np.testing.assert_allclose(rotation[2], [0, 0, sign])
+
+
+def test_pose_looking_at_a_point_sees_it_in_the_image_centre() -> None:
+    camera = PinholeCamera()
+    pose = geo.poses_looking_along([1.0, 2, 3], [0.3, -0.4, 0.5])
+    seen = geo.transform(pose, [[1.3, 1.6, 3.5]])
+    np.testing.assert_allclose(camera.project(seen), [[camera.cx, camera.cy]], atol=1e-9)
+    assert seen[0, 2] == pytest.approx(np.linalg.norm([0.3, -0.4, 0.5]))
+
+
+@pytest.mark.parametrize("angle_deg", [0.0, 1e-6, 0.4, 30.0, 179.999])
+def test_rotation_angle_is_exact_even_when_tiny(angle_deg: float) -> None:
+    base = Rotation.random(rng=np.random.default_rng(3))
+    turned = Rotation.from_rotvec(np.radians(angle_deg) * np.array([0.6, 0, 0.8])) * base
+    assert geo.rotation_angle_deg(base.as_matrix(), turned.as_matrix()) == pytest.approx(angle_deg, abs=1e-7, rel=1e-6)
+
+
+def test_pose_error_is_between_centres_not_translations() -> None:
+    rotation = Rotation.random(rng=np.random.default_rng(4)).as_matrix()
+    center = np.array([10.0, -20, 3])
+    true = np.concatenate([rotation, -rotation @ center[:, None]], axis=1)
+    turned = Rotation.from_euler("z", 5, degrees=True).as_matrix() @ rotation
+    moved = center + np.array([0.03, 0.04, 0])
+    estimate = np.concatenate([turned, -turned @ moved[:, None]], axis=1)
+    error_m, error_deg = geo.pose_error(estimate, true)
+    assert (error_m, error_deg) == (pytest.approx(0.05), pytest.approx(5))
+
+
+def test_bad_camera() -> None:
+    with pytest.raises(ConfigError, match="positive"):
+        PinholeCamera(640, 0, 320)

@@ -1,0 +1,166 @@
+"""Binned inputs against bins counted by hand and the plain twin."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from conftest import RandomViews
+from synthetic_dataset import make_landmarks
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.colmap_camera import ColmapCamera
+from wheretolook.geometry.poses import transform
+from wheretolook.inputs.bins import (
+    ALL_CHANNELS,
+    CHANNELS,
+    INPUT_VARIANTS,
+    LANDMARK_CHANNELS,
+    PAPER_VARIANTS,
+    arrange,
+    bin_views,
+    bin_views_plain,
+    count_bins,
+)
+from wheretolook.inputs.landmarks_in_view import ATTRIBUTES, LandmarkDescriber
+from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.utils.errors import ConfigError
+from wheretolook.visibility.frustum import VisibleSets, visible_landmarks
+
+LOOKING_ALONG_Z = np.eye(3, 4)[None]
+
+
+def hand_counted(points: list[list[float]]) -> VisibleSets:
+    return VisibleSets.from_mask(np.ones((1, len(points)), dtype=bool))
+
+
+@pytest.mark.parametrize("bin_function", [bin_views, bin_views_plain])
+def test_bins_counted_by_hand(bin_function) -> None:  # type: ignore[no-untyped-def]
+    # 60 x 30 pixels, f = 30: bins of 2 x 1 pixels. The optical axis passes through (30, 15).
+    camera = PinholeCamera(60, 30, 30.0)
+    points = [
+        [0.01, 0.01, 1.0],  # pixel (30.3, 15.3): row 15, column 15
+        [0.09, 0.05, 3.0],  # pixel (30.9, 15.5): the same bin
+        [-0.98, -0.48, 1.0],  # pixel (0.6, 0.6): row 0, column 0
+        [0.98, 0.48, 1.0],  # pixel (59.4, 29.4): row 29, column 29
+        [1.01, 0.0, 1.0],  # pixel (60.3, 15): outside
+        [0.0, 0.0, -1.0],  # behind
+    ]
+    binned = bin_function(camera, LOOKING_ALONG_Z, np.array(points), hand_counted(points), np.zeros(1, int))
+    assert {tuple(cell): int(binned.counts[0][tuple(cell)]) for cell in np.argwhere(binned.counts[0])} == {
+        (0, 0): 1, (15, 15): 2, (29, 29): 1,
+    }  # fmt: skip
+    np.testing.assert_allclose(binned.means[0, :, 15, 15], [30.6, 15.4, 0.05, 0.03, 2.0], rtol=1e-5)
+    np.testing.assert_allclose(binned.means[0, :, 0, 0], [0.6, 0.6, -0.98, -0.48, 1.0], rtol=1e-5)
+    assert binned.n_visible.tolist() == [4] and binned.n_filled.tolist() == [3]
+    assert np.all(binned.means[:, :, binned.counts[0] == 0] == 0)
+
+
+def test_kernel_bins_as_its_plain_twin(random_views: RandomViews, device: str) -> None:
+    v = random_views
+    arguments = v.camera, v.cam_from_world, v.points, v.visible, v.location_rows
+    kernel, plain = bin_views(*arguments, bins=12, device=device), bin_views_plain(*arguments, bins=12)
+    np.testing.assert_array_equal(kernel.counts, plain.counts)
+    np.testing.assert_allclose(kernel.means, plain.means, rtol=1e-5, atol=2e-5)
+    assert plain.counts.sum() > 500
+
+
+def test_counted_bins_are_those_that_the_plain_twin_fills(random_views: RandomViews, device: str) -> None:
+    v = random_views
+    arguments = v.camera, v.cam_from_world, v.points, v.visible, v.location_rows
+    plain = bin_views_plain(*arguments, bins=12)
+    for block_bytes in (1 << 30, 3 * 12 * 12 * 4):  # all at once, and three views at a time
+        n_visible, n_filled = count_bins(*arguments, bins=12, device=device, block_bytes=block_bytes)
+        np.testing.assert_array_equal(n_visible, plain.n_visible)
+        np.testing.assert_array_equal(n_filled, plain.n_filled)
+    distorted = ColmapCamera("RADIAL", 320, 240, (150.0, 165.0, 118.0, -0.15, 0.02))
+    binned = bin_views(distorted, *arguments[1:], bins=6)
+    np.testing.assert_array_equal(count_bins(distorted, *arguments[1:], bins=6), (binned.n_visible, binned.n_filled))
+
+
+def test_a_distorted_camera_bins_what_it_projects(random_views: RandomViews) -> None:
+    v = random_views
+    camera = ColmapCamera("RADIAL", 320, 240, (150.0, 165.0, 118.0, -0.15, 0.02))
+    binned = bin_views(camera, v.cam_from_world, v.points, v.visible, v.location_rows, bins=6)
+    for view, pose in enumerate(v.cam_from_world):
+        seen = transform(pose, v.points[v.visible[v.location_rows[view]]])
+        pixels = camera.project(seen)[camera.sees(seen)]
+        expected, _, _ = np.histogram2d(pixels[:, 1], pixels[:, 0], bins=6, range=((0, 240), (0, 320)))
+        np.testing.assert_array_equal(binned.counts[view], expected)
+
+
+def landmarks_of(views: RandomViews) -> Landmarks:
+    return replace(make_landmarks(np.random.default_rng(0), len(views.points)), points=views.points)
+
+
+def test_kernel_bins_what_landmarks_are_like_as_its_plain_twin(random_views: RandomViews, device: str) -> None:
+    v, landmarks = random_views, landmarks_of(random_views)
+    arguments = v.camera, v.cam_from_world, v.points, v.visible, v.location_rows
+    kernel = bin_views(*arguments, bins=12, device=device, landmarks=landmarks)
+    plain = bin_views_plain(*arguments, bins=12, landmarks=landmarks)
+    assert kernel.channels == plain.channels == ALL_CHANNELS
+    np.testing.assert_array_equal(kernel.counts, plain.counts)
+    np.testing.assert_allclose(kernel.means, plain.means, rtol=1e-5, atol=2e-5)
+    without = bin_views(*arguments, bins=12, device=device)
+    assert without.channels == CHANNELS
+    np.testing.assert_array_equal(kernel.means[:, : len(CHANNELS)], without.means)  # who does not ask pays nothing
+    assert plain.means[:, len(CHANNELS) :].std((0, 2, 3)).min() > 0.01
+
+
+@pytest.mark.parametrize("distorted", [False, True])
+def test_channels_of_landmarks_are_means_of_their_attributes(random_views: RandomViews, distorted: bool) -> None:
+    v, landmarks = random_views, landmarks_of(random_views)
+    camera = ColmapCamera("RADIAL", 320, 240, (150.0, 165.0, 118.0, -0.15, 0.02)) if distorted else v.camera
+    arguments = v.cam_from_world, v.points, v.visible, v.location_rows
+    binned = bin_views(camera, *arguments, bins=1, landmarks=landmarks)
+    seen = visible_landmarks(camera, *arguments)
+    described = LandmarkDescriber(LocalizationMap(landmarks, camera)).describe(v.cam_from_world, seen)
+    of_bins = [ATTRIBUTES.index(name) for name in LANDMARK_CHANNELS]
+    for view in range(len(v.cam_from_world)):
+        values = described.values[described.views == view].numpy()[:, of_bins]
+        expected = values.mean(0) if len(values) else np.zeros(len(LANDMARK_CHANNELS))
+        np.testing.assert_allclose(binned.means[view, len(CHANNELS) :, 0, 0], expected, rtol=1e-4, atol=1e-5)
+
+
+def test_a_mean_with_an_unknown_value_is_unknown_and_nothing_else_is(random_views: RandomViews, device: str) -> None:
+    v, landmarks = random_views, landmarks_of(random_views)
+    known = np.random.default_rng(1).random(len(landmarks)) < 0.9
+    landmarks = replace(landmarks, ambiguity=np.where(known, landmarks.ambiguity, np.nan).astype(np.float32))
+    arguments = v.camera, v.cam_from_world, v.points, v.visible, v.location_rows
+    kernel = bin_views(*arguments, bins=12, device=device, landmarks=landmarks)
+    plain = bin_views_plain(*arguments, bins=12, landmarks=landmarks)
+    np.testing.assert_array_equal(np.isnan(kernel.means), np.isnan(plain.means))
+    unknown = np.isnan(kernel.means).sum((0, 2, 3))
+    assert 0 < unknown[ALL_CHANNELS.index("ambiguity")] < (kernel.counts > 0).sum()
+    assert unknown.sum() == unknown[ALL_CHANNELS.index("ambiguity")]
+
+
+def test_blocks_do_not_change_the_bins(random_views: RandomViews) -> None:
+    v = random_views
+    arguments = v.camera, v.cam_from_world, v.points, v.visible, v.location_rows
+    whole, blocks = bin_views(*arguments, bins=6), bin_views(*arguments, bins=6, block_bytes=7 * 36 * 24)
+    np.testing.assert_array_equal(whole.means, blocks.means)
+    np.testing.assert_array_equal(whole.counts, blocks.counts)
+
+
+def test_input_sizes_are_those_of_the_variants(random_views: RandomViews) -> None:
+    v = random_views
+    binned = bin_views(v.camera, v.cam_from_world, v.points, v.visible, v.location_rows)
+    sizes = {name: binned.select(channels).means[0].size for name, channels in PAPER_VARIANTS.items()}
+    assert sizes == {"2d": 1800, "2d+z": 2700, "2d+3d": 4500}
+    assert len(INPUT_VARIANTS["2d+3d+landmark"]) * 900 == 12600
+    np.testing.assert_array_equal(binned.select(("z",)).means[:, 0], binned.means[:, CHANNELS.index("z")])
+    with pytest.raises(ConfigError, match="unknown input channel"):
+        binned.select(("u", "colour"))
+
+
+def test_compact_layout_moves_filled_bins_to_the_front_in_order() -> None:
+    means = np.zeros((1, 2, 2, 2), dtype=np.float32)
+    means[0, :, 0, 1], means[0, :, 1, 1] = (5, 6), (7, 8)
+    filled = np.array([[[False, True], [False, True]]])
+    assert arrange(means, filled, "compact").reshape(2, 4).tolist() == [[5, 7, 0, 0], [6, 8, 0, 0]]
+    assert arrange(means, filled, "in_place") is means
+    with pytest.raises(ConfigError, match="layout"):
+        arrange(means, filled, "sideways")  # type: ignore[arg-type]

@@ -1,0 +1,185 @@
+"""Landmarks of views described one by one, and pooled, against NumPy view by view."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from synthetic_dataset import CAMERA, make_landmarks
+from wheretolook.geometry.colmap_camera import ColmapCamera
+from wheretolook.geometry.poses import Float, poses_looking_along, transform
+from wheretolook.inputs.landmarks_in_view import ATTRIBUTES, POOLED, POSE_ATTRIBUTES, LandmarkDescriber, pool
+from wheretolook.inputs.localization_map import LocalizationMap, shared_locations
+from wheretolook.labelling.labeller import LABELS
+from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
+from wheretolook.visibility.occlusion import StoredOcclusion
+
+COLMAP = ColmapCamera("OPENCV", 160, 120, (80.0, 80.0, 80.0, 60.0, -0.1, 0.01, 1e-3, -1e-3))
+
+
+def some_views() -> Float:
+    rng = np.random.default_rng(1)
+    at = rng.uniform((-2, -2, 0.5), (2, 2, 2), (6, 3))
+    return poses_looking_along(at[rng.integers(0, 6, 50)], rng.normal(size=(50, 3)))
+
+
+@pytest.fixture(params=[CAMERA, COLMAP], ids=["pinhole", "opencv"])
+def localization_map(request: pytest.FixtureRequest, device: str) -> LocalizationMap:
+    rng = np.random.default_rng(0)
+    landmarks = make_landmarks(rng, 400)
+    centers = np.unique(-np.einsum("bji,bj->bi", some_views()[:, :, :3], some_views()[:, :, 3]).round(6), axis=0)
+    occlusion = StoredOcclusion.from_mask(centers, rng.random((len(centers), 400)) < 0.7)
+    return LocalizationMap(landmarks, request.param, occlusion, device)
+
+
+def test_each_landmark_by_hand(localization_map: LocalizationMap) -> None:
+    m, views = localization_map.landmarks, some_views()
+    described = LandmarkDescriber(localization_map).describe(views)
+    visible = localization_map.visible_landmarks(views)
+    assert len(described) == 50 and described.counts.tolist() == np.diff(visible.starts).tolist()
+    assert described.counts.min() == 0 and described.counts.max() > 50
+    np.testing.assert_array_equal(described.rows.cpu(), visible.indices)
+    np.testing.assert_array_equal(described.views.cpu(), np.repeat(np.arange(50), np.diff(visible.starts)))
+    for view, pose in enumerate(views):
+        rows = visible[view]
+        x, y, z = transform(pose, m.points[rows]).T
+        ray = m.points[rows] + pose[:, :3].T @ pose[:, 3]
+        distance = np.linalg.norm(ray, axis=1)
+        expected = {
+            "across": x / z,
+            "down": y / z,
+            "distance": np.log(distance),
+            "mapped_angle": (ray * m.mapping_direction[rows]).sum(1) / distance,
+            "distance_ratio": np.log(distance / m.mapping_distance_m[rows]),
+            "track_length": np.log(m.track_length[rows]),
+            "reprojection_error": m.reprojection_error_px[rows],
+            "triangulation_angle": np.log(m.triangulation_angle_deg[rows]),
+            "direction_spread": m.mapping_direction_spread[rows],
+            "ambiguity": m.ambiguity[rows],
+            "mapped_distance": np.log(m.mapping_distance_m[rows]),
+            "distance_spread": m.mapping_distance_spread[rows],
+        }
+        assert tuple(expected) == ATTRIBUTES == POSE_ATTRIBUTES + MAP_ATTRIBUTES
+        found = described.values[described.starts[view] : described.starts[view + 1]].cpu()
+        np.testing.assert_allclose(found, np.stack([*expected.values()], axis=1), rtol=1e-4, atol=1e-5)
+
+
+def test_pooled_by_numpy(localization_map: LocalizationMap) -> None:
+    views = some_views()
+    described = LandmarkDescriber(localization_map).describe(views)
+    pooled = pool(described, views, localization_map.camera).cpu().numpy()
+    assert pooled.shape == (50, len(POOLED)) and pooled.dtype == np.float32
+    binned = localization_map.bin_views(views)
+    np.testing.assert_allclose(pooled[:, 0], np.log1p(binned.n_visible), rtol=1e-6)
+    np.testing.assert_allclose(pooled[:, 1], np.log1p(binned.n_filled), rtol=1e-6)
+    coarse = localization_map.bin_views(views, bins=4).counts.reshape(50, -1)
+    np.testing.assert_allclose(pooled[:, 2], (coarse > 0).sum(1))
+    np.testing.assert_allclose(pooled[:, 3], np.log1p(np.sort(coarse, axis=1)[:, 8:]).sum(1), rtol=1e-5)
+    np.testing.assert_allclose(pooled[:, 4], views[:, 2, 2], atol=1e-6)
+    values, starts = described.values.cpu().numpy(), described.starts.cpu().numpy()
+    for view in range(50):
+        part = values[starts[view] : starts[view + 1]].astype(np.float64)
+        if len(part) == 0:
+            assert np.isnan(pooled[view, 5:]).all()
+            continue
+        rank = (np.array([0.1, 0.5, 0.9]) * (len(part) - 1) + 0.5).astype(int)
+        expected = np.concatenate([part.mean(0)[:, None], part.std(0)[:, None], np.sort(part, axis=0)[rank].T], axis=1)
+        np.testing.assert_allclose(pooled[view, 5:].reshape(len(ATTRIBUTES), 5), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_a_views_numbers_are_its_own(localization_map: LocalizationMap) -> None:
+    views, order = some_views(), np.random.default_rng(2).permutation(50)
+    describer, camera = LandmarkDescriber(localization_map), localization_map.camera
+    together = pool(describer.describe(views), views, camera).cpu()
+    shuffled = pool(describer.describe(views[order]), views[order], camera).cpu()
+    np.testing.assert_allclose(shuffled, together[order], rtol=1e-5, atol=1e-6)
+    alone = pool(describer.describe(views[3:4]), views[3:4], camera).cpu()
+    np.testing.assert_allclose(alone, together[3:4], rtol=1e-5, atol=1e-6)
+
+
+def test_without_descriptors_only_the_ambiguity_is_unknown() -> None:
+    landmarks = make_landmarks(np.random.default_rng(0), 300)
+    without = replace(landmarks, ambiguity=np.full(300, np.nan, np.float32))
+    views = some_views()
+    known, unknown = (
+        pool(LandmarkDescriber(one).describe(views), views, CAMERA).numpy()
+        for one in (LocalizationMap(landmarks, CAMERA), LocalizationMap(without, CAMERA))
+    )
+    of_ambiguity = np.array([name.startswith("ambiguity_") for name in POOLED])
+    assert of_ambiguity.sum() == 5 and np.isnan(unknown[:, of_ambiguity]).all()
+    np.testing.assert_allclose(unknown[:, ~of_ambiguity], known[:, ~of_ambiguity], equal_nan=True)
+
+
+def test_no_views_and_no_landmarks() -> None:
+    empty = LocalizationMap(make_landmarks(np.random.default_rng(0), 0), CAMERA)
+    described = LandmarkDescriber(empty).describe(some_views())
+    pooled = pool(described, some_views(), CAMERA)
+    assert pooled.shape == (50, len(POOLED)) and not pooled[:, :4].any() and pooled[:, 5:].isnan().all()
+    full = LocalizationMap(make_landmarks(np.random.default_rng(0), 30), CAMERA)
+    assert pool(LandmarkDescriber(full).describe(np.empty((0, 3, 4))), np.empty((0, 3, 4)), CAMERA).shape == (
+        0,
+        len(POOLED),
+    )
+
+
+def test_inputs_are_known_before_localization() -> None:
+    """Nothing that only localizing tells may enter a score."""
+    names = {*ATTRIBUTES, *POOLED}
+    assert not names & {*LABELS}
+    assert not [
+        name for name in names for word in ("status", "inlier", "matched_rows", "localiz", "label") if word in name
+    ]
+
+
+@pytest.mark.parametrize("most", [None, 1, 20, 10_000])
+def test_blocks_of_views_hold_all_or_evenly_spread_landmarks(
+    localization_map: LocalizationMap, most: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    views = some_views()
+    describer = LandmarkDescriber(localization_map)
+    whole = describer.describe(views)
+    monkeypatch.setattr("wheretolook.inputs.landmarks_in_view.BLOCK_ENTRIES", {"cpu": 100, "cuda": 100})
+    at = 0
+    for rows, part, visible in describer.in_blocks(views, most):
+        assert rows.start == at and (len(part) == 1 or part.counts.sum() <= 100)
+        for view in range(len(part)):
+            all_rows = whole.rows[whole.starts[at] : whole.starts[at + 1]]
+            found = slice(int(part.starts[view]), int(part.starts[view + 1]))
+            assert visible[view] == len(all_rows)
+            if most is None or len(all_rows) <= most:
+                expected = torch.arange(len(all_rows))
+            else:
+                expected = torch.arange(most) * len(all_rows) // most
+            assert torch.equal(part.rows[found].cpu(), all_rows.cpu()[expected])
+            assert torch.equal(part.values[found], whole.values[whole.starts[at] : whole.starts[at + 1]][expected])
+            at += 1
+    assert at == len(views)
+
+
+def test_no_views_are_no_blocks(localization_map: LocalizationMap) -> None:
+    assert list(LandmarkDescriber(localization_map).in_blocks(some_views()[:0], 5)) == []
+
+
+def test_views_share_locations_in_whatever_order_they_come() -> None:
+    rng = np.random.default_rng(5)
+    places = rng.uniform(0, 4, (4, 3))
+    for order in ([0, 0, 0], [0, 0, 1, 1, 2], [2, 0, 2, 1, 0, 3, 3, 0], []):
+        poses = poses_looking_along(places[order], rng.normal(size=(len(order), 3)))
+        locations, rows = shared_locations(poses)
+        assert len(locations) == len(set(order))
+        np.testing.assert_allclose(locations[rows], places[order], atol=1e-6)
+
+
+def test_one_view_is_described_and_thinned_as_it_is_among_others(localization_map: LocalizationMap) -> None:
+    poses, describer = some_views(), LandmarkDescriber(localization_map)
+    ((_, together, seen),) = describer.in_blocks(poses, 20)
+    assert int(seen.max()) > 20 == int(together.counts.max())
+    for view, pose in enumerate(poses):
+        ((_, alone, alone_seen),) = describer.in_blocks(pose[None], 20)
+        mine = together.views == view
+        assert alone.rows.tolist() == together.rows[mine].tolist()
+        torch.testing.assert_close(alone.values, together.values[mine], rtol=1e-5, atol=1e-5, equal_nan=True)
+        assert int(alone_seen[0]) == int(seen[view])

@@ -1,0 +1,266 @@
+"""The convolutional network and the paper's network with landmark channels: what they can learn, on disk and back."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from synthetic_dataset import CAMERA, make_dataset, make_landmarks
+from wheretolook.dataset.folders import Dataset
+from wheretolook.evaluation.config import EvaluateConfig
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.poses import poses_looking_along
+from wheretolook.inputs.bins import ALL_CHANNELS, InputStatistics
+from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.learning.config import TrainConfig
+from wheretolook.learning.data import ViewpointDataModule
+from wheretolook.learning.weights import METADATA_KEY, read_training, weights_kind
+from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.methods.conv.config import ConvConfig
+from wheretolook.methods.conv.learn import ConvNetwork, ConvSpec
+from wheretolook.methods.conv.score import ConvScorer
+from wheretolook.methods.mlp.score import LearnedScorer
+from wheretolook.methods.mlp.weights import load_classifier
+from wheretolook.methods.registry import load_scorer, make_scorer
+from wheretolook.stages.evaluate import evaluate_methods as evaluate
+from wheretolook.stages.train import train_variants as train
+from wheretolook.utils.errors import ConfigError, WeightsError
+from wheretolook.utils.tracking import TrackingConfig, client
+from wheretolook.viewpoints.table import LOCALIZED, NO_POSE, UNLABELLED, poses, write_table
+
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
+FEW = ConvConfig(epochs=2, batch_size=64, widths=(4, 8, 8), bins=12)
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """One MLflow store for all tests: making its database takes seconds."""
+    return str(tmp_path_factory.mktemp("mlruns"))
+
+
+@pytest.fixture
+def network() -> ConvNetwork:
+    """An untrained network whose scores differ from view to view."""
+    mean = (80.0, 60.0, 0.0, 0.0, 2.0, 0.5, 0.0, 1.5, 0.25, 2.0, 0.5, 0.5, 0.5, 0.2)
+    std = (40.0, 30.0, 1.0, 1.0, 1.0, *(0.3 for _ in range(9)))
+    torch.manual_seed(0)
+    found = ConvNetwork(ConvSpec(CAMERA, InputStatistics(ALL_CHANNELS, mean, std), 12, (8, 16), 0.5)).eval()
+    found.scale, found.offset = 1.7, -0.3
+    return found
+
+
+def label_by(dataset: Dataset, channel: str, bins: int = 1) -> None:
+    """Label views by the mean of a channel over what they see: those above the median localize.
+
+    Views that see nothing have no label: that they see nothing would tell.
+    """
+    for scene in dataset.scenes:
+        table = scene.read_table()
+        binned = scene.localization_map(dataset.camera).bin_views(poses(table), bins, landmark_channels=True)
+        filled = (binned.counts > 0).sum((1, 2))
+        values = binned.select((channel,)).means.sum((1, 2, 3)) / np.maximum(filled, 1)
+        good = values > np.median(values[filled > 0])
+        errors = np.where(good, 0.001, np.nan)
+        status = np.select([filled == 0, good], [UNLABELLED, LOCALIZED], NO_POSE)
+        write_table(table.assign(status=status, error_m=errors, error_deg=errors), scene.table)
+
+
+def make_one_wall_ambiguous(dataset: Dataset) -> None:
+    """One wall in every other scene, the other wall in the rest, so that places do not tell which."""
+    for number, scene in enumerate(dataset.scenes):
+        landmarks = Landmarks.load(scene.landmarks)
+        one_wall = (landmarks.points[:, 0] > landmarks.points[:, 1]) ^ (number % 2 == 1)
+        replace(landmarks, ambiguity=(0.3 * landmarks.ambiguity + 0.6 * one_wall).astype(np.float32)).save(
+            scene.landmarks
+        )
+
+
+def views_of(network: ConvNetwork) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    filled = torch.rand((20, 12, 12), generator=generator) < 0.3
+    means = torch.rand((20, len(ALL_CHANNELS), 12, 12), generator=generator) * filled[:, None]
+    means[:5, ALL_CHANNELS.index("ambiguity")] = torch.where(filled[:5], torch.nan, 0.0)
+    return means, filled
+
+
+def test_attributes_tell_a_network_what_places_cannot(tmp_path: Path, store: str) -> None:
+    dataset = make_dataset(tmp_path / "tiny", ("train", "train", "val"), n_locations=14, n_landmarks=200)
+    make_one_wall_ambiguous(dataset)
+    label_by(dataset, "ambiguity")
+    config = TrainConfig(
+        ("2d+3d", "2d+3d+landmark"), epochs=8, batch_size=32, hidden=(32,), bins=6, accelerator="cpu"
+    )  # fmt: skip
+    without, told = train(dataset, config, TrackingConfig(store), progress=False)
+    assert told.path.name == "mlp-2d+3d+landmark.safetensors"
+    assert told.metrics["val_average_precision"] > 0.9
+    assert without.metrics["val_average_precision"] < 0.8
+    scorer = load_scorer(told.path, dataset.scenes[1].localization_map(CAMERA))
+    assert isinstance(scorer, LearnedScorer) and (scorer.name, scorer.inputs) == ("mlp", "2d+3d+landmark")
+
+
+def test_a_convolutional_network_learns_where_landmarks_are(tmp_path: Path, store: str) -> None:
+    dataset = make_dataset(tmp_path / "tiny", ("train", "val"), n_locations=20)
+    label_by(dataset, "v", bins=8)
+    options = replace(FEW, epochs=4, learning_rate=5e-3, bins=8)
+    config = TrainConfig(("conv",), accelerator="cpu", conv=options)
+    (model,) = train(dataset, config, TrackingConfig(store), progress=False)
+    assert model.metrics["val_average_precision"] > 0.85
+    scorer = load_scorer(model.path, dataset.scenes[1].localization_map(CAMERA))
+    table = dataset.scenes[1].read_table()
+    table = table[table["status"] != UNLABELLED]
+    good = (table["status"] == LOCALIZED).to_numpy()
+    # calibrated on these views: the probabilities are right on average
+    assert scorer.score(poses(table)).mean() == pytest.approx(good.mean(), abs=1e-3)
+
+
+def test_only_who_looks_at_landmark_channels_has_them_loaded(tmp_path: Path, store: str) -> None:
+    dataset = make_dataset(tmp_path / "tiny", ("train", "val"), n_locations=4, n_directions=8)
+    widths: list[int] = []
+
+    class Watched(ViewpointDataModule):
+        def setup(self, stage: str | None = None) -> None:
+            super().setup(stage)
+            widths.append(self.views.means.shape[1])
+
+    config = TrainConfig(("2d", "2d+z"), epochs=1, hidden=(4,), bins=4, accelerator="cpu")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("wheretolook.learning.data.ViewpointDataModule", Watched)
+        train(dataset, config, TrackingConfig(store), progress=False)
+        assert {*widths} == {5}
+        widths.clear()
+        wide = replace(config, variants=("2d", "2d+3d+landmark", "released"))
+        train(dataset, wide, TrackingConfig(store), progress=False, force=True)
+    # one binning for both; the released code's options are others, and its inputs the paper's
+    assert widths[0] == 14 and widths[-1] == 5
+
+
+def test_the_paper_trains_as_before() -> None:
+    assert TrainConfig().variants == ("2d", "2d+z", "2d+3d", "set")  # what beats it learns beside it
+
+
+def test_a_map_without_descriptors_trains_and_scores(tmp_path: Path, store: str) -> None:
+    dataset = make_dataset(tmp_path / "tiny", ("train", "train", "val"), n_locations=6, n_directions=12)
+    for number, scene in enumerate(dataset.scenes):
+        landmarks = Landmarks.load(scene.landmarks)
+        unknown = np.full(len(landmarks), np.nan, dtype=np.float32)
+        changes = {"mapping_distance_spread": unknown} | ({} if number == 1 else {"ambiguity": unknown})
+        replace(landmarks, **changes).save(scene.landmarks)
+    config = TrainConfig(("2d+3d+landmark", "conv"), epochs=2, hidden=(8,), bins=6, accelerator="cpu", conv=FEW)
+    models = train(dataset, config, TrackingConfig(store), progress=False)
+    for model in models:
+        assert np.isfinite(list(model.metrics.values())).all()
+        for scene in dataset.scenes:
+            scores = load_scorer(model.path, scene.localization_map(CAMERA)).score(poses(scene.read_table()))
+            assert np.isfinite(scores).all() and len(np.unique(scores)) > 10
+
+
+def test_training_logs_a_run_is_reused_and_evaluated(tmp_path: Path, store: str) -> None:
+    dataset = make_dataset(tmp_path / "tiny", ("train", "train", "test"), n_locations=8, n_directions=12)
+    tracking = TrackingConfig(store, "conv")
+    config = TrainConfig(("conv",), accelerator="cpu", conv=FEW)
+    (model,) = train(dataset, config, tracking, progress=False)
+    assert model.path == dataset.root / "weights" / "conv.safetensors"
+    run = client(tracking).get_run(model.run_id)
+    assert (run.data.params["variant"], run.data.params["epochs"], run.data.params["widths"]) == (
+        "conv", "2", "[4, 8, 8]",
+    )  # fmt: skip
+    data = ViewpointDataModule(dataset, config, progress=False)
+    data.setup()
+    assert run.data.params["n_train"] == str(len(data.train_rows))  # all of them: nothing is balanced
+    assert len(pd.read_csv(Path(run.info.artifact_uri) / "history.csv")) == 2
+    assert [m.step for m in client(tracking).get_metric_history(model.run_id, "val_average_precision")] == [0, 1]
+
+    # a network's options do not matter to it, its own do
+    assert train(dataset, replace(config, learning_rate=0.5, bins=5), tracking, progress=False)[0].reused
+    other = replace(config, conv=replace(FEW, dropout=0.0))
+    assert not train(dataset, other, tracking, progress=False)[0].reused
+
+    table = evaluate(dataset, EvaluateConfig(("bins", "conv"), resamples=50), tracking, progress=False)
+    rows = table[(table["scene"] == "all") & (table["top_n"] == 1)].set_index("method")
+    assert {*rows.index} == {"bins", "conv", "oracle"} and (rows["reference"] == "conv").all()
+    assert 0 <= rows.loc["conv", "ece"] < 0.5
+
+
+def test_a_network_comes_back_from_disk(network: ConvNetwork, tmp_path: Path) -> None:
+    path = tmp_path / "weights" / "conv.safetensors"
+    network.save(path, {"variant": "conv"})
+    loaded, views = ConvNetwork.load(path), views_of(network)
+    assert loaded.spec == network.spec and not loaded.training
+    torch.testing.assert_close(loaded.log_odds(*views), network.log_odds(*views), rtol=0, atol=0)
+    assert network.log_odds(*views).isfinite().all()
+    content = path.read_bytes()
+    loaded.save(path, {"variant": "conv"})
+    assert path.read_bytes() == content
+    assert [file.name for file in path.parent.iterdir()] == ["conv.safetensors"]
+    assert weights_kind(path) == "conv" and read_training(path) == {"variant": "conv"}
+    with pytest.raises(WeightsError, match=r"conv\.safetensors.*not of mlp"):
+        load_classifier(path)
+
+
+def test_damaged_networks_are_named(network: ConvNetwork, tmp_path: Path) -> None:
+    path = tmp_path / "conv.safetensors"
+    network.save(path)
+    tensors, header = load_file(path), json.loads(_header(path))
+    for wrong, changed, message in (
+        ({}, {"kind": "trees"}, "not of conv"),
+        ({}, {"widths": [8, 15]}, "do not fit"),
+        ({}, {"widths": []}, "damaged description"),
+        ({}, {"camera": {"breadth": 3}}, "damaged description"),
+        ({}, {"statistics": {"channels": ["u"], "mean": [0.0], "std": [1.0]}}, "damaged description.*other channels"),
+        ({"last.weight": torch.zeros(1, 3)}, {}, "do not fit"),
+    ):
+        save_file({**tensors, **wrong}, path, metadata={METADATA_KEY: json.dumps({**header, **changed})})
+        with pytest.raises(WeightsError, match=message) as error:
+            ConvNetwork.load(path)
+        assert str(path) in str(error.value)
+    save_file(tensors, path, metadata={METADATA_KEY: json.dumps({**header, "kind": "oracle"})})
+    with pytest.raises(WeightsError, match="not of one scorer"):
+        load_scorer(path, LocalizationMap(make_landmarks(np.random.default_rng(0), 10), CAMERA))
+
+
+@pytest.mark.parametrize("wrong", [{"widths": ()}, {"widths": (8, 0)}, {"dropout": 1.0}, {"bins": 0}, {"epochs": 0}])
+def test_options_that_are_none(wrong: dict[str, object]) -> None:
+    with pytest.raises(ConfigError):
+        ConvConfig(**wrong)  # type: ignore[arg-type]
+
+
+def test_the_scorer_is_the_network_on_binned_views(network: ConvNetwork, tmp_path: Path, device: str) -> None:
+    path = tmp_path / "conv.safetensors"
+    network.save(path)
+    rng = np.random.default_rng(1)
+    views = poses_looking_along(rng.uniform((-1, -1, 1), (1, 1, 2), (40, 3)), rng.normal(size=(40, 3)))
+    localization_map = LocalizationMap(make_landmarks(np.random.default_rng(0), 200), CAMERA, device=device)
+    scorer = load_scorer(path, localization_map)
+    assert isinstance(scorer, ConvScorer) and (scorer.name, scorer.inputs) == ("conv", "")
+    binned = localization_map.bin_views(views, 12, landmark_channels=True)
+    with torch.inference_mode():
+        logits = network(torch.from_numpy(binned.means), torch.from_numpy(binned.counts > 0)).double()
+    scores = scorer.score(views)
+    np.testing.assert_allclose(scores, (1.7 * logits - 0.3).sigmoid(), rtol=1e-5)
+    assert len(np.unique(scores)) > 20  # some views see nothing
+    narrow_bins = localization_map.bin_views(views, 12)  # without what the landmarks are like
+    np.testing.assert_array_equal(scorer.score_binned(views, narrow_bins), scores)
+    np.testing.assert_allclose([scorer.score(views[i : i + 1])[0] for i in range(5)], scores[:5], rtol=1e-6)
+
+    double = PinholeCamera(2 * CAMERA.width, 2 * CAMERA.height, 2 * CAMERA.focal_px)
+    same = load_scorer(path, replace(localization_map, camera=double))
+    np.testing.assert_allclose(same.score(views), scores, rtol=1e-5)
+    with pytest.raises(WeightsError, match=r"conv\.safetensors.*trained for a camera"):
+        load_scorer(path, replace(localization_map, camera=replace(CAMERA, focal_px=40.0)))
+    with pytest.raises(WeightsError, match="not of trees"):
+        make_scorer("trees", localization_map, weights=path)
+
+
+def _header(path: Path) -> str:
+    from safetensors import safe_open
+
+    with safe_open(path, framework="pt") as file:
+        return str(file.metadata()[METADATA_KEY])

@@ -1,0 +1,465 @@
+"""Learners that look at landmarks one by one: which are found, and what a view may expect of them."""
+
+from __future__ import annotations
+
+import gc
+import json
+import weakref
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from safetensors.numpy import load_file, save_file
+
+from synthetic_dataset import CAMERA, make_dataset
+from wheretolook.dataset.folders import Dataset
+from wheretolook.evaluation.config import EvaluateConfig
+from wheretolook.fisher import information
+from wheretolook.inputs.landmarks_in_view import ATTRIBUTES, LandmarkDescriber, ViewLandmarks
+from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.learning.config import TrainConfig
+from wheretolook.learning.data import labelled_rows, training_scenes
+from wheretolook.learning.landmark_views import AttributeStatistics, LandmarkLoader, load_landmark_views
+from wheretolook.learning.weights import METADATA_KEY, weights_kind
+from wheretolook.methods.matchability.config import MatchabilityConfig
+from wheretolook.methods.matchability.learn import LandmarkBatches, Matchability
+from wheretolook.methods.registry import load_scorer, make_scorer
+from wheretolook.methods.set.config import SetConfig
+from wheretolook.methods.set.learn import SetModel, of_size
+from wheretolook.methods.set.network import (
+    EXPECTED,
+    MatchabilityNetwork,
+    SetNetwork,
+    bearing_numbers,
+    expected_parts,
+    expected_statistics,
+    information_matrices,
+)
+from wheretolook.methods.set.score import SetScorer
+from wheretolook.stages.evaluate import evaluate_methods as evaluate
+from wheretolook.stages.train import train_variants as train
+from wheretolook.utils.errors import ConfigError, TableError, WeightsError
+from wheretolook.utils.tracking import TrackingConfig
+from wheretolook.viewpoints.table import LOCALIZED, poses, read_table, write_table
+
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
+DISTANCE = ATTRIBUTES.index("distance")
+NO_STATISTICS = AttributeStatistics((0.0,) * len(ATTRIBUTES), (1.0,) * len(ATTRIBUTES))
+
+
+def attributes_of(offsets: np.ndarray) -> torch.Tensor:
+    """Attributes of landmarks at offsets (N, 3) in the camera's axes; what a map tells of them is 0."""
+    values = np.zeros((len(offsets), len(ATTRIBUTES)))
+    values[:, 0], values[:, 1] = offsets[:, 0] / offsets[:, 2], offsets[:, 1] / offsets[:, 2]
+    values[:, DISTANCE] = np.log(np.linalg.norm(offsets, axis=1))
+    return torch.from_numpy(values)
+
+
+def some_offsets(n: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).uniform((-1, -1, 1), (1, 1, 4), (n, 3))
+
+
+def test_the_information_is_that_of_the_fisher_package() -> None:
+    offsets = some_offsets(40)
+    numbers = bearing_numbers(attributes_of(offsets))
+    np.testing.assert_allclose(numbers, information.bearing_numbers(offsets), rtol=1e-9, atol=1e-12)
+    matrices = information_matrices(numbers)
+    np.testing.assert_allclose(matrices, information.information_matrices(numbers.numpy()), rtol=1e-12)
+
+
+def test_expectations_in_closed_form() -> None:
+    offsets = some_offsets(50)
+    values = attributes_of(offsets)
+    odds = torch.from_numpy(np.random.default_rng(1).normal(size=50))
+    sums = expected_parts(values, odds).sum(0, keepdim=True)
+    found = dict(zip(EXPECTED, expected_statistics(sums, torch.tensor([50]))[0].tolist(), strict=True))
+    p = 1 / (1 + np.exp(-odds.numpy()))
+    matrix = information.information_matrices((p[:, None] * information.bearing_numbers(offsets)).sum(0))
+    covariance = np.linalg.inv(matrix + 1e-3 * np.eye(6))
+    pixels = values[:, :2].numpy()
+    spread = np.linalg.det(np.cov(pixels.T, aweights=p, ddof=0))
+    expected = {
+        "log_expected_inliers": np.log1p(p.sum()),
+        "log_visible": np.log(51),
+        "log_expected_share": None,
+        "log_position_variance": np.log(np.trace(covariance[:3, :3])),
+        "log_orientation_variance": np.log(np.trace(covariance[3:, 3:])),
+        "log_det_information": np.linalg.slogdet(matrix + 1e-3 * np.eye(6))[1],
+        "log_variance_z": np.log(covariance[2, 2]),
+        "log_spread": np.log(spread + 1e-4),
+    }
+    for name, value in expected.items():
+        if value is not None:
+            assert found[name] == pytest.approx(value, rel=1e-5), name
+    assert found["expected_share"] == pytest.approx(p.mean(), rel=1e-5)
+
+
+def test_more_landmarks_leave_less_error_to_expect() -> None:
+    few, many = (attributes_of(np.tile(some_offsets(20), (n, 1))) for n in (1, 10))
+    likely = [torch.full((len(values),), 2.0).double() for values in (few, many)]
+    sums = torch.stack([expected_parts(v, o).sum(0) for v, o in zip((few, many), likely, strict=True)])
+    statistics = expected_statistics(sums, torch.tensor([20, 200]))
+    ratio = statistics[1] - statistics[0]
+    for name in ("log_position_variance", "log_variance_x", "log_orientation_variance"):
+        assert ratio[EXPECTED.index(name)] == pytest.approx(-np.log(10), abs=0.1)  # variance falls as one over n
+
+
+def test_views_without_landmarks_are_scored() -> None:
+    network = SetNetwork(NO_STATISTICS, pooled=3).eval()
+    empty = ViewLandmarks(torch.tensor([0, 0, 0]), torch.zeros(0, dtype=torch.int64), torch.zeros(0, len(ATTRIBUTES)))
+    logits = network.score(empty, empty.counts, torch.zeros(2))
+    assert logits.shape == (2,) and torch.isfinite(logits).all()
+
+
+@pytest.mark.parametrize("pooled", [0, 4])
+def test_a_sample_of_all_landmarks_scores_as_all_of_them(pooled: int) -> None:
+    torch.manual_seed(0)
+    network = SetNetwork(NO_STATISTICS, pooled=pooled).eval()
+    counts = torch.tensor([30, 1, 17])
+    starts = torch.tensor([0, 30, 31, 48])
+    values = attributes_of(some_offsets(48)).float()
+    padded = torch.full((3, 30, len(ATTRIBUTES)), 7.0)
+    for view in range(3):
+        padded[view, : counts[view]] = values[starts[view] : starts[view + 1]]
+    height = torch.tensor([0.1, -0.2, 0.3])
+    whole = network.score(ViewLandmarks(starts, torch.zeros(48, dtype=torch.int64), values), counts, height)
+    torch.testing.assert_close(network(padded, counts, counts, height), whole, rtol=1e-4, atol=1e-5)
+
+
+def test_what_is_not_known_is_the_mean_and_what_is_hidden_does_not_matter() -> None:
+    values = torch.randn(100, len(ATTRIBUTES))
+    values[:, -1] = torch.nan
+    statistics = AttributeStatistics.of(values)
+    assert statistics.mean[-1] == 0 and statistics.std[-1] == 1
+    assert statistics.mean[0] == pytest.approx(float(values[:, 0].mean()), rel=1e-5)
+    network = MatchabilityNetwork(statistics, hidden=("ambiguity",))
+    known = values.clone()
+    known[:, -1] = 0
+    assert torch.equal(network(values), network(known))
+    column = ATTRIBUTES.index("ambiguity")
+    known[:, column] += 1
+    assert torch.equal(network(values), network(known))
+    known[:, 0] += 1
+    assert not torch.equal(network(values), network(known))
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    """Labels by filled bins; a landmark is found if its descriptor is unlike others."""
+    made = make_dataset(tmp_path_factory.mktemp("data"))
+    for scene in made.scenes:
+        table = read_table(scene.table)
+        localization_map = scene.localization_map(CAMERA)
+        visible = localization_map.visible_landmarks(poses(table))
+        clear = localization_map.landmarks.ambiguity < 0.5
+        found = [rows[clear[rows]].astype(np.int32) for rows in (visible[view] for view in range(len(table)))]
+        strangers = np.array([len(clear) - 1], dtype=np.int32)  # matched, but perhaps not in view
+        matched = [np.union1d(rows, strangers).astype(np.int32) for rows in found]
+        write_table(table.assign(matched_rows=matched, inlier_rows=found), scene.table)
+    return made
+
+
+def test_views_by_their_landmarks(dataset: Dataset) -> None:
+    scenes = training_scenes(dataset)
+    views = load_landmark_views(dataset, scenes, TrainConfig(), 20, progress=False, matches=True)
+    at = 0
+    assert views.found is not None
+    for number, scene in enumerate(scenes):
+        table = scene.read_table(matches=True)
+        described = LandmarkDescriber(scene.localization_map(CAMERA)).describe(poses(table))
+        for view in range(len(table)):
+            all_values = described.values[described.starts[view] : described.starts[view + 1]].half()
+            rows = described.rows[described.starts[view] : described.starts[view + 1]].numpy()
+            part = slice(int(views.starts[at]), int(views.starts[at + 1]))
+            kept = views.values[part]
+            assert len(kept) == min(20, len(all_values)) and views.visible[at] == len(all_values)
+            inliers = table["inlier_rows"].iloc[view] if table["status"].iloc[view] == LOCALIZED else None
+            for values, found in zip(kept, views.found[part], strict=True):
+                row = rows[(all_values == values).all(1).numpy()]
+                assert len(row) == 1
+                if inliers is not None:
+                    assert bool(found) == (row[0] in inliers)
+            assert views.scene[at] == number
+            at += 1
+    assert at == len(views)
+
+
+def test_batches_hold_samples_of_each_view(dataset: Dataset) -> None:
+    views = load_landmark_views(dataset, training_scenes(dataset), TrainConfig(), 40, progress=False)
+    rows = torch.arange(5, len(views))
+    loader = LandmarkLoader(views, rows, 64, width=8, shuffle_seed=3)
+    first, second = (torch.cat([batch.inputs[2] for batch in loader]) for _ in range(2))
+    assert not torch.equal(first, second)  # another order
+    assert torch.equal(first.sort().values, views.visible[rows].sort().values)
+    for batch in LandmarkLoader(views, rows, 64, width=8):
+        values, taken, visible, _ = batch.inputs
+        assert torch.equal(taken, visible.clamp(max=8)) and values.shape[1] == taken.max()
+    in_order = LandmarkLoader(views, rows, len(rows), width=8)
+    values, taken, *_ = next(iter(in_order)).inputs
+    assert torch.equal(values[0, : taken[0]].half(), views.values[views.starts[5] : views.starts[5] + taken[0]])
+    wide = next(iter(LandmarkLoader(views, rows, len(rows), 40, shuffle_seed=1))).inputs[0]
+    assert torch.isfinite(wide[..., DISTANCE]).all()
+
+
+FEW = TrainConfig(
+    variants=("matchability", "set"),
+    matchability=MatchabilityConfig(epochs=6, batch_size=8, learning_rate=5e-3),
+    set=SetConfig(epochs=4, batch_size=32, landmarks=32),
+    accelerator="cpu",
+)
+
+
+@pytest.fixture(scope="module")
+def tracking(tmp_path_factory: pytest.TempPathFactory) -> TrackingConfig:
+    return TrackingConfig(folder=str(tmp_path_factory.mktemp("mlruns")))
+
+
+@pytest.fixture(scope="module")
+def trained(dataset: Dataset, tracking: TrackingConfig) -> dict[str, Path]:
+    models = train(dataset, FEW, tracking, progress=False)
+    assert all(not model.reused for model in models)
+    return {model.variant: model.path for model in models}
+
+
+def test_enlarged_views_are_those_of_an_enlarged_scene(dataset: Dataset) -> None:
+    views = load_landmark_views(dataset, training_scenes(dataset), TrainConfig(), 40, progress=False)
+    views = replace(views, axis_height=torch.arange(len(views)).float())  # tells who is who
+    rows = torch.arange(len(views))
+    plain, large = (next(iter(LandmarkLoader(views, rows, len(rows), 8, 3, enlarged=by))) for by in (1.0, 4.0))
+    changed = [DISTANCE, ATTRIBUTES.index("mapped_distance")]
+    same = [at for at in range(len(ATTRIBUTES)) if at not in changed]
+    torch.testing.assert_close(large.inputs[0][..., same], plain.inputs[0][..., same], equal_nan=True)
+    growth = (large.inputs[0] - plain.inputs[0])[..., changed]
+    assert torch.allclose(growth, growth[:, :1, :1], atol=1e-5)  # one for all landmarks of a view
+    growth = growth[:, 0, 0]
+    assert growth.min() < -1.2 and growth.max() > 1.2 and growth.abs().max() <= np.log(4) + 1e-5
+    table = pd.concat([labelled_rows(scene) for scene in training_scenes(dataset)], ignore_index=True)
+    table = table.iloc[large.inputs[3].long().numpy()]
+    error_m = table["error_m"].to_numpy() * growth.exp().numpy()
+    good = (table["status"] == LOCALIZED) & (error_m < 0.05) & (table["error_deg"] < 0.4)
+    assert np.array_equal(large.labels.numpy() > 0, good) and not torch.equal(large.labels, plain.labels)
+
+    # and the attributes are those of the same views in a scene of twice the size
+    scene = dataset.scenes[0]
+    localization_map = scene.localization_map(dataset.camera)
+    landmarks = localization_map.landmarks
+    twice = replace(landmarks, points=2 * landmarks.points, mapping_distance_m=2 * landmarks.mapping_distance_m)
+    cam_from_world = poses(labelled_rows(scene))[:20]
+    visible = localization_map.visible_landmarks(cam_from_world)
+    here = LandmarkDescriber(localization_map).describe(cam_from_world, visible).values
+    cam_from_world[:, :, 3] *= 2
+    there = LandmarkDescriber(LocalizationMap(twice, dataset.camera)).describe(cam_from_world, visible).values
+    torch.testing.assert_close(there[:, same], here[:, same], equal_nan=True, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(there[:, changed], here[:, changed] + np.log(2), rtol=1e-4, atol=1e-4)
+
+
+def test_landmarks_of_enlarged_views() -> None:
+    values = torch.randn(500, len(ATTRIBUTES), generator=torch.Generator().manual_seed(0))
+    found, rows = values[:, 0] > 0, torch.arange(500)
+    (plain,), (large,) = (list(LandmarkBatches(values, found, rows, 500, 1, enlarged=by)) for by in (1.0, 2.0))
+    growth = large.inputs[0] - plain.inputs[0]
+    assert torch.equal(large.labels, plain.labels) and 0.6 < float(growth.max()) <= np.log(2) + 1e-5
+    assert torch.allclose(growth[:, DISTANCE], growth[:, ATTRIBUTES.index("mapped_distance")], atol=1e-5)
+    growth[:, [DISTANCE, ATTRIBUTES.index("mapped_distance")]] = 0
+    assert not growth.any()
+
+
+@pytest.mark.parametrize(("world_size", "enlarged"), [(2, 1.0), (3, 3.0)])
+def test_processes_share_out_every_batch(dataset: Dataset, world_size: int, enlarged: float) -> None:
+    views = load_landmark_views(dataset, training_scenes(dataset), TrainConfig(), 40, progress=False)
+    rows = torch.arange(101)  # the last batch has one view: some processes get none
+    whole = list(LandmarkLoader(views, rows, 20, width=8, shuffle_seed=3, enlarged=enlarged))
+    loaders = [LandmarkLoader(views, rows, 20, 8, 3, rank, world_size, enlarged) for rank in range(world_size)]
+    for batch, shares in zip(whole, zip(*loaders, strict=True), strict=True):
+        assert {share.total for share in shares} == {len(batch.labels)}
+        assert torch.equal(torch.cat([share.inputs[2] for share in shares]), batch.inputs[2])
+        assert torch.equal(torch.cat([share.labels for share in shares]), batch.labels)
+        at = 0
+        for share in shares:
+            values, taken = share.inputs[:2]
+            for one, many in zip(values, taken, strict=True):
+                assert torch.equal(one[:many], batch.inputs[0][at][:many])
+                at += 1
+    found = torch.rand(1000) < 0.5
+    alone = [LandmarkBatches(views.values, found, torch.arange(1000), 300, 5)]
+    together = [LandmarkBatches(views.values, found, torch.arange(1000), 300, 5, rank, world_size)
+                for rank in range(world_size)]  # fmt: skip
+    for batch, shares in zip(alone[0], zip(*together, strict=True), strict=True):
+        assert torch.equal(torch.cat([share.labels for share in shares]), batch.labels)
+
+
+def test_a_batch_of_one_view_or_none_is_learnt_from() -> None:
+    network = SetNetwork(NO_STATISTICS, pooled=2).train()
+    for n in (0, 1):
+        taken = torch.full((n,), 3)
+        network(torch.randn(n, 3, len(ATTRIBUTES)), taken, taken, torch.zeros(n)).sum().backward()
+    assert all(torch.isfinite(parameter.grad).all() for parameter in network.parameters())
+
+
+def test_maps_of_expected_scorers_can_go(dataset: Dataset, trained: dict[str, Path]) -> None:
+    localization_map = dataset.split("test")[0].localization_map(CAMERA)
+    scorer = make_scorer("expected-inliers", localization_map, weights=trained["matchability"])
+    scorer.score(poses(dataset.split("test")[0].read_table())[:3])
+    gone = weakref.ref(localization_map)
+    del scorer, localization_map
+    gc.collect()
+    assert gone() is None
+
+
+def test_who_is_found_is_learnt(dataset: Dataset, trained: dict[str, Path]) -> None:
+    matchability = Matchability.load(trained["matchability"])
+    localization_map = dataset.split("test")[0].localization_map(CAMERA)
+    described = LandmarkDescriber(localization_map).describe(poses(dataset.split("test")[0].read_table())[:50])
+    probability = matchability.log_odds(described.values).sigmoid().numpy()
+    clear = localization_map.landmarks.ambiguity[described.rows.numpy()]
+    assert probability[clear < 0.4].mean() > 0.8 and probability[clear > 0.6].mean() < 0.2
+
+
+def test_the_set_network_starts_from_the_matchability(
+    dataset: Dataset, trained: dict[str, Path], tracking: TrackingConfig
+) -> None:
+    again = train(dataset, FEW, tracking, progress=False)
+    assert all(model.reused for model in again)
+    record = json.loads(trained["set"].with_suffix(".json").read_text())
+    assert record["about"]["matchability_sha256"] is not None
+    assert record["metrics"]["val_average_precision"] > 0.8
+    statistics = Matchability.load(trained["matchability"]).network.statistics
+    assert SetModel.load(trained["set"]).network.statistics == statistics
+
+
+def test_matches_must_be_stored(tmp_path: Path, tracking: TrackingConfig) -> None:
+    plain = make_dataset(tmp_path)
+    with pytest.raises(TableError, match="not stored which landmarks"):
+        train(plain, replace(FEW, variants=("matchability",)), tracking, progress=False)
+
+
+@pytest.mark.parametrize("variant", ["matchability", "set"])
+def test_models_come_back_from_disk(trained: dict[str, Path], tmp_path: Path, variant: str) -> None:
+    model_class = {"matchability": Matchability, "set": SetModel}[variant]
+    model = model_class.load(trained[variant])
+    copy = tmp_path / "copy.safetensors"
+    model.save(copy)
+    model_class.load(copy).save(tmp_path / "again.safetensors")
+    assert copy.read_bytes() == (tmp_path / "again.safetensors").read_bytes()
+    assert weights_kind(copy) == variant
+    for name, tensor in model_class.load(copy).network.state_dict().items():
+        assert torch.equal(tensor, model.network.state_dict()[name])
+    tensors = load_file(copy)
+    tensors.pop(sorted(tensors)[0])
+    save_file(tensors, tmp_path / "broken.safetensors", metadata=_metadata(copy))
+    with pytest.raises(WeightsError, match="damaged weights"):
+        model_class.load(tmp_path / "broken.safetensors")
+    other = {"matchability": SetModel, "set": Matchability}[variant]
+    with pytest.raises(WeightsError, match="not of"):
+        other.load(copy)
+
+
+def _metadata(path: Path) -> dict[str, str]:
+    from safetensors import safe_open
+
+    with safe_open(path, framework="np") as file:
+        return {METADATA_KEY: file.metadata()[METADATA_KEY]}
+
+
+def test_expected_scores_by_hand(dataset: Dataset, trained: dict[str, Path]) -> None:
+    scene = dataset.split("test")[0]
+    localization_map = scene.localization_map(CAMERA)
+    views = poses(scene.read_table())[:40]
+    described = LandmarkDescriber(localization_map).describe(views)
+    p = Matchability.load(trained["matchability"]).log_odds(described.values).sigmoid().double().numpy()
+    starts = described.starts.numpy()
+    scores = {
+        name: make_scorer(name, localization_map, weights=trained["matchability"]).score(views)
+        for name in ("expected-inliers", "expected-bins", "fisher-trace-expected", "fisher-mineig-expected")
+    }
+    fx = CAMERA.focal_px
+    for view in range(40):
+        part = slice(starts[view], starts[view + 1])
+        assert scores["expected-inliers"][view] == pytest.approx(
+            p[part].sum() / len(localization_map.landmarks), rel=1e-5
+        )
+        uv = described.values[part, :2].double().numpy() * fx + [CAMERA.cx, CAMERA.cy]
+        cells = (uv * 30 / [CAMERA.width, CAMERA.height]).astype(int).clip(0, 29)
+        none = {}
+        for cell, one in zip(map(tuple, cells), p[part], strict=True):
+            none[cell] = none.get(cell, 1.0) * (1 - one)
+        assert scores["expected-bins"][view] == pytest.approx(
+            sum(1 - one for one in none.values()) / 900, rel=1e-4, abs=1e-9
+        )
+        points = localization_map.landmarks.points[described.rows.numpy()[part]]
+        offsets = points + views[view][:, :3].T @ views[view][:, 3]
+        numbers = (p[part, None] * information.bearing_numbers(offsets)).sum(0)
+        matrix = information.information_matrices(numbers)
+        values = np.linalg.eigvalsh(matrix)
+        assert scores["fisher-trace-expected"][view] == pytest.approx(values.sum(), rel=1e-4, abs=1e-6)
+        assert scores["fisher-mineig-expected"][view] == pytest.approx(abs(values).min(), rel=1e-3, abs=1e-5)
+
+
+def test_certain_landmarks_give_the_exact_information(dataset: Dataset, tmp_path: Path) -> None:
+    network = MatchabilityNetwork(NO_STATISTICS)
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.zero_()
+        network.layers[-1].bias.fill_(40.0)
+    Matchability(network, CAMERA).save(tmp_path / "certain.safetensors")
+    localization_map = dataset.split("test")[0].localization_map(CAMERA)
+    views = poses(dataset.split("test")[0].read_table())[:60]
+    for metric in ("trace", "logdet"):
+        certain = make_scorer(f"fisher-{metric}-expected", localization_map, weights=tmp_path / "certain.safetensors")
+        expected = certain.score(views)
+        exact = make_scorer(f"fisher-{metric}-exact", localization_map).score(views)
+        np.testing.assert_allclose(expected, exact, rtol=1e-3, atol=1e-4)
+
+
+def test_scores_of_a_set_network(dataset: Dataset, trained: dict[str, Path]) -> None:
+    scene = dataset.split("test")[0]
+    localization_map, views = scene.localization_map(CAMERA), poses(scene.read_table())
+    scorer = load_scorer(trained["set"], localization_map)
+    assert isinstance(scorer, SetScorer)
+    scores = scorer.score(views)
+    assert scores.min() >= 0 and scores.max() <= 1 and len(np.unique(scores)) > len(scores) / 2
+    order = np.random.default_rng(0).permutation(len(views))
+    np.testing.assert_allclose(scorer.score(views[order]), scores[order], rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(scorer.score(views[7:8]), scores[7:8], rtol=1e-4, atol=1e-6)
+    narrow = LocalizationMap(localization_map.landmarks, replace(CAMERA, focal_px=2 * CAMERA.focal_px))
+    with pytest.raises(WeightsError, match="trained for a camera"):
+        load_scorer(trained["set"], narrow)
+    with pytest.raises(WeightsError, match="not of one scorer"):
+        load_scorer(trained["matchability"], localization_map)
+
+
+def test_all_are_evaluated(dataset: Dataset, trained: dict[str, Path], tracking: TrackingConfig) -> None:
+    names = ("bins", "set", "expected-inliers", "expected-bins", "fisher-logdet-expected")
+    config = EvaluateConfig(methods=names, top_n=(1,), resamples=50)
+    table = evaluate(dataset, config, tracking, progress=False)
+    rows = table[table["scene"] == "all"].set_index(["method", "inputs"])
+    assert {("set", ""), ("expected", "inliers"), ("expected", "bins"), ("fisher", "logdet expected")} <= set(
+        rows.index
+    )
+    assert rows.loc[("set", ""), "roc_auc"] > 0.8 and np.isfinite(rows.loc[("set", ""), "ece"])
+    assert rows.loc[("set", ""), "reference"] == "set"
+
+
+def test_few_views_are_gone_through_more_often() -> None:
+    config = TrainConfig(variants=("set",)).of_variant("set")
+    assert of_size(config, 200_000) is config and of_size(config, 16 * 1024) is config
+    few = of_size(config, 1350)
+    assert few.batch_size == 84 and few.epochs * 17 >= 600 > (few.epochs - 1) * 17
+    assert of_size(config, 100).batch_size == 64 and of_size(config, 100).epochs == 300
+
+
+def test_impossible_options() -> None:
+    with pytest.raises(ConfigError, match="hidden names"):
+        SetConfig(hidden=("colour",))
+    with pytest.raises(ConfigError, match="pooled"):
+        SetConfig(pooled=-1)
+    with pytest.raises(ConfigError, match="landmarks and width"):
+        MatchabilityConfig(width=0)
+    with pytest.raises(ConfigError, match="epochs"):
+        SetConfig(epochs=0)
+    with pytest.raises(ConfigError, match="enlarged"):
+        MatchabilityConfig(enlarged=0.5)

@@ -1,0 +1,173 @@
+"""Inputs of the network, and weights on disk."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.inputs.bins import ALL_CHANNELS, CHANNELS, INPUT_VARIANTS, LANDMARK_CHANNELS, InputStatistics, arrange
+from wheretolook.learning.weights import METADATA_KEY, read_training
+from wheretolook.methods.mlp.network import BinnedInput, NetworkSpec, ViewpointNetwork, add_noise, move_to_front
+from wheretolook.methods.mlp.weights import load_classifier, save_classifier
+from wheretolook.utils.errors import WeightsError
+
+BINS = 6
+
+
+@pytest.fixture
+def views() -> tuple[torch.Tensor, torch.Tensor]:
+    """Random binned views with all channels; view 0 sees nothing."""
+    generator = torch.Generator().manual_seed(0)
+    filled = torch.rand((50, BINS, BINS), generator=generator) < 0.4
+    filled[0] = False
+    scale = torch.tensor([100.0, 70.0, 1.0, 2.0, 5.0] + [0.3] * len(LANDMARK_CHANNELS))[:, None, None]
+    values = torch.randn((50, len(ALL_CHANNELS), BINS, BINS), generator=generator)
+    return (values + 3) * scale * filled[:, None], filled
+
+
+def make_network(
+    views: tuple[torch.Tensor, torch.Tensor], variant: str = "2d+z", **options: object
+) -> ViewpointNetwork:
+    statistics = InputStatistics.of(*views, torch.arange(50), ALL_CHANNELS).select(INPUT_VARIANTS[variant])
+    torch.manual_seed(1)
+    spec = NetworkSpec(variant, PinholeCamera(64, 48, 32.0), statistics, bins=BINS, hidden=(8, 8), **options)  # type: ignore[arg-type]
+    return ViewpointNetwork(spec).eval()
+
+
+def test_statistics_are_over_filled_bins_of_the_given_views(views: tuple[torch.Tensor, torch.Tensor]) -> None:
+    means, filled = views
+    rows = torch.arange(10, 40)
+    statistics = InputStatistics.of(means, filled, rows, ALL_CHANNELS)
+    for index, name in enumerate(ALL_CHANNELS):
+        values = means[rows, index][filled[rows]].double()
+        assert statistics.mean[statistics.channels.index(name)] == pytest.approx(values.mean().item(), rel=1e-6)
+        assert statistics.std[index] == pytest.approx(values.std(correction=0).item(), rel=1e-5)
+
+
+def test_statistics_of_nothing_and_of_constants_are_harmless() -> None:
+    means, filled = torch.zeros(3, len(CHANNELS), 2, 2), torch.zeros(3, 2, 2, dtype=torch.bool)
+    assert InputStatistics.of(means, filled, torch.arange(3)).std == (1.0,) * len(CHANNELS)
+
+
+@pytest.mark.parametrize("variant", INPUT_VARIANTS)
+def test_standardized_inputs_have_mean_0_and_deviation_1_where_filled_and_are_0_elsewhere(
+    views: tuple[torch.Tensor, torch.Tensor], variant: str
+) -> None:
+    means, filled = views
+    statistics = InputStatistics.of(means, filled, torch.arange(50), ALL_CHANNELS).select(INPUT_VARIANTS[variant])
+    layer = BinnedInput(NetworkSpec(variant, PinholeCamera(), statistics, bins=BINS))
+    values = layer(means, filled).reshape(50, -1, BINS, BINS)
+    assert values.shape[1] == len(INPUT_VARIANTS[variant])
+    for channel in values.unbind(1):
+        assert torch.all(channel[~filled] == 0)
+        assert channel[filled].mean().item() == pytest.approx(0, abs=1e-5)
+        assert channel[filled].std(correction=0).item() == pytest.approx(1, abs=1e-4)
+
+
+def test_what_is_not_known_of_landmarks_is_the_mean_of_what_is(views: tuple[torch.Tensor, torch.Tensor]) -> None:
+    means, filled = views
+    ambiguity, spread = (ALL_CHANNELS.index(name) for name in ("ambiguity", "distance_spread"))
+    known = means.clone()
+    means[:20, ambiguity] = torch.where(filled[:20], torch.nan, 0.0)  # a map without descriptors
+    means[:, spread] = torch.where(filled, torch.nan, 0.0)  # known of no map
+    statistics = InputStatistics.of(means, filled, torch.arange(50), ALL_CHANNELS)
+    rest = InputStatistics.of(means[20:], filled[20:], torch.arange(30), ALL_CHANNELS)
+    assert statistics.mean[ambiguity] == pytest.approx(rest.mean[ambiguity], rel=1e-9)
+    assert statistics.std[ambiguity] == pytest.approx(rest.std[ambiguity], rel=1e-6)
+
+    variant = "2d+3d+landmark"
+    layer = BinnedInput(NetworkSpec(variant, PinholeCamera(), statistics, bins=BINS))
+    values = layer(means, filled).reshape(known.shape)
+    assert values.isfinite().all()
+    assert torch.all(values[:20, ambiguity] == 0) and values[20:, ambiguity].std() > 0.1
+    assert torch.all(values[:, spread] == 0)
+    # what was never known while it learnt says nothing to a network when it is
+    assert torch.all(layer(known, filled).reshape(known.shape)[:, spread] == 0)
+    means[3, 0, 2, 2] = torch.nan  # where a landmark lies is always known: such an error is not hidden
+    assert layer(means, torch.ones_like(filled)).isnan().any()
+
+
+def test_noise_leaves_what_landmarks_are_like(views: tuple[torch.Tensor, torch.Tensor]) -> None:
+    means, filled = views
+    noisy = add_noise(means, filled, noise_px=2.0, noise_m=0.1, channels=ALL_CHANNELS)
+    changed = (noisy != means).sum((0, 2, 3)) > 0
+    assert changed.tolist() == [name in CHANNELS for name in ALL_CHANNELS]
+
+
+def test_compact_layout_is_the_one_of_features(views: tuple[torch.Tensor, torch.Tensor]) -> None:
+    means, filled = views
+    expected = arrange(means.numpy(), filled.numpy(), "compact")
+    np.testing.assert_array_equal(move_to_front(means, filled).numpy(), expected)
+    in_place, compact = make_network(views), make_network(views, layout="compact")
+    compact.load_state_dict(in_place.state_dict())
+    assert not torch.allclose(in_place(means, filled), compact(means, filled))
+
+
+def test_paper_sizes() -> None:
+    for variant, size in {"2d": 1800, "2d+z": 2700, "2d+3d": 4500}.items():
+        channels = INPUT_VARIANTS[variant]
+        statistics = InputStatistics(channels, (0.0,) * len(channels), (1.0,) * len(channels))
+        layers = ViewpointNetwork(NetworkSpec(variant, PinholeCamera(), statistics)).layers
+        assert [layer.weight.shape for layer in layers if isinstance(layer, torch.nn.Linear)] == [
+            (300, size),
+            (300, 300),
+            (1, 300),
+        ]
+
+
+def test_weights_survive_the_disk(views: tuple[torch.Tensor, torch.Tensor], tmp_path: Path) -> None:
+    network = make_network(views, "2d+3d", input_dropout=0.3)
+    path = tmp_path / "weights" / "mlp.safetensors"
+    save_classifier(network, path, {"dataset_fingerprint": "abc"})
+    loaded = load_classifier(path)
+    assert loaded.spec == network.spec
+    assert not loaded.training
+    torch.testing.assert_close(loaded(*views), network(*views), rtol=0, atol=0)
+    assert read_training(path) == {"dataset_fingerprint": "abc"}
+    assert [file.name for file in path.parent.iterdir()] == ["mlp.safetensors"]
+    first = path.read_bytes()
+    save_classifier(network, path, {"dataset_fingerprint": "abc"})
+    assert path.read_bytes() == first
+
+
+def test_unusable_weights_are_named(views: tuple[torch.Tensor, torch.Tensor], tmp_path: Path) -> None:
+    good = tmp_path / "good.safetensors"
+    save_classifier(make_network(views), good)
+    with pytest.raises(WeightsError, match=r"nowhere\.safetensors.*there are no weights"):
+        load_classifier(tmp_path / "nowhere.safetensors")
+
+    truncated = tmp_path / "truncated.safetensors"
+    truncated.write_bytes(good.read_bytes()[:-7])
+    with pytest.raises(WeightsError, match="not a readable safetensors file"):
+        load_classifier(truncated)
+
+    foreign = tmp_path / "foreign.safetensors"
+    save_file({"a": torch.zeros(3)}, foreign)
+    with pytest.raises(WeightsError, match="not written by wheretolook"):
+        load_classifier(foreign)
+
+    tensors = load_file(good)
+    header = {"format_version": 1, **json.loads(_header(good))}
+    other = tmp_path / "other.safetensors"
+    for change, message in (
+        ({"format_version": 99}, "reads weights of format 1"),
+        ({"hidden": [9, 9]}, "do not fit the network"),
+        ({"variant": "4d"}, "unknown input variant"),
+        ({"camera": {"width": 0}}, "camera needs a positive width"),
+    ):
+        save_file(tensors, other, metadata={METADATA_KEY: json.dumps({**header, **change})})
+        with pytest.raises(WeightsError, match=message):
+            load_classifier(other)
+
+
+def _header(path: Path) -> str:
+    from safetensors import safe_open
+
+    with safe_open(path, framework="pt") as file:
+        return str(file.metadata()[METADATA_KEY])

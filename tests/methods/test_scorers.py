@@ -1,0 +1,180 @@
+"""Every method against hand-counted views, and the contract that all of them keep."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from synthetic_dataset import CAMERA, make_landmarks, make_mapping_poses
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.poses import Float, poses_looking_along
+from wheretolook.inputs.bins import ALL_CHANNELS, CHANNELS, INPUT_VARIANTS, BinnedViews, InputStatistics
+from wheretolook.inputs.landmarks_in_view import ATTRIBUTES, LandmarkDescriber, pool
+from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.learning.landmark_views import AttributeStatistics
+from wheretolook.methods.base import Scorer
+from wheretolook.methods.bins import BinsScorer
+from wheretolook.methods.conv.learn import ConvNetwork, ConvSpec
+from wheretolook.methods.matchability.learn import Matchability
+from wheretolook.methods.mlp.network import NetworkSpec, ViewpointNetwork
+from wheretolook.methods.mlp.weights import save_classifier
+from wheretolook.methods.registry import EXPECTED_METHODS, SCORERS, load_scorer, make_scorer
+from wheretolook.methods.set.learn import SetModel
+from wheretolook.methods.set.network import MatchabilityNetwork, SetNetwork
+from wheretolook.methods.sphere.config import SphereConfig
+from wheretolook.methods.sphere.learn import SphereModel, SphereNetwork
+from wheretolook.methods.trees.config import TreesConfig
+from wheretolook.methods.trees.learn import BoostedTrees, PooledViews, fit_trees
+from wheretolook.methods.visible import VisibleScorer
+from wheretolook.utils.errors import ConfigError, WeightsError
+
+
+@pytest.fixture
+def localization_map() -> LocalizationMap:
+    landmarks = make_landmarks(np.random.default_rng(0), 200)
+    return LocalizationMap(landmarks, CAMERA, mapping_poses=make_mapping_poses(0))
+
+
+@pytest.fixture
+def views() -> Float:
+    rng = np.random.default_rng(1)
+    return poses_looking_along(rng.uniform((-1, -1, 1), (1, 1, 2), (40, 3)), rng.normal(size=(40, 3)))
+
+
+@pytest.fixture
+def weights(tmp_path: Path) -> Path:
+    """An untrained network whose scores differ from view to view."""
+    torch.manual_seed(0)
+    channels = INPUT_VARIANTS["2d+3d"]
+    statistics = InputStatistics(channels, (80.0, 60.0, 0.0, 0.0, 2.0), (40.0, 30.0, 1.0, 1.0, 1.0))
+    path = tmp_path / "mlp.safetensors"
+    save_classifier(ViewpointNetwork(NetworkSpec("2d+3d", CAMERA, statistics, hidden=(16,))), path)
+    return path
+
+
+NO_STATISTICS = AttributeStatistics((0.0,) * len(ATTRIBUTES), (1.0,) * len(ATTRIBUTES))
+
+
+def some_trees(localization_map: LocalizationMap) -> BoostedTrees:
+    """Trees whose scores differ from view to view."""
+    rng = np.random.default_rng(2)
+    directions = poses_looking_along(rng.uniform((-1, -1, 1), (1, 1, 2), (300, 3)), rng.normal(size=(300, 3)))
+    values = pool(LandmarkDescriber(localization_map).describe(directions), directions, CAMERA).numpy()
+    labels = np.nan_to_num(values[:, 0] + values[:, 10]) + rng.normal(size=300) > 3
+    views = PooledViews(values, labels, np.zeros(300, int), np.arange(300))
+    return fit_trees(views, views, CAMERA, TreesConfig(max_trees=10, max_leaves=15, min_leaf=3))[0]
+
+
+def some_convolutions() -> ConvNetwork:
+    """An untrained network whose scores differ from view to view."""
+    torch.manual_seed(0)
+    mean, std = (80.0, 60.0, 0.0, 0.0, 2.0, *[0.5] * 9), (40.0, 30.0, *[1.0] * 12)
+    return ConvNetwork(ConvSpec(CAMERA, InputStatistics(ALL_CHANNELS, mean, std), 30, (8, 8), 0.0))
+
+
+@pytest.mark.parametrize("name", SCORERS)
+def test_scorers_keep_their_contract(
+    name: str, localization_map: LocalizationMap, views: Float, weights: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if name == "trees":
+        weights = weights.with_name("trees.safetensors")
+        some_trees(localization_map).save(weights)
+    if name == "conv":
+        weights = weights.with_name("conv.safetensors")
+        some_convolutions().save(weights)
+    if name == "sphere":
+        weights = weights.with_name("sphere.safetensors")
+        SphereModel(SphereNetwork(SphereConfig()), SphereConfig(), CAMERA).save(weights)
+    if name == "set":
+        weights = weights.with_name("set.safetensors")
+        SetModel(SetNetwork(NO_STATISTICS, pooled=2), CAMERA).save(weights)
+    if name in EXPECTED_METHODS:
+        weights = weights.with_name("matchability.safetensors")
+        Matchability(MatchabilityNetwork(NO_STATISTICS), CAMERA).save(weights)
+    scorer = make_scorer(name, localization_map, seed=3, weights=weights)
+    assert isinstance(scorer, Scorer)
+    assert name in (scorer.name, f"{scorer.name}-{scorer.inputs.replace(' ', '-')}")
+    scores = scorer.score(views)
+    assert scores.shape == (40,)
+    assert scores.dtype == np.float64
+    assert np.isfinite(scores).all()
+    assert scorer.name == "fisher" or np.all((scores >= 0) & (scores <= 1))
+    assert len(np.unique(scores)) > 15
+    order = np.random.default_rng(0).permutation(40)
+    np.testing.assert_allclose(scorer.score(views[order]), scores[order], rtol=1e-6)  # a pose's score is its own
+    np.testing.assert_allclose(scorer.score(views[7:8]), scores[7:8], rtol=1e-6)
+    np.testing.assert_array_equal(scorer.score_binned(views, localization_map.bin_views(views)), scores)
+    monkeypatch.setattr("wheretolook.methods.base.BLOCK", 7)
+    np.testing.assert_allclose(scorer.score(views), scores, rtol=1e-6)
+    assert scorer.score(views[:0]).shape == (0,)
+
+
+def _binned(counts: list[list[int]]) -> BinnedViews:
+    """Views of 2 x 2 bins with so many landmarks each."""
+    array = np.array(counts, dtype=np.int32).reshape(-1, 2, 2)
+    return BinnedViews(np.zeros((len(array), len(CHANNELS), 2, 2), dtype=np.float32), array, CHANNELS)
+
+
+def test_counting_scorers_on_hand_counted_bins(localization_map: LocalizationMap) -> None:
+    binned = _binned([[0, 0, 0, 0], [9, 0, 0, 0], [1, 1, 0, 0], [1, 2, 0, 0], [1, 1, 1, 1], [50, 50, 50, 50]])
+    np.testing.assert_allclose(
+        VisibleScorer(localization_map, bins=2).score_bins(binned) * 200, [0, 9, 2, 3, 4, 200], rtol=1e-12
+    )
+    by_bins = BinsScorer(localization_map, bins=2).score_bins(binned)
+    # one bin with nine landmarks loses to two bins with one each; equal bins are told apart by their landmarks
+    np.testing.assert_array_equal(np.argsort(by_bins), [0, 1, 2, 3, 4, 5])
+    np.testing.assert_array_equal(np.floor(by_bins * 5), [0, 1, 2, 2, 4, 4])
+    assert by_bins.max() < 1
+
+
+def test_random_scores_are_uniform_and_depend_on_the_seed(localization_map: LocalizationMap) -> None:
+    rng = np.random.default_rng(0)
+    views = poses_looking_along(np.zeros((20000, 3)), rng.normal(size=(20000, 3)))
+    a, b = (make_scorer("random", localization_map, seed=seed).score(views) for seed in (0, 1))
+    assert np.abs(np.histogram(a, 20, (0, 1))[0] - 1000).max() < 6 * np.sqrt(1000)
+    assert abs(np.corrcoef(a, b)[0, 1]) < 0.03
+    assert abs(np.corrcoef(a[1:], a[:-1])[0, 1]) < 0.03
+    # a pose that went to disk and back is the same pose
+    np.testing.assert_array_equal(make_scorer("random", localization_map).score(views[:100] * (1 + 1e-16)), a[:100])
+
+
+def test_learned_scores_equal_the_network_by_hand(
+    localization_map: LocalizationMap, views: Float, weights: Path
+) -> None:
+    scorer = load_scorer(weights, localization_map)
+    assert (scorer.name, scorer.inputs) == ("mlp", "2d+3d")
+    binned = localization_map.bin_views(views)
+    network = scorer.network
+    mean = np.array(network.spec.statistics.mean, dtype=np.float32)[:, None, None]
+    std = np.array(network.spec.statistics.std, dtype=np.float32)[:, None, None]
+    values = np.where(binned.counts[:, None] > 0, (binned.means - mean) / std, 0).reshape(40, -1)
+    first, last = network.layers[0], network.layers[-1]
+    hidden = np.maximum(values @ first.weight.numpy().T + first.bias.numpy(), 0)
+    logits = hidden @ last.weight.numpy().T + last.bias.numpy()
+    np.testing.assert_allclose(scorer.score(views), 1 / (1 + np.exp(-logits[:, 0])), rtol=1e-5)
+
+
+def test_another_resolution_of_the_same_field_of_view_scores_the_same(
+    localization_map: LocalizationMap, views: Float, weights: Path
+) -> None:
+    double = PinholeCamera(2 * CAMERA.width, 2 * CAMERA.height, 2 * CAMERA.focal_px)
+    scores = load_scorer(weights, LocalizationMap(localization_map.landmarks, double)).score(views)
+    np.testing.assert_allclose(scores, load_scorer(weights, localization_map).score(views), rtol=1e-5)
+
+
+def test_another_field_of_view_is_refused(localization_map: LocalizationMap, weights: Path) -> None:
+    narrow = PinholeCamera(CAMERA.width, CAMERA.height, 2 * CAMERA.focal_px)
+    with pytest.raises(WeightsError, match=r"mlp\.safetensors.*trained for a camera of 160 x 120 px, 90\.0"):
+        load_scorer(weights, LocalizationMap(localization_map.landmarks, narrow))
+
+
+def test_unknown_methods_and_missing_weights_are_refused(localization_map: LocalizationMap, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"unknown method.*random, .*visible, bins, .*mlp"):
+        make_scorer("oracle", localization_map)
+    with pytest.raises(ConfigError, match="needs weights"):
+        make_scorer("mlp", localization_map)
+    with pytest.raises(WeightsError, match="there are no weights"):
+        make_scorer("mlp", localization_map, weights=tmp_path / "none.safetensors")

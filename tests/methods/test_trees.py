@@ -1,0 +1,174 @@
+"""Boosted trees: the same numbers as scikit-learn's, on disk and back, trained and evaluated as any other method."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.numpy import load_file, save_file
+from sklearn.ensemble import HistGradientBoostingClassifier
+
+from synthetic_dataset import CAMERA, make_dataset
+from wheretolook.dataset.folders import Dataset
+from wheretolook.evaluation.config import EvaluateConfig
+from wheretolook.inputs.landmarks_in_view import POOLED
+from wheretolook.learning.config import TrainConfig
+from wheretolook.learning.weights import METADATA_KEY, read_training, weights_kind
+from wheretolook.methods.mlp.weights import load_classifier
+from wheretolook.methods.registry import load_scorer, make_scorer
+from wheretolook.methods.trees.config import TreesConfig
+from wheretolook.methods.trees.learn import BoostedTrees, PooledViews, fit_trees, load_pooled
+from wheretolook.methods.trees.score import TreesScorer
+from wheretolook.stages.evaluate import evaluate_methods as evaluate
+from wheretolook.stages.train import train_variants as train
+from wheretolook.utils.errors import ConfigError, WeightsError
+from wheretolook.utils.tracking import TrackingConfig
+from wheretolook.viewpoints.table import is_good, poses
+
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
+FEW = TreesConfig(max_trees=20, max_leaves=7, min_leaf=5)
+
+
+def some_views(n: int, seed: int) -> PooledViews:
+    """Views whose label follows two statistics, one of them unknown now and then."""
+    rng = np.random.default_rng(seed)
+    values = rng.normal(size=(n, len(POOLED))).astype(np.float32)
+    labels = values[:, 0] + 2 * np.maximum(values[:, 7], 0) + 0.5 * rng.normal(size=n) > 0.5
+    values[rng.random(n) < 0.2, 7] = np.nan
+    return PooledViews(values, labels, np.zeros(n, int), np.arange(n))
+
+
+@pytest.fixture(scope="module")
+def trees() -> BoostedTrees:
+    return fit_trees(some_views(3000, 0), some_views(1000, 1), CAMERA, FEW)[0]
+
+
+def test_trees_are_scikit_learns() -> None:
+    views, others = some_views(2000, 0), some_views(500, 1)
+    model = HistGradientBoostingClassifier(max_iter=30, random_state=0, early_stopping=False)
+    model.fit(views.values, views.labels)
+    for n_trees in (1, 17, 30):
+        found = BoostedTrees.of_sklearn(model, CAMERA, n_trees)
+        assert len(found.roots) == n_trees and found.depth > 3
+        logits = list(model.staged_decision_function(others.values))[n_trees - 1]
+        np.testing.assert_allclose(found.raw_logits(torch.from_numpy(others.values)), np.ravel(logits), rtol=1e-12)
+
+
+def test_as_many_trees_are_kept_as_order_the_other_views_best() -> None:
+    train_views, val = some_views(400, 0), some_views(1000, 1)
+    config = TreesConfig(max_trees=200, max_leaves=31, min_leaf=1, learning_rate=0.3)
+    trees, metrics = fit_trees(train_views, val, CAMERA, config)
+    assert metrics["n_trees"] == len(trees.roots) < 200  # so many would have learnt by heart
+    assert metrics["val_roc_auc"] > 0.85
+    probability = trees.logits(torch.from_numpy(val.values)).sigmoid().numpy()
+    assert probability.mean() == pytest.approx(val.labels.mean(), abs=1e-3)  # calibrated
+    assert (
+        fit_trees(train_views, val, CAMERA, config)[0]
+        .raw_logits(torch.from_numpy(val.values))
+        .equal(trees.raw_logits(torch.from_numpy(val.values)))
+    )
+
+
+def test_a_statistic_that_is_never_known_is_not_asked_for() -> None:
+    train_views, val = some_views(400, 0), some_views(200, 1)
+    train_views.values[:, 11] = np.nan
+    trees, _ = fit_trees(train_views, val, CAMERA, FEW)
+    assert 11 not in trees.feature[trees.left != torch.arange(len(trees.left))]
+    assert torch.isfinite(trees.logits(torch.from_numpy(val.values))).all()
+
+
+def test_trees_come_back_from_disk(trees: BoostedTrees, tmp_path: Path) -> None:
+    path = tmp_path / "weights" / "trees.safetensors"
+    trees.save(path, {"variant": "trees"})
+    views = torch.from_numpy(some_views(300, 2).values)
+    torch.testing.assert_close(BoostedTrees.load(path).logits(views), trees.logits(views), rtol=0, atol=0)
+    content = path.read_bytes()
+    BoostedTrees.load(path).save(path, {"variant": "trees"})
+    assert path.read_bytes() == content
+    assert weights_kind(path) == "trees" and read_training(path) == {"variant": "trees"}
+    with pytest.raises(WeightsError, match=r"trees.safetensors.*not of mlp"):
+        load_classifier(path)
+
+
+def test_damaged_trees_are_named(trees: BoostedTrees, tmp_path: Path) -> None:
+    path = tmp_path / "trees.safetensors"
+    trees.save(path)
+    arrays = load_file(path)
+    header = {"format_version": 1, "kind": "trees", "features": list(POOLED), "camera": vars(CAMERA),
+              "depth": trees.depth, "baseline": 0.0, "scale": 1.0, "offset": 0.0}  # fmt: skip
+    for wrong, changed, message in (
+        ({"left": np.full_like(arrays["left"], 10**6)}, {}, "lead out of"),
+        ({"value": arrays["value"][:-1]}, {}, "lead out of"),
+        ({"feature": np.full_like(arrays["feature"], 200)}, {}, "lead out of"),
+        ({}, {"features": ["height"]}, "other statistics"),
+        ({}, {"kind": "mlp"}, "not of trees"),
+        ({}, {"camera": {"width": 3}}, "damaged description"),
+    ):
+        save_file({**arrays, **wrong}, path, metadata={METADATA_KEY: json.dumps({**header, **changed})})
+        if changed.get("camera"):
+            header_of_camera = {**header, "camera": {"breadth": 3}}
+            save_file(arrays, path, metadata={METADATA_KEY: json.dumps(header_of_camera)})
+        with pytest.raises(WeightsError, match=message) as error:
+            BoostedTrees.load(path)
+        assert str(path) in str(error.value)
+
+
+@pytest.mark.parametrize("wrong", [{"max_trees": 0}, {"max_leaves": 1}, {"min_leaf": 0}, {"learning_rate": 0.0}])
+def test_options_that_are_none(wrong: dict[str, float]) -> None:
+    with pytest.raises(ConfigError, match="trees need"):
+        TreesConfig(**wrong)  # type: ignore[arg-type]
+
+
+def test_trees_are_trained_and_evaluated(tmp_path: Path) -> None:
+    dataset = make_dataset(tmp_path / "tiny", ("train", "train", "test", "val"), n_locations=14, n_directions=16)
+    tracking = TrackingConfig(str(tmp_path / "mlruns"))
+    config = TrainConfig(("trees", "2d"), epochs=2, hidden=(16,), accelerator="cpu", trees=FEW)
+    trees, network = train(dataset, config, tracking, progress=False)
+    assert trees.path == dataset.root / "weights" / "trees.safetensors"
+    again = train(dataset, replace(config, learning_rate=0.5, epochs=3), tracking, progress=False)
+    assert again[0].reused and not again[1].reused  # a network's options do not matter to trees
+    assert not train(dataset, replace(config, trees=replace(FEW, l2=3.0)), tracking, progress=False)[0].reused
+
+    methods = ("visible", "trees", "mlp")
+    table = evaluate(dataset, EvaluateConfig(methods, resamples=50), tracking, progress=False)
+    rows = table[(table["scene"] == "all") & (table["top_n"] == 1)].set_index("method")
+    assert rows.loc["trees", "roc_auc"] > 0.9 and 0 <= rows.loc["trees", "ece"] < 0.5
+    assert {*rows.index} == {"visible", "trees", "mlp", "oracle"}
+    named = evaluate(
+        dataset,
+        EvaluateConfig(("visible", "trees"), (trees.path, network.path), resamples=50),
+        tracking,
+        progress=False,
+    )
+    assert {*named["method"]} == {"visible", "trees", "oracle"}
+    assert (named["reference"] == "trees").all()
+    trees.path.unlink()
+    assert "trees" not in {*evaluate(dataset, EvaluateConfig(resamples=50), tracking, progress=False)["method"]}
+    with pytest.raises(WeightsError, match="no weights of trees"):
+        evaluate(dataset, EvaluateConfig(methods), tracking, progress=False)
+
+
+def test_the_scorer_is_the_trees_on_pooled_views(tmp_path: Path) -> None:
+    dataset = make_dataset(tmp_path / "tiny", ("train", "val"), n_locations=10, n_directions=12)
+    tracking = TrackingConfig(str(tmp_path / "mlruns"))
+    (model,) = train(dataset, TrainConfig(("trees",), accelerator="cpu", trees=FEW), tracking, progress=False)
+    scene = dataset.scenes[1]
+    localization_map = scene.localization_map(dataset.camera)
+    scorer = load_scorer(model.path, localization_map)
+    assert isinstance(scorer, TreesScorer) and (scorer.name, scorer.inputs) == ("trees", "")
+    views = load_pooled(Dataset(dataset.root, dataset.camera, (scene,)), [scene], (0.05, 0.4), progress=False)
+    table = scene.read_table()
+    np.testing.assert_array_equal(views.labels, is_good(table))
+    scores = scorer.score(poses(table))
+    logits = BoostedTrees.load(model.path).logits(torch.from_numpy(views.values))
+    np.testing.assert_allclose(scores, logits.sigmoid(), rtol=1e-6)
+    with pytest.raises(WeightsError, match="not of mlp"):
+        make_scorer("mlp", localization_map, weights=model.path)
+    wide = replace(localization_map, camera=replace(dataset.camera, focal_px=dataset.camera.focal_px / 2))
+    with pytest.raises(WeightsError, match=r"trees.safetensors.*trained for a camera"):
+        load_scorer(model.path, wide)

@@ -1,0 +1,110 @@
+"""Free space by depth images against free space by the mesh they are of."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from visibility.test_tsdf import CAMERA, ROOM, depth_images, room
+from wheretolook.geometry.poses import poses_looking_along
+from wheretolook.planning.config import PathConfig
+from wheretolook.planning.path_planning import plan_path
+from wheretolook.rendering.raycasting import MeshRaycaster
+from wheretolook.space.free_space import FreeSpace, FreeSpaceConfig
+from wheretolook.space.tsdf_space import TsdfSpace, seen_through
+from wheretolook.visibility.tsdf import DepthImage, TsdfConfig, TsdfVolume
+
+VOXEL_M, CLEARANCE_M = 0.03, 0.2
+
+
+def space_of(images: list[DepthImage], clearance_m: float = CLEARANCE_M) -> TsdfSpace:
+    volume = TsdfVolume.from_images(images, TsdfConfig(voxel_size_m=VOXEL_M), progress=False)
+    return TsdfSpace(volume, images, FreeSpaceConfig(clearance_m=clearance_m), progress=False)
+
+
+@pytest.fixture(scope="module")
+def images() -> list[DepthImage]:
+    return depth_images(room(), seed=1, n=150)  # which see all there is to see
+
+
+@pytest.fixture(scope="module")
+def space(images: list[DepthImage]) -> TsdfSpace:
+    return space_of(images)
+
+
+def random_points(n: int, seed: int = 0, beyond_m: float = 0.5) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(-beyond_m, ROOM + beyond_m, (n, 3))
+
+
+@pytest.mark.parametrize("clearance_m", [0.07, 0.2])
+def test_a_camera_is_free_where_it_is_by_the_mesh_but_never_near_a_surface(
+    images: list[DepthImage], clearance_m: float
+) -> None:
+    points, space = random_points(6000), space_of(images, clearance_m)
+    free = space.is_free(points)
+    distance = MeshRaycaster(room()).distance_to_surface(points, 1.0)
+    assert not free[distance < clearance_m - VOXEL_M].any()
+    by_mesh = FreeSpace(room(), FreeSpaceConfig(clearance_m=clearance_m)).is_free(points)
+    away = distance > clearance_m + VOXEL_M
+    assert by_mesh[away].sum() > 500 and (free[away] <= by_mesh[away]).all()
+    assert free[away & by_mesh].mean() > 0.995
+
+
+def test_ways_never_come_near_a_surface(space: TsdfSpace) -> None:
+    ends = random_points(4000, seed=2, beyond_m=0.0)
+    ends = ends[space.is_free(ends)]
+    a, b = ends[: len(ends) // 2], ends[len(ends) // 2 : len(ends) // 2 * 2]
+    free, raycaster = space.segments_are_free(a, b), MeshRaycaster(room())
+    assert not free[~raycaster.segments_are_clear(a, b, CLEARANCE_M - VOXEL_M)].any()
+    clear = raycaster.segments_are_clear(a, b, CLEARANCE_M + VOXEL_M)
+    assert clear.sum() > 50 and (~clear).sum() > 50 and free[clear].mean() > 0.9
+    np.testing.assert_array_equal(space.segments_are_free(b, a), free)
+    assert space.segments_are_free(a[:3], a[:3]).all() and len(space.segments_are_free(a[:0], a[:0])) == 0
+
+
+def test_few_images_leave_holes_but_no_way_through_them(images: list[DepthImage]) -> None:
+    """Of a ceiling that was not seen nothing is known but that nobody saw through it."""
+    space, points = space_of(images[::4]), random_points(6000, beyond_m=0.0)
+    free = space.is_free(points)
+    distance = MeshRaycaster(room()).distance_to_surface(points, 1.0)
+    assert not free[distance < CLEARANCE_M - VOXEL_M].any()
+    assert 0.2 < free[FreeSpace(room()).is_free(points)].mean() < 0.95
+
+
+def test_what_no_image_saw_is_not_free(images: list[DepthImage]) -> None:
+    """Cameras on one side of the wall, which see nothing of a part of the other."""
+    west = [image for image in images if -image.cam_from_world[:, :3].T[0] @ image.cam_from_world[:, 3] < 1.8]
+    points = random_points(6000, beyond_m=0.0)
+    seen, by_mesh = seen_through(points, west, 10.0, progress=False), FreeSpace(room()).is_free(points)
+    hidden = by_mesh & ~seen & (points[:, 0] > 2.2)
+    space = space_of(west)
+    assert hidden.sum() > 50 and not space.is_free(points[hidden]).any()
+    assert space.is_free(points[by_mesh & (points[:, 0] < 1.5)]).mean() > 0.8
+    start = np.tile([1.0, 1.2, 1.2], (hidden.sum(), 1))
+    assert space.is_free(start[:1]).all() and not space.segments_are_free(start, points[hidden]).any()
+
+
+def test_a_way_through_what_was_not_seen_is_not_free(images: list[DepthImage]) -> None:
+    space = space_of(images)
+    a, b = np.array([[0.6, 0.5, 1.2]]), np.array([[0.6, 1.9, 1.2]])
+    assert space.segments_are_free(a, b).all()
+    near = np.linalg.norm(space.cells.centers() - (a + b) / 2, axis=1) < 0.1
+    space.to_unseen_m[near.reshape(space.cells.shape)] = 0.0
+    assert space.is_free(np.concatenate([a, b])).all() and not space.segments_are_free(a, b).any()
+
+
+def test_an_image_sees_up_to_its_readings() -> None:
+    depth = np.full((CAMERA.height, CAMERA.width), 2.0, dtype=np.float32)
+    depth[:, : CAMERA.width // 2] = 0
+    image = DepthImage(depth, CAMERA, poses_looking_along([[0.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])[0])
+    points = np.array([[0.1, 1.9, 0], [0.1, 2.1, 0], [0.1, -1.0, 0], [-0.1, 1.0, 0], [0.5, 0.1, 0], [0.1, 1.0, 1.5]])
+    np.testing.assert_array_equal(seen_through(points, [image], 10.0, False), [True, *[False] * 5])
+    assert not seen_through(points, [image], 1.5, False).any()
+
+
+def test_a_path_is_planned_in_it(space: TsdfSpace) -> None:
+    start, goal = (0.7, 0.7, 1.2), (3.3, 0.7, 1.2)  # either side of the wall
+    path = plan_path(start, goal, space, space.bounds, config=PathConfig(time_s=1.0), progress=False)
+    np.testing.assert_allclose(path.positions[[0, -1]], [start, goal])
+    clear = MeshRaycaster(room()).segments_are_clear(path.positions[:-1], path.positions[1:], CLEARANCE_M - VOXEL_M)
+    assert clear.all() and path.positions[:, 1].max() > 2

@@ -1,0 +1,375 @@
+"""The data module and the train stage on a tiny dataset whose labels follow a known rule."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from synthetic_dataset import make_dataset
+from wheretolook.dataset.folders import Dataset, SceneFolder
+from wheretolook.inputs.bins import InputStatistics
+from wheretolook.learning.config import TrainConfig
+from wheretolook.learning.data import BatchLoader, ViewpointDataModule, balance_classes, hold_out_locations, with_also
+from wheretolook.learning.fit import EpochRecord
+from wheretolook.learning.provenance import training_fingerprint, was_trained_on
+from wheretolook.methods.mlp.weights import load_classifier
+from wheretolook.methods.registry import load_scorer
+from wheretolook.stages.train import train_variants as train
+from wheretolook.utils.errors import ConfigError, TableError
+from wheretolook.utils.tracking import TrackingConfig, client
+from wheretolook.viewpoints.table import LOCALIZED, NO_POSE, UNLABELLED, is_good, write_table
+
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
+SMALL = TrainConfig(variants=("2d",), epochs=3, hidden=(32,), accelerator="cpu")
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """One MLflow store for all tests: making its database takes seconds."""
+    return str(tmp_path_factory.mktemp("mlruns"))
+
+
+@pytest.fixture
+def dataset(tmp_path: Path) -> Dataset:
+    return make_dataset(tmp_path / "data" / "tiny")
+
+
+def test_held_out_locations_are_whole_and_the_same_for_the_same_seed() -> None:
+    scene = np.repeat([0, 0, 0, 0, 1, 1], 5)
+    location = np.repeat([3, 5, 7, 9, 3, 5], 5)
+    held_out = hold_out_locations(scene, location, 0.3, seed=4)
+    for number in (0, 1):
+        of_scene = scene == number
+        inside = {*location[of_scene & held_out]}
+        outside = {*location[of_scene & ~held_out]}
+        assert inside and outside and not inside & outside
+    assert len({*location[(scene == 0) & held_out]}) == 2  # 30 % of 4, rounded up
+    np.testing.assert_array_equal(held_out, hold_out_locations(scene, location, 0.3, seed=4))
+    assert any(np.any(held_out != hold_out_locations(scene, location, 0.3, seed=seed)) for seed in range(5, 10))
+    assert not hold_out_locations(scene[:5], location[:5], 0.3, seed=0).any()  # one location only: it stays
+
+
+def test_data_module_reads_labelled_train_views_only(dataset: Dataset) -> None:
+    scene = dataset.scenes[0]
+    table = scene.read_table()
+    table.loc[table.index[::3], "status"] = UNLABELLED
+    write_table(table, scene.table)
+    data = ViewpointDataModule(dataset, TrainConfig(accelerator="cpu"), progress=False)
+    data.setup()
+    kept = table[table["status"] != UNLABELLED]
+    other = dataset.scenes[1].read_table()
+    assert len(data.views) == len(kept) + len(other)
+    expected = np.concatenate([is_good(kept), is_good(other)])
+    np.testing.assert_array_equal(data.views.labels.numpy() > 0, expected)
+    n_visible = np.concatenate([kept["n_visible"], other["n_visible"]])
+    np.testing.assert_array_equal(data.views.filled.any(2).any(1).numpy(), n_visible > 0)
+
+    sides = [{(data.views.scene[row], data.views.location[row]) for row in rows.tolist()}
+             for rows in (data.train_rows, data.val_rows)]  # fmt: skip
+    assert not sides[0] & sides[1]
+    assert len(data.train_rows) + len(data.val_rows) == len(data.views)
+    labels = data.views.labels[data.train_rows]
+    assert data.class_weights == pytest.approx(
+        (len(labels) / 2 / (len(labels) - labels.sum().item()), len(labels) / 2 / labels.sum().item())
+    )
+
+
+def test_validation_scenes_are_used_where_there_are_some(tmp_path: Path) -> None:
+    dataset = make_dataset(tmp_path / "tiny", ("train", "val", "test"), n_locations=6, n_directions=12)
+    data = ViewpointDataModule(dataset, SMALL, progress=False)
+    data.setup()
+    assert {*data.views.scene[data.train_rows]} == {0}
+    assert {*data.views.scene[data.val_rows]} == {1}
+
+
+def test_every_pass_visits_every_training_view_once_in_its_own_order(dataset: Dataset) -> None:
+    data = ViewpointDataModule(dataset, replace(SMALL, batch_size=100), progress=False)
+    data.setup()
+    loader, again = data.train_dataloader(), data.train_dataloader()
+    first, second = (torch.cat([batch.labels for batch in loader]) for _ in range(2))
+    assert len(first) == len(data.train_rows)
+    assert first.sum() == data.views.labels[data.train_rows].sum()
+    assert not torch.equal(first, second)
+    assert torch.equal(first, torch.cat([batch.labels for batch in again]))
+    assert len(loader) == len(list(loader))
+
+
+def test_batches_hold_the_channels_asked_for(dataset: Dataset) -> None:
+    data = ViewpointDataModule(dataset, replace(SMALL, batch_size=7), progress=False)
+    data.setup()
+    data.channels = ("z", "u")
+    batches = list(data.val_dataloader())
+    means = data.views.means[data.val_rows]
+    torch.testing.assert_close(torch.cat([batch.inputs[0] for batch in batches]), means[:, [4, 0]], rtol=0, atol=0)
+    filled, labels = data.views.filled[data.val_rows], data.views.labels[data.val_rows]
+    assert torch.equal(torch.cat([batch.inputs[1] for batch in batches]), filled)
+    assert torch.equal(torch.cat([batch.labels for batch in batches]), labels)
+
+
+@pytest.mark.parametrize("world_size", [2, 3])
+def test_processes_share_out_every_batch(dataset: Dataset, world_size: int) -> None:
+    data = ViewpointDataModule(dataset, SMALL, progress=False)
+    data.setup()
+    rows = data.train_rows[:101]  # the last batch has one view: some processes get none
+    whole = list(BatchLoader(data.views, rows, 10, shuffle_seed=5))
+    loaders = [BatchLoader(data.views, rows, 10, 5, rank=rank, world_size=world_size) for rank in range(world_size)]
+    shared_out = list(zip(*loaders, strict=True))
+    assert len(shared_out) == len(whole) == 11
+    for batch, shares in zip(whole, shared_out, strict=True):
+        assert torch.equal(torch.cat([share.inputs[0] for share in shares]), batch.inputs[0])
+        assert {share.total for share in shares} == {batch.total} == {len(batch.labels)}
+        sizes = [len(share.labels) for share in shares]
+        assert max(sizes) - min(sizes) <= 1
+
+
+def test_balanced_training_views_are_equally_many_and_all_of_the_rarer_class(dataset: Dataset) -> None:
+    for scene in dataset.split("train"):
+        table = scene.read_table()
+        write_table(table.assign(status=np.where(table.index % 4 == 0, table["status"], NO_POSE)), scene.table)
+    plain, balanced = (
+        ViewpointDataModule(dataset, replace(SMALL, balance=balance), progress=False) for balance in (False, True)
+    )
+    plain.setup()
+    balanced.setup()
+    positives = {*plain.train_rows[plain.views.labels[plain.train_rows] > 0].tolist()}
+    chosen = {*balanced.train_rows.tolist()}
+    assert 0 < len(positives) < len(plain.train_rows) / 3
+    assert len(chosen) == len(balanced.train_rows) == 2 * len(positives)
+    assert positives < chosen < {*plain.train_rows.tolist()}
+    assert balanced.class_weights == (1.0, 1.0)
+    assert torch.equal(plain.val_rows, balanced.val_rows)
+    views = balanced.views
+    assert balanced.statistics == InputStatistics.of(views.means, views.filled, balanced.train_rows)
+
+
+def test_the_choice_of_a_balance_follows_its_seed() -> None:
+    labels = torch.tensor([1.0] * 90 + [0.0] * 10)[torch.randperm(100, generator=torch.Generator().manual_seed(0))]
+    rows = balance_classes(labels, seed=3)
+    assert torch.equal(rows, rows.sort().values)
+    assert labels[rows].sum() == 10
+    assert torch.equal(rows, balance_classes(labels, seed=3))
+    assert not torch.equal(rows, balance_classes(labels, seed=4))
+    assert torch.equal(balance_classes(1 - labels, seed=3), balance_classes(1 - labels, seed=3))
+    assert (1 - labels)[balance_classes(1 - labels, seed=3)].sum() == 10
+
+
+@pytest.mark.parametrize("status", [NO_POSE, LOCALIZED])
+def test_labels_of_one_class_are_refused(dataset: Dataset, status: str) -> None:
+    for scene in dataset.split("train"):
+        table = scene.read_table()
+        table["status"], table["error_m"], table["error_deg"] = status, 0.001, 0.001
+        write_table(table, scene.table)
+    config = replace(SMALL, val_fraction=1e-9)
+    with pytest.raises(TableError, match="training labels are of one class") as caught:
+        train(dataset, config, TrackingConfig(str(dataset.root / "mlruns")), progress=False)
+    total = 2 * (24 - 1) * 20  # one location of each scene is held out
+    assert f"{total if status == LOCALIZED else 0} of {total} viewpoints" in str(caught.value)
+    assert caught.value.fix
+    assert not (dataset.root / "weights").exists()
+
+
+def test_no_label_and_no_train_scene_are_refused(tmp_path: Path, dataset: Dataset) -> None:
+    only_test = make_dataset(tmp_path / "only-test", ("test",), n_locations=2, n_directions=4)
+    with pytest.raises(TableError, match="no train scene"):
+        ViewpointDataModule(only_test, SMALL, progress=False).setup()
+    scene = dataset.scenes[0]
+    write_table(scene.read_table().assign(status=UNLABELLED), scene.table)
+    with pytest.raises(TableError, match=r"scene-0.*no viewpoint has a label"):
+        ViewpointDataModule(dataset, SMALL, progress=False).setup()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"variants": ("2d", "5d")},
+        {"variants": ()},
+        {"epochs": 0},
+        {"dropout": 1.0},
+        {"val_fraction": 0.0},
+        {"layout": "sideways"},
+        {"learning_rate": float("nan")},
+        {"l2": -1.0},
+        {"patience": 0},
+        {"devices": 0},
+    ],
+)
+def test_options_out_of_range_are_refused(options: dict) -> None:
+    with pytest.raises(ConfigError):
+        TrainConfig(**options)
+
+
+def test_training_learns_the_rule_logs_a_run_and_is_reused(
+    dataset: Dataset, store: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    empty = tmp_path / "cwd"
+    empty.mkdir()
+    monkeypatch.chdir(empty)
+    tracking = TrackingConfig(store, "tiny")
+    config = replace(SMALL, variants=("2d", "2d+3d"), epochs=4, noise_px=0.5, noise_m=0.02, schedule="cosine")
+    models = train(dataset, config, tracking, progress=False)
+    assert [model.variant for model in models] == ["2d", "2d+3d"]
+    for model in models:
+        assert model.metrics["val_average_precision"] > 0.9
+        assert model.metrics["train_bce"] < 0.69
+        run = client(tracking).get_run(model.run_id)
+        assert run.info.status == "FINISHED"
+        assert run.data.params["variant"] == model.variant
+        assert run.data.params["epochs"] == "4"
+        assert len(run.data.params["dataset_fingerprint"]) == 16
+        assert run.data.tags["code_version"]
+        history = client(tracking).get_metric_history(model.run_id, "val_average_precision")
+        assert [metric.step for metric in history] == [0, 1, 2, 3]
+        assert max(metric.value for metric in history) == pytest.approx(model.metrics["val_average_precision"])
+        artifacts = Path(run.info.artifact_uri)
+        assert {file.name for file in artifacts.iterdir()} == {"curves.png", "history.csv", model.path.name}
+        assert artifacts.is_relative_to(Path(store) / "artifacts")
+        assert len(pd.read_csv(artifacts / "history.csv")) == 4
+        assert (artifacts / model.path.name).read_bytes() == model.path.read_bytes()
+    assert not list(empty.iterdir())
+
+    before = {path: path.stat().st_mtime_ns for path in (dataset.root / "weights").iterdir()}
+    again = train(dataset, config, tracking, progress=False)
+    assert all(model.reused for model in again)
+    assert [model.run_id for model in again] == [model.run_id for model in models]
+    assert {path: path.stat().st_mtime_ns for path in (dataset.root / "weights").iterdir()} == before
+
+    models[0].path.write_bytes(b"changed")
+    scene = dataset.split("test")[0]
+    write_table(scene.read_table().iloc[:-1], scene.table)  # the test scene has no say in training
+    third = train(dataset, config, tracking, progress=False)
+    assert [model.reused for model in third] == [False, True]
+
+
+def test_other_datasets_are_learnt_from_too(dataset: Dataset, store: str) -> None:
+    other = make_dataset(dataset.root.parent / "other", ("val", "test", "test", "test", "train"), n_locations=5)
+    tracking, config = TrackingConfig(store, "also"), replace(SMALL, epochs=1, also=("other",))
+    (model,) = train(dataset, config, tracking, progress=False)
+    about = json.loads(model.path.with_suffix(".json").read_text())["about"]
+    together = Dataset(dataset.root, dataset.camera, (*dataset.scenes, *other.split("train")))
+    assert about["also"] == ["other"] and about["dataset_fingerprint"] == training_fingerprint(together)
+    views = client(tracking).get_run(model.run_id).data.params
+    assert int(views["n_train"]) + int(views["n_val"]) == (2 * 24 + 5) * 20
+    assert was_trained_on(dataset, about) and not was_trained_on(dataset, {**about, "also": []})
+    (again,) = train(dataset, config, tracking, progress=False)
+    (without,) = train(dataset, replace(config, also=()), tracking, progress=False)
+    assert again.reused and not without.reused
+    with pytest.raises(TableError, match=r"nowhere.*no dataset"):
+        train(dataset, replace(config, also=("nowhere",)), tracking, progress=False)
+    elsewhere = Dataset(dataset.root.parent / "moved" / "tiny", dataset.camera, dataset.scenes)  # without the other one
+    assert was_trained_on(elsewhere, about)
+    assert not was_trained_on(Dataset(elsewhere.root, dataset.camera, dataset.scenes[1:]), about)
+    for names in (("tiny",), ("other", "other")):
+        with pytest.raises(ConfigError, match="learnt from twice"):
+            with_also(dataset, names)
+    leak = Dataset(other.root, other.camera, (SceneFolder(other.scenes[2].folder, "train"),))
+    shutil.copy(dataset.split("test")[0].landmarks, leak.scenes[0].landmarks)
+    leak.save()
+    with pytest.raises(ConfigError, match=r"other/scene-2.*is the scene .*tiny/scene-2 again"):
+        train(dataset, config, tracking, progress=False)
+    Dataset(other.root, other.camera, other.split("test")).save()
+    with pytest.raises(TableError, match=r"other.*no train scene"):
+        train(dataset, config, tracking, progress=False)
+    Dataset(other.root, replace(other.camera, width=other.camera.width + 2), other.scenes).save()
+    with pytest.raises(ConfigError, match="other was made for another camera"):
+        train(dataset, config, tracking, progress=False)
+
+
+def test_the_same_seed_gives_the_same_weights(dataset: Dataset, store: str) -> None:
+    config, tracking = replace(SMALL, noise_px=1.0), TrackingConfig(store, "same seed")
+    torch.manual_seed(123)
+    first = train(dataset, config, tracking, progress=False)[0].path.read_bytes()
+    torch.manual_seed(456)
+    state = torch.get_rng_state()
+    assert train(dataset, config, tracking, progress=False, force=True)[0].path.read_bytes() == first
+    assert torch.equal(torch.get_rng_state(), state)  # training leaves the caller's random numbers alone
+    assert train(dataset, replace(config, seed=1), tracking, progress=False)[0].path.read_bytes() != first
+
+
+@pytest.mark.slow
+def test_two_processes_train_as_one_does(dataset: Dataset, store: str, capfd: pytest.CaptureFixture[str]) -> None:
+    # 920 training views: the last batch has one view, so that one of two processes has none
+    tracking, one = TrackingConfig(store, "devices"), replace(SMALL, dropout=0.0, batch_size=919)
+    (alone,) = train(dataset, one, tracking, progress=False)
+    expected = load_classifier(alone.path).state_dict()
+    capfd.readouterr()
+    (shared,) = train(dataset, replace(one, devices=2), tracking, progress=False, force=True)
+    assert not "".join(capfd.readouterr())  # the processes are as quiet as one
+    for name, weights in load_classifier(shared.path).state_dict().items():
+        torch.testing.assert_close(weights, expected[name], rtol=1e-4, atol=1e-5)
+    assert shared.metrics == pytest.approx(alone.metrics, rel=1e-4)
+    experiment = client(tracking).get_experiment_by_name("devices")
+    runs = client(tracking).search_runs([experiment.experiment_id])
+    assert {run.info.run_id for run in runs} == {alone.run_id, shared.run_id}
+    histories = [
+        [(metric.step, metric.value) for metric in client(tracking).get_metric_history(model.run_id, "val_bce")]
+        for model in (alone, shared)
+    ]
+    assert [step for step, _ in histories[1]] == [0, 1, 2]
+    np.testing.assert_allclose(histories[1], histories[0], rtol=1e-4)
+    # which devices trained does not decide what was learnt
+    assert train(dataset, one, tracking, progress=False)[0].reused
+
+
+@pytest.mark.parametrize(("accelerator", "gpus"), [("auto", 1), ("gpu", 1), ("gpu", 0)])
+def test_more_gpus_than_there_are_are_refused(
+    dataset: Dataset, accelerator: Any, gpus: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: gpus)
+    config = replace(SMALL, accelerator=accelerator, devices=2)
+    with pytest.raises(ConfigError, match=rf"more GPUs than there are: {gpus} \(got 2\)"):
+        train(dataset, config, TrackingConfig(str(dataset.root / "mlruns")), progress=False)
+
+
+def test_views_that_do_not_fit_into_shared_memory_are_refused(
+    dataset: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise RuntimeError("unable to allocate shared memory: No space left on device")
+
+    monkeypatch.setattr(torch.Tensor, "share_memory_", full)
+    with pytest.raises(ConfigError, match=r"do not fit into shared memory.*No space left.*devices to 1"):
+        ViewpointDataModule(dataset, replace(SMALL, devices=2), progress=False).setup()
+
+
+def test_an_interrupted_training_is_reported_as_such(
+    dataset: Dataset, store: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(EpochRecord, "on_train_epoch_end", stop)
+    tracking, handler = TrackingConfig(store, "interrupted"), signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        train(dataset, SMALL, tracking, progress=False)
+    assert signal.getsignal(signal.SIGINT) is handler
+    experiment = client(tracking).get_experiment_by_name("interrupted")
+    (run,) = client(tracking).search_runs([experiment.experiment_id])
+    assert run.info.status == "KILLED"
+    assert not (dataset.root / "weights").exists()
+
+
+def test_the_released_variant_trains_as_the_released_code(dataset: Dataset, store: str) -> None:
+    config = replace(SMALL, variants=("2d+3d", "released"), epochs=2, hidden=(16,))
+    ours, released = train(dataset, config, TrackingConfig(store), progress=False)
+    assert released.path.name == "mlp-released.safetensors"
+    spec = load_classifier(released.path).spec
+    assert (spec.variant, spec.layout, spec.input_dropout, spec.hidden) == ("2d+3d", "compact", 0.5, (300, 300))
+    params = client(TrackingConfig(store)).get_run(released.run_id).data.params
+    expected = {"learning_rate": "0.0001", "l2": "0.0", "balance": "True", "keep": "last", "epochs": "2"}
+    assert {name: params[name] for name in expected} == expected
+    assert float(params["positives_train"]) == 0.5  # so that no class weighs more than the other
+    assert released.metrics["epoch"] == 1  # the last, whichever was best
+    assert load_classifier(ours.path).spec.layout == "in_place"
+    assert all(model.reused for model in train(dataset, config, TrackingConfig(store), progress=False))
+    localization_map = dataset.scenes[0].localization_map(dataset.camera)
+    assert [load_scorer(model.path, localization_map).inputs for model in (ours, released)] == ["2d+3d", "released"]

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ import pandas as pd
 import pycolmap
 import pytest
 
-from wheretolook import labelling, stages
+from wheretolook import stages
 from wheretolook.cli import main, parse_experiment
 from wheretolook.dataset.folders import Dataset
 from wheretolook.dataset.scene import space_and_occlusion
@@ -24,7 +25,7 @@ from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.colmap_camera import ColmapCamera
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.labelling import report
+from wheretolook.labelling import labeller
 from wheretolook.learning.config import TrainConfig
 from wheretolook.methods.mlp.weights import load_classifier
 from wheretolook.methods.registry import WEIGHTS_OF, load_scorer
@@ -274,14 +275,14 @@ def test_a_stage_refuses_what_an_earlier_one_has_remade(copy: Path, capsys: pyte
 def test_labels_of_different_settings_are_not_used_together(
     copy: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    original = labelling.label_scenes
+    original = labeller.label_scenes
 
     def interrupted(*args: Any, **options: Any) -> Iterator[Any]:
         with closing(original(*args, **options)) as scenes:
             yield next(scenes)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(labelling, "label_scenes", interrupted)
+    monkeypatch.setattr(labeller, "label_scenes", interrupted)
     assert run("label", copy, "--label.localizer.min_inliers", "11") == 130
     capsys.readouterr()
     for stage in ("train", "evaluate"):
@@ -296,7 +297,8 @@ def test_a_report_that_could_not_be_logged_is_logged_the_next_time(
     tracking = TrackingConfig(str(copy / "mlruns"))
     first = newest_run(tracking, "label")
     with monkeypatch.context() as patch:
-        patch.setattr(report, "log", lambda *args, **options: (_ for _ in ()).throw(OSError("the disk is full")))
+        label_stage = import_module("wheretolook.stages.label")  # the package has its function under this name
+        patch.setattr(label_stage, "log", lambda *args, **options: (_ for _ in ()).throw(OSError("the disk is full")))
         assert run("label", copy, "--label.localizer.min_inliers", "11") == 2
     assert "the disk is full" in capsys.readouterr().err
     assert run("label", copy, "--label.localizer.min_inliers", "11") == 0
@@ -429,4 +431,7 @@ def test_paths_keep_clear_of_what_depth_images_saw(copy: Path, tmp_path: Path) -
     rest = ["--scene", scene.name, "--method", "forward", "--film", "none", "--plan.planner.time_s", "1"]
     assert run("plan", copy, *tsdf, *ends, *rest) == 0
     path = pd.read_csv(tmp_path / "way" / "path.csv")[["x_m", "y_m", "z_m"]].to_numpy()
-    assert len(path) > 1 and space.is_free(path).all()
+    # on the way it is looked, a voxel apart, whether all is clear and seen, not what is below
+    assert len(path) > 1 and (space._raycaster.distance_to_surface(path, 1.0) > space.config.clearance_m - 1e-3).all()
+    space.config = replace(space.config, clearance_m=space.config.clearance_m - experiment.occlusion.voxel_m / 2)
+    assert space._is_known_at(path).all()

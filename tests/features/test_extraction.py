@@ -111,7 +111,7 @@ def test_first_octave_minus_one_adds_small_keypoints():
         assert fine.scales_px.min() < 0.75 * coarse.scales_px.min()
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", ["opencv", pytest.param("colmap", marks=pytest.mark.slow)])
 def test_same_image_same_keypoints_in_any_process(method):
     images = [textured_image(seed) for seed in range(5)]
     extractor = KeypointExtractor(ExtractorConfig(method=method))

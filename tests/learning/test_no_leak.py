@@ -25,11 +25,13 @@ from wheretolook.stages.train import train_variants as train
 from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import LOCALIZED, is_good, read_table, write_table
 
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
 CONFIG = TrainConfig(
     variants=("2d+3d", "trees", "set"),
     epochs=2,
     trees=TreesConfig(max_trees=5, min_leaf=5),
-    set=SetConfig(epochs=1, landmarks=16, batch_size=64, enlarged=1.0),  # enlarged, labels follow from errors
+    set=SetConfig(epochs=1, landmarks=16, batch_size=16, enlarged=1.0),  # enlarged, labels follow from errors
     matchability=MatchabilityConfig(epochs=1),
     accelerator="cpu",
 )
@@ -61,7 +63,7 @@ def same_labels_other_outcomes(source: Dataset, root: Path) -> Dataset:
 
 
 def test_only_labels_of_the_outcome_are_learnt_from(tmp_path: Path, tracking: TrackingConfig) -> None:
-    one = make_dataset(tmp_path / "one")
+    one = make_dataset(tmp_path / "one", n_locations=14, n_directions=16)
     other = same_labels_other_outcomes(one, tmp_path / "other")
     assert other.fingerprint() != one.fingerprint()
     for first, second in zip(*(train(data, CONFIG, tracking, progress=False) for data in (one, other)), strict=True):

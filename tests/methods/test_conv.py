@@ -36,6 +36,8 @@ from wheretolook.utils.tracking import client
 from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import LOCALIZED, NO_POSE, UNLABELLED, poses, write_table
 
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
 FEW = ConvConfig(epochs=2, batch_size=64, widths=(4, 8, 8), bins=12)
 
 

@@ -45,6 +45,8 @@ from wheretolook.utils.errors import ConfigError, TableError, WeightsError
 from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import LOCALIZED, poses, read_table, write_table
 
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
 DISTANCE = ATTRIBUTES.index("distance")
 NO_STATISTICS = AttributeStatistics((0.0,) * len(ATTRIBUTES), (1.0,) * len(ATTRIBUTES))
 

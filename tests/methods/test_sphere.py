@@ -36,6 +36,8 @@ from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import is_good, poses, write_table
 from wheretolook.visibility.occlusion import StoredOcclusion
 
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
 FEW = SphereConfig(points=48, cameras=8, width=32, heads=2, layers=1, dropout=0.0, epochs=10, batch_size=40)
 SMALL = TrainConfig(("sphere",), accelerator="cpu", sphere=FEW)
 NAMES = {name: index for index, name in enumerate(FEATURES)}

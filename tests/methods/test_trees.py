@@ -29,6 +29,8 @@ from wheretolook.utils.errors import ConfigError, WeightsError
 from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import is_good, poses
 
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
 FEW = TreesConfig(max_trees=20, max_leaves=7, min_leaf=5)
 
 

@@ -38,7 +38,10 @@ from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import is_good, poses, write_table
 from wheretolook.visibility.occlusion import StoredOcclusion
 
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
 TRAIN = TrainConfig(("2d", "2d+z"), epochs=3, hidden=(16,), accelerator="cpu")
+EVALUATE = EvaluateConfig(("random", "visible", "bins", "fisher-trace-exact", "mlp"), resamples=100, top_n=(1, 5))
 CONFIGS = Path(__file__).parents[1] / "configs"
 VERSIONS = {"numpy": "2.9.9", "pycolmap": "4.1.0"}
 
@@ -60,7 +63,7 @@ def label_stamped(root: Path, **options: int) -> Dataset:
 def experiment_of(folder: Path, name: str = "tiny") -> Experiment:
     return Experiment(
         name=name, data=folder / "data", device="cpu", camera=CAMERA, train=TRAIN,
-        scenes=ScenesConfig(train=2, test=2, seed=70), evaluate=EvaluateConfig(resamples=100, top_n=(1, 5)),
+        scenes=ScenesConfig(train=2, test=2, seed=70), evaluate=EVALUATE,
         tracking=TrackingConfig(str(folder / "mlruns")),
     )  # fmt: skip
 
@@ -135,7 +138,7 @@ def test_a_release_leaves_matches_out(tmp_path: Path) -> None:
 
 def test_a_release_scores_as_the_original(finished: Path, tmp_path: Path) -> None:
     """The same weights, in half precision too, on both."""
-    config, tracking = EvaluateConfig(resamples=50), TrackingConfig(str(tmp_path / "mlruns"))
+    config, tracking = replace(EVALUATE, resamples=50), TrackingConfig(str(tmp_path / "mlruns"))
     root = finished / "data" / "release"
     original, release = Dataset.load(finished / "data" / "tiny"), Dataset.load(root)
     shutil.copytree(root, tmp_path / "release")
@@ -186,14 +189,17 @@ def test_the_best_on_validation_ships(finished: Path) -> None:
 def test_what_is_best_of_all_ships_beside_the_network(folder: Path, tmp_path: Path) -> None:
     root = folder / "data" / "release"
     release, tracking = Dataset.load(root), TrackingConfig(str(folder / "mlruns"))
-    few = replace(TRAIN, set=SetConfig(epochs=4, batch_size=32), trees=TreesConfig(max_trees=3, min_leaf=5))
+    few = replace(TRAIN, set=SetConfig(epochs=4, batch_size=16), trees=TreesConfig(max_trees=3, min_leaf=5))
     train(release, replace(few, variants=("set", "trees")), tracking, progress=False)
     records = {name: root / "weights" / f"{name}.json" for name in ("set", "trees")}
     for name, precision in (("set", 0.9999), ("trees", 0.5)):  # whatever they have learnt from so little
         record = json.loads(records[name].read_text())
         record["metrics"]["val_average_precision"] = precision
         records[name].write_text(json.dumps(record))
-    stages.release(experiment_of(folder, "release"), say=quiet)
+    experiment = replace(
+        experiment_of(folder, "release"), evaluate=replace(EVALUATE, methods=(*EVALUATE.methods, "set"))
+    )
+    stages.release(experiment, say=quiet)
     (network,) = (path for path in (root / "weights").glob("mlp-*.safetensors"))
     assert sorted(path.name for path in (root / "weights").glob("*.safetensors")) == [network.name, "set.safetensors"]
     assert (root / "weights" / releases.SHELF / "trees.safetensors").is_file()
@@ -207,7 +213,7 @@ def test_what_is_best_of_all_ships_beside_the_network(folder: Path, tmp_path: Pa
     scorer = load_scorer(root / "weights", release.scenes[0].localization_map(release.camera))
     assert scorer.name == "set"
     before = contents(root)
-    stages.release(experiment_of(folder, "release"), say=quiet)
+    stages.release(experiment, say=quiet)
     assert contents(root) == before
 
 
@@ -377,6 +383,7 @@ def test_the_shipped_best_scorer_scores_as_the_card_says(shipped: Dataset) -> No
     assert abs(views.mean() - good.mean()) < 0.03
 
 
+@pytest.mark.slow
 def test_the_shipped_weights_score_as_the_card_says(shipped: Dataset, tmp_path: Path) -> None:
     shutil.copytree(shipped.root, tmp_path / "data" / "release")
     experiment = parse_experiment(

@@ -34,6 +34,8 @@ from wheretolook.utils.tracking import (
 from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import UNLABELLED, is_good, poses, write_table
 
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
 CONFIG = EvaluateConfig(("random", "visible", "bins", "mlp"), resamples=100, top_n=(1, 5))
 RULES = replace(CONFIG, methods=("random", "visible", "bins"))
 

@@ -29,6 +29,8 @@ from wheretolook.utils.tracking import client
 from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import LOCALIZED, NO_POSE, UNLABELLED, is_good, write_table
 
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
 SMALL = TrainConfig(variants=("2d",), epochs=3, hidden=(32,), accelerator="cpu")
 
 
@@ -294,6 +296,7 @@ def test_the_same_seed_gives_the_same_weights(dataset: Dataset, store: str) -> N
     assert train(dataset, replace(config, seed=1), tracking, progress=False)[0].path.read_bytes() != first
 
 
+@pytest.mark.slow
 def test_two_processes_train_as_one_does(dataset: Dataset, store: str, capfd: pytest.CaptureFixture[str]) -> None:
     # 920 training views: the last batch has one view, so that one of two processes has none
     tracking, one = TrackingConfig(store, "devices"), replace(SMALL, dropout=0.0, batch_size=919)

@@ -41,7 +41,7 @@ STAGES = {
         ),
     ),
     "label": ("label", "Render and localize every viewpoint, measure the pose error. Resumes.", ("label", "tracking")),
-    "train": ("train", "Train one network for each input variant.", ("train", "tracking")),
+    "train": ("train", "Learn from the labels, one weights file for each method.", ("train", "tracking")),
     "evaluate": ("evaluate", "Score all methods on the test scenes.", ("evaluate", "occlusion", "tracking")),
     "viewpoint-map": (
         "viewpoint_map",
@@ -279,7 +279,7 @@ _MORE_HELP = {
     "evaluate": "\nWhat evaluate.methods may name: wheretolook evaluate --list-methods\n",
     "log-release": """
 A release ships its tables, not an MLflow store. This logs them into one, in seconds: an evaluation with a nested run
-for each method x inputs x N x occlusion x candidates, a train run for each weights record, the comparison of learners,
+for each method x N x occlusion x candidates, a train run for each weights record, the comparison of learners,
 planned paths and measured times. Done again, it adds only what is new; `make ui` does it first. Without --config it is
 configs/release.yaml.
 

@@ -10,9 +10,9 @@ from matplotlib.lines import Line2D
 from matplotlib.style import context
 
 from wheretolook.evaluation.score_table import main_rows, methods_of, threshold_keys
+from wheretolook.evaluation.scores import by_chance
 from wheretolook.figures.style import INK, RC, new_figure
-from wheretolook.methods.names import Method
-from wheretolook.methods.styles import method_style, rows_by_group
+from wheretolook.methods.styles import ORACLE, method_style, rows_by_group
 from wheretolook.viewpoints.thresholds import ALL, threshold_label
 
 _LABELS = {"mesh": "mesh rays", "tsdf": "TSDF", "hidden-points": "hidden-point removal", "none": "none"}
@@ -33,10 +33,10 @@ def occlusion_figure(scores: pd.DataFrame) -> Figure:
     """
     scores = main_rows(scores, ("candidates",))
     key, n = threshold_keys(scores)[0], scores["top_n"].iloc[0]
-    pooled = scores[(scores["scene"] == ALL) & (scores["top_n"] == n) & (scores["method"] != "oracle")]
+    pooled = scores[(scores["scene"] == ALL) & (scores["top_n"] == n) & (scores["method"] != ORACLE)]
     models = list(pooled["occlusion"].unique())
     chosen = "best view" if n == 1 else f"best {n} views"
-    methods = [method for method in methods_of(pooled) if method[0] != "random"]
+    methods = [method for method in methods_of(pooled) if not by_chance(method)]
     y = rows_by_group(methods)
     with context(RC):
         figure = new_figure(8.0, 1.5 + 0.3 * (max(y.values(), default=0) + 1))
@@ -47,8 +47,8 @@ def occlusion_figure(scores: pd.DataFrame) -> Figure:
         left.set(xlabel=f"average precision\n{threshold_label(key)}", xlim=(0, 1.02))
         right.set(xlabel=f"{chosen} within {threshold_label(key)}\n% of the oracle's share", xlim=(0, 104))
         figure.supxlabel("whiskers: 95 % bootstrap interval over locations", fontsize=8)
-        right.axvline(100, color=INK, linewidth=1, linestyle="--", label=method_style("oracle").label)
-        left.set_yticks(list(y.values()), [method_style(*method).label for method in y], fontsize=9)
+        right.axvline(100, color=INK, linewidth=1, linestyle="--", label=method_style(ORACLE).label)
+        left.set_yticks(list(y.values()), [method_style(method).label for method in y], fontsize=9)
         left.set_ylim(max(y.values(), default=0) + 0.7, -0.7)
         for axes in (left, right):
             axes.tick_params(axis="y", length=0)
@@ -57,7 +57,8 @@ def occlusion_figure(scores: pd.DataFrame) -> Figure:
                    markerfacecolor=INK if place == 0 else "white", label=_LABELS.get(model, model))
             for place, model in enumerate(models)
         ]  # fmt: skip
-        handles += [line for line in right.lines if line.get_label() in ("random", "oracle")]
+        labels = [method_style(name).label for name in (ORACLE, *filter(by_chance, methods_of(pooled)))]
+        handles += [line for line in right.lines if line.get_label() in labels]
         figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), columnspacing=1.4)
         return figure
 
@@ -66,15 +67,15 @@ def _draw(
     axes: Axes,
     pooled: pd.DataFrame,
     models: list[str],
-    y: dict[Method, float],
+    y: dict[str, float],
     column: str,
     scale: float,
     ends: tuple[str, ...] = (),
 ) -> None:
     """A line from model to model for each method, and their marks; `ends` names the columns of whiskers."""
     for method, place in y.items():
-        style = method_style(*method)
-        rows = pooled[(pooled["method"] == method[0]) & (pooled["inputs"] == method[1])]
+        style = method_style(method)
+        rows = pooled[pooled["method"] == method]
         by_model = scale * rows.set_index("occlusion").reindex(models)[[column, *ends]]
         shift = 0.16 * (np.arange(len(models)) - (len(models) - 1) / 2) if ends else np.zeros(len(models))
         axes.plot(by_model[column], place + shift, color=style.color, linewidth=1, label=style.label)
@@ -84,7 +85,6 @@ def _draw(
                 axes.hlines(place + shift[number], low, high, color=style.color, linewidth=0.9)
             axes.plot(value, place + shift[number], _MARKERS[number % len(_MARKERS)], color=style.color, markersize=6,
                       markerfacecolor=style.color if number == 0 else "white")  # fmt: skip
-    random = pooled.loc[pooled["method"] == "random", column]
-    if len(random):
-        style = method_style("random")
-        axes.axvline(scale * random.iloc[0], color=style.color, linestyle=style.dashes, label=style.label, zorder=1)
+    for method, values in pooled[pooled["method"].map(by_chance)].groupby("method"):
+        style = method_style(str(method))
+        axes.axvline(scale * values[column].iloc[0], color=style.color, linestyle=style.dashes, label=style.label, zorder=1)

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.style import context
 
 from wheretolook.figures.style import INK, RC, new_figure
-from wheretolook.methods.styles import scorer_style
+from wheretolook.methods.styles import method_style
 
 TITLES = {"planned": "places and views planned", "given": "views along a given path"}
 
@@ -36,7 +36,7 @@ def paths_figure(summary: pd.DataFrame) -> Figure:
                 of_method = rows[rows["method"] == method].set_index("scene").reindex(scenes)
                 at = np.arange(len(scenes)) + (number - (len(methods) - 1) / 2) * width
                 name, _, rule = method.partition(" ")
-                style = scorer_style(name)
+                style = method_style(name)
                 value, low, high = (100 * of_method[f"localized{end}"].to_numpy() for end in ("", "_low", "_high"))
                 axes.bar(
                     at, value, 0.92 * width, color=style.color, hatch="////" if rule else "", edgecolor="white",

@@ -15,13 +15,13 @@ from wheretolook.methods.styles import method_style
 
 
 def viewpoint_sphere_figure(
-    directions: Float, scores: Mapping[tuple[str, str], Float], good: NDArray[np.bool_] | None = None
+    directions: Float, scores: Mapping[str, Float], good: NDArray[np.bool_] | None = None
 ) -> Figure:
     """Scores over the directions at one location, one map of the sphere of directions for each method.
 
     Args:
         directions: (D, 3) unit vectors the camera looks along, world frame.
-        scores: (D,) by method and inputs.
+        scores: (D,) by method.
         good: (D,) whether a view localizes; such directions get a dark ring.
 
     Returns:
@@ -41,5 +41,5 @@ def viewpoint_sphere_figure(
                 axes.scatter(azimuth[good], elevation[good], s=size, facecolors="none", edgecolors=INK, linewidths=1.0)
             best = int(np.argmax(values))
             axes.plot(azimuth[best], elevation[best], "*", markersize=17, color="#D55E00", markeredgecolor="white")
-            axes.set(xticklabels=[], yticklabels=[], title=method_style(*method).label)
+            axes.set(xticklabels=[], yticklabels=[], title=method_style(method).label)
         return figure

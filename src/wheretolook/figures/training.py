@@ -9,7 +9,6 @@ from matplotlib.figure import Figure
 from matplotlib.style import context
 
 from wheretolook.figures.style import RC, new_figure
-from wheretolook.learning.config import LEARNERS
 from wheretolook.methods.styles import method_style
 
 
@@ -17,7 +16,7 @@ def training_figure(histories: Mapping[str, pd.DataFrame]) -> Figure:
     """Loss and average precision over the epochs, of which the first is 1.
 
     Args:
-        histories: for each input variant, one row an epoch with `epoch`, `train_bce`, `val_bce`,
+        histories: for each method, one row an epoch with `epoch`, `train_bce`, `val_bce`,
             `train_average_precision` and `val_average_precision`.
 
     Returns:
@@ -26,8 +25,8 @@ def training_figure(histories: Mapping[str, pd.DataFrame]) -> Figure:
     with context(RC):
         figure = new_figure(9, 3.4)
         panels = figure.subplots(1, 2)
-        for variant, history in histories.items():
-            style = method_style(variant) if variant in LEARNERS else method_style("mlp", variant)
+        for method, history in histories.items():
+            style = method_style(method)
             for panel, name in zip(panels, ("bce", "average_precision"), strict=True):
                 panel.plot(1 + history["epoch"], history[f"train_{name}"], ":", color=style.color, linewidth=1.1,
                            label=f"{style.label}: training")  # fmt: skip

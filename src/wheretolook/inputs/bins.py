@@ -8,7 +8,7 @@ the filled ones to the front, so that an input has no fixed place in the image. 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -18,6 +18,7 @@ from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.colmap_camera import Camera, ColmapCamera
 from wheretolook.geometry.poses import Float, split_poses
 from wheretolook.inputs.bins_kernel import bin_kernel, count_bins_kernel
+from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS, Layout
 from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.warp import start_warp
@@ -35,27 +36,6 @@ if TYPE_CHECKING:
     from wheretolook.mapping.landmarks import Landmarks
 import torch
 from torch import Tensor
-
-CHANNELS = ("u", "v", "x", "y", "z")
-"""Channels of every landmark: pixel (u, v) and position (x, y, z) in the camera frame in metres."""
-
-LANDMARK_CHANNELS = ("mapped_angle", "distance_ratio", *MAP_ATTRIBUTES)
-"""Channels of what landmarks are like, on request only: two of `inputs.landmarks_in_view.POSE_ATTRIBUTES`, and what the
-map knows. A bin's mean is NaN where one of its landmarks' values is not known."""
-
-ALL_CHANNELS = CHANNELS + LANDMARK_CHANNELS
-
-PAPER_VARIANTS: dict[str, tuple[str, ...]] = {
-    "2d": ("u", "v"),
-    "2d+z": ("u", "v", "z"),
-    "2d+3d": ("u", "v", "x", "y", "z"),
-}
-"""The paper's inputs by name: 1,800, 2,700 and 4,500 values at 30 x 30 bins (its "4220" is a stale number)."""
-
-INPUT_VARIANTS: dict[str, tuple[str, ...]] = {**PAPER_VARIANTS, "2d+3d+landmark": ALL_CHANNELS}
-"""All inputs of the paper's network by name: the paper's own, and with what landmarks are like."""
-
-Layout = Literal["in_place", "compact"]
 
 GPU_LANES = 32
 """Threads that share a view on a GPU where bins are only counted."""
@@ -299,7 +279,7 @@ class InputStatistics:
     """Mean and standard deviation of each kind of input over the filled bins of the training views.
 
     Attributes:
-        channels: names of the channels, as in `wheretolook.inputs.bins.ALL_CHANNELS`.
+        channels: names of the channels, as in `wheretolook.inputs.channels.ALL_CHANNELS`.
         mean: mean of each channel, in its unit (such as pixels or metres), over the values that are known.
         std: standard deviation of each channel, in its unit; 1 where it would be 0. Infinite where no value is known,
             so that a network does not look at a channel that it has never seen.

@@ -16,18 +16,13 @@ from torch import Tensor
 
 from wheretolook.geometry.colmap_camera import Camera, ColmapCamera
 from wheretolook.geometry.poses import Float, split_poses
+from wheretolook.inputs.channels import ATTRIBUTES
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 from wheretolook.visibility.frustum import VisibleSets
 
 BLOCK_ENTRIES = {"cpu": 1 << 15, "cuda": 1 << 22}
 """Landmarks in view that a network over them looks at together: what stays in the cache, or a gigabyte of a GPU's."""
-
-POSE_ATTRIBUTES = ("across", "down", "distance", "mapped_angle", "distance_ratio")
-"""Of a landmark in a view: x/z and y/z in the camera; the distance in metres, its logarithm; the cosine between the ray
-from the camera and the mean direction it was mapped from; the logarithm of the distance over the mean mapping one."""
-
-ATTRIBUTES = POSE_ATTRIBUTES + MAP_ATTRIBUTES
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,12 +32,14 @@ class ViewLandmarks:
     Attributes:
         starts: (B + 1,) int64; view b has entries `starts[b]` to `starts[b + 1]`.
         rows: (E,) int64, rows of the landmarks in the map.
-        values: (E, len(ATTRIBUTES)) float32.
+        values: (E, A) float32.
+        attributes: names of the A attributes.
     """
 
     starts: Tensor
     rows: Tensor
     values: Tensor
+    attributes: tuple[str, ...] = ATTRIBUTES
 
     def __len__(self) -> int:
         return len(self.starts) - 1
@@ -63,10 +60,12 @@ class LandmarkDescriber:
 
     Args:
         localization_map: landmarks, camera, occlusion, and the device to work on.
+        attributes: what to tell of each landmark: some of `ATTRIBUTES`, by name, in the order asked for.
     """
 
-    def __init__(self, localization_map: LocalizationMap) -> None:
-        self.localization_map = localization_map
+    def __init__(self, localization_map: LocalizationMap, attributes: tuple[str, ...] = ATTRIBUTES) -> None:
+        self.localization_map, self.attributes = localization_map, attributes
+        self._columns = [ATTRIBUTES.index(name) for name in attributes]
         landmarks, device = localization_map.landmarks, localization_map.device
         self._points = torch.from_numpy(landmarks.points).to(device)
         self._directions = torch.from_numpy(landmarks.mapping_direction).to(device)
@@ -111,7 +110,10 @@ class LandmarkDescriber:
             ],
             dim=1,
         )
-        return ViewLandmarks(starts, rows, torch.cat([of_pose, of_map], dim=1))
+        values = torch.cat([of_pose, of_map], dim=1)
+        if self.attributes != ATTRIBUTES:
+            values = values[:, self._columns]
+        return ViewLandmarks(starts, rows, values, self.attributes)
 
     def in_blocks(
         self, cam_from_world: Float, most: int | None = None
@@ -212,7 +214,7 @@ def _occupied(landmarks: ViewLandmarks, views: Tensor, camera: Camera, bins: int
 
 def image_cells(landmarks: ViewLandmarks, camera: Camera, bins: int) -> Tensor:
     """Which of bins x bins cells of the image, row by row, each landmark falls into, (E,) int64."""
-    rays = landmarks.values[:, :2]
+    rays = torch.stack([landmarks.values[:, landmarks.attributes.index(name)] for name in ("across", "down")], dim=1)
     if isinstance(camera, ColmapCamera):
         along = torch.cat([rays, torch.ones_like(rays[:, :1])], dim=1)
         pixels = torch.from_numpy(camera.project(along.cpu().double().numpy())).to(rays)

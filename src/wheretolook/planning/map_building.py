@@ -111,7 +111,7 @@ def update_viewpoint_map(
     _check_landmarks(one.landmarks)
     digests = landmark_digests(one.landmarks)
     origin = _origin(scorer, old.origin.lattice, digests)
-    for name in ("scorer", "inputs", "camera", "occlusion"):
+    for name in ("scorer", "camera", "occlusion"):
         if getattr(origin, name) != getattr(old.origin, name):
             raise ConfigError(
                 f"the viewpoint map was built with another {name}", value=getattr(origin, name),
@@ -256,9 +256,7 @@ def _check_unchanged(old: ViewpointMap, scorer: Scorer, rows: NDArray[np.int64])
 def _origin(scorer: Scorer, lattice: str, digests: NDArray[np.uint64]) -> MapOrigin:
     one = scorer.localization_map
     digest = hashlib.sha256(one.landmarks.ids.tobytes() + digests.tobytes())
-    return MapOrigin(
-        scorer.name, scorer.inputs, lattice, _intrinsics(one.camera), one.occlusion.name, digest.hexdigest()[:16]
-    )
+    return MapOrigin(scorer.name, lattice, _intrinsics(one.camera), one.occlusion.name, digest.hexdigest()[:16])
 
 
 def _intrinsics(camera: Camera) -> dict[str, Any]:

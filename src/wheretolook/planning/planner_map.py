@@ -7,8 +7,7 @@ from pathlib import Path
 
 from wheretolook.dataset.folders import Dataset, SceneFolder
 from wheretolook.geometry.lattices import Lattice
-from wheretolook.methods.names import PROBABILITIES
-from wheretolook.methods.registry import WEIGHTS_OF, check_method
+from wheretolook.methods.registry import find, members, methods_named, scorers
 from wheretolook.planning.borrowing import with_borrowed_views
 from wheretolook.planning.config import ViewpointMapConfig
 from wheretolook.planning.path_comparison import shares_below
@@ -42,11 +41,12 @@ def planner_map(
     Raises:
         ConfigError: the method needs weights. Else as `wheretolook.planning.scene_map.scene_viewpoint_map`.
     """
-    if method in WEIGHTS_OF and weights is None:
+    if weights is None and any(known.weights for known in members(method, scorers())):
         raise ConfigError(f"{method} needs weights", path=dataset.root, fix="Train it, or name weights.")
     config = ViewpointMapConfig(method=method, weights=weights, grid=grid, directions=directions, lattice=lattice)
     views = scene_viewpoint_map(scene, dataset.camera, config, space, occlusion, device)
-    if views.origin.scorer.split()[0] not in PROBABILITIES:
+    scored_by = find(views.origin.scorer)
+    if scored_by is None or not scored_by.probability:
         views = shares_below(views)
     return with_borrowed_views(views, space)
 
@@ -62,4 +62,4 @@ def check_methods(methods: Iterable[str]) -> None:
     """
     for name in methods:
         if name:
-            check_method(name)
+            methods_named([name], scorers())

@@ -1,0 +1,33 @@
+"""Names of what bins and landmarks in view tell, apart from `wheretolook.inputs.bins` so that options can be read without
+PyTorch."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
+
+CHANNELS = ("u", "v", "x", "y", "z")
+"""Channels of every landmark: pixel (u, v) and position (x, y, z) in the camera frame in metres."""
+
+POSE_ATTRIBUTES = ("across", "down", "distance", "mapped_angle", "distance_ratio")
+"""Of a landmark in a view: x/z and y/z in the camera; the distance in metres, its logarithm; the cosine between the ray
+from the camera and the mean direction it was mapped from; the logarithm of the distance over the mean mapping one."""
+
+ATTRIBUTES = POSE_ATTRIBUTES + MAP_ATTRIBUTES
+"""All that is known of a landmark in a view."""
+
+LANDMARK_CHANNELS = ("mapped_angle", "distance_ratio", *MAP_ATTRIBUTES)
+"""Channels of what landmarks are like, on request only: two of `POSE_ATTRIBUTES`, and what the map knows. A bin's mean is NaN where one of its landmarks' values is not known."""
+
+ALL_CHANNELS = CHANNELS + LANDMARK_CHANNELS
+
+PAPER_VARIANTS: dict[str, tuple[str, ...]] = {
+    "2d": ("u", "v"),
+    "2d+z": ("u", "v", "z"),
+    "2d+3d": ("u", "v", "x", "y", "z"),
+}
+"""The paper's inputs by name: 1,800, 2,700 and 4,500 values at 30 x 30 bins (its "4220" is a stale number)."""
+
+Layout = Literal["in_place", "compact"]
+"""Order of the bins in a flat input, see `wheretolook.inputs.bins.arrange`."""

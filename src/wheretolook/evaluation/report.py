@@ -124,10 +124,7 @@ _RANKING: list[Column] = [
 def _table(rows: pd.DataFrame, columns: Sequence[Column], first: str = "method") -> str:
     """A row for each method; columns of which nothing is known are left out."""
     shown = [(header, text) for header, needs, text in columns if needs in rows and rows[needs].notna().any()]
-    lines = [
-        [method_style(row["method"]).label, *(text(row) for _, text in shown)]
-        for row in rows.to_dict("records")
-    ]
+    lines = [[method_style(row["method"]).label, *(text(row) for _, text in shown)] for row in rows.to_dict("records")]
     return markdown_table([first, *(header for header, _ in shown)], lines)
 
 

@@ -55,7 +55,9 @@ def choose_weights(dataset: Dataset, config: EvaluateConfig, models: Sequence[Tr
         # who asks for all methods gets those that have been trained
         if "" not in kinds and not kinds & {*served.values()} and config.methods != EvaluateConfig().methods:
             fix = f"Run the train stage first, name weights, or leave {name} out of the methods."
-            raise WeightsError(f"there are no weights of {' or '.join(sorted(kinds))} to evaluate", path=folder, fix=fix)
+            raise WeightsError(
+                f"there are no weights of {' or '.join(sorted(kinds))} to evaluate", path=folder, fix=fix
+            )
     return {path: kind for path, kind in served.items() if kind in wanted}
 
 

@@ -87,4 +87,6 @@ def _draw(
                       markerfacecolor=style.color if number == 0 else "white")  # fmt: skip
     for method, values in pooled[pooled["method"].map(by_chance)].groupby("method"):
         style = method_style(str(method))
-        axes.axvline(scale * values[column].iloc[0], color=style.color, linestyle=style.dashes, label=style.label, zorder=1)
+        axes.axvline(
+            scale * values[column].iloc[0], color=style.color, linestyle=style.dashes, label=style.label, zorder=1
+        )

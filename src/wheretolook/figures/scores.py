@@ -14,8 +14,8 @@ from matplotlib.style import context
 from matplotlib.ticker import MaxNLocator
 
 from wheretolook.evaluation.score_table import main_rows, methods_of, reference_of, threshold_keys
-from wheretolook.figures.style import INK, RC, new_figure
 from wheretolook.evaluation.scores import by_chance
+from wheretolook.figures.style import INK, RC, new_figure
 from wheretolook.methods.styles import ORACLE, method_group, method_style, rows_by_group
 from wheretolook.viewpoints.thresholds import ALL, threshold_label
 
@@ -154,10 +154,7 @@ def _layout(pooled: pd.DataFrame, key: str) -> _Layout:
     shown = pooled[pooled["method"] != ORACLE]
     y = rows_by_group(methods_of(shown))
     methods = list(y)
-    rows = {
-        (row["method"], row["top_n"]): {str(name): row[name] for name in row}
-        for row in shown.to_dict("records")
-    }
+    rows = {(row["method"], row["top_n"]): {str(name): row[name] for name in row} for row in shown.to_dict("records")}
     top_n = [int(n) for n in shown["top_n"].unique()]
     everything = _Layout(rows, y, top_n, methods)
     drawn = next(filter(by_chance, methods), "")

@@ -59,9 +59,7 @@ def home_device(config: SharedConfig) -> str:
     return "cuda:0" if gpus else "cpu"
 
 
-def fit(
-    classifier: ViewpointClassifier, data: LightningDataModule, record: EpochRecord, config: SharedConfig
-) -> None:
+def fit(classifier: ViewpointClassifier, data: LightningDataModule, record: EpochRecord, config: SharedConfig) -> None:
     """Train a classifier; afterwards `record` has the history and the weights to keep.
 
     With `config.devices > 1`, every device has its own process, started here and ended here: a script that calls this

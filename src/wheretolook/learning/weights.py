@@ -123,4 +123,3 @@ def read_weights(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
             fix="Train again, or install the version that wrote them.",
         )
     return tensors, header
-

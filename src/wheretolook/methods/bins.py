@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,7 +28,7 @@ class BinsScorer(CountingScorer):
 METHODS = (
     Method(
         name=BinsScorer.name,
-        about="Share of the image's bins with a visible landmark in them (paper, Sec. 4.1, \"reprojection with bins\").",
+        about='Share of the image\'s bins with a visible landmark in them (paper, Sec. 4.1, "reprojection with bins").',
         style=MethodStyle("reprojections with bins", "#009E73", "D", "-."),
         build=lambda localization_map, options: BinsScorer(localization_map),
     ),

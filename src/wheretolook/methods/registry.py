@@ -96,7 +96,9 @@ def members(name: str, among: Mapping[str, Method]) -> list[Method]:
     """The methods that a name stands for: one, or those of a family; empty if there are none among these."""
     if name in among:
         return [among[name]]
-    return [] if not name else [method for method in among.values() if method.family == name and not method.only_if_named]
+    return (
+        [] if not name else [method for method in among.values() if method.family == name and not method.only_if_named]
+    )
 
 
 def methods_named(names: Iterable[str], among: Mapping[str, Method]) -> list[Method]:

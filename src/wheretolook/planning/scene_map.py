@@ -82,9 +82,7 @@ def weights_for(
     return default_weights(dataset, say, kinds)
 
 
-def default_weights(
-    dataset: Dataset, say: Callable[[str], None] = print, kinds: Collection[str] = ()
-) -> Path | None:
+def default_weights(dataset: Dataset, say: Callable[[str], None] = print, kinds: Collection[str] = ()) -> Path | None:
     """The best weights of a dataset, or else of the release beside it, that serve its camera's field of view.
 
     Args:

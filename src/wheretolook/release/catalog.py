@@ -273,9 +273,7 @@ _BENCH = "python tests/benchmarks/bench_visibility.py{} --out cpu.json && python
 _LOG_RELEASE = "wheretolook log-release --config {config}"
 _OTHERS = (("dataset", "interiors"),)
 
-_SET, _PAPERS, _WIDEST = (
-    (("dataset", "{dataset}"), ("method", method)) for method in ("set", "mlp-2d+z", "mlp-2d+3d")
-)
+_SET, _PAPERS, _WIDEST = ((("dataset", "{dataset}"), ("method", method)) for method in ("set", "mlp-2d+z", "mlp-2d+3d"))
 _TRAIN_SET, _TRAIN_WIDEST = (
     "wheretolook train --config configs/release-set.yaml",
     f"{_TRAIN} --train.methods '[mlp-2d+3d]'",

@@ -28,4 +28,6 @@ def learn_conv(task: Task) -> Learnt:
     calibration = fit_platt(*predict(network.to(device), data))
     labels = data.views.labels.cpu()
     counts = class_counts(train=labels[data.train_rows].numpy(), val=labels[data.val_rows].numpy())
-    return Learnt(TrainedNetwork(task.method, network.cpu(), task.dataset.camera, *calibration), metrics, counts, history)
+    return Learnt(
+        TrainedNetwork(task.method, network.cpu(), task.dataset.camera, *calibration), metrics, counts, history
+    )

@@ -81,7 +81,7 @@ METHODS = (
     ),
     Method(
         name="fisher-stationary-trace",
-        about='The stationary point of the quadratic field\'s trace ("trace app zero deriv"), which is its minimum\'s '
+        about="The stationary point of the quadratic field's trace (\"trace app zero deriv\"), which is its minimum's "
         "side.",
         style=MethodStyle("probe: stationary trace", "#7A7A7A", "2", (0, (1, 3))),
         group="probes",

@@ -60,9 +60,7 @@ METHODS = (
         )
         for inputs, style in _STYLES.items()
     ),
-    _network(
-        "2d+3d+landmark", MethodStyle("MLP, 2d + 3d + landmark", "#8C3A00", "H", (0, (6, 1, 1, 1))), ALL_CHANNELS
-    ),
+    _network("2d+3d+landmark", MethodStyle("MLP, 2d + 3d + landmark", "#8C3A00", "H", (0, (6, 1, 1, 1))), ALL_CHANNELS),
     _network(
         "released",
         MethodStyle("MLP, trained as the released code", "#F0A070", "p", (0, (2, 2))),

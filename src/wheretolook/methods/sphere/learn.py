@@ -19,7 +19,9 @@ def learn_sphere(task: Task) -> Learnt:
         MapError: a scene's mapping cameras are not known.
     """
     dataset, config = task.dataset, task.config
-    views = load_sphere_views(dataset, training_scenes(dataset), config, task.options, home_device(config), task.progress)
+    views = load_sphere_views(
+        dataset, training_scenes(dataset), config, task.options, home_device(config), task.progress
+    )
     held_out = validation_views(dataset, views.scene, views.location, config)
     labels = views.labels.numpy() > 0
     for name, side in (("training", ~held_out), ("validation", held_out)):

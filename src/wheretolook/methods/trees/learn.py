@@ -110,7 +110,9 @@ class BoostedTrees:
         narrow = {"roots": torch.int32, "left": torch.int32, "right": torch.int32, "feature": torch.uint8}
         narrow["missing_left"] = torch.uint8
         arrays = {name: getattr(self, name) for name in _ARRAYS}
-        write_weights(path, "trees", {name: one.to(narrow.get(name, one.dtype)) for name, one in arrays.items()}, header)
+        write_weights(
+            path, "trees", {name: one.to(narrow.get(name, one.dtype)) for name, one in arrays.items()}, header
+        )
 
     @classmethod
     def load(cls, path: str | Path) -> BoostedTrees:

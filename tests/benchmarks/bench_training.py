@@ -28,9 +28,8 @@ from lightning.pytorch import LightningModule, Trainer, seed_everything
 
 from wheretolook.dataset.folders import Dataset
 from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.inputs.bins import CHANNELS, PAPER_VARIANTS
+from wheretolook.inputs.channels import CHANNELS, PAPER_VARIANTS
 from wheretolook.learning.classifier import ViewpointClassifier, weight_penalty, weighted_bce
-from wheretolook.learning.config import TrainConfig
 from wheretolook.learning.data import LabelledViews, ViewpointDataModule
 from wheretolook.learning.fit import EpochRecord, RunLog, fit, home_device
 from wheretolook.methods.mlp.network import NetworkSpec, ViewpointNetwork

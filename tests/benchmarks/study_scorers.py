@@ -39,7 +39,7 @@ from wheretolook.learning.learner import Task
 from wheretolook.methods.set import learn as set_learner
 from wheretolook.methods.set.config import SetConfig
 from wheretolook.methods.set.learn import SetData, learn_set
-from wheretolook.stages.train import train_variants as train
+from wheretolook.stages.train import train_methods as train
 from wheretolook.utils.tracking import TrackingConfig, start_run
 
 VARIANTS = ("2d+z", "2d+3d+landmark", "conv", "trees", "set", "sphere")

@@ -22,9 +22,11 @@ from wheretolook.dataset.scene import space_and_occlusion
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.colmap_camera import ColmapCamera
 from wheretolook.geometry.poses import camera_centers
+from wheretolook.inputs.channels import CHANNELS
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.labelling import report
-from wheretolook.methods.mlp.weights import load_classifier
+from wheretolook.learning.trained_network import TrainedNetwork
+from wheretolook.methods.mlp.network import ViewpointNetwork
 from wheretolook.methods.registry import load_scorer
 from wheretolook.planning.path_comparison import draw_pairs
 from wheretolook.space.free_space import FreeSpace
@@ -47,7 +49,7 @@ scenes:
 map: {n_images: 30}
 sample: {grid: [6, 6, 4], directions: 100, keep: 50, max_locations: 8, max_directions: 5}
 label: {workers: 2, shard_size: 8}
-train: {epochs: 2, val_fraction: 0.3}
+train: {val_fraction: 0.3, mlp: {epochs: 2}}
 evaluate: {resamples: 50}
 """
 
@@ -88,7 +90,7 @@ def test_every_stage_leaves_its_result(demo: Path) -> None:
         assert len(pycolmap.Reconstruction(scene.map).points3D) > 100
         assert not (scene.folder / "shards").exists()
     scores = pd.read_csv(dataset.root / "results" / "scores.csv")
-    assert {"random", "bins", "mlp", "oracle"} <= set(scores["method"])
+    assert {"random", "bins", "mlp-2d+z", "oracle"} <= set(scores["method"])
     for picture in ("scores.png", "overview.png"):
         assert (dataset.root / "results" / picture).stat().st_size > 10_000
     run_of_evaluation = newest_run(TrackingConfig(str(demo / "mlruns")), "evaluate")
@@ -151,7 +153,7 @@ def test_three_lines_score_viewpoints_of_a_colmap_model(demo: Path) -> None:
     weights = demo / "data" / "tiny" / "weights" / "mlp-2d+3d.safetensors"
     scores = load_scorer(weights, localization_map).score(poses(table))
     assert scores.shape == (len(table),) and np.all((scores > 0) & (scores < 1)) and np.ptp(scores) > 0
-    assert load_classifier(weights).spec.variant == "2d+3d"
+    assert TrainedNetwork.load(weights, ViewpointNetwork, "mlp-2d+3d").network.spec.channels == CHANNELS
     # the camera that mapped is the same pinhole, projected by COLMAP; landmarks on an edge may be rounded otherwise
     by_colmap = LocalizationMap.from_colmap(scene.map, ColmapCamera.of_map(scene.map), mesh=scene.mesh)
     difference = by_colmap.bin_views(poses(table)).counts - localization_map.bin_views(poses(table)).counts

@@ -85,7 +85,7 @@ def top_n_table(scores: pd.DataFrame, methods: Sequence[str] = ()) -> pd.DataFra
     return table
 
 
-def _present(pooled: pd.DataFrame, methods: Sequence[str]) -> list[Method]:
+def _present(pooled: pd.DataFrame, methods: Sequence[str]) -> list[str]:
     """Those of the methods that a table has; a family stands for the first of its methods that is there."""
     first: dict[str, str] = {}
     for name in methods_of(pooled):

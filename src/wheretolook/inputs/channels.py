@@ -1,5 +1,4 @@
-"""Names of what bins and landmarks in view tell, apart from `wheretolook.inputs.bins` so that options can be read without
-PyTorch."""
+"""Names of what bins and landmarks in view tell: apart from what makes them, so that options need no PyTorch."""
 
 from __future__ import annotations
 
@@ -18,7 +17,8 @@ ATTRIBUTES = POSE_ATTRIBUTES + MAP_ATTRIBUTES
 """All that is known of a landmark in a view."""
 
 LANDMARK_CHANNELS = ("mapped_angle", "distance_ratio", *MAP_ATTRIBUTES)
-"""Channels of what landmarks are like, on request only: two of `POSE_ATTRIBUTES`, and what the map knows. A bin's mean is NaN where one of its landmarks' values is not known."""
+"""Channels of what landmarks are like, on request only: two of `POSE_ATTRIBUTES`, and what the map knows. A bin's mean
+is NaN where one of its landmarks' values is not known."""
 
 ALL_CHANNELS = CHANNELS + LANDMARK_CHANNELS
 

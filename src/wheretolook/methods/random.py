@@ -58,7 +58,8 @@ def _splitmix64(state: NDArray[np.uint64]) -> NDArray[np.uint64]:
 METHODS = (
     Method(
         name=RandomScorer.name,
-        about="Uniform random scores, a function of pose and seed, so that they do not depend on the order of the batch.",
+        about="Uniform random scores, a function of pose and seed, so that they do not depend on the order of the "
+        "batch.",
         style=MethodStyle("random", "#999999", "x", ":"),
         build=lambda localization_map, options: RandomScorer(localization_map, options.seed),
         by_chance=True,

@@ -74,7 +74,8 @@ METHODS = (
     ),
     Method(
         name="fisher-worst-trace",
-        about='The view with the least trace by the quadratic field ("trace app worst"): what the field says not to do.',
+        about='The view with the least trace by the quadratic field ("trace app worst"): what the field says not '
+        "to do.",
         style=MethodStyle("probe: worst trace", "#4D4D4D", "1", (0, (1, 2))),
         group="probes",
         build=_worst,

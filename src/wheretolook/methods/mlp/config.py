@@ -30,8 +30,8 @@ RELEASED_SETTINGS: dict[str, Any] = {
     "keep": "last",
     "patience": None,
 }
-"""Options of the paper's released code where they can differ from the paper's; batch size (128 there) and epochs stay as
-configured."""
+"""Options of the paper's released code where they can differ from the paper's; batch size (128 there) and epochs stay
+as configured."""
 
 
 @dataclass(frozen=True)

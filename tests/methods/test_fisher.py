@@ -18,9 +18,8 @@ from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.methods.fisher import APPROXIMATIONS
+from wheretolook.methods.fisher import APPROXIMATIONS, Approximation
 from wheretolook.methods.fisher.score import (
-    Approximation,
     FisherScorer,
     PoseInformation,
     StationaryTraceScorer,

@@ -78,7 +78,8 @@ def reference_method(methods: Iterable[str], name: str) -> str:
     if name and name not in methods:
         known = f"There are {', '.join(methods)}."
         raise ConfigError("the reference is none of the methods evaluated", value=name, fix=known)
-    ranks = {other: known.reference for other in methods if (known := find(other)) and known.probability}
+    found = {other: find(other) for other in methods}
+    ranks = {other: known.reference for other, known in found.items() if known is not None and known.probability}
     return name or max(ranks, key=lambda other: ranks[other], default="")
 
 

@@ -85,8 +85,6 @@ def _draw(
                 axes.hlines(place + shift[number], low, high, color=style.color, linewidth=0.9)
             axes.plot(value, place + shift[number], _MARKERS[number % len(_MARKERS)], color=style.color, markersize=6,
                       markerfacecolor=style.color if number == 0 else "white")  # fmt: skip
-    for method, values in pooled[pooled["method"].map(by_chance)].groupby("method"):
-        style = method_style(str(method))
-        axes.axvline(
-            scale * values[column].iloc[0], color=style.color, linestyle=style.dashes, label=style.label, zorder=1
-        )
+    for method in filter(by_chance, methods_of(pooled)):
+        style, value = method_style(method), scale * pooled.loc[pooled["method"] == method, column].iloc[0]
+        axes.axvline(value, color=style.color, linestyle=style.dashes, label=style.label, zorder=1)

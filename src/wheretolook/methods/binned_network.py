@@ -96,7 +96,8 @@ class BinnedNetworkScorer(BinnedScorer):
         super().__init__(localization_map, network.bins, not {*self.channels} <= {*CHANNELS})
         camera, self.device = localization_map.camera, localization_map.device
         check_field_of_view(trained.camera, camera)
-        self.name, self.trained, self.network = trained.method, trained, network.to(self.device).eval()
+        self.name, self.trained = trained.method, trained
+        self.network: Any = network.to(self.device).eval()
         pixels = {"u": trained.camera.width / camera.width, "v": trained.camera.height / camera.height}
         scales = [pixels.get(name, 1.0) for name in self.channels]
         self._scale = torch.tensor(scales, device=self.device)[:, None, None]

@@ -50,6 +50,11 @@ class ScorerOptions:
     heading: tuple[tuple[float, float, float], ...] = ()
 
 
+def no_params(camera: Camera) -> dict[str, Any]:
+    """Nothing to log."""
+    return {}
+
+
 @dataclass(frozen=True)
 class Method:
     """A method of scoring viewpoints, or something learnt that methods build on.
@@ -99,4 +104,4 @@ class Method:
     settings: Mapping[str, Any] = field(default_factory=dict)
     trained_unasked: bool = False
     ships: Literal["best", "network", "never"] = "best"
-    params: Callable[[Camera], dict[str, Any]] = lambda camera: {}
+    params: Callable[[Camera], dict[str, Any]] = no_params

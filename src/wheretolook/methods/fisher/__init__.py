@@ -3,19 +3,21 @@ probes of the field that its tables list among them."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
-from wheretolook.methods.method import Method, MethodStyle, ScorerOptions
+from wheretolook.methods.method import Method, MethodStyle, ScorerOptions, no_params
 
 if TYPE_CHECKING:
     from wheretolook.geometry.colmap_camera import Camera
     from wheretolook.inputs.localization_map import LocalizationMap
     from wheretolook.methods.base import Scorer
 
+Approximation = Literal["exact", "quadratic", "gp"]
+
 METRICS = {"mineig": ("min. eigenvalue", "P"), "logdet": ("log det", "X"), "trace": ("trace", "h")}
 """Metrics of the information: name for people, marker."""
 
-APPROXIMATIONS: dict[str, tuple[str, str, Any]] = {
+APPROXIMATIONS: dict[Approximation, tuple[str, str, Any]] = {
     "exact": ("exact", "#5E2750", "-"),
     "quadratic": ("quadratic", "#B65C93", (0, (5, 1))),
     "gp": ("GP", "#DDA3C6", (0, (2, 1))),
@@ -23,7 +25,7 @@ APPROXIMATIONS: dict[str, tuple[str, str, Any]] = {
 """How the sum over landmarks is taken: name for people, shade of one colour (the exact one darkest), line style."""
 
 
-def _metric(metric: str, approximation: str, about_origin: bool) -> Method:
+def _metric(metric: str, approximation: Approximation, about_origin: bool) -> Method:
     def build(localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
         from wheretolook.methods.fisher.score import FisherScorer
 
@@ -48,7 +50,7 @@ def _metric(metric: str, approximation: str, about_origin: bool) -> Method:
         build=build,
         family="fisher",
         only_if_named=about_origin,
-        **({"params": params} if approximation == "gp" else {}),
+        params=params if approximation == "gp" else no_params,
     )
 
 

@@ -4,7 +4,7 @@ probes of the field that its tables list among them."""
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -23,9 +23,9 @@ from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import Float, check_poses, split_poses
 from wheretolook.inputs.localization_map import LocalizationMap, shared_locations
 from wheretolook.methods.base import Scorer
+from wheretolook.methods.fisher import Approximation
 from wheretolook.visibility.frustum import VisibleSets
 
-Approximation = Literal["exact", "quadratic", "gp"]
 PROBE_AXES = 2000
 """Axes among which the worst view is sought."""
 

@@ -38,15 +38,15 @@ tracking = open_store(release)
 from wheretolook.release.paper_architecture import paper_architecture_table
 from wheretolook.utils.tracking import newest_run
 
-run = newest_run(tracking, "train", params={"dataset": release.name, "variant": "2d+3d"})
+run = newest_run(tracking, "train", params={"dataset": release.name, "method": "mlp-2d+3d"})
 paper_architecture_table(run.data.params).style.hide()
 
 # %% [markdown]
 # ## What was trained
 #
-# The newest run of each variant, the best first, on viewpoints of an apartment that none has learnt from. `set` looks
-# at landmarks one by one and knows what they are like; `2d`, `2d+z` and `2d+3d` are the paper's network, `released` is
-# it as the paper's released code trains it.
+# The newest run of each method, the best first, on viewpoints of an apartment that none has learnt from. `set` looks
+# at landmarks one by one and knows what they are like; `mlp-2d`, `mlp-2d+z` and `mlp-2d+3d` are the paper's network,
+# `mlp-released` is it as the paper's released code trains it.
 
 # %%
 from wheretolook.learning.runs import trained

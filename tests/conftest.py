@@ -18,7 +18,8 @@ from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import Float, poses_looking_along
 from wheretolook.labelling import local_engine
 from wheretolook.labelling.shard import LabelledShard, Shard, ShardWorker
-from wheretolook.utils.tracking import TrackingConfig, client
+from wheretolook.utils.tracking import client
+from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.utils.warp import start_warp
 from wheretolook.visibility.frustum import LandmarkSets
 

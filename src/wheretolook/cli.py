@@ -88,12 +88,12 @@ STAGES = {
     ),
     "train": Stage(
         "train",
-        "Train one network for each input variant.",
-        ("train.variants", "train.epochs", "train.batch_size", "train.learning_rate", "train.balance",
-         "train.noise_px", "train.noise_m", "train.also", "train.seed", "train.accelerator", "train.devices",
+        "Learn from the labels, one weights file for each method.",
+        ("train.methods", "train.also", "train.val_fraction", "train.seed", "train.accelerator", "train.devices",
+         "train.mlp.epochs", "train.mlp.batch_size", "train.mlp.balance", "train.set.epochs",
          "tracking.folder"),
         ("train", "tracking"),
-        "--config configs/demo.yaml --train.variants '[2d+z, set]'",
+        "--config configs/demo.yaml --train.methods '[mlp-2d+z, set]'",
     ),
     "evaluate": Stage(
         "evaluate",

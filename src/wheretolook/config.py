@@ -12,8 +12,8 @@ from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.figures.config import FiguresConfig
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.labelling.config import LabelConfig
-from wheretolook.learning.config import TrainConfig
 from wheretolook.mapping.config import MapConfig
+from wheretolook.methods.train_config import TrainConfig
 from wheretolook.planning.config import PathsConfig, PlanConfig, ViewpointMapConfig
 from wheretolook.scenes.config import ApartmentConfig
 from wheretolook.space.config import FreeSpaceConfig, MappedSpaceConfig

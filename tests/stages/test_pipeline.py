@@ -23,11 +23,13 @@ from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.colmap_camera import ColmapCamera
 from wheretolook.geometry.poses import camera_centers
+from wheretolook.inputs.channels import CHANNELS
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.labelling import labeller
-from wheretolook.learning.config import TrainConfig
-from wheretolook.methods.mlp.weights import load_classifier
-from wheretolook.methods.registry import WEIGHTS_OF, load_scorer
+from wheretolook.learning.trained_network import TrainedNetwork
+from wheretolook.methods.mlp.network import ViewpointNetwork
+from wheretolook.methods.registry import load_scorer, scorers
+from wheretolook.methods.train_config import TrainConfig
 from wheretolook.planning.path_comparison import draw_pairs
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.space.tsdf_space import TsdfSpace
@@ -51,7 +53,7 @@ scenes:
 map: {n_images: 24}
 sample: {grid: [6, 6, 4], directions: 100, keep: 50, max_locations: 8, max_directions: 5}
 label: {workers: 1, shard_size: 20}
-train: {epochs: 2, val_fraction: 0.3, variants: [2d, 2d+3d, set], set: {epochs: 2, batch_size: 1}}
+train: {val_fraction: 0.3, methods: [mlp-2d, mlp-2d+3d, set], mlp: {epochs: 2}, set: {epochs: 2, batch_size: 1}}
 evaluate: {resamples: 20, top_n: [1], methods: [random, visible, bins, fisher-trace-exact, mlp, set]}
 """
 
@@ -92,7 +94,9 @@ def test_every_stage_leaves_its_result(demo: Path) -> None:
         assert len(pycolmap.Reconstruction(scene.map).points3D) > 100
         assert not (scene.folder / "shards").exists()
     scores = pd.read_csv(dataset.root / "results" / "scores.csv")
-    assert {"random", "visible", "bins", "fisher", "mlp", "set", "oracle"} == set(scores["method"])
+    assert {"random", "visible", "bins", "fisher-trace-exact", "mlp-2d", "mlp-2d+3d", "set", "oracle"} == set(
+        scores["method"]
+    )
     for picture in ("scores.png", "overview.png"):
         assert (dataset.root / "results" / picture).stat().st_size > 10_000
     run_of_evaluation = newest_run(TrackingConfig(str(demo / "mlruns")), "evaluate")
@@ -107,13 +111,12 @@ def test_run_again_it_reuses_what_is_there(demo: Path) -> None:
 
 @pytest.mark.slow
 def test_all_methods_are_trained_and_compared(copy: Path) -> None:
-    methods, variants = EvaluateConfig().methods, TrainConfig().variants
-    assert run("train", copy, "--train.variants", f"[{','.join(variants)}]") == 0
+    methods, learned = EvaluateConfig().methods, TrainConfig().methods
+    assert run("train", copy, "--train.methods", f"[{','.join(learned)}]") == 0
     assert run("evaluate", copy, "--evaluate.methods", f"[{','.join(methods)}]") == 0
     scores = pd.read_csv(copy / "data" / "tiny" / "results" / "scores.csv")
-    expected = {"mlp", "set", *(name for name in methods if name not in WEIGHTS_OF)}
-    assert {name.split("-")[0] for name in expected} <= {name.split("-")[0] for name in scores["method"]}
-    assert {"2d", "2d+z", "2d+3d"} <= set(scores["inputs"])
+    rules = {name for name in methods if not scorers()[name].weights}
+    assert {*learned, *rules} <= {*scores["method"]}
 
 
 @pytest.mark.parametrize("workers", ["1", pytest.param("2", marks=pytest.mark.slow)])
@@ -173,7 +176,7 @@ def test_three_lines_score_viewpoints_of_a_colmap_model(demo: Path) -> None:
     weights = demo / "data" / "tiny" / "weights" / "mlp-2d+3d.safetensors"
     scores = load_scorer(weights, localization_map).score(poses(table))
     assert scores.shape == (len(table),) and np.all((scores > 0) & (scores < 1)) and np.ptp(scores) > 0
-    assert load_classifier(weights).spec.variant == "2d+3d"
+    assert TrainedNetwork.load(weights, ViewpointNetwork, "mlp-2d+3d").network.spec.channels == CHANNELS
     # the camera that mapped is the same pinhole, projected by COLMAP; landmarks on an edge may be rounded otherwise
     by_colmap = LocalizationMap.from_colmap(scene.map, ColmapCamera.of_map(scene.map), mesh=scene.mesh)
     difference = by_colmap.bin_views(poses(table)).counts - localization_map.bin_views(poses(table)).counts

@@ -10,7 +10,8 @@ from matplotlib.style import context
 from wheretolook.evaluation.score_table import main_rows, methods_of
 from wheretolook.figures.config import Look
 from wheretolook.figures.style import INK, RC, new_figure
-from wheretolook.methods.styles import MethodStyle, method_style
+from wheretolook.methods.method import MethodStyle
+from wheretolook.methods.styles import method_style
 
 _BEFORE, _AFTER = "before", "after"
 
@@ -22,7 +23,7 @@ def calibration_figure(table: pd.DataFrame) -> Figure:
     of views in each bin.
 
     Args:
-        table: `calibration.csv` of the evaluate stage: a row for each method, inputs, `when` ("before", "after") and
+        table: `calibration.csv` of the evaluate stage: a row for each method, `when` ("before", "after") and
             bin. Of several occlusion models or sets of candidates the first is drawn.
     """
     table = main_rows(table)
@@ -31,8 +32,8 @@ def calibration_figure(table: pd.DataFrame) -> Figure:
         figure = new_figure(0.9 + 2.8 * len(methods), 4.3)
         panels = figure.subplots(2, len(methods), sharex=True, sharey="row", squeeze=False, height_ratios=(3, 1))
         for (curve, counts), method in zip(panels.T, methods, strict=True):
-            style = method_style(*method)
-            rows = table[(table["method"] == method[0]) & (table["inputs"] == method[1])]
+            style = method_style(method)
+            rows = table[table["method"] == method]
             curve.plot([0, 1], [0, 1], color=INK, linewidth=1, linestyle="--")
             for when in (_BEFORE, _AFTER):
                 part = rows[rows["when"] == when].sort_values("bin_low")

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from wheretolook.figures.dollhouse import ORANGE
 from wheretolook.figures.style import INK, PRINT, TWO_COLUMNS_IN, new_figure
 from wheretolook.geometry.poses import Float
-from wheretolook.inputs.bins import PAPER_VARIANTS
+from wheretolook.inputs.channels import PAPER_VARIANTS
 
 UNITS = {"u": "px", "v": "px", "x": "m", "y": "m", "z": "m"}
 

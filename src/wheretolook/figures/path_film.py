@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from wheretolook.figures.config import Look
 from wheretolook.figures.style import INK, RC, new_figure
 from wheretolook.geometry.poses import Float
-from wheretolook.methods.styles import scorer_style
+from wheretolook.methods.styles import method_style
 from wheretolook.planning.path_view import PathView, Pixels
 from wheretolook.planning.polylines import lengths_along
 from wheretolook.utils.errors import ConfigError
@@ -72,7 +72,7 @@ def methods_figure(paths: Mapping[str, Sequence[PathView]], landmarks: Float) ->
         for axes, (name, views) in zip(figure.subplots(1, len(paths), squeeze=False)[0], paths.items(), strict=True):
             _draw_map(axes, views, landmarks, None)
             n_seen = np.mean([len(view.pixels) for view in views])
-            axes.set_title(f"{scorer_style(name).label}\n{n_seen:,.0f} landmarks in view on average", fontsize=10)
+            axes.set_title(f"{method_style(name).label}\n{n_seen:,.0f} landmarks in view on average", fontsize=10)
         return figure
 
 

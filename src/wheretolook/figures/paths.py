@@ -11,7 +11,7 @@ from matplotlib.style import context
 
 from wheretolook.figures.config import Look
 from wheretolook.figures.style import INK, RC, new_figure
-from wheretolook.methods.styles import scorer_style
+from wheretolook.methods.styles import method_style
 
 TITLES = {"planned": "places and views planned", "given": "views along a given path"}
 
@@ -35,7 +35,7 @@ def paths_figure(summary: pd.DataFrame) -> Figure:
                 of_method = rows[rows["method"] == method].set_index("scene").reindex(scenes)
                 at = np.arange(len(scenes)) + (number - (len(methods) - 1) / 2) * width
                 name, _, rule = method.partition(" ")
-                style = scorer_style(name)
+                style = method_style(name)
                 value, low, high = (100 * of_method[f"localized{end}"].to_numpy() for end in ("", "_low", "_high"))
                 label, hatch = (f"{style.label}, greedy", "////") if rule else (style.label, "")
                 look: Look = {"color": style.color, "hatch": hatch, "edgecolor": "white", "linewidth": 0.4}

@@ -14,10 +14,10 @@ from matplotlib.style import context
 from matplotlib.ticker import MaxNLocator
 
 from wheretolook.evaluation.score_table import main_rows, methods_of, reference_of, threshold_keys
+from wheretolook.evaluation.scores import by_chance
 from wheretolook.figures.config import Look
 from wheretolook.figures.style import INK, RC, new_figure
-from wheretolook.methods.names import Method
-from wheretolook.methods.styles import method_group, method_style, rows_by_group
+from wheretolook.methods.styles import ORACLE, method_group, method_style, rows_by_group
 from wheretolook.viewpoints.thresholds import ALL, threshold_label
 
 _OTHER_MARKERS = ("o", "D", "s", "^")
@@ -33,10 +33,10 @@ _WHISKERS = "whiskers: 95 % bootstrap interval over locations"
 class _Layout:
     """What the panels of a figure share: rows of the table by method and N, and the places y of methods."""
 
-    rows: dict[tuple[Method, int], dict[str, float]]
-    y: dict[Method, float]
+    rows: dict[tuple[str, int], dict[str, float]]
+    y: dict[str, float]
     top_n: Sequence[int]
-    near: Sequence[Method]
+    near: Sequence[str]
     """Methods nearer to the oracle than to chance, whose values the axes hold."""
 
     def others(self) -> list[tuple[int, str, float]]:
@@ -47,12 +47,12 @@ class _Layout:
             for number, n in enumerate(others)
         ]
 
-    def value(self, method: Method, n: int, column: str) -> float:
-        """A value of the table in percent; NaN if missing."""
+    def value(self, method: str, n: int, column: str) -> float:
+        """In percent; NaN where it is not known."""
         return 100 * self.rows.get((method, n), {}).get(column, float("nan"))
 
-    def ends(self, method: Method, n: int, column: str) -> tuple[float, float]:
-        """Ends of its interval in percent; NaN if missing."""
+    def ends(self, method: str, n: int, column: str) -> tuple[float, float]:
+        """Of the interval, in percent; NaN where it is not known."""
         name, _, key = column.partition("_")
         return self.value(method, n, f"{name}_low_{key}"), self.value(method, n, f"{name}_high_{key}")
 
@@ -96,7 +96,7 @@ def score_figure(scores: pd.DataFrame) -> Figure:
             axes.axvline(100, color=INK, linewidth=1, linestyle="--")
             _draw(axes, layout, column)
             axes.set_title(f"within {threshold_label(key)}", fontsize=10)
-            best = pooled.loc[(pooled["method"] == "oracle") & (pooled["top_n"] == layout.top_n[0]), f"raw_{key}"]
+            best = pooled.loc[(pooled["method"] == ORACLE) & (pooled["top_n"] == layout.top_n[0]), f"raw_{key}"]
             if len(best) and best.iloc[0] > 0:
                 _add_raw_axis(axes, best.iloc[0])
         _name_rows(panels[0], layout)
@@ -123,8 +123,8 @@ def regret_figure(scores: pd.DataFrame) -> Figure:
         raise ValueError("the score table has no regret: evaluate again")
     layout, reference = _layout(pooled, key), reference_of(pooled)
     columns = {f"regret_{key}": "regret: oracle minus method"}
-    if reference is not None:
-        columns[f"difference_{key}"] = f"method minus {method_style(*reference).label}"
+    if reference:
+        columns[f"difference_{key}"] = f"method minus {method_style(reference).label}"
     with context(RC):
         figure = new_figure(3.0 + 3.1 * len(columns), _height(layout))
         panels = figure.subplots(1, len(columns), sharey=True, squeeze=False)[0]
@@ -137,7 +137,7 @@ def regret_figure(scores: pd.DataFrame) -> Figure:
             _draw(axes, layout, column)
             axes.set_title(title, fontsize=10)
         panels[0].set_xlabel("percentage points, lower is better", fontsize=9)
-        if reference is not None:
+        if reference:
             panels[1].set_xlabel("percentage points, higher is better", fontsize=9)
         figure.supxlabel(f"shares of chosen views within {threshold_label(key)}\n{_WHISKERS}", fontsize=9)
         _name_rows(panels[0], layout)
@@ -147,21 +147,19 @@ def regret_figure(scores: pd.DataFrame) -> Figure:
 
 def _layout(pooled: pd.DataFrame, key: str) -> _Layout:
     """Rows by groups from top to bottom, in the table's order within each."""
-    shown = pooled[pooled["method"] != "oracle"]
+    shown = pooled[pooled["method"] != ORACLE]
     y = rows_by_group(methods_of(shown))
     methods = list(y)
-    rows = {
-        ((row["method"], row["inputs"]), row["top_n"]): {str(name): row[name] for name in row}
-        for row in shown.to_dict("records")
-    }
+    rows = {(row["method"], row["top_n"]): {str(name): row[name] for name in row} for row in shown.to_dict("records")}
     top_n = [int(n) for n in shown["top_n"].unique()]
     everything = _Layout(rows, y, top_n, methods)
-    chance = np.nan_to_num(everything.value(("random", ""), top_n[0], f"normalized_{key}"))
+    drawn = next(filter(by_chance, methods), "")
+    chance = np.nan_to_num(everything.value(drawn, top_n[0], f"normalized_{key}"))
     near = [
         method
         for method in methods
         if everything.value(method, top_n[0], f"normalized_{key}") >= (100 + chance) / 2
-        and method_group(method[0]) != "probes"
+        and method_group(method) != "probes"
     ]
     return _Layout(rows, y, top_n, near or methods)
 
@@ -176,7 +174,7 @@ def _draw(axes: Axes, layout: _Layout, column: str) -> None:
     low, high = axes.get_xlim()
     plate = {"facecolor": "white", "edgecolor": "none", "pad": 0.5}
     for method, y in layout.y.items():
-        style = method_style(*method)
+        style = method_style(method)
         values = [layout.value(method, n, column) for n in layout.top_n]
         if low <= values[0] <= high:
             axes.hlines(y, *layout.ends(method, layout.top_n[0], column), color=INK, linewidth=1.2)
@@ -208,7 +206,7 @@ def _add_raw_axis(axes: Axes, best: float) -> None:
 
 
 def _name_rows(axes: Axes, layout: _Layout) -> None:
-    labels = [method_style(*method).label for method in layout.y]
+    labels = [method_style(method).label for method in layout.y]
     labels = [",\n".join(label.rsplit(", ", 1)) if len(label) > _WRAP else label for label in labels]
     axes.set_yticks(list(layout.y.values()), labels, fontsize=9)
     axes.set_ylim(max(layout.y.values()) + 0.8, -0.6)

@@ -10,7 +10,6 @@ from matplotlib.style import context
 
 from wheretolook.figures.config import Look
 from wheretolook.figures.style import RC, new_figure
-from wheretolook.learning.config import LEARNERS
 from wheretolook.methods.styles import method_style
 
 
@@ -18,14 +17,14 @@ def training_figure(histories: Mapping[str, pd.DataFrame]) -> Figure:
     """Loss and average precision over the epochs (the first is 1), a ring at the best validation average precision.
 
     Args:
-        histories: for each learner or input variant, one row for each epoch with `epoch`, `train_bce`, `val_bce`,
+        histories: for each method, one row for each epoch with `epoch`, `train_bce`, `val_bce`,
             `train_average_precision` and `val_average_precision`.
     """
     with context(RC):
         figure = new_figure(9, 3.4)
         panels = figure.subplots(1, 2)
-        for variant, history in histories.items():
-            style = method_style(variant) if variant in LEARNERS else method_style("mlp", variant)
+        for method, history in histories.items():
+            style = method_style(method)
             dotted: Look = {"linestyle": ":", "linewidth": 1.1, "label": f"{style.label}: training"}
             solid: Look = {"linestyle": "-", "label": f"{style.label}: validation"}
             for panel, name in zip(panels, ("bce", "average_precision"), strict=True):

@@ -105,7 +105,7 @@ def update_viewpoint_map(
     _check_landmarks(landmarks)
     digests = landmark_digests(landmarks)
     origin = _origin(scorer, old.origin.lattice, digests)
-    for name in ("scorer", "inputs", "camera", "occlusion"):
+    for name in ("scorer", "camera", "occlusion"):
         now, before = getattr(origin, name), getattr(old.origin, name)
         if now != before:
             fix = f"Use {before!r}, or build it anew."
@@ -247,7 +247,6 @@ def _origin(scorer: Scorer, lattice: str, digests: NDArray[np.uint64]) -> MapOri
     digest = hashlib.sha256(localization_map.landmarks.ids.tobytes() + digests.tobytes()).hexdigest()[:16]
     return MapOrigin(
         scorer.name,
-        scorer.inputs,
         lattice,
         _intrinsics(localization_map.camera),
         localization_map.occlusion.name,

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float, rotation_looking_along
+from wheretolook.learning.old_names import name_of
 from wheretolook.planning.map_file import ARRAYS, DESCRIPTION, REBUILD, read_map, write_map
 from wheretolook.planning.turns import angles_to_axis_deg, check_axis, turns_from_deg, within
 from wheretolook.utils.errors import MapFormatError
@@ -58,7 +59,6 @@ class MapOrigin:
 
     Attributes:
         scorer: name of the method.
-        inputs: its input variant, "" if it has none.
         lattice: name of the directions' lattice, "" for others.
         camera: intrinsics: COLMAP's name of the "model", "width" and "height" in pixels, "params" in COLMAP's order.
         occlusion: name of the occlusion model.
@@ -68,7 +68,6 @@ class MapOrigin:
     """
 
     scorer: str
-    inputs: str
     lattice: str
     camera: dict[str, Any]
     occlusion: str
@@ -136,6 +135,9 @@ class ViewpointMap:
             MapFormatError: there is no map, it is damaged, or of another version.
         """
         grid, origin, arrays = read_map(folder, mmap)
+        if "inputs" in origin:  # of a map built before methods had one name each
+            origin = {**origin, "scorer": name_of(origin["scorer"], origin["inputs"])}
+            del origin["inputs"]
         try:
             return cls(grid=grid, origin=MapOrigin(**origin), **arrays)
         except TypeError as error:

@@ -8,7 +8,8 @@ from itertools import pairwise
 
 import pandas as pd
 
-from wheretolook.inputs.bins import INPUT_VARIANTS
+from wheretolook.inputs.channels import PAPER_VARIANTS
+from wheretolook.learning.old_names import name_of_variant
 
 
 def paper_architecture_table(params: Mapping[str, str]) -> pd.DataFrame:
@@ -16,7 +17,8 @@ def paper_architecture_table(params: Mapping[str, str]) -> pd.DataFrame:
 
     A row for each layer: `layer` (its number in the paper's table), `paper` and `here`.
     """
-    channels, bins = INPUT_VARIANTS[params["variant"]], int(params["bins"])
+    method = params.get("method") or name_of_variant(params["variant"])
+    channels, bins = PAPER_VARIANTS[method.removeprefix("mlp-")], int(params["bins"])
     widths = [len(channels) * bins**2, *map(int, ast.literal_eval(params["hidden"]))]
     here = []
     for before, after in pairwise(widths):

@@ -17,9 +17,9 @@ from wheretolook.figures.peaks import spread_extrema
 from wheretolook.figures.pipeline import Pipeline
 from wheretolook.figures.sampling import Sampling
 from wheretolook.geometry.poses import Float, poses_looking_along, rotation_looking_along
-from wheretolook.inputs.bins import CHANNELS
+from wheretolook.inputs.channels import CHANNELS
 from wheretolook.methods.base import Scorer
-from wheretolook.methods.mlp.score import LearnedScorer
+from wheretolook.methods.binned_network import BinnedNetworkScorer
 from wheretolook.planning.config import PathsConfig, PlanConfig
 from wheretolook.planning.method_paths import path_views, plan_by_methods
 from wheretolook.planning.path_comparison import draw_pairs
@@ -121,8 +121,8 @@ def binned_image_of(showcase: Showcase, cam_from_world: ArrayLike, bins: int = 3
     return BinnedImage(showcase.render(pose)[0], pixels, means, binned.counts[0])
 
 
-def learning_of(showcase: Showcase, scorer: LearnedScorer, location_id: int, best: bool = True) -> Learning:
-    """Inputs, activations and score of the paper's network at its best (or worst) labelled view of a location."""
+def learning_of(showcase: Showcase, scorer: BinnedNetworkScorer, location_id: int, best: bool = True) -> Learning:
+    """What the paper's network makes of the labelled view of a location that it scores highest, or else lowest."""
     from wheretolook.methods.mlp.architecture import activations
 
     candidates = showcase.viewpoints(location_id)

@@ -151,8 +151,8 @@ def test_new_columns_by_hand() -> None:
     assert [bins[f"good_{key}"] for key in (fine, coarse)] == [2, 4]
     assert [bins[f"regret_{key}"] for key in (fine, coarse)] == pytest.approx([1 / 7, 1 / 7])
     assert [bins[f"difference_{key}"] for key in (fine, coarse)] == pytest.approx([-1 / 7, -1 / 7])
-    assert row["mlp", 3, "all"][f"regret_{fine}"] == 0
-    assert [row["mlp", 3, "all"][f"difference_{key}"] for key in (fine, coarse)] == [0, 0]
+    assert row["mlp-2d", 3, "all"][f"regret_{fine}"] == 0
+    assert [row["mlp-2d", 3, "all"][f"difference_{key}"] for key in (fine, coarse)] == [0, 0]
 
     chance = row["random", 1, "all"]  # of location 0 2 and 3 of 4 views are good, of location 2 1 and 2 of 3
     assert [chance[f"good_{key}"] for key in (fine, coarse)] == pytest.approx([1 / 2 + 1 / 3, 3 / 4 + 2 / 3])

@@ -12,13 +12,7 @@ from synthetic_scores import make_scores
 from wheretolook.dataset.folders import RELEASE_FILE, Dataset
 from wheretolook.evaluation.paper_tables import write_paper_tables
 
-METHODS: tuple[str, ...] = (
-    "random",
-    "bins",
-    "fisher-trace-exact",
-    "mlp-2d+z",
-    "mlp-2d+3d",
-)
+METHODS: tuple[str, ...] = ("random", "bins", "fisher-trace-exact", "mlp-2d+z", "mlp-2d+3d")
 
 
 def make_release(root: Path) -> Dataset:

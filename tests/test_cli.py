@@ -39,10 +39,7 @@ def test_only_evaluate_lists_methods(capsys: pytest.CaptureFixture[str]) -> None
             "viewpoint-map",
             ["--scenes.mapped_space.clearance_m", "--map.photographs.assume_metric", "photographs has no"],
         ),
-        (
-            "plan",
-            ["--plan.start", "--plan.film", "wheretolook plan --config", "--tracking.folder", "model tsdf"],
-        ),
+        ("plan", ["--plan.start", "--plan.film", "wheretolook plan --config", "--tracking.folder", "model tsdf"]),
     ],
 )
 def test_help_names_what_a_stage_reads(stage: str, says: list[str], capsys: pytest.CaptureFixture[str]) -> None:

@@ -151,8 +151,8 @@ def test_new_columns_by_hand() -> None:
     assert [bins[f"good_{key}"] for key in (fine, coarse)] == [2, 4]
     assert [bins[f"regret_{key}"] for key in (fine, coarse)] == pytest.approx([1 / 7, 1 / 7])
     assert [bins[f"difference_{key}"] for key in (fine, coarse)] == pytest.approx([-1 / 7, -1 / 7])
-    assert row["mlp", 3, "all"][f"regret_{fine}"] == 0
-    assert [row["mlp", 3, "all"][f"difference_{key}"] for key in (fine, coarse)] == [0, 0]
+    assert row["mlp-2d", 3, "all"][f"regret_{fine}"] == 0
+    assert [row["mlp-2d", 3, "all"][f"difference_{key}"] for key in (fine, coarse)] == [0, 0]
 
     chance = row["random", 1, "all"]  # of location 0 2 and 3 of 4 views are good, of location 2 1 and 2 of 3
     assert [chance[f"good_{key}"] for key in (fine, coarse)] == pytest.approx([1 / 2 + 1 / 3, 3 / 4 + 2 / 3])
@@ -252,11 +252,7 @@ def test_with_shuffled_labels_every_method_is_as_good_as_chance() -> None:
     views = random_views(rng, 3000)
     informed = views.good[:, 0] + rng.normal(size=len(views.location))
     shuffled = TestViews(views.location, views.viewpoint_id, rng.permutation(views.good), views.location_scene)
-    scores = {
-        "random": rng.random(len(informed)),
-        "bins": informed,
-        "mlp-2d": rng.random(len(informed)),
-    }
+    scores = {"random": rng.random(len(informed)), "bins": informed, "mlp-2d": rng.random(len(informed))}
     config = EvaluateConfig(thresholds=((0.05, 0.4), (5.0, 10.0)), resamples=1000, reference="random")
     table = pooled_rows(score_table(shuffled, scores, ["a", "b", "c"], config))
     for n in config.top_n:

@@ -88,7 +88,7 @@ def test_further_tables(scores: pd.DataFrame, report: str) -> None:
         "By scene: best viewpoint of each location, within 5 cm, 0.4°", "Divided by 0.527", "Calibration", "Probes",
     ]  # fmt: skip
     five = table_below(report, "Best 5 viewpoints")["MLP, 2d"]
-    row = one_row(scores, "mlp", "2d", 5)
+    row = one_row(scores, "mlp-2d", 5)
     assert five["25 cm, 2°"] == f"{percent(row[f'normalized_{KEYS[1]}'])} ({percent(row[f'raw_{KEYS[1]}'])})"
     some = table_below(report, "At least one good")["reprojections with bins"]
     for n in (1, 5, 10):

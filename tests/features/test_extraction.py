@@ -73,10 +73,7 @@ def test_colmap_method_gives_the_keypoints_of_colmaps_own_feature_extraction(tmp
     options = pycolmap.FeatureExtractionOptions()
     options.sift.first_octave = 0
     pycolmap.extract_features(
-        str(tmp_path / "database.db"),
-        str(tmp_path / "images"),
-        extraction_options=options,
-        device=pycolmap.Device.cpu,
+        str(tmp_path / "database.db"), str(tmp_path / "images"), extraction_options=options, device=pycolmap.Device.cpu
     )
     with pycolmap.Database.open(str(tmp_path / "database.db")) as database:
         pixels = np.asarray(database.read_keypoints(1))[:, :2]

@@ -12,12 +12,7 @@ from synthetic_dataset import make_landmarks
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.colmap_camera import ColmapCamera
 from wheretolook.geometry.poses import transform
-from wheretolook.inputs.bins import (
-    arrange,
-    bin_views,
-    bin_views_plain,
-    count_bins,
-)
+from wheretolook.inputs.bins import arrange, bin_views, bin_views_plain, count_bins
 from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS, LANDMARK_CHANNELS, PAPER_VARIANTS
 from wheretolook.inputs.landmarks_in_view import ATTRIBUTES, LandmarkDescriber
 from wheretolook.inputs.localization_map import LocalizationMap

@@ -19,12 +19,7 @@ from wheretolook.geometry.poses import Float, camera_centers, poses_looking_alon
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.methods.fisher import APPROXIMATIONS, Approximation
-from wheretolook.methods.fisher.score import (
-    FisherScorer,
-    PoseInformation,
-    StationaryTraceScorer,
-    WorstTraceScorer,
-)
+from wheretolook.methods.fisher.score import FisherScorer, PoseInformation, StationaryTraceScorer, WorstTraceScorer
 from wheretolook.methods.registry import make_scorer, scorers
 from wheretolook.visibility.frustum import LandmarkSets
 from wheretolook.visibility.occlusion import StoredOcclusion

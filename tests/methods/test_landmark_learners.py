@@ -32,12 +32,7 @@ from wheretolook.methods.matchability.network import MatchabilityNetwork, bearin
 from wheretolook.methods.registry import load_scorer, make_scorer
 from wheretolook.methods.set.config import SetConfig
 from wheretolook.methods.set.learn import of_size
-from wheretolook.methods.set.network import (
-    EXPECTED,
-    SetNetwork,
-    expected_statistics,
-    information_matrices,
-)
+from wheretolook.methods.set.network import EXPECTED, SetNetwork, expected_statistics, information_matrices
 from wheretolook.methods.set.score import SetScorer
 from wheretolook.stages.evaluate import evaluate_methods as evaluate
 from wheretolook.stages.train import train_methods as train

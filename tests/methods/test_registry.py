@@ -104,6 +104,7 @@ METHODS = (
 
 PROGRAM = """
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 from synthetic_dataset import CAMERA, make_dataset
@@ -117,7 +118,12 @@ from wheretolook.planning.map_building import build_viewpoint_map
 from wheretolook.planning.scene_map import weights_for
 from wheretolook.stages.evaluate import evaluate_methods
 from wheretolook.stages.train import train_methods
+<<<<<<< HEAD
 from wheretolook.utils.tracking_config import TrackingConfig
+=======
+from wheretolook.utils.tracking import TrackingConfig
+from wheretolook.visibility.occlusion import NoOcclusion
+>>>>>>> hM
 
 folder = Path(sys.argv[1])
 dataset = make_dataset(folder / "tiny", ("train", "test"), n_locations=8, n_directions=12)
@@ -135,7 +141,7 @@ assert labels[0] == "line" and "fewest landmarks" in labels, labels
 weights = weights_for("linear", dataset)
 assert weights == model.path
 scene = dataset.split("test")[0]
-scorer = load_scorer(weights, scene.localization_map(CAMERA))
+scorer = load_scorer(weights, replace(scene.localization_map(CAMERA), occlusion=NoOcclusion()))
 grid = VoxelGrid((-2, -2, 0.5), (2, 2, 2), (2, 2, 1))
 views = build_viewpoint_map(scorer, grid, [0, 3], [[1, 0, 0], [0, 1, 0], [-1, 0, 0]])
 assert views.origin.scorer == "linear" and views.scores.shape == (2, 3)
@@ -176,12 +182,25 @@ def test_what_other_packages_get_wrong_is_named(monkeypatch: pytest.MonkeyPatch)
             all_methods.__wrapped__()
 
 
+LIGHT = """
+import sys
+from wheretolook.methods.registry import describe_methods
+from wheretolook.methods.train_config import TrainConfig
+TrainConfig(), describe_methods()
+print([name for name in ("torch", "lightning", "pandas", "mlflow", "warp", "scipy") if name in sys.modules])
+"""
+
+
 def test_records_of_methods_are_light() -> None:
+<<<<<<< HEAD
     program = "import sys; from wheretolook.methods.train_config import TrainConfig; TrainConfig(); " \
         "from wheretolook.evaluation.config import EvaluateConfig; EvaluateConfig(); " \
         "heavy = ('torch', 'lightning', 'pandas', 'mlflow', 'warp', 'scipy'); " \
         "print([name for name in heavy if name in sys.modules])"  # fmt: skip
     done = run_python(program, path=[SOURCE.parent])
+=======
+    done = run_python(LIGHT, path=[SOURCE.parent])
+>>>>>>> hM
     assert done.stdout.strip() == "[]", done.stdout + done.stderr
 
 

@@ -20,13 +20,7 @@ from wheretolook.release.notebook import open_store
 from wheretolook.release.runs import ReleaseRuns, log_release
 from wheretolook.stages.evaluate import evaluate_methods as evaluate
 from wheretolook.utils.errors import MissingRunError
-from wheretolook.utils.tracking import (
-    client,
-    experiment_ids,
-    finished_runs,
-    newest_artifact,
-    newest_run,
-)
+from wheretolook.utils.tracking import client, experiment_ids, finished_runs, newest_artifact, newest_run
 from wheretolook.utils.tracking_config import TrackingConfig
 
 PAGE = Path(__file__).parents[1] / "mlruns" / "README.md"

@@ -246,11 +246,7 @@ def _origin(scorer: Scorer, lattice: str, digests: NDArray[np.uint64]) -> MapOri
     localization_map = scorer.localization_map
     digest = hashlib.sha256(localization_map.landmarks.ids.tobytes() + digests.tobytes()).hexdigest()[:16]
     return MapOrigin(
-        scorer.name,
-        lattice,
-        _intrinsics(localization_map.camera),
-        localization_map.occlusion.name,
-        digest,
+        scorer.name, lattice, _intrinsics(localization_map.camera), localization_map.occlusion.name, digest
     )
 
 

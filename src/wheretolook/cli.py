@@ -182,7 +182,7 @@ Without --config it is configs/release.yaml, whose runs are logged first. Tables
         "",
         "Run all stages on the embedded default and draw the score figure.",
         ("scenes.train", "scenes.test", "scenes.meshes", "map.n_images", "sample.max_locations",
-         "sample.max_directions", "label.workers", "train.variants", "train.epochs", "evaluate.methods",
+         "sample.max_directions", "label.workers", "train.methods", "train.mlp.epochs", "evaluate.methods",
          "evaluate.weights", "tracking.folder"),
         example="--name small --scenes.train 2",
         config="demo",

@@ -118,12 +118,8 @@ from wheretolook.planning.map_building import build_viewpoint_map
 from wheretolook.planning.scene_map import weights_for
 from wheretolook.stages.evaluate import evaluate_methods
 from wheretolook.stages.train import train_methods
-<<<<<<< HEAD
-from wheretolook.utils.tracking_config import TrackingConfig
-=======
 from wheretolook.utils.tracking import TrackingConfig
 from wheretolook.visibility.occlusion import NoOcclusion
->>>>>>> hM
 
 folder = Path(sys.argv[1])
 dataset = make_dataset(folder / "tiny", ("train", "test"), n_locations=8, n_directions=12)
@@ -192,15 +188,7 @@ print([name for name in ("torch", "lightning", "pandas", "mlflow", "warp", "scip
 
 
 def test_records_of_methods_are_light() -> None:
-<<<<<<< HEAD
-    program = "import sys; from wheretolook.methods.train_config import TrainConfig; TrainConfig(); " \
-        "from wheretolook.evaluation.config import EvaluateConfig; EvaluateConfig(); " \
-        "heavy = ('torch', 'lightning', 'pandas', 'mlflow', 'warp', 'scipy'); " \
-        "print([name for name in heavy if name in sys.modules])"  # fmt: skip
-    done = run_python(program, path=[SOURCE.parent])
-=======
     done = run_python(LIGHT, path=[SOURCE.parent])
->>>>>>> hM
     assert done.stdout.strip() == "[]", done.stdout + done.stderr
 
 

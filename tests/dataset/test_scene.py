@@ -72,7 +72,7 @@ def test_views_that_cannot_be_are_refused(wrong: dict[str, object]) -> None:
 
 
 def test_stages_load_nothing_heavy_until_there_is_work() -> None:
-    heavy = "torch lightning warp mlflow matplotlib pycolmap open3d sklearn scipy cv2".split()
+    heavy = ["torch", "lightning", "warp", "mlflow", "matplotlib", "pycolmap", "open3d", "sklearn", "scipy", "cv2"]
     code = f"import sys, wheretolook.stages; print([name for name in {heavy} if name in sys.modules])"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "[]"

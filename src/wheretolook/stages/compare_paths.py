@@ -178,10 +178,16 @@ def _as_table(views: pd.DataFrame) -> pd.DataFrame:
     """Views as rows of a table of viewpoints, to be labelled."""
     n = len(views)
     values: dict[str, Any] = {
-        "viewpoint_id": np.arange(n), "location_id": np.arange(n), "direction_id": np.zeros(n),
-        "n_visible": np.zeros(n), "visibility_rank": np.zeros(n), "status": np.full(n, UNLABELLED),
-        "error_m": np.full(n, np.nan), "error_deg": np.full(n, np.nan), "n_inliers": np.zeros(n),
-    }  # fmt: skip
+        "viewpoint_id": np.arange(n),
+        "location_id": np.arange(n),
+        "direction_id": np.zeros(n),
+        "n_visible": np.zeros(n),
+        "visibility_rank": np.zeros(n),
+        "status": np.full(n, UNLABELLED),
+        "error_m": np.full(n, np.nan),
+        "error_deg": np.full(n, np.nan),
+        "n_inliers": np.zeros(n),
+    }
     types = {field.name: field.type.to_pandas_dtype() for field in SCHEMA if field.name != "status"}
     columns = {name: values.get(name, views.get(name)) for name in SCHEMA.names}
     return pd.DataFrame(columns).astype(types)

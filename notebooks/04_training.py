@@ -38,15 +38,15 @@ tracking = open_store(release)
 from wheretolook.release.paper_architecture import paper_architecture_table
 from wheretolook.utils.tracking import newest_run
 
-run = newest_run(tracking, "train", params={"dataset": release.name, "variant": "2d+3d"})
+run = newest_run(tracking, "train", params={"dataset": release.name, "method": "mlp-2d+3d"})
 paper_architecture_table(run.data.params).style.hide()
 
 # %% [markdown]
 # ## What was trained
 #
-# The newest run of each variant, the best first, on viewpoints of an apartment that none has learnt from. `set` looks
-# at landmarks one by one and knows what they are like; `2d`, `2d+z` and `2d+3d` are the paper's network, `released` is
-# it as the paper's released code trains it.
+# The newest run of each method, the best first, on viewpoints of an apartment that none has learnt from. `set` looks
+# at landmarks one by one and knows what they are like; `mlp-2d`, `mlp-2d+z` and `mlp-2d+3d` are the paper's network,
+# `mlp-released` is it as the paper's released code trains it.
 
 # %%
 from wheretolook.learning.runs import trained
@@ -113,7 +113,7 @@ location = showcase.instructive_location()
 
 # %%
 mlp = load_scorer(release.root / "weights" / "mlp-2d+z.safetensors", showcase.localization_map)
-display(peaks_figure(*peaks_of(showcase, mlp, location).drawn))
+display(peaks_figure(*peaks_of(showcase, mlp, location)))
 
 # %% [markdown]
 # ### The set network
@@ -124,7 +124,7 @@ display(peaks_figure(*peaks_of(showcase, mlp, location).drawn))
 
 # %%
 scorer = load_scorer(release.root / "weights", showcase.localization_map)
-display(peaks_figure(*peaks_of(showcase, scorer, location).drawn))
+display(peaks_figure(*peaks_of(showcase, scorer, location)))
 
 # %% [markdown]
 # ### Where they err
@@ -134,10 +134,10 @@ display(peaks_figure(*peaks_of(showcase, scorer, location).drawn))
 
 # %%
 mistaken = mistaken_location(showcase, mlp)
-display(peaks_figure(*peaks_of(showcase, mlp, mistaken).drawn))
+display(peaks_figure(*peaks_of(showcase, mlp, mistaken)))
 
 # %% [markdown]
 # The set network at that place:
 
 # %%
-display(peaks_figure(*peaks_of(showcase, scorer, mistaken).drawn))
+display(peaks_figure(*peaks_of(showcase, scorer, mistaken)))

@@ -11,15 +11,8 @@ from synthetic_dataset import make_dataset
 from synthetic_scores import make_scores
 from wheretolook.dataset.folders import RELEASE_FILE, Dataset
 from wheretolook.evaluation.paper_tables import write_paper_tables
-from wheretolook.methods.names import Method
 
-METHODS: tuple[Method, ...] = (
-    ("random", ""),
-    ("bins", ""),
-    ("fisher", "trace exact"),
-    ("mlp", "2d+z"),
-    ("mlp", "2d+3d"),
-)
+METHODS: tuple[str, ...] = ("random", "bins", "fisher-trace-exact", "mlp-2d+z", "mlp-2d+3d")
 
 
 def make_release(root: Path) -> Dataset:
@@ -39,7 +32,7 @@ def make_release(root: Path) -> Dataset:
     learners().to_csv(results / "learners.csv", index=False)
     paths().to_csv(results / "paths.csv", index=False)
     config = {"bins": 30, "hidden": [300, 300], "dropout": 0.5, "seed": 0}
-    about = {"variant": "2d+3d", "dataset": dataset.name, "dataset_fingerprint": "0", "config": config}
+    about = {"method": "mlp-2d+3d", "dataset": dataset.name, "dataset_fingerprint": "0", "config": config}
     metrics = {"epoch": 1.0, "val_average_precision": 0.75, "val_roc_auc": 0.8}
     record = {"about": about, "weights_sha256": "0", "run_id": "0" * 32, "metrics": metrics}
     (weights / "mlp-2d+3d.json").write_text(json.dumps(record))
@@ -57,7 +50,7 @@ def history() -> pd.DataFrame:
 
 def calibration() -> pd.DataFrame:
     bins = {"bin_low": [0.0, 0.5], "bin_high": [0.5, 1.0], "mean_predicted": [0.2, 0.8], "share_good": [0.1, 0.9]}
-    about = {"method": "mlp", "inputs": "2d+z", "temperature": 1.2, "n_val": 10, "n_views": 30, "when": "before"}
+    about = {"method": "mlp-2d+z", "temperature": 1.2, "n_val": 10, "n_views": 30, "when": "before"}
     return pd.DataFrame({**bins, "n": [10, 20], "ece": 0.1, "nll": 0.3}).assign(**about)
 
 

@@ -8,19 +8,18 @@ import numpy as np
 import pandas as pd
 
 from wheretolook.evaluation.scores import RELEASED_DIVISOR
-from wheretolook.methods.names import Method
 from wheretolook.viewpoints.thresholds import THRESHOLDS, threshold_key
 
 KEYS = tuple(map(threshold_key, THRESHOLDS))
-FISHER: tuple[Method, ...] = tuple(
-    ("fisher", f"{metric} {approximation}")
+FISHER: tuple[str, ...] = tuple(
+    f"fisher-{metric}-{approximation}"
     for metric in ("mineig", "logdet", "trace")
     for approximation in ("exact", "quadratic", "gp")
 )
-EVERY_METHOD: tuple[Method, ...] = (
-    ("random", ""), ("forward", ""), ("visible", ""), ("bins", ""), ("max-visibility", ""),
-    ("max-visibility-swapped", ""), *FISHER, ("fisher-worst-trace", ""), ("fisher-stationary-trace", ""),
-    ("mlp", "2d"), ("mlp", "2d+z"), ("mlp", "2d+3d"),
+EVERY_METHOD: tuple[str, ...] = (
+    "random", "forward", "visible", "bins", "max-visibility",
+    "max-visibility-swapped", *FISHER, "fisher-worst-trace", "fisher-stationary-trace",
+    "mlp-2d", "mlp-2d+z", "mlp-2d+3d",
 )  # fmt: skip
 
 _BAD = {"random": 0.4, "forward": 0.45, "max-visibility-swapped": 0.42, "fisher-worst-trace": 0.1,
@@ -28,8 +27,8 @@ _BAD = {"random": 0.4, "forward": 0.45, "max-visibility-swapped": 0.42, "fisher-
 
 
 def make_scores(
-    methods: Sequence[Method] = EVERY_METHOD,
-    reference: Method | None = ("mlp", "2d+3d"),
+    methods: Sequence[str] = EVERY_METHOD,
+    reference: str = "mlp-2d+3d",
     top_n: Sequence[int] = (1, 5, 10),
     scenes: Sequence[str] = ("a", "b"),
     seed: int = 0,
@@ -39,17 +38,15 @@ def make_scores(
     rows = []
     for scene in ("all", *scenes):
         n_locations = 50 * (len(scenes) if scene == "all" else 1)
-        raw = {
-            method: np.round(50 * (_BAD.get(method[0], 0.7) + rng.uniform(0, 0.1, shape))) / 50 for method in methods
-        }
-        raw["oracle", ""] = np.full(shape, 0.9)
+        raw = {method: np.round(50 * (_BAD.get(method, 0.7) + rng.uniform(0, 0.1, shape))) / 50 for method in methods}
+        raw["oracle"] = np.full(shape, 0.9)
         unknown = np.full(shape, np.nan)
         for method, shares in raw.items():
-            differences = shares - (unknown if reference is None else raw[reference])
-            learned, width = method[0] == "mlp", 0.0 if method == reference else 0.02
+            differences = shares - (raw[reference] if reference else unknown)
+            learned, width = method.startswith("mlp"), 0.0 if method == reference else 0.02
             for number, n in enumerate(top_n):
-                row: dict[str, object] = {"method": method[0], "inputs": method[1], "occlusion": "mesh",
-                                          "candidates": "all", "top_n": n, "scene": scene}  # fmt: skip
+                row: dict[str, object] = {"method": method, "occlusion": "mesh", "candidates": "all"}
+                row |= {"top_n": n, "scene": scene}
                 row |= {"n_locations": n_locations, "n_views": n * n_locations}
                 for key, share, difference in zip(KEYS, shares[number], differences[number], strict=True):
                     row |= {f"good_{key}": share * n * n_locations, f"raw_{key}": share}
@@ -63,7 +60,7 @@ def make_scores(
                     row |= {f"regret_high_{key}": 0.92 - share, f"difference_{key}": difference}
                     row |= {f"difference_low_{key}": difference - width, f"difference_high_{key}": difference + width}
                     row |= {f"p_{key}": 0.04 if width else 1.0}
-                row |= {"reference": "" if reference is None else " ".join(reference).strip()}
+                row |= {"reference": reference}
                 row |= {"average_precision": rng.random(), "roc_auc": rng.random()}
                 row |= {"ece": 0.0712 if learned else np.nan, "ece_scaled": 0.0234 if learned else np.nan}
                 rows.append({**row, "temperature": 1.375 if learned else np.nan})

@@ -12,8 +12,9 @@ from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.figures.config import FiguresConfig
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.labelling.config import LabelConfig
-from wheretolook.learning.config import TrainConfig
 from wheretolook.mapping.config import MapConfig
+from wheretolook.methods.train_config import MOVED as MOVED_TRAIN_OPTIONS
+from wheretolook.methods.train_config import TrainConfig
 from wheretolook.planning.config import PathsConfig, PlanConfig, ViewpointMapConfig
 from wheretolook.scenes.config import ApartmentConfig
 from wheretolook.space.config import FreeSpaceConfig, MappedSpaceConfig
@@ -159,5 +160,5 @@ class Experiment:
         return usable_device(self.device)
 
 
-MOVED: dict[str, str] = {}
+MOVED: dict[str, str] = {**MOVED_TRAIN_OPTIONS}
 """Options there were, and where they have gone: the name of another option, or a sentence."""

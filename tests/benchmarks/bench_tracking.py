@@ -25,7 +25,8 @@ from wheretolook.dataset.folders import Dataset
 from wheretolook.evaluation.results import SCORES_CSV, runs_of_rows
 from wheretolook.evaluation.scores import read_scores
 from wheretolook.release.runs import log_release
-from wheretolook.utils.tracking import NestedRun, TrackingConfig, client, log_nested, start_run
+from wheretolook.utils.tracking import NestedRun, client, log_nested, start_run
+from wheretolook.utils.tracking_config import TrackingConfig
 
 
 @contextmanager

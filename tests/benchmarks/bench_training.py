@@ -28,12 +28,13 @@ from lightning.pytorch import LightningModule, Trainer, seed_everything
 
 from wheretolook.dataset.folders import Dataset
 from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.inputs.bins import CHANNELS, PAPER_VARIANTS
+from wheretolook.inputs.channels import CHANNELS, PAPER_VARIANTS
 from wheretolook.learning.classifier import ViewpointClassifier, weight_penalty, weighted_bce
-from wheretolook.learning.config import TrainConfig
 from wheretolook.learning.data import LabelledViews, ViewpointDataModule
 from wheretolook.learning.fit import EpochRecord, RunLog, fit, home_device
+from wheretolook.methods.mlp.config import MlpConfig
 from wheretolook.methods.mlp.network import NetworkSpec, ViewpointNetwork
+from wheretolook.methods.train_config import TrainConfig
 from wheretolook.utils.tracking import start_run
 from wheretolook.utils.tracking_config import TrackingConfig
 
@@ -100,17 +101,17 @@ class TimedRecord(EpochRecord):
 
 
 def make_network(data: ViewpointDataModule, variant: str) -> ViewpointNetwork:
-    config = data.config
-    seed_everything(config.seed, verbose=False)
+    config = data.options
+    seed_everything(data.config.seed, verbose=False)
     statistics_of_variant = data.statistics.select(PAPER_VARIANTS[variant])
     return ViewpointNetwork(
-        NetworkSpec(variant, CAMERA, statistics_of_variant, config.bins, config.layout, config.hidden, config.dropout)
+        NetworkSpec(statistics_of_variant, config.bins, config.layout, config.hidden, config.dropout)
     )
 
 
 def bare_epochs(data: ViewpointDataModule, variant: str, epochs: int, device: str) -> list[float]:
     """Seconds of each epoch of a plain loop over the same batches."""
-    config, network = data.config, make_network(data, variant).to(device)
+    config, network = data.options, make_network(data, variant).to(device)
     optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate, fused=True)
     loader, seconds = data.train_dataloader(), []
     for _ in range(epochs):
@@ -131,25 +132,25 @@ def spread(seconds: list[float]) -> dict[str, float]:
 
 
 def measure(args: argparse.Namespace) -> dict[str, Any]:
-    config = TrainConfig(
-        (args.variant,), args.epochs, args.batch, hidden=tuple(args.hidden), devices=args.devices,
-        accelerator={"auto": "auto", "cpu": "cpu", "cuda": "gpu"}[args.device],
-    )  # fmt: skip
+    accelerator = {"auto": "auto", "cpu": "cpu", "cuda": "gpu"}[args.device]
+    options = MlpConfig(epochs=args.epochs, batch_size=args.batch, hidden=tuple(args.hidden))
+    config = TrainConfig(methods=(f"mlp-{args.variant}",), devices=args.devices, accelerator=accelerator, mlp=options)
     device = home_device(config)
     start = now(device)
-    views = random_views(args.views + args.val_views, device if args.devices == 1 else "cpu", config.bins)
+    views = random_views(args.views + args.val_views, device if args.devices == 1 else "cpu", options.bins)
     made = now(device)
     with tempfile.TemporaryDirectory() as folder:
-        data = ViewpointDataModule(Dataset(folder, CAMERA, ()), config, device, progress=False)
+        data = ViewpointDataModule(Dataset(folder, CAMERA, ()), config, options, device=device, progress=False)
         data.use(views, np.arange(len(views)) >= args.views)
         data.channels = PAPER_VARIANTS[args.variant]
         split = now(device)
         tracking = TrackingConfig(folder, "benchmark")
         with start_run(tracking, "benchmark", "train") as (_, run_id):
             opened = now(device)
-            record = TimedRecord("train", config, args.progress, TimedLog(tracking, run_id))
+            record = TimedRecord("train", options, args.progress, TimedLog(tracking, run_id))
             record.device = device
-            fit(ViewpointClassifier(make_network(data, args.variant), config, data.class_weights), data, record)
+            classifier = ViewpointClassifier(make_network(data, args.variant), options, data.class_weights)
+            fit(classifier, data, record, config)
             done = now(device)
     rows, steps = record.rows, len(data.train_dataloader())
     logging = [row["logging_s"] for row in rows]
@@ -161,7 +162,7 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
         "torch": torch.__version__,
         "lightning": lightning.__version__,
         "variant": args.variant,
-        "hidden": list(config.hidden),
+        "hidden": list(options.hidden),
         "views": args.views,
         "val_views": args.val_views,
         "batch": args.batch,

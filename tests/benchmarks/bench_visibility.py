@@ -360,12 +360,7 @@ def main() -> None:
     parser.add_argument("--bounded", action="store_true", help="2 million landmarks x 5,000 locations, too")
     parser.add_argument("--memory-gb", type=float, default=2.0, help="bound on the blocks in work")
     parser.add_argument("--out", help="write the results to this JSON file")
-    parser.add_argument(
-        "--draw",
-        nargs="+",
-        metavar="JSON",
-        help="draw earlier results, or a table of such",
-    )
+    parser.add_argument("--draw", nargs="+", metavar="JSON", help="draw earlier results, or a table of such")
     parser.add_argument("--figures", default=".", help="folder for figures and tables")
     parser.add_argument("--log", action="store_true", help="log tables and figures to MLflow")
     args = parser.parse_args()

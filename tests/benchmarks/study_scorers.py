@@ -11,7 +11,7 @@ and scenes of others are scored once, with every seed's weights. (For the weight
 candidates, before the rooms of configs/varied.yaml got patterns that repeat, and then as said.)
 
 Appends one row a training to `<out>/<part>.csv`; rows that are there are not made again. Weights lie in
-`<out>/<variant>-<seed>/weights`, and those of other parts in `<out>/<part>/<condition>-<seed>.safetensors`.
+`<out>/<method>-<seed>/weights`, and those of other parts in `<out>/<part>/<condition>-<seed>.safetensors`.
 
 `--set '{"pooled": 8}'` changes the network that attributes, options and curves start from; `--choices '[{"head": 96},
 ...]'` are the options to try.
@@ -32,20 +32,22 @@ import torch
 
 from wheretolook.dataset.folders import Dataset
 from wheretolook.inputs.landmarks_in_view import ATTRIBUTES
-from wheretolook.learning.config import MATCHABILITY, SET, TrainConfig, weights_name
 from wheretolook.learning.data import with_also
 from wheretolook.learning.fit import RunLog
 from wheretolook.learning.learner import Task
+from wheretolook.learning.provenance import weights_path
+from wheretolook.methods.mlp.config import MlpConfig
 from wheretolook.methods.set import learn as set_learner
 from wheretolook.methods.set.config import SetConfig
 from wheretolook.methods.set.learn import SetData, learn_set
-from wheretolook.stages.train import train_variants as train
+from wheretolook.methods.train_config import TrainConfig
+from wheretolook.stages.train import train_methods as train
 from wheretolook.utils.tracking import start_run
 from wheretolook.utils.tracking_config import TrackingConfig
 
-VARIANTS = ("2d+z", "2d+3d+landmark", "conv", "trees", "set", "sphere")
+METHODS = ("mlp-2d+z", "mlp-2d+3d+landmark", "conv", "trees", "set", "sphere")
 
-OF_NETWORKS = {"balance": True, "batch_size": 4096, "noise_px": 1.0, "noise_m": 0.02, "epochs": 100}
+OF_NETWORKS = MlpConfig(epochs=100, batch_size=4096, noise_px=1.0, noise_m=0.02, balance=True)
 """Options of the paper's network: those of configs/release.yaml, with a third of its epochs."""
 
 
@@ -88,22 +90,22 @@ def seeds(dataset: Dataset, args: argparse.Namespace, tracking: TrackingConfig) 
     def described_once(task: Task) -> SetData:
         if not described:
             described["all"] = SetData(task)
-        described["all"].config = task.config
+        described["all"].config, described["all"].options = task.config, task.options
         return described["all"]
 
     set_learner.SetData = described_once  # type: ignore[assignment,misc]
     for seed in args.seeds:
-        for variant in args.variants:
-            if table.has(variant=variant, seed=seed):
+        for method in args.methods:
+            if table.has(method=method, seed=seed):
                 continue
-            own = Dataset(args.out / f"{variant}-{seed}", dataset.camera, dataset.scenes)
-            start = dataset.root / "weights" / weights_name(MATCHABILITY)
+            own = Dataset(args.out / f"{method}-{seed}", dataset.camera, dataset.scenes)
+            start = weights_path(dataset, "matchability")
             if start.is_file():
                 (own.root / "weights").mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(start, own.root / "weights" / start.name)
-            config = TrainConfig(variants=(variant,), seed=seed, **OF_NETWORKS)
+            config = TrainConfig(methods=(method,), seed=seed, mlp=OF_NETWORKS)
             (model,) = train(own, config, tracking, progress=args.progress)
-            table.add({"variant": variant, "seed": seed, **metrics_of(model.metrics)})
+            table.add({"method": method, "seed": seed, **metrics_of(model.metrics)})
 
 
 def metrics_of(metrics: dict[str, float]) -> dict[str, float]:
@@ -115,7 +117,7 @@ def of_set_network(dataset: Dataset, args: argparse.Namespace, tracking: Trackin
     """The set network under other conditions, all on views that are described once."""
     table = Table(args.out / f"{args.part}.csv")
     log = RunLog(tracking, "")
-    task = Task(dataset, TrainConfig(variants=(SET,)).of_variant(SET), SET, args.progress, log)
+    task = Task(dataset, "set", TrainConfig(methods=("set",)), SetConfig(), "set", args.progress, log)
     data = SetData(task)
     whole = data.train_rows
     conditions: list[tuple[str, dict[str, Any], torch.Tensor]] = []
@@ -140,14 +142,14 @@ def of_set_network(dataset: Dataset, args: argparse.Namespace, tracking: Trackin
             settings = replace(SetConfig(**args.set), **options)
             # as many steps, whatever there is to learn from
             epochs = min(200, round(settings.epochs * len(whole) / len(rows)))
-            config = TrainConfig(variants=(SET,), seed=seed, set=replace(settings, epochs=epochs)).of_variant(SET)
+            config, own = replace(task.config, seed=seed), replace(settings, epochs=epochs)
             data.config = config
             torch.manual_seed(seed)
             about = {"condition": name, "seed": seed}
             with start_run(tracking, f"study {args.part} {name}", "train", about) as (_, run):
-                learnt = learn_set(replace(task, config=config, run_log=RunLog(tracking, run)), data)
+                learnt = learn_set(replace(task, config=config, options=own, run_log=RunLog(tracking, run)), data)
             file = f"{name.replace(' ', '_').replace('=', '-') or 'default'}-{seed}.safetensors"
-            learnt.model.save(args.out / args.part / file, {"variant": SET, "condition": name, "seed": seed})
+            learnt.model.save(args.out / args.part / file, {"method": "set", "condition": name, "seed": seed})
             table.add({"condition": name, "seed": seed, "views": len(rows), **metrics_of(learnt.metrics)})
 
 
@@ -160,7 +162,7 @@ def main() -> None:
     parser.add_argument("--also", nargs="+", default=[], help="datasets whose train scenes help")
     parser.add_argument("--out", type=Path, default=Path("study"))
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
-    parser.add_argument("--variants", nargs="+", default=list(VARIANTS))
+    parser.add_argument("--methods", nargs="+", default=list(METHODS))
     parser.add_argument("--set", type=json.loads, default={}, help="options of the set network, JSON")
     parser.add_argument("--choices", type=json.loads, default=CHOICES, help="options to try, a list of JSON objects")
     parser.add_argument("--progress", action="store_true")

@@ -92,7 +92,7 @@ def test_random_choice_by_enumeration(n: int) -> None:
 
 def test_table_by_hand() -> None:
     config = EvaluateConfig(methods=("bins",), top_n=(1, 3), thresholds=((0.05, 0.4), (5.0, 10.0)), resamples=200)
-    table = score_table(HAND, {("bins", ""): HAND_SCORES}, ["a", "b"], config)
+    table = score_table(HAND, {"bins": HAND_SCORES}, ["a", "b"], config)
     assert len(table) == 2 * 2 * 3  # methods (with the oracle) x N x scenes (with all)
     row = {(r["method"], r["top_n"], r["scene"]): r for r in table.to_dict("records")}
 
@@ -120,7 +120,7 @@ def test_table_by_hand() -> None:
 
 def test_without_a_good_view_shares_are_zero_and_quotients_unknown() -> None:
     views = TestViews(np.array([0, 0, 1]), np.arange(3), np.zeros((3, 4), dtype=bool), np.array([0, 0]))
-    table = score_table(views, {("bins", ""): np.arange(3.0)}, ["a"], EvaluateConfig(resamples=10))
+    table = score_table(views, {"bins": np.arange(3.0)}, ["a"], EvaluateConfig(resamples=10))
     assert (table["raw_0.05m_0.4deg"] == 0).all()
     assert table["normalized_0.05m_0.4deg"].isna().all()
     assert table[table["method"] == "bins"][["average_precision", "roc_auc"]].isna().all(axis=None)
@@ -129,7 +129,7 @@ def test_without_a_good_view_shares_are_zero_and_quotients_unknown() -> None:
 def test_new_columns_by_hand() -> None:
     # location 0: 11, 13, 12, 10; location 2: 6, 7, 5
     reference = np.array([0.1, 0.3, 0.9, 0.5, 0.2, 0.8, 0.6, 0.4])
-    scores = {("random", ""): np.zeros(8), ("bins", ""): HAND_SCORES, ("mlp", "2d"): reference}
+    scores = {"random": np.zeros(8), "bins": HAND_SCORES, "mlp-2d": reference}
     config = EvaluateConfig(top_n=(1, 3), thresholds=((0.05, 0.4), (5.0, 10.0)), resamples=2000)
     table = score_table(HAND, scores, ["a", "b"], config)
     row = {(r["method"], r["top_n"], r["scene"]): r for r in table.to_dict("records")}
@@ -151,8 +151,8 @@ def test_new_columns_by_hand() -> None:
     assert [bins[f"good_{key}"] for key in (fine, coarse)] == [2, 4]
     assert [bins[f"regret_{key}"] for key in (fine, coarse)] == pytest.approx([1 / 7, 1 / 7])
     assert [bins[f"difference_{key}"] for key in (fine, coarse)] == pytest.approx([-1 / 7, -1 / 7])
-    assert row["mlp", 3, "all"][f"regret_{fine}"] == 0
-    assert [row["mlp", 3, "all"][f"difference_{key}"] for key in (fine, coarse)] == [0, 0]
+    assert row["mlp-2d", 3, "all"][f"regret_{fine}"] == 0
+    assert [row["mlp-2d", 3, "all"][f"difference_{key}"] for key in (fine, coarse)] == [0, 0]
 
     chance = row["random", 1, "all"]  # of location 0 2 and 3 of 4 views are good, of location 2 1 and 2 of 3
     assert [chance[f"good_{key}"] for key in (fine, coarse)] == pytest.approx([1 / 2 + 1 / 3, 3 / 4 + 2 / 3])
@@ -167,15 +167,15 @@ def test_new_columns_by_hand() -> None:
     assert row["oracle", 1, "all"][f"difference_{fine}"] == pytest.approx(1 / 3)
 
 
-def pooled_rows(table: pd.DataFrame) -> dict[tuple[str, str, int], dict[str, float]]:
+def pooled_rows(table: pd.DataFrame) -> dict[tuple[str, int], dict[str, float]]:
     rows = table[table["scene"] == "all"].to_dict("records")
-    return {(row["method"], row["inputs"], row["top_n"]): row for row in rows}  # type: ignore[misc]
+    return {(row["method"], row["top_n"]): row for row in rows}  # type: ignore[misc]
 
 
 def test_regret_is_never_negative_and_that_of_the_oracle_is_zero() -> None:
     rng = np.random.default_rng(3)
     views = random_views(rng)
-    scores = {("random", ""): rng.random(len(views.location)), ("bins", ""): rng.random(len(views.location))}
+    scores = {"random": rng.random(len(views.location)), "bins": rng.random(len(views.location))}
     config = EvaluateConfig(thresholds=((0.05, 0.4), (5.0, 10.0)), resamples=100)
     table = score_table(views, scores, ["a", "b", "c"], config)
     regrets = [name for name in table if name.startswith("regret_")]
@@ -193,30 +193,30 @@ def test_a_method_that_chooses_alike_does_not_differ() -> None:
     rng = np.random.default_rng(4)
     views = random_views(rng)
     values = rng.random(len(views.location))
-    scores = {("mlp", "2d"): values / 2, ("mlp", "2d+3d"): values, ("bins", ""): rng.random(len(values))}
+    scores = {"mlp-2d": values / 2, "mlp-2d+3d": values, "bins": rng.random(len(values))}
     config = EvaluateConfig(thresholds=((0.05, 0.4), (5.0, 10.0)), resamples=200)
     table = score_table(views, scores, ["a", "b", "c"], config)
-    same, other = table[table["method"] == "mlp"], table[table["method"] == "bins"]
+    same, other = table[table["method"].str.startswith("mlp")], table[table["method"] == "bins"]
     assert (same[[name for name in table if name.startswith("difference_")]] == 0).all(axis=None)
     assert (same[[name for name in table if name.startswith("p_")]] == 1).all(axis=None)
     assert (other["difference_5m_10deg"] != 0).any() and (other["p_5m_10deg"] < 1).any()
     against = score_table(views, scores, ["a", "b", "c"], EvaluateConfig(
         thresholds=((0.05, 0.4), (5.0, 10.0)), resamples=200, reference="bins"))  # fmt: skip
-    mirrored = -against.loc[against["method"] == "mlp", "difference_5m_10deg"]
+    mirrored = -against.loc[against["method"].str.startswith("mlp"), "difference_5m_10deg"]
     assert sorted(mirrored) == sorted([*other["difference_5m_10deg"], *other["difference_5m_10deg"]])
 
 
 def test_who_is_compared_with() -> None:
-    methods = [("random", ""), ("mlp", "2d"), ("mlp", "2d+3d"), ("fisher", "trace gp")]
-    assert reference_method(methods, "") == ("mlp", "2d+3d")
-    assert reference_method(methods[:2], "") == ("mlp", "2d")
-    assert reference_method(methods[:1], "") is None
-    assert reference_method(methods, "random") == ("random", "")
-    assert reference_method(methods, "mlp 2d") == ("mlp", "2d")
-    assert reference_method(methods, "fisher trace gp") == ("fisher", "trace gp")
-    with pytest.raises(ConfigError, match=r"'mlp 2d\+z'.*random, mlp 2d, mlp 2d\+3d, fisher trace gp"):
-        reference_method(methods, "mlp 2d+z")
-    table = score_table(HAND, {("bins", ""): HAND_SCORES}, ["a", "b"], EvaluateConfig(
+    methods = ["random", "mlp-2d", "mlp-2d+3d", "fisher-trace-gp"]
+    assert reference_method(methods, "") == "mlp-2d+3d"
+    assert reference_method(methods[:2], "") == "mlp-2d"
+    assert reference_method(methods[:1], "") == ""
+    assert reference_method(methods, "random") == "random"
+    assert reference_method(methods, "mlp-2d") == "mlp-2d"
+    assert reference_method(methods, "fisher-trace-gp") == "fisher-trace-gp"
+    with pytest.raises(ConfigError, match=r"'mlp-2d\+z'.*random, mlp-2d, mlp-2d\+3d, fisher-trace-gp"):
+        reference_method(methods, "mlp-2d+z")
+    table = score_table(HAND, {"bins": HAND_SCORES}, ["a", "b"], EvaluateConfig(
         thresholds=((0.05, 0.4), (5.0, 10.0)), resamples=10))  # fmt: skip
     columns = [name for name in table if name.startswith(("difference_", "p_"))]
     assert len(columns) == 2 * 4 and table[columns].isna().all(axis=None)
@@ -229,19 +229,19 @@ def test_intervals_of_differences_are_the_normal_ones_of_many_locations() -> Non
         np.repeat(np.arange(1500), 6), np.arange(9000), (quality < 0.4).reshape(-1, 1), np.zeros(1500, int)
     )
     scores = {
-        ("bins", ""): (rng.random((1500, 6)) - 0.3 * quality).reshape(-1),
-        ("mlp", "2d"): (rng.random((1500, 6)) - 0.6 * quality).reshape(-1),
+        "bins": (rng.random((1500, 6)) - 0.3 * quality).reshape(-1),
+        "mlp-2d": (rng.random((1500, 6)) - 0.6 * quality).reshape(-1),
     }
     config = EvaluateConfig(top_n=(1,), thresholds=((0.05, 0.4),), resamples=4000)
-    row = pooled_rows(score_table(views, scores, ["a"], config))["bins", "", 1]
+    row = pooled_rows(score_table(views, scores, ["a"], config))["bins", 1]
     good = {method: (quality < 0.4)[np.arange(1500), values.reshape(1500, 6).argmax(1)].astype(float)
             for method, values in scores.items()}  # fmt: skip
-    difference = good["bins", ""] - good["mlp", "2d"]
+    difference = good["bins"] - good["mlp-2d"]
     error = difference.std() / np.sqrt(1500)
     assert row["difference_0.05m_0.4deg"] == pytest.approx(difference.mean())
     assert row["difference_low_0.05m_0.4deg"] == pytest.approx(difference.mean() - 1.96 * error, abs=0.1 * error)
     assert row["difference_high_0.05m_0.4deg"] == pytest.approx(difference.mean() + 1.96 * error, abs=0.1 * error)
-    regret = 1.0 * (quality < 0.4).any(1) - good["bins", ""]
+    regret = 1.0 * (quality < 0.4).any(1) - good["bins"]
     error = regret.std() / np.sqrt(1500)
     assert row["regret_low_0.05m_0.4deg"] == pytest.approx(regret.mean() - 1.96 * error, abs=0.1 * error)
     assert row["regret_high_0.05m_0.4deg"] == pytest.approx(regret.mean() + 1.96 * error, abs=0.1 * error)
@@ -252,17 +252,13 @@ def test_with_shuffled_labels_every_method_is_as_good_as_chance() -> None:
     views = random_views(rng, 3000)
     informed = views.good[:, 0] + rng.normal(size=len(views.location))
     shuffled = TestViews(views.location, views.viewpoint_id, rng.permutation(views.good), views.location_scene)
-    scores = {
-        ("random", ""): rng.random(len(informed)),
-        ("bins", ""): informed,
-        ("mlp", "2d"): rng.random(len(informed)),
-    }
+    scores = {"random": rng.random(len(informed)), "bins": informed, "mlp-2d": rng.random(len(informed))}
     config = EvaluateConfig(thresholds=((0.05, 0.4), (5.0, 10.0)), resamples=1000, reference="random")
     table = pooled_rows(score_table(shuffled, scores, ["a", "b", "c"], config))
     for n in config.top_n:
-        chance = table["random", "", n]
-        for method in (("bins", ""), ("mlp", "2d")):
-            row = table[*method, n]
+        chance = table["random", n]
+        for method in ("bins", "mlp-2d"):
+            row = table[method, n]
             for key in ("0.05m_0.4deg", "5m_10deg"):
                 assert row[f"raw_low_{key}"] < chance[f"raw_{key}"] < row[f"raw_high_{key}"]
                 assert row[f"difference_low_{key}"] < 0 < row[f"difference_high_{key}"]
@@ -270,10 +266,10 @@ def test_with_shuffled_labels_every_method_is_as_good_as_chance() -> None:
             assert row["any_0.05m_0.4deg"] == pytest.approx(chance["any_0.05m_0.4deg"], abs=0.03)
             assert row["roc_auc"] == pytest.approx(0.5, abs=0.02)
             assert row["average_precision"] == pytest.approx(views.good[:, 0].mean(), abs=0.02)
-    config = replace(config, reference="mlp 2d")
+    config = replace(config, reference="mlp-2d")
     table = pooled_rows(score_table(shuffled, scores, ["a", "b", "c"], config))
-    assert min(table["bins", "", n][f"p_{key}"] for n in config.top_n for key in ("0.05m_0.4deg", "5m_10deg")) > 0.05
-    row = pooled_rows(score_table(views, scores, ["a", "b", "c"], config))["bins", "", 1]  # the labels it knows
+    assert min(table["bins", n][f"p_{key}"] for n in config.top_n for key in ("0.05m_0.4deg", "5m_10deg")) > 0.05
+    row = pooled_rows(score_table(views, scores, ["a", "b", "c"], config))["bins", 1]  # the labels it knows
     assert row["difference_low_0.05m_0.4deg"] > 0.1 and row["p_0.05m_0.4deg"] == 1 / 1001
 
 
@@ -289,24 +285,24 @@ def test_only_some_views_by_hand() -> None:
 def test_a_scene_without_candidates_has_no_shares() -> None:
     config = EvaluateConfig(top_n=(1,), thresholds=((0.05, 0.4), (5.0, 10.0)), resamples=50)
     in_a = HAND.only(HAND.location < 2)
-    table = score_table(in_a, {("mlp", "2d"): HAND_SCORES[HAND.location < 2]}, ["a", "b"], config)
+    table = score_table(in_a, {"mlp-2d": HAND_SCORES[HAND.location < 2]}, ["a", "b"], config)
     rows = table.set_index(["method", "scene"])
-    assert rows.loc[("mlp", "b"), "n_locations"] == 0
+    assert rows.loc[("mlp-2d", "b"), "n_locations"] == 0
     names = [name for name in table if name.endswith("deg") and not name.startswith("good_")]
-    assert rows.loc[("mlp", "b"), names].isna().all()
-    assert rows.loc[("mlp", "all"), "raw_5m_10deg"] == rows.loc[("mlp", "a"), "raw_5m_10deg"] == 1 / 2
+    assert rows.loc[("mlp-2d", "b"), names].isna().all()
+    assert rows.loc[("mlp-2d", "all"), "raw_5m_10deg"] == rows.loc[("mlp-2d", "a"), "raw_5m_10deg"] == 1 / 2
 
 
 def test_calibration_columns_of_learned_methods() -> None:
     # predicted 0.8 for all, of which 3 in 8 are good; at temperature 2 it says sigmoid(log(4) / 2) = 2/3
     flat = np.full(8, 0.8)
-    scores = {("bins", ""): flat, ("mlp", "2d"): flat, ("mlp", "2d+z"): flat}
+    scores = {"bins": flat, "mlp-2d": flat, "mlp-2d+z": flat}
     config = EvaluateConfig(top_n=(1, 3), thresholds=((0.05, 0.4), (5.0, 10.0)), resamples=10)
-    table = score_table(HAND, scores, ["a", "b"], config, temperatures={("mlp", "2d"): 2.0, ("mlp", "2d+z"): np.nan})
-    rows = table[table["top_n"] == 3].set_index(["method", "inputs", "scene"])[["ece", "ece_scaled", "temperature"]]
-    np.testing.assert_allclose(rows.loc[("mlp", "2d", "all")], [0.8 - 3 / 8, 2 / 3 - 3 / 8, 2])
-    np.testing.assert_allclose(rows.loc[("mlp", "2d", "b")], [0.8 - 1 / 3, 2 / 3 - 1 / 3, 2])
-    np.testing.assert_allclose(rows.loc[("mlp", "2d+z", "all")], [0.8 - 3 / 8, np.nan, np.nan])
+    table = score_table(HAND, scores, ["a", "b"], config, temperatures={"mlp-2d": 2.0, "mlp-2d+z": np.nan})
+    rows = table[table["top_n"] == 3].set_index(["method", "scene"])[["ece", "ece_scaled", "temperature"]]
+    np.testing.assert_allclose(rows.loc[("mlp-2d", "all")], [0.8 - 3 / 8, 2 / 3 - 3 / 8, 2])
+    np.testing.assert_allclose(rows.loc[("mlp-2d", "b")], [0.8 - 1 / 3, 2 / 3 - 1 / 3, 2])
+    np.testing.assert_allclose(rows.loc[("mlp-2d+z", "all")], [0.8 - 3 / 8, np.nan, np.nan])
     assert rows.loc[["bins", "oracle"]].isna().all(axis=None)
 
 

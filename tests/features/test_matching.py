@@ -146,6 +146,7 @@ def run_python(code: str, **environment: str) -> str:
     return run.stdout.decode().strip()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("instructions", ["AVX2", "AVX512_CORE"])
 def test_a_cpu_whose_byte_products_saturate_finds_the_same(instructions: str) -> None:
     """oneDNN is told to leave out this CPU's newer instructions."""

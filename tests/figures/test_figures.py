@@ -10,12 +10,10 @@ import pytest
 from matplotlib.colors import to_rgb
 
 from wheretolook.figures.lattices import covering_radius_deg, fibonacci_figure, nearest_angles_deg
-from wheretolook.figures.sphere import viewpoint_sphere_figure
 from wheretolook.figures.style import save_figure
 from wheretolook.figures.training import training_figure
 from wheretolook.geometry.lattices import fibonacci_sphere, released_lattice
-from wheretolook.methods.fisher import FISHER_METHODS
-from wheretolook.methods.registry import PROBES
+from wheretolook.methods.fisher import APPROXIMATIONS, METRICS
 from wheretolook.methods.styles import method_group, method_style
 
 
@@ -51,7 +49,7 @@ def test_fibonacci_figure_tells_the_radii(tmp_path: Path) -> None:
 def test_training_figure_marks_the_best_epoch(tmp_path: Path) -> None:
     history = pd.DataFrame({"epoch": range(5), "train_bce": 0.5, "val_bce": 0.6, "train_average_precision": 0.9,
                             "val_average_precision": [0.1, 0.4, 0.8, 0.7, 0.8]})  # fmt: skip
-    figure = training_figure({"2d": history, "2d+3d": history + 0.01})
+    figure = training_figure({"mlp-2d": history, "mlp-2d+3d": history + 0.01})
     rings = [line for line in figure.axes[1].lines if line.get_marker() == "o"]
     assert [line.get_xdata()[0] for line in rings] == [3, 3.01]
     _assert_draws(figure, tmp_path)
@@ -64,32 +62,23 @@ def test_training_figure_names_learners_as_other_figures_do() -> None:
     assert labels == ["set of landmarks: training", "set of landmarks: validation"]
 
 
-def test_sphere_figure_stars_the_best_direction(tmp_path: Path) -> None:
-    directions, best = fibonacci_sphere(100), 37
-    scores = {("bins", ""): -np.abs(np.arange(100) - best).astype(float), ("mlp", "2d"): np.arange(100.0)}
-    figure = viewpoint_sphere_figure(directions, scores, np.arange(100) < 20)
-    x, y = (float(values[0]) for values in figure.axes[0].lines[0].get_data())
-    np.testing.assert_allclose([np.cos(y) * np.cos(x), np.cos(y) * np.sin(x), np.sin(y)], directions[best], atol=1e-12)
-    assert len(figure.axes) == 2
-    _assert_draws(figure, tmp_path)
-
-
 def test_methods_look_different() -> None:
-    methods = [("oracle", ""), ("random", ""), ("forward", ""), ("visible", ""), ("bins", ""), ("max-visibility", ""),
-               ("max-visibility-swapped", ""), *((name, "") for name in PROBES), ("mlp", "2d"), ("mlp", "2d+z"),
-               ("mlp", "2d+3d"), ("mlp", "released")]  # fmt: skip
-    styles = [method_style(*method) for method in methods]
+    methods = ["oracle", "random", "forward", "visible", "bins", "max-visibility",
+               "max-visibility-swapped", "fisher-worst-trace", "fisher-stationary-trace", "mlp-2d", "mlp-2d+z",
+               "mlp-2d+3d", "mlp-released"]  # fmt: skip
+    styles = [method_style(method) for method in methods]
     for name in ("label", "color", "marker"):
         assert len({getattr(style, name) for style in styles}) == len(methods)
     assert method_style("new") == method_style("new")
-    assert {method_group(name) for name, _ in methods[:7]} == {"rules"}
+    assert {method_group(name) for name in methods[:7]} == {"rules"}
 
 
 def test_fisher_rows_are_one_family() -> None:
     """A marker for each metric, a shade for each approximation, dark to light also in greyscale."""
     styles = {
-        f"{metric} {approximation}": method_style("fisher", f"{metric} {approximation}")
-        for metric, approximation, _ in FISHER_METHODS.values()
+        f"{metric} {approximation}": method_style(f"fisher-{metric}-{approximation}")
+        for metric in METRICS
+        for approximation in APPROXIMATIONS
     }
     assert len({style.label for style in styles.values()}) == len(styles) == 9
     for name, style in styles.items():
@@ -101,9 +90,9 @@ def test_fisher_rows_are_one_family() -> None:
     greys = [weights @ to_rgb(styles[f"trace {one}"].color) for one in ("exact", "quadratic", "gp")]
     assert np.diff(greys).min() > 0.15
     assert styles["mineig exact"].label == "Fisher, min. eigenvalue, exact"
-    assert method_group("fisher") == "Fisher"
-    assert {method_group(name) for name in PROBES} == {"probes"}
-    assert method_group("mlp") == "learned"
+    assert method_group("fisher-trace-gp") == "Fisher"
+    assert method_group("fisher-worst-trace") == method_group("fisher-stationary-trace") == "probes"
+    assert method_group("mlp-2d") == "learned"
 
 
 def _assert_draws(figure, folder: Path) -> None:  # type: ignore[no-untyped-def]

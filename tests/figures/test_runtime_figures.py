@@ -167,7 +167,7 @@ def test_scaling_figure_of_one_machine(growth: pd.DataFrame, tmp_path: Path) -> 
     _assert_draws(figure, tmp_path)
 
 
-METHODS = (("random", ""), ("bins", ""), ("mlp", "2d"), ("oracle", ""))
+METHODS = ("random", "bins", "mlp-2d", "oracle")
 
 
 @pytest.fixture
@@ -177,8 +177,8 @@ def scores() -> pd.DataFrame:
     for occlusion in ("mesh", "hidden-points", "none"):
         for scene in ("all", "a", "b"):
             for n in (1, 5):
-                for method, inputs in METHODS:
-                    row = {"method": method, "inputs": inputs, "occlusion": occlusion, "top_n": n, "scene": scene}
+                for method in METHODS:
+                    row = {"method": method, "occlusion": occlusion, "top_n": n, "scene": scene}
                     for key in ("0.05m_0.4deg", "0.25m_2deg"):
                         low, value, high = np.sort(rng.random(3)) if method != "random" else (0.2, 0.3, 0.4)
                         row |= {f"normalized_{key}": value, f"normalized_low_{key}": low}
@@ -195,16 +195,16 @@ def test_occlusion_figure_draws_every_method_by_model(scores: pd.DataFrame, tmp_
     names = [text.get_text() for text in legend.get_texts()]
     assert names == ["mesh rays", "hidden-point removal", "none", "random", "oracle"]
     first = scores[(scores["scene"] == "all") & (scores["top_n"] == 1)]
-    for method, inputs in METHODS[1:3]:
-        rows = first[(first["method"] == method) & (first["inputs"] == inputs)]
-        style = method_style(method, inputs)
+    for method in METHODS[1:3]:
+        rows = first[first["method"] == method]
+        style = method_style(method)
         np.testing.assert_allclose(_line(left, style.label).get_xdata(), rows["average_precision"])
         drawn = _line(right, style.label)
         np.testing.assert_allclose(drawn.get_xdata(), 100 * rows["normalized_0.05m_0.4deg"])
-        row = {"mlp": 0, "bins": 1.6}[method]
+        row = {"mlp-2d": 0, "bins": 1.6}[method]
         assert np.abs(np.asarray(drawn.get_ydata()) - row).max() < 0.5 and drawn.get_color() == style.color
     ends = [segment[:, 0] for collection in right.collections for segment in collection.get_segments()]  # type: ignore[attr-defined]
-    shown = first[first["method"].isin(["bins", "mlp"])].sort_values("method", kind="stable", ascending=False)
+    shown = first[first["method"].isin(["bins", "mlp-2d"])].sort_values("method", kind="stable", ascending=False)
     columns = ["normalized_low_0.05m_0.4deg", "normalized_high_0.05m_0.4deg"]
     np.testing.assert_allclose(ends, 100 * shown[columns].to_numpy())
     assert set(_line(left, "random").get_xdata()) == {0.25}

@@ -10,7 +10,6 @@ from matplotlib.style import context
 
 from wheretolook.figures.config import KINDS
 from wheretolook.figures.style import ONE_COLUMN_IN, PRINT, new_figure, note_of, save_figure
-from wheretolook.methods.styles import method_style, scorer_style
 from wheretolook.utils.errors import ConfigError
 
 
@@ -46,12 +45,3 @@ def test_other_kinds_of_files_are_refused(tmp_path: Path) -> None:
         with pytest.raises(ConfigError, match=r"figure\.bmp"):
             work(tmp_path / "figure.bmp")
     assert not list(tmp_path.iterdir())
-
-
-def test_methods_are_drawn_alike_by_either_of_their_names() -> None:
-    for name, (method, inputs) in {
-        "set": ("set", ""), "mlp-2d+z": ("mlp", "2d+z"), "fisher-trace-gp": ("fisher", "trace gp"),
-        "max-visibility": ("max-visibility", ""), "expected-bins": ("expected", "bins"),
-    }.items():  # fmt: skip
-        assert scorer_style(name) == method_style(method, inputs)
-        assert scorer_style(name).label != name or name == "forward"

@@ -12,17 +12,8 @@ from synthetic_dataset import make_landmarks
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.colmap_camera import ColmapCamera
 from wheretolook.geometry.poses import transform
-from wheretolook.inputs.bins import (
-    ALL_CHANNELS,
-    CHANNELS,
-    INPUT_VARIANTS,
-    LANDMARK_CHANNELS,
-    PAPER_VARIANTS,
-    arrange,
-    bin_views,
-    bin_views_plain,
-    count_bins,
-)
+from wheretolook.inputs.bins import arrange, bin_views, bin_views_plain, count_bins
+from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS, LANDMARK_CHANNELS, PAPER_VARIANTS
 from wheretolook.inputs.landmarks_in_view import ATTRIBUTES, LandmarkDescriber
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
@@ -150,7 +141,7 @@ def test_input_sizes_are_those_of_the_variants(random_views: RandomViews) -> Non
     binned = bin_views(v.camera, v.cam_from_world, v.points, v.visible, v.location_rows)
     sizes = {name: binned.select(channels).means[0].size for name, channels in PAPER_VARIANTS.items()}
     assert sizes == {"2d": 1800, "2d+z": 2700, "2d+3d": 4500}
-    assert len(INPUT_VARIANTS["2d+3d+landmark"]) * 900 == 12600
+    assert len(ALL_CHANNELS) * 900 == 12600
     np.testing.assert_array_equal(binned.select(("z",)).means[:, 0], binned.means[:, CHANNELS.index("z")])
     with pytest.raises(ConfigError, match="unknown input channel"):
         binned.select(("u", "colour"))

@@ -11,7 +11,8 @@ import torch
 from synthetic_dataset import CAMERA, make_landmarks
 from wheretolook.geometry.colmap_camera import ColmapCamera
 from wheretolook.geometry.poses import Float, poses_looking_along, transform
-from wheretolook.inputs.landmarks_in_view import ATTRIBUTES, POOLED, POSE_ATTRIBUTES, LandmarkDescriber, pool
+from wheretolook.inputs.channels import ATTRIBUTES, POSE_ATTRIBUTES
+from wheretolook.inputs.landmarks_in_view import POOLED, LandmarkDescriber, pool
 from wheretolook.inputs.localization_map import LocalizationMap, shared_locations
 from wheretolook.labelling.labeller import LABELS
 from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES

@@ -38,6 +38,7 @@ from wheretolook.utils.errors import StorageError, TableError, WorkerError
 from wheretolook.viewpoints.table import read_table, write_table
 
 
+@pytest.mark.slow
 def test_killed_workers_are_replaced_and_repeat_their_shard_only(
     room: MappedRoom, views: pd.DataFrame, expected: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -74,6 +75,7 @@ def test_killed_workers_are_replaced_and_repeat_their_shard_only(
     assert not multiprocessing.active_children()
 
 
+@pytest.mark.slow
 def test_a_shard_that_kills_its_worker_every_time_is_given_up(
     room: MappedRoom, views: pd.DataFrame, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -168,7 +170,7 @@ def test_a_shard_that_is_damaged_while_others_are_made_is_an_error(
     assert [path.name[:8] for path in times(tmp_path)] == ["00000002"]  # the next run makes the other anew
 
 
-@pytest.mark.parametrize("matches", [False, True])
+@pytest.mark.parametrize("matches", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_no_flipped_bit_of_a_table_goes_unnoticed(
     matches: bool, expected: bytes, expected_matches: bytes, tmp_path: Path
 ) -> None:
@@ -214,6 +216,7 @@ def test_shards_of_another_mesh_or_of_other_viewpoints_are_not_used(
     assert (read_table(tmp_path / "shards-labelled.parquet")["status"] == "too_few_matches").all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("n_finished", "matches"), [(0, False), (3, False), (3, True)])
 def test_killed_at_any_moment_it_resumes_to_the_same_table(
     room: MappedRoom,

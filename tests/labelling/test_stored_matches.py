@@ -107,6 +107,7 @@ def test_rows_of_earlier_labels_do_not_survive(room: MappedRoom, matched: pd.Dat
     assert file_bytes(again, tmp_path / "again") == file_bytes(matched[:2], tmp_path / "first")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("workers", "shard_size"), [(1, 24), (2, 5)])
 def test_workers_and_shards_do_not_change_the_rows(
     room: MappedRoom, views: pd.DataFrame, expected_matches: bytes, tmp_path: Path, workers: int, shard_size: int

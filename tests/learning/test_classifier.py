@@ -9,7 +9,7 @@ import torch
 from torch import nn
 from torchmetrics.classification import BinaryCalibrationError
 
-from wheretolook.inputs.bins import CHANNELS
+from wheretolook.inputs.channels import CHANNELS
 from wheretolook.learning.classifier import CALIBRATION_BINS, weight_penalty, weighted_bce
 from wheretolook.learning.data import class_weights
 from wheretolook.methods.mlp.network import add_noise

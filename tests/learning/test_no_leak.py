@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from learning_options import train_config
 from synthetic_dataset import make_dataset
 from wheretolook.dataset.folders import Dataset
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.inputs.landmarks_in_view import ATTRIBUTES, POOLED, LandmarkDescriber
-from wheretolook.learning.config import TrainConfig
 from wheretolook.learning.weights import read_weights
 from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 from wheretolook.mapping.landmarks import Landmarks
@@ -21,15 +21,19 @@ from wheretolook.methods.matchability.config import MatchabilityConfig
 from wheretolook.methods.set.config import SetConfig
 from wheretolook.methods.trees.config import TreesConfig
 from wheretolook.stages.evaluate import evaluate_methods as evaluate
-from wheretolook.stages.train import train_variants as train
+from wheretolook.stages.train import train_methods as train
 from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import LOCALIZED, is_good, read_table, write_table
 
-CONFIG = TrainConfig(
-    variants=("2d+3d", "trees", "set"),
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
+CONFIG = train_config(
+    "mlp-2d+3d",
+    "trees",
+    "set",
     epochs=2,
     trees=TreesConfig(max_trees=5, min_leaf=5),
-    set=SetConfig(epochs=1, landmarks=16, batch_size=64, enlarged=1.0),  # enlarged, labels follow from errors
+    set=SetConfig(epochs=1, landmarks=16, batch_size=16, enlarged=1.0),  # enlarged, labels follow from errors
     matchability=MatchabilityConfig(epochs=1),
     accelerator="cpu",
 )
@@ -61,12 +65,12 @@ def same_labels_other_outcomes(source: Dataset, root: Path) -> Dataset:
 
 
 def test_only_labels_of_the_outcome_are_learnt_from(tmp_path: Path, tracking: TrackingConfig) -> None:
-    one = make_dataset(tmp_path / "one")
+    one = make_dataset(tmp_path / "one", n_locations=14, n_directions=16)
     other = same_labels_other_outcomes(one, tmp_path / "other")
     assert other.fingerprint() != one.fingerprint()
     for first, second in zip(*(train(data, CONFIG, tracking, progress=False) for data in (one, other)), strict=True):
         tensors, others = (read_weights(model.path)[0] for model in (first, second))
-        assert all(np.array_equal(tensors[name], others[name]) for name in tensors), first.variant
+        assert all(np.array_equal(tensors[name], others[name]) for name in tensors), first.method
     config = EvaluateConfig(methods=("bins", "mlp", "trees", "set"), top_n=(1,), resamples=10)
     columns = ["method", "raw_0.05m_0.4deg", "roc_auc", "average_precision"]
     tables = [evaluate(data, config, tracking, progress=False)[columns] for data in (one, other)]
@@ -82,6 +86,6 @@ def test_what_is_known_of_a_landmark_comes_from_map_and_pose() -> None:
     assert set(MAP_ATTRIBUTES) == of_map and set(ATTRIBUTES) == of_map | of_pose
     assert {name.rsplit("_", 1)[0] for name in POOLED[5:]} == set(ATTRIBUTES)
     # a describer is built of a map, and asked about poses and what is visible: there is no way in for anything else
-    assert list(inspect.signature(LandmarkDescriber).parameters) == ["localization_map"]
+    assert list(inspect.signature(LandmarkDescriber).parameters) == ["localization_map", "attributes"]
     assert list(inspect.signature(LandmarkDescriber.describe).parameters) == ["self", "cam_from_world", "visible"]
     assert list(inspect.signature(Landmarks.attributes).parameters) == ["self"]

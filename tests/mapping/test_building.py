@@ -199,7 +199,7 @@ class FailingRenderer:
 
 
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
-@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_failed_build_leaves_nothing_and_keeps_the_earlier_map(
     room, room_free_space, renderer, tmp_path, error, workers
 ):

@@ -12,29 +12,32 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from learning_options import changed, train_config
 from synthetic_dataset import CAMERA, make_dataset, make_landmarks
 from wheretolook.dataset.folders import Dataset
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import poses_looking_along
-from wheretolook.inputs.bins import ALL_CHANNELS, InputStatistics
+from wheretolook.inputs.bins import InputStatistics
+from wheretolook.inputs.channels import ALL_CHANNELS
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.learning.config import TrainConfig
 from wheretolook.learning.data import ViewpointDataModule
-from wheretolook.learning.weights import METADATA_KEY, read_training, weights_kind
+from wheretolook.learning.trained_network import TrainedNetwork
+from wheretolook.learning.weights import METADATA_KEY, method_of_weights, read_training
 from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.methods.binned_network import BinnedNetworkScorer
 from wheretolook.methods.conv.config import ConvConfig
-from wheretolook.methods.conv.learn import ConvNetwork, ConvSpec
-from wheretolook.methods.conv.score import ConvScorer
-from wheretolook.methods.mlp.score import LearnedScorer
-from wheretolook.methods.mlp.weights import load_classifier
+from wheretolook.methods.conv.network import ConvNetwork, ConvSpec
+from wheretolook.methods.mlp.network import ViewpointNetwork
 from wheretolook.methods.registry import load_scorer, make_scorer
 from wheretolook.stages.evaluate import evaluate_methods as evaluate
-from wheretolook.stages.train import train_variants as train
+from wheretolook.stages.train import train_methods as train
 from wheretolook.utils.errors import ConfigError, WeightsError
 from wheretolook.utils.tracking import client
 from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import LOCALIZED, NO_POSE, UNLABELLED, poses, write_table
+
+pytestmark = pytest.mark.usefixtures("no_pictures")
 
 FEW = ConvConfig(epochs=2, batch_size=64, widths=(4, 8, 8), bins=12)
 
@@ -46,14 +49,13 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 @pytest.fixture
-def network() -> ConvNetwork:
+def trained() -> TrainedNetwork[ConvNetwork]:
     """An untrained network whose scores differ from view to view."""
     mean = (80.0, 60.0, 0.0, 0.0, 2.0, 0.5, 0.0, 1.5, 0.25, 2.0, 0.5, 0.5, 0.5, 0.2)
     std = (40.0, 30.0, 1.0, 1.0, 1.0, *(0.3 for _ in range(9)))
     torch.manual_seed(0)
-    found = ConvNetwork(ConvSpec(CAMERA, InputStatistics(ALL_CHANNELS, mean, std), 12, (8, 16), 0.5)).eval()
-    found.scale, found.offset = 1.7, -0.3
-    return found
+    network = ConvNetwork(ConvSpec(InputStatistics(ALL_CHANNELS, mean, std), 12, (8, 16), 0.5))
+    return TrainedNetwork("conv", network, CAMERA, 1.7, -0.3)
 
 
 def label_by(dataset: Dataset, channel: str, bins: int = 1) -> None:
@@ -82,7 +84,7 @@ def make_one_wall_ambiguous(dataset: Dataset) -> None:
         )
 
 
-def views_of(network: ConvNetwork) -> tuple[torch.Tensor, torch.Tensor]:
+def some_views() -> tuple[torch.Tensor, torch.Tensor]:
     generator = torch.Generator().manual_seed(0)
     filled = torch.rand((20, 12, 12), generator=generator) < 0.3
     means = torch.rand((20, len(ALL_CHANNELS), 12, 12), generator=generator) * filled[:, None]
@@ -94,22 +96,22 @@ def test_attributes_tell_a_network_what_places_cannot(tmp_path: Path, store: str
     dataset = make_dataset(tmp_path / "tiny", ("train", "train", "val"), n_locations=14, n_landmarks=200)
     make_one_wall_ambiguous(dataset)
     label_by(dataset, "ambiguity")
-    config = TrainConfig(
-        ("2d+3d", "2d+3d+landmark"), epochs=8, batch_size=32, hidden=(32,), bins=6, accelerator="cpu"
-    )  # fmt: skip
+    config = train_config(
+        "mlp-2d+3d", "mlp-2d+3d+landmark", epochs=8, batch_size=32, hidden=(32,), bins=6, accelerator="cpu"
+    )
     without, told = train(dataset, config, TrackingConfig(store), progress=False)
     assert told.path.name == "mlp-2d+3d+landmark.safetensors"
     assert told.metrics["val_average_precision"] > 0.9
     assert without.metrics["val_average_precision"] < 0.8
     scorer = load_scorer(told.path, dataset.scenes[1].localization_map(CAMERA))
-    assert isinstance(scorer, LearnedScorer) and (scorer.name, scorer.inputs) == ("mlp", "2d+3d+landmark")
+    assert isinstance(scorer, BinnedNetworkScorer) and scorer.name == "mlp-2d+3d+landmark"
 
 
 def test_a_convolutional_network_learns_where_landmarks_are(tmp_path: Path, store: str) -> None:
     dataset = make_dataset(tmp_path / "tiny", ("train", "val"), n_locations=20)
     label_by(dataset, "v", bins=8)
     options = replace(FEW, epochs=4, learning_rate=5e-3, bins=8)
-    config = TrainConfig(("conv",), accelerator="cpu", conv=options)
+    config = train_config("conv", accelerator="cpu", conv=options)
     (model,) = train(dataset, config, TrackingConfig(store), progress=False)
     assert model.metrics["val_average_precision"] > 0.85
     scorer = load_scorer(model.path, dataset.scenes[1].localization_map(CAMERA))
@@ -129,20 +131,20 @@ def test_only_who_looks_at_landmark_channels_has_them_loaded(tmp_path: Path, sto
             super().setup(stage)
             widths.append(self.views.means.shape[1])
 
-    config = TrainConfig(("2d", "2d+z"), epochs=1, hidden=(4,), bins=4, accelerator="cpu")
+    config = train_config("mlp-2d", "mlp-2d+z", epochs=1, hidden=(4,), bins=4, accelerator="cpu")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("wheretolook.learning.data.ViewpointDataModule", Watched)
+        patch.setattr("wheretolook.methods.mlp.learn.ViewpointDataModule", Watched)
         train(dataset, config, TrackingConfig(store), progress=False)
         assert {*widths} == {5}
         widths.clear()
-        wide = replace(config, variants=("2d", "2d+3d+landmark", "released"))
+        wide = changed(config, methods=("mlp-2d+3d+landmark", "mlp-2d", "mlp-released"))
         train(dataset, wide, TrackingConfig(store), progress=False, force=True)
     # one binning for both; the released code's options are others, and its inputs the paper's
     assert widths[0] == 14 and widths[-1] == 5
 
 
 def test_the_paper_trains_as_before() -> None:
-    assert TrainConfig().variants == ("2d", "2d+z", "2d+3d", "set")  # what beats it learns beside it
+    assert train_config().methods == ("mlp-2d", "mlp-2d+z", "mlp-2d+3d", "set")  # what beats it learns beside it
 
 
 def test_a_map_without_descriptors_trains_and_scores(tmp_path: Path, store: str) -> None:
@@ -152,7 +154,7 @@ def test_a_map_without_descriptors_trains_and_scores(tmp_path: Path, store: str)
         unknown = np.full(len(landmarks), np.nan, dtype=np.float32)
         changes = {"mapping_distance_spread": unknown} | ({} if number == 1 else {"ambiguity": unknown})
         replace(landmarks, **changes).save(scene.landmarks)
-    config = TrainConfig(("2d+3d+landmark", "conv"), epochs=2, hidden=(8,), bins=6, accelerator="cpu", conv=FEW)
+    config = train_config("mlp-2d+3d+landmark", "conv", epochs=2, hidden=(8,), bins=6, accelerator="cpu", conv=FEW)
     models = train(dataset, config, TrackingConfig(store), progress=False)
     for model in models:
         assert np.isfinite(list(model.metrics.values())).all()
@@ -164,22 +166,22 @@ def test_a_map_without_descriptors_trains_and_scores(tmp_path: Path, store: str)
 def test_training_logs_a_run_is_reused_and_evaluated(tmp_path: Path, store: str) -> None:
     dataset = make_dataset(tmp_path / "tiny", ("train", "train", "test"), n_locations=8, n_directions=12)
     tracking = TrackingConfig(store, "conv")
-    config = TrainConfig(("conv",), accelerator="cpu", conv=FEW)
+    config = train_config("conv", accelerator="cpu", conv=FEW)
     (model,) = train(dataset, config, tracking, progress=False)
     assert model.path == dataset.root / "weights" / "conv.safetensors"
     run = client(tracking).get_run(model.run_id)
-    assert (run.data.params["variant"], run.data.params["epochs"], run.data.params["widths"]) == (
+    assert (run.data.params["method"], run.data.params["epochs"], run.data.params["widths"]) == (
         "conv", "2", "[4, 8, 8]",
     )  # fmt: skip
-    data = ViewpointDataModule(dataset, config, progress=False)
+    data = ViewpointDataModule(dataset, config, FEW, progress=False)
     data.setup()
     assert run.data.params["n_train"] == str(len(data.train_rows))  # all of them: nothing is balanced
     assert len(pd.read_csv(Path(run.info.artifact_uri) / "history.csv")) == 2
     assert [m.step for m in client(tracking).get_metric_history(model.run_id, "val_average_precision")] == [0, 1]
 
     # a network's options do not matter to it, its own do
-    assert train(dataset, replace(config, learning_rate=0.5, bins=5), tracking, progress=False)[0].reused
-    other = replace(config, conv=replace(FEW, dropout=0.0))
+    assert train(dataset, changed(config, learning_rate=0.5, bins=5), tracking, progress=False)[0].reused
+    other = changed(config, conv=replace(FEW, dropout=0.0))
     assert not train(dataset, other, tracking, progress=False)[0].reused
 
     table = evaluate(dataset, EvaluateConfig(("bins", "conv"), resamples=50), tracking, progress=False)
@@ -188,40 +190,42 @@ def test_training_logs_a_run_is_reused_and_evaluated(tmp_path: Path, store: str)
     assert 0 <= rows.loc["conv", "ece"] < 0.5
 
 
-def test_a_network_comes_back_from_disk(network: ConvNetwork, tmp_path: Path) -> None:
+def test_a_network_comes_back_from_disk(trained: TrainedNetwork[ConvNetwork], tmp_path: Path) -> None:
     path = tmp_path / "weights" / "conv.safetensors"
-    network.save(path, {"variant": "conv"})
-    loaded, views = ConvNetwork.load(path), views_of(network)
-    assert loaded.spec == network.spec and not loaded.training
-    torch.testing.assert_close(loaded.log_odds(*views), network.log_odds(*views), rtol=0, atol=0)
-    assert network.log_odds(*views).isfinite().all()
+    trained.save(path, {"method": "conv"})
+    loaded, views = TrainedNetwork.load(path, ConvNetwork, "conv"), some_views()
+    assert loaded.network.spec == trained.network.spec and not loaded.network.training
+    assert (loaded.camera, loaded.scale, loaded.offset) == (CAMERA, 1.7, -0.3)
+    torch.testing.assert_close(loaded.network(*views), trained.network(*views), rtol=0, atol=0)
+    assert loaded.network(*views).isfinite().all()
     content = path.read_bytes()
-    loaded.save(path, {"variant": "conv"})
+    loaded.save(path, {"method": "conv"})
     assert path.read_bytes() == content
     assert [file.name for file in path.parent.iterdir()] == ["conv.safetensors"]
-    assert weights_kind(path) == "conv" and read_training(path) == {"variant": "conv"}
+    assert method_of_weights(path) == "conv" and read_training(path) == {"method": "conv"}
     with pytest.raises(WeightsError, match=r"conv\.safetensors.*not of mlp"):
-        load_classifier(path)
+        TrainedNetwork.load(path, ViewpointNetwork, "mlp-2d")
 
 
-def test_damaged_networks_are_named(network: ConvNetwork, tmp_path: Path) -> None:
+def test_damaged_networks_are_named(trained: TrainedNetwork[ConvNetwork], tmp_path: Path) -> None:
     path = tmp_path / "conv.safetensors"
-    network.save(path)
+    trained.save(path)
     tensors, header = load_file(path), json.loads(_header(path))
-    for wrong, changed, message in (
-        ({}, {"kind": "trees"}, "not of conv"),
+    for wrong, other, message in (
+        ({}, {"method": "trees"}, "not of conv"),
         ({}, {"widths": [8, 15]}, "do not fit"),
         ({}, {"widths": []}, "damaged description"),
         ({}, {"camera": {"breadth": 3}}, "damaged description"),
-        ({}, {"statistics": {"channels": ["u"], "mean": [0.0], "std": [1.0]}}, "damaged description.*other channels"),
+        ({}, {"statistics": {"channels": ["u"], "mean": [0.0], "std": [1.0]}}, "do not fit"),
+        ({}, {"statistics": {"channels": ["colour"], "mean": [0.0], "std": [1.0]}}, "unknown channel.*colour"),
         ({"last.weight": torch.zeros(1, 3)}, {}, "do not fit"),
     ):
-        save_file({**tensors, **wrong}, path, metadata={METADATA_KEY: json.dumps({**header, **changed})})
+        save_file({**tensors, **wrong}, path, metadata={METADATA_KEY: json.dumps({**header, **other})})
         with pytest.raises(WeightsError, match=message) as error:
-            ConvNetwork.load(path)
+            TrainedNetwork.load(path, ConvNetwork, "conv")
         assert str(path) in str(error.value)
-    save_file(tensors, path, metadata={METADATA_KEY: json.dumps({**header, "kind": "oracle"})})
-    with pytest.raises(WeightsError, match="not of one scorer"):
+    save_file(tensors, path, metadata={METADATA_KEY: json.dumps({**header, "method": "oracle"})})
+    with pytest.raises(WeightsError, match="not of a scorer"):
         load_scorer(path, LocalizationMap(make_landmarks(np.random.default_rng(0), 10), CAMERA))
 
 
@@ -231,17 +235,19 @@ def test_options_that_are_none(wrong: dict[str, object]) -> None:
         ConvConfig(**wrong)  # type: ignore[arg-type]
 
 
-def test_the_scorer_is_the_network_on_binned_views(network: ConvNetwork, tmp_path: Path, device: str) -> None:
+def test_the_scorer_is_the_network_on_binned_views(
+    trained: TrainedNetwork[ConvNetwork], tmp_path: Path, device: str
+) -> None:
     path = tmp_path / "conv.safetensors"
-    network.save(path)
+    trained.save(path)
     rng = np.random.default_rng(1)
     views = poses_looking_along(rng.uniform((-1, -1, 1), (1, 1, 2), (40, 3)), rng.normal(size=(40, 3)))
     localization_map = LocalizationMap(make_landmarks(np.random.default_rng(0), 200), CAMERA, device=device)
     scorer = load_scorer(path, localization_map)
-    assert isinstance(scorer, ConvScorer) and (scorer.name, scorer.inputs) == ("conv", "")
+    assert isinstance(scorer, BinnedNetworkScorer) and scorer.name == "conv"
     binned = localization_map.bin_views(views, 12, landmark_channels=True)
     with torch.inference_mode():
-        logits = network(torch.from_numpy(binned.means), torch.from_numpy(binned.counts > 0)).double()
+        logits = trained.network(torch.from_numpy(binned.means), torch.from_numpy(binned.counts > 0)).double()
     scores = scorer.score(views)
     np.testing.assert_allclose(scores, (1.7 * logits - 0.3).sigmoid(), rtol=1e-5)
     assert len(np.unique(scores)) > 20  # some views see nothing

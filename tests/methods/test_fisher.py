@@ -18,17 +18,9 @@ from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.methods.fisher import (
-    APPROXIMATIONS,
-    FISHER_METHODS,
-    ORIGIN_METHODS,
-    Approximation,
-    FisherScorer,
-    PoseInformation,
-    StationaryTraceScorer,
-    WorstTraceScorer,
-)
-from wheretolook.methods.registry import OPTIONAL, PROBES, SCORERS, make_scorer
+from wheretolook.methods.fisher import APPROXIMATIONS, Approximation
+from wheretolook.methods.fisher.score import FisherScorer, PoseInformation, StationaryTraceScorer, WorstTraceScorer
+from wheretolook.methods.registry import make_scorer, scorers
 from wheretolook.visibility.frustum import LandmarkSets
 from wheretolook.visibility.occlusion import StoredOcclusion
 
@@ -112,15 +104,18 @@ def test_exact_scores_are_numpys_of_the_sums(about_origin: bool) -> None:
 
 
 def test_all_nine_rows_and_the_two_probes_are_methods() -> None:
-    assert len(FISHER_METHODS) == 9 and set(FISHER_METHODS) | set(PROBES) <= set(SCORERS)
     localization_map = LocalizationMap(two_walls(np.random.default_rng(4), 200), CAMERA)
-    assert len(OPTIONAL) == 6 and not {*OPTIONAL} & {*EvaluateConfig().methods}
-    assert {*OPTIONAL} | {*EvaluateConfig().methods} == {*SCORERS}
-    for name, (metric, approximation, about_origin) in {**FISHER_METHODS, **ORIGIN_METHODS}.items():
-        scorer = make_scorer(name, localization_map)
-        assert isinstance(scorer, FisherScorer)
-        assert (scorer.metric, scorer.approximation, scorer.about_origin) == (metric, approximation, about_origin)
-        assert f"fisher-{scorer.inputs.replace(' ', '-')}" == name
+    rows = {(metric, approximation, False) for metric in METRICS for approximation in APPROXIMATIONS}
+    turned = {(metric, approximation, True) for metric, approximation, _ in rows if metric != "logdet"}
+    found = {
+        name: make_scorer(name, localization_map) for name, method in scorers().items() if method.family == "fisher"
+    }
+    assert {(one.metric, one.approximation, one.about_origin) for one in found.values()} == rows | turned
+    for name, scorer in found.items():
+        assert isinstance(scorer, FisherScorer) and scorer.name == name
+        assert scorers()[name].only_if_named == scorer.about_origin == (name not in EvaluateConfig().methods)
+    probes = [name for name, method in scorers().items() if method.group == "probes"]
+    assert probes == ["fisher-worst-trace", "fisher-stationary-trace"] and {*probes} < {*EvaluateConfig().methods}
 
 
 def test_probes_look_away_from_the_landmarks() -> None:

@@ -7,6 +7,7 @@ import json
 import weakref
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -14,36 +15,32 @@ import pytest
 import torch
 from safetensors.numpy import load_file, save_file
 
+from learning_options import changed, train_config
 from synthetic_dataset import CAMERA, make_dataset
 from wheretolook.dataset.folders import Dataset
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.fisher import information
 from wheretolook.inputs.landmarks_in_view import ATTRIBUTES, LandmarkDescriber, ViewLandmarks
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.learning.config import TrainConfig
 from wheretolook.learning.data import labelled_rows, training_scenes
 from wheretolook.learning.landmark_views import AttributeStatistics, LandmarkLoader, load_landmark_views
-from wheretolook.learning.weights import METADATA_KEY, weights_kind
+from wheretolook.learning.trained_network import StoredNetwork, TrainedNetwork
+from wheretolook.learning.weights import METADATA_KEY, method_of_weights
 from wheretolook.methods.matchability.config import MatchabilityConfig
-from wheretolook.methods.matchability.learn import LandmarkBatches, Matchability
+from wheretolook.methods.matchability.learn import LandmarkBatches
+from wheretolook.methods.matchability.network import MatchabilityNetwork, bearing_numbers, expected_parts
 from wheretolook.methods.registry import load_scorer, make_scorer
 from wheretolook.methods.set.config import SetConfig
-from wheretolook.methods.set.learn import SetModel, of_size
-from wheretolook.methods.set.network import (
-    EXPECTED,
-    MatchabilityNetwork,
-    SetNetwork,
-    bearing_numbers,
-    expected_parts,
-    expected_statistics,
-    information_matrices,
-)
+from wheretolook.methods.set.learn import of_size
+from wheretolook.methods.set.network import EXPECTED, SetNetwork, expected_statistics, information_matrices
 from wheretolook.methods.set.score import SetScorer
 from wheretolook.stages.evaluate import evaluate_methods as evaluate
-from wheretolook.stages.train import train_variants as train
+from wheretolook.stages.train import train_methods as train
 from wheretolook.utils.errors import ConfigError, TableError, WeightsError
 from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import LOCALIZED, poses, read_table, write_table
+
+pytestmark = pytest.mark.usefixtures("no_pictures")
 
 DISTANCE = ATTRIBUTES.index("distance")
 NO_STATISTICS = AttributeStatistics((0.0,) * len(ATTRIBUTES), (1.0,) * len(ATTRIBUTES))
@@ -163,7 +160,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 def test_views_by_their_landmarks(dataset: Dataset) -> None:
     scenes = training_scenes(dataset)
-    views = load_landmark_views(dataset, scenes, TrainConfig(), 20, progress=False, matches=True)
+    views = load_landmark_views(dataset, scenes, train_config(), 20, progress=False, matches=True)
     at = 0
     assert views.found is not None
     for number, scene in enumerate(scenes):
@@ -187,7 +184,7 @@ def test_views_by_their_landmarks(dataset: Dataset) -> None:
 
 
 def test_batches_hold_samples_of_each_view(dataset: Dataset) -> None:
-    views = load_landmark_views(dataset, training_scenes(dataset), TrainConfig(), 40, progress=False)
+    views = load_landmark_views(dataset, training_scenes(dataset), train_config(), 40, progress=False)
     rows = torch.arange(5, len(views))
     loader = LandmarkLoader(views, rows, 64, width=8, shuffle_seed=3)
     first, second = (torch.cat([batch.inputs[2] for batch in loader]) for _ in range(2))
@@ -203,8 +200,17 @@ def test_batches_hold_samples_of_each_view(dataset: Dataset) -> None:
     assert torch.isfinite(wide[..., DISTANCE]).all()
 
 
-FEW = TrainConfig(
-    variants=("matchability", "set"),
+NETWORKS: dict[str, type[StoredNetwork]] = {"matchability": MatchabilityNetwork, "set": SetNetwork}
+
+
+def load(path: Path, method: str = "") -> TrainedNetwork[Any]:
+    """What has been learnt, of the method that the file is named after unless told otherwise."""
+    return TrainedNetwork.load(path, NETWORKS[method or path.stem], method or path.stem)
+
+
+FEW = train_config(
+    "matchability",
+    "set",
     matchability=MatchabilityConfig(epochs=6, batch_size=8, learning_rate=5e-3),
     set=SetConfig(epochs=4, batch_size=32, landmarks=32),
     accelerator="cpu",
@@ -220,11 +226,11 @@ def tracking(tmp_path_factory: pytest.TempPathFactory) -> TrackingConfig:
 def trained(dataset: Dataset, tracking: TrackingConfig) -> dict[str, Path]:
     models = train(dataset, FEW, tracking, progress=False)
     assert all(not model.reused for model in models)
-    return {model.variant: model.path for model in models}
+    return {model.method: model.path for model in models}
 
 
 def test_enlarged_views_are_those_of_an_enlarged_scene(dataset: Dataset) -> None:
-    views = load_landmark_views(dataset, training_scenes(dataset), TrainConfig(), 40, progress=False)
+    views = load_landmark_views(dataset, training_scenes(dataset), train_config(), 40, progress=False)
     views = replace(views, axis_height=torch.arange(len(views)).float())  # tells who is who
     rows = torch.arange(len(views))
     plain, large = (next(iter(LandmarkLoader(views, rows, len(rows), 8, 3, enlarged=by))) for by in (1.0, 4.0))
@@ -268,7 +274,7 @@ def test_landmarks_of_enlarged_views() -> None:
 
 @pytest.mark.parametrize(("world_size", "enlarged"), [(2, 1.0), (3, 3.0)])
 def test_processes_share_out_every_batch(dataset: Dataset, world_size: int, enlarged: float) -> None:
-    views = load_landmark_views(dataset, training_scenes(dataset), TrainConfig(), 40, progress=False)
+    views = load_landmark_views(dataset, training_scenes(dataset), train_config(), 40, progress=False)
     rows = torch.arange(101)  # the last batch has one view: some processes get none
     whole = list(LandmarkLoader(views, rows, 20, width=8, shuffle_seed=3, enlarged=enlarged))
     loaders = [LandmarkLoader(views, rows, 20, 8, 3, rank, world_size, enlarged) for rank in range(world_size)]
@@ -309,10 +315,10 @@ def test_maps_of_expected_scorers_can_go(dataset: Dataset, trained: dict[str, Pa
 
 
 def test_who_is_found_is_learnt(dataset: Dataset, trained: dict[str, Path]) -> None:
-    matchability = Matchability.load(trained["matchability"])
+    matchability = load(trained["matchability"])
     localization_map = dataset.split("test")[0].localization_map(CAMERA)
     described = LandmarkDescriber(localization_map).describe(poses(dataset.split("test")[0].read_table())[:50])
-    probability = matchability.log_odds(described.values).sigmoid().numpy()
+    probability = matchability.calibrated(matchability.network(described.values)).sigmoid().numpy()
     clear = localization_map.landmarks.ambiguity[described.rows.numpy()]
     assert probability[clear < 0.4].mean() > 0.8 and probability[clear > 0.6].mean() < 0.2
 
@@ -325,35 +331,34 @@ def test_the_set_network_starts_from_the_matchability(
     record = json.loads(trained["set"].with_suffix(".json").read_text())
     assert record["about"]["matchability_sha256"] is not None
     assert record["metrics"]["val_average_precision"] > 0.8
-    statistics = Matchability.load(trained["matchability"]).network.statistics
-    assert SetModel.load(trained["set"]).network.statistics == statistics
+    statistics = load(trained["matchability"]).network.statistics
+    assert load(trained["set"]).network.statistics == statistics
 
 
 def test_matches_must_be_stored(tmp_path: Path, tracking: TrackingConfig) -> None:
     plain = make_dataset(tmp_path)
     with pytest.raises(TableError, match="not stored which landmarks"):
-        train(plain, replace(FEW, variants=("matchability",)), tracking, progress=False)
+        train(plain, changed(FEW, methods=("matchability",)), tracking, progress=False)
 
 
 @pytest.mark.parametrize("variant", ["matchability", "set"])
 def test_models_come_back_from_disk(trained: dict[str, Path], tmp_path: Path, variant: str) -> None:
-    model_class = {"matchability": Matchability, "set": SetModel}[variant]
-    model = model_class.load(trained[variant])
+    model = load(trained[variant])
     copy = tmp_path / "copy.safetensors"
     model.save(copy)
-    model_class.load(copy).save(tmp_path / "again.safetensors")
+    load(copy, variant).save(tmp_path / "again.safetensors")
     assert copy.read_bytes() == (tmp_path / "again.safetensors").read_bytes()
-    assert weights_kind(copy) == variant
-    for name, tensor in model_class.load(copy).network.state_dict().items():
+    assert method_of_weights(copy) == variant
+    for name, tensor in load(copy, variant).network.state_dict().items():
         assert torch.equal(tensor, model.network.state_dict()[name])
     tensors = load_file(copy)
     tensors.pop(sorted(tensors)[0])
     save_file(tensors, tmp_path / "broken.safetensors", metadata=_metadata(copy))
-    with pytest.raises(WeightsError, match="damaged weights"):
-        model_class.load(tmp_path / "broken.safetensors")
-    other = {"matchability": SetModel, "set": Matchability}[variant]
+    with pytest.raises(WeightsError, match="do not fit"):
+        load(tmp_path / "broken.safetensors", variant)
+    other = {"matchability": "set", "set": "matchability"}[variant]
     with pytest.raises(WeightsError, match="not of"):
-        other.load(copy)
+        load(copy, other)
 
 
 def _metadata(path: Path) -> dict[str, str]:
@@ -368,7 +373,8 @@ def test_expected_scores_by_hand(dataset: Dataset, trained: dict[str, Path]) -> 
     localization_map = scene.localization_map(CAMERA)
     views = poses(scene.read_table())[:40]
     described = LandmarkDescriber(localization_map).describe(views)
-    p = Matchability.load(trained["matchability"]).log_odds(described.values).sigmoid().double().numpy()
+    model = load(trained["matchability"])
+    p = model.calibrated(model.network(described.values)).sigmoid().double().numpy()
     starts = described.starts.numpy()
     scores = {
         name: make_scorer(name, localization_map, weights=trained["matchability"]).score(views)
@@ -403,7 +409,7 @@ def test_certain_landmarks_give_the_exact_information(dataset: Dataset, tmp_path
         for parameter in network.parameters():
             parameter.zero_()
         network.layers[-1].bias.fill_(40.0)
-    Matchability(network, CAMERA).save(tmp_path / "certain.safetensors")
+    TrainedNetwork("matchability", network, CAMERA).save(tmp_path / "certain.safetensors")
     localization_map = dataset.split("test")[0].localization_map(CAMERA)
     views = poses(dataset.split("test")[0].read_table())[:60]
     for metric in ("trace", "logdet"):
@@ -426,7 +432,7 @@ def test_scores_of_a_set_network(dataset: Dataset, trained: dict[str, Path]) -> 
     narrow = LocalizationMap(localization_map.landmarks, replace(CAMERA, focal_px=2 * CAMERA.focal_px))
     with pytest.raises(WeightsError, match="trained for a camera"):
         load_scorer(trained["set"], narrow)
-    with pytest.raises(WeightsError, match="not of one scorer"):
+    with pytest.raises(WeightsError, match="not of a scorer"):
         load_scorer(trained["matchability"], localization_map)
 
 
@@ -434,16 +440,14 @@ def test_all_are_evaluated(dataset: Dataset, trained: dict[str, Path], tracking:
     names = ("bins", "set", "expected-inliers", "expected-bins", "fisher-logdet-expected")
     config = EvaluateConfig(methods=names, top_n=(1,), resamples=50)
     table = evaluate(dataset, config, tracking, progress=False)
-    rows = table[table["scene"] == "all"].set_index(["method", "inputs"])
-    assert {("set", ""), ("expected", "inliers"), ("expected", "bins"), ("fisher", "logdet expected")} <= set(
-        rows.index
-    )
-    assert rows.loc[("set", ""), "roc_auc"] > 0.8 and np.isfinite(rows.loc[("set", ""), "ece"])
-    assert rows.loc[("set", ""), "reference"] == "set"
+    rows = table[table["scene"] == "all"].set_index("method")
+    assert {"set", "expected-inliers", "expected-bins", "fisher-logdet-expected"} <= set(rows.index)
+    assert rows.loc["set", "roc_auc"] > 0.8 and np.isfinite(rows.loc["set", "ece"])
+    assert rows.loc["set", "reference"] == "set"
 
 
 def test_few_views_are_gone_through_more_often() -> None:
-    config = TrainConfig(variants=("set",)).of_variant("set")
+    config = SetConfig()
     assert of_size(config, 200_000) is config and of_size(config, 16 * 1024) is config
     few = of_size(config, 1350)
     assert few.batch_size == 84 and few.epochs * 17 >= 600 > (few.epochs - 1) * 17
@@ -455,7 +459,7 @@ def test_impossible_options() -> None:
         SetConfig(hidden=("colour",))
     with pytest.raises(ConfigError, match="pooled"):
         SetConfig(pooled=-1)
-    with pytest.raises(ConfigError, match="landmarks and width"):
+    with pytest.raises(ConfigError, match="width"):
         MatchabilityConfig(width=0)
     with pytest.raises(ConfigError, match="epochs"):
         SetConfig(epochs=0)

@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 import torch
 
-from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.inputs.bins import CHANNELS, INPUT_VARIANTS, BinnedViews, InputStatistics
+from wheretolook.inputs.bins import BinnedViews, InputStatistics
+from wheretolook.inputs.channels import CHANNELS, PAPER_VARIANTS
 from wheretolook.methods.mlp.architecture import activations, architecture_table
 from wheretolook.methods.mlp.network import NetworkSpec, ViewpointNetwork
 
 
 def make_network(variant: str, **options) -> ViewpointNetwork:  # type: ignore[no-untyped-def]
     torch.manual_seed(0)
-    channels = INPUT_VARIANTS[variant]
+    channels = PAPER_VARIANTS[variant]
     statistics = InputStatistics(channels, (1.0,) * len(channels), (2.0,) * len(channels))
-    return ViewpointNetwork(NetworkSpec(variant, PinholeCamera(), statistics, **options)).eval()
+    return ViewpointNetwork(NetworkSpec(statistics, **options)).eval()
 
 
 def test_the_papers_networks_have_their_sizes() -> None:
@@ -46,9 +46,10 @@ def test_activations_end_in_the_networks_score(variant: str) -> None:
     counts = rng.integers(0, 2, (1, 30, 30)).astype(np.int32)
     means = (rng.normal(size=(1, len(CHANNELS), 30, 30)) * (counts[:, None] > 0)).astype(np.float32)
     inputs, first, second, score = activations(network, BinnedViews(means, counts, CHANNELS))
+    chosen = [CHANNELS.index(name) for name in network.spec.channels]
     with torch.inference_mode():
-        logit = network(torch.from_numpy(means), torch.from_numpy(counts > 0))
+        logit = network(torch.from_numpy(means[:, chosen]), torch.from_numpy(counts > 0))
     assert score == pytest.approx(logit.double().sigmoid().numpy())
     assert (first.shape, second.shape) == ((30,), (20,)) and first.min() >= 0
-    rows = [CHANNELS.index(name) for name in INPUT_VARIANTS[variant]]
+    rows = [CHANNELS.index(name) for name in PAPER_VARIANTS[variant]]
     np.testing.assert_allclose(inputs, (means[0, rows] - 1) / 2 * (counts[0] > 0), atol=1e-6)

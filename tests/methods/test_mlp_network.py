@@ -11,13 +11,16 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.inputs.bins import ALL_CHANNELS, CHANNELS, INPUT_VARIANTS, LANDMARK_CHANNELS, InputStatistics, arrange
+from wheretolook.inputs.bins import InputStatistics, arrange
+from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS, LANDMARK_CHANNELS, PAPER_VARIANTS
+from wheretolook.learning.trained_network import TrainedNetwork
 from wheretolook.learning.weights import METADATA_KEY, read_training
 from wheretolook.methods.mlp.network import BinnedInput, NetworkSpec, ViewpointNetwork, add_noise, move_to_front
-from wheretolook.methods.mlp.weights import load_classifier, save_classifier
 from wheretolook.utils.errors import WeightsError
 
 BINS = 6
+INPUTS = {**PAPER_VARIANTS, "2d+3d+landmark": ALL_CHANNELS}
+CAMERA = PinholeCamera(64, 48, 32.0)
 
 
 @pytest.fixture
@@ -34,10 +37,14 @@ def views() -> tuple[torch.Tensor, torch.Tensor]:
 def make_network(
     views: tuple[torch.Tensor, torch.Tensor], variant: str = "2d+z", **options: object
 ) -> ViewpointNetwork:
-    statistics = InputStatistics.of(*views, torch.arange(50), ALL_CHANNELS).select(INPUT_VARIANTS[variant])
+    statistics = InputStatistics.of(*views, torch.arange(50), ALL_CHANNELS).select(INPUTS[variant])
     torch.manual_seed(1)
-    spec = NetworkSpec(variant, PinholeCamera(64, 48, 32.0), statistics, bins=BINS, hidden=(8, 8), **options)  # type: ignore[arg-type]
+    spec = NetworkSpec(statistics, bins=BINS, hidden=(8, 8), **options)  # type: ignore[arg-type]
     return ViewpointNetwork(spec).eval()
+
+
+def load(path: Path) -> ViewpointNetwork:
+    return TrainedNetwork.load(path, ViewpointNetwork, "mlp-2d+z", "mlp-2d+3d").network
 
 
 def test_statistics_are_over_filled_bins_of_the_given_views(views: tuple[torch.Tensor, torch.Tensor]) -> None:
@@ -55,15 +62,16 @@ def test_statistics_of_nothing_and_of_constants_are_harmless() -> None:
     assert InputStatistics.of(means, filled, torch.arange(3)).std == (1.0,) * len(CHANNELS)
 
 
-@pytest.mark.parametrize("variant", INPUT_VARIANTS)
+@pytest.mark.parametrize("variant", INPUTS)
 def test_standardized_inputs_have_mean_0_and_deviation_1_where_filled_and_are_0_elsewhere(
     views: tuple[torch.Tensor, torch.Tensor], variant: str
 ) -> None:
     means, filled = views
-    statistics = InputStatistics.of(means, filled, torch.arange(50), ALL_CHANNELS).select(INPUT_VARIANTS[variant])
-    layer = BinnedInput(NetworkSpec(variant, PinholeCamera(), statistics, bins=BINS))
-    values = layer(means, filled).reshape(50, -1, BINS, BINS)
-    assert values.shape[1] == len(INPUT_VARIANTS[variant])
+    statistics = InputStatistics.of(means, filled, torch.arange(50), ALL_CHANNELS).select(INPUTS[variant])
+    layer = BinnedInput(NetworkSpec(statistics, bins=BINS))
+    chosen = [ALL_CHANNELS.index(name) for name in statistics.channels]
+    values = layer(means[:, chosen], filled).reshape(50, -1, BINS, BINS)
+    assert values.shape[1] == len(INPUTS[variant])
     for channel in values.unbind(1):
         assert torch.all(channel[~filled] == 0)
         assert channel[filled].mean().item() == pytest.approx(0, abs=1e-5)
@@ -81,8 +89,7 @@ def test_what_is_not_known_of_landmarks_is_the_mean_of_what_is(views: tuple[torc
     assert statistics.mean[ambiguity] == pytest.approx(rest.mean[ambiguity], rel=1e-9)
     assert statistics.std[ambiguity] == pytest.approx(rest.std[ambiguity], rel=1e-6)
 
-    variant = "2d+3d+landmark"
-    layer = BinnedInput(NetworkSpec(variant, PinholeCamera(), statistics, bins=BINS))
+    layer = BinnedInput(NetworkSpec(statistics, bins=BINS))
     values = layer(means, filled).reshape(known.shape)
     assert values.isfinite().all()
     assert torch.all(values[:20, ambiguity] == 0) and values[20:, ambiguity].std() > 0.1
@@ -106,14 +113,15 @@ def test_compact_layout_is_the_one_of_features(views: tuple[torch.Tensor, torch.
     np.testing.assert_array_equal(move_to_front(means, filled).numpy(), expected)
     in_place, compact = make_network(views), make_network(views, layout="compact")
     compact.load_state_dict(in_place.state_dict())
-    assert not torch.allclose(in_place(means, filled), compact(means, filled))
+    chosen = means[:, [ALL_CHANNELS.index(name) for name in in_place.spec.channels]]
+    assert not torch.allclose(in_place(chosen, filled), compact(chosen, filled))
 
 
 def test_paper_sizes() -> None:
     for variant, size in {"2d": 1800, "2d+z": 2700, "2d+3d": 4500}.items():
-        channels = INPUT_VARIANTS[variant]
+        channels = INPUTS[variant]
         statistics = InputStatistics(channels, (0.0,) * len(channels), (1.0,) * len(channels))
-        layers = ViewpointNetwork(NetworkSpec(variant, PinholeCamera(), statistics)).layers
+        layers = ViewpointNetwork(NetworkSpec(statistics)).layers
         assert [layer.weight.shape for layer in layers if isinstance(layer, torch.nn.Linear)] == [
             (300, size),
             (300, 300),
@@ -124,33 +132,35 @@ def test_paper_sizes() -> None:
 def test_weights_survive_the_disk(views: tuple[torch.Tensor, torch.Tensor], tmp_path: Path) -> None:
     network = make_network(views, "2d+3d", input_dropout=0.3)
     path = tmp_path / "weights" / "mlp.safetensors"
-    save_classifier(network, path, {"dataset_fingerprint": "abc"})
-    loaded = load_classifier(path)
+    trained = TrainedNetwork("mlp-2d+3d", network, CAMERA)
+    trained.save(path, {"dataset_fingerprint": "abc"})
+    loaded = load(path)
     assert loaded.spec == network.spec
     assert not loaded.training
-    torch.testing.assert_close(loaded(*views), network(*views), rtol=0, atol=0)
+    means, filled = views[0][:, :5], views[1]
+    torch.testing.assert_close(loaded(means, filled), network(means, filled), rtol=0, atol=0)
     assert read_training(path) == {"dataset_fingerprint": "abc"}
     assert [file.name for file in path.parent.iterdir()] == ["mlp.safetensors"]
     first = path.read_bytes()
-    save_classifier(network, path, {"dataset_fingerprint": "abc"})
+    trained.save(path, {"dataset_fingerprint": "abc"})
     assert path.read_bytes() == first
 
 
 def test_unusable_weights_are_named(views: tuple[torch.Tensor, torch.Tensor], tmp_path: Path) -> None:
     good = tmp_path / "good.safetensors"
-    save_classifier(make_network(views), good)
+    TrainedNetwork("mlp-2d+z", make_network(views), CAMERA).save(good)
     with pytest.raises(WeightsError, match=r"nowhere\.safetensors.*there are no weights"):
-        load_classifier(tmp_path / "nowhere.safetensors")
+        load(tmp_path / "nowhere.safetensors")
 
     truncated = tmp_path / "truncated.safetensors"
     truncated.write_bytes(good.read_bytes()[:-7])
     with pytest.raises(WeightsError, match="not a readable safetensors file"):
-        load_classifier(truncated)
+        load(truncated)
 
     foreign = tmp_path / "foreign.safetensors"
     save_file({"a": torch.zeros(3)}, foreign)
     with pytest.raises(WeightsError, match="not written by wheretolook"):
-        load_classifier(foreign)
+        load(foreign)
 
     tensors = load_file(good)
     header = {"format_version": 1, **json.loads(_header(good))}
@@ -158,12 +168,25 @@ def test_unusable_weights_are_named(views: tuple[torch.Tensor, torch.Tensor], tm
     for change, message in (
         ({"format_version": 99}, "reads weights of format 1"),
         ({"hidden": [9, 9]}, "do not fit the network"),
-        ({"variant": "4d"}, "unknown input variant"),
+        ({"statistics": {"channels": ["w"], "mean": [0], "std": [1]}}, "unknown channel of the bins.*'w'"),
+        ({"method": "set"}, "not of mlp"),
         ({"camera": {"width": 0}}, "camera needs a positive width"),
     ):
         save_file(tensors, other, metadata={METADATA_KEY: json.dumps({**header, **change})})
         with pytest.raises(WeightsError, match=message):
-            load_classifier(other)
+            load(other)
+
+
+def test_weights_of_older_versions_are_read(views: tuple[torch.Tensor, torch.Tensor], tmp_path: Path) -> None:
+    path, network = tmp_path / "old.safetensors", make_network(views)
+    TrainedNetwork("mlp-2d+z", network, CAMERA).save(path, {"variant": "2d+z"})
+    header = {**json.loads(_header(path)), "variant": "2d+z"}  # as it was, without the name of the method
+    for name in ("method", "scale", "offset"):
+        del header[name]
+    save_file(load_file(path), path, metadata={METADATA_KEY: json.dumps(header)})
+    found = TrainedNetwork.load(path, ViewpointNetwork, "mlp-2d+z")
+    assert (found.method, found.network.spec, found.camera) == ("mlp-2d+z", network.spec, CAMERA)
+    assert read_training(path) == {"method": "mlp-2d+z"}
 
 
 def _header(path: Path) -> str:

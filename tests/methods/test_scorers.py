@@ -8,24 +8,24 @@ import numpy as np
 import pytest
 import torch
 
+from learning_options import save_network
 from synthetic_dataset import CAMERA, make_landmarks, make_mapping_poses
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import Float, poses_looking_along
-from wheretolook.inputs.bins import ALL_CHANNELS, CHANNELS, INPUT_VARIANTS, BinnedViews, InputStatistics
+from wheretolook.inputs.bins import BinnedViews, InputStatistics
+from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS
 from wheretolook.inputs.landmarks_in_view import ATTRIBUTES, LandmarkDescriber, pool
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.learning.landmark_views import AttributeStatistics
 from wheretolook.methods.base import Scorer
 from wheretolook.methods.bins import BinsScorer
-from wheretolook.methods.conv.learn import ConvNetwork, ConvSpec
-from wheretolook.methods.matchability.learn import Matchability
+from wheretolook.methods.conv.network import ConvNetwork, ConvSpec
+from wheretolook.methods.matchability.network import MatchabilityNetwork
 from wheretolook.methods.mlp.network import NetworkSpec, ViewpointNetwork
-from wheretolook.methods.mlp.weights import save_classifier
-from wheretolook.methods.registry import EXPECTED_METHODS, SCORERS, load_scorer, make_scorer
-from wheretolook.methods.set.learn import SetModel
-from wheretolook.methods.set.network import MatchabilityNetwork, SetNetwork
+from wheretolook.methods.registry import load_scorer, make_scorer, scorers
+from wheretolook.methods.set.network import SetNetwork
 from wheretolook.methods.sphere.config import SphereConfig
-from wheretolook.methods.sphere.learn import SphereModel, SphereNetwork
+from wheretolook.methods.sphere.network import SphereNetwork
 from wheretolook.methods.trees.config import TreesConfig
 from wheretolook.methods.trees.learn import BoostedTrees, PooledViews, fit_trees
 from wheretolook.methods.visible import VisibleScorer
@@ -48,11 +48,9 @@ def views() -> Float:
 def weights(tmp_path: Path) -> Path:
     """An untrained network whose scores differ from view to view."""
     torch.manual_seed(0)
-    channels = INPUT_VARIANTS["2d+3d"]
-    statistics = InputStatistics(channels, (80.0, 60.0, 0.0, 0.0, 2.0), (40.0, 30.0, 1.0, 1.0, 1.0))
+    statistics = InputStatistics(CHANNELS, (80.0, 60.0, 0.0, 0.0, 2.0), (40.0, 30.0, 1.0, 1.0, 1.0))
     path = tmp_path / "mlp.safetensors"
-    save_classifier(ViewpointNetwork(NetworkSpec("2d+3d", CAMERA, statistics, hidden=(16,))), path)
-    return path
+    return save_network(path, "mlp-2d+3d", ViewpointNetwork(NetworkSpec(statistics, hidden=(16,))))
 
 
 NO_STATISTICS = AttributeStatistics((0.0,) * len(ATTRIBUTES), (1.0,) * len(ATTRIBUTES))
@@ -72,36 +70,42 @@ def some_convolutions() -> ConvNetwork:
     """An untrained network whose scores differ from view to view."""
     torch.manual_seed(0)
     mean, std = (80.0, 60.0, 0.0, 0.0, 2.0, *[0.5] * 9), (40.0, 30.0, *[1.0] * 12)
-    return ConvNetwork(ConvSpec(CAMERA, InputStatistics(ALL_CHANNELS, mean, std), 30, (8, 8), 0.0))
+    return ConvNetwork(ConvSpec(InputStatistics(ALL_CHANNELS, mean, std), 30, (8, 8), 0.0))
 
 
-@pytest.mark.parametrize("name", SCORERS)
+def weights_of(method: str, path: Path, localization_map: LocalizationMap) -> Path:
+    """Untrained weights of a method."""
+    if method == "trees":
+        some_trees(localization_map).save(path)
+        return path
+    torch.manual_seed(0)
+    if method.startswith("mlp"):
+        statistics = InputStatistics(CHANNELS, (80.0, 60.0, 0.0, 0.0, 2.0), (40.0, 30.0, 1.0, 1.0, 1.0))
+        return save_network(path, method, ViewpointNetwork(NetworkSpec(statistics, hidden=(16,))))
+    network = {
+        "conv": some_convolutions,
+        "sphere": lambda: SphereNetwork(SphereConfig()),
+        "set": lambda: SetNetwork(NO_STATISTICS, pooled=2),
+        "matchability": lambda: MatchabilityNetwork(NO_STATISTICS),
+    }[method]()
+    return save_network(path, method, network)
+
+
+@pytest.mark.parametrize("name", scorers())
 def test_scorers_keep_their_contract(
     name: str, localization_map: LocalizationMap, views: Float, weights: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if name == "trees":
-        weights = weights.with_name("trees.safetensors")
-        some_trees(localization_map).save(weights)
-    if name == "conv":
-        weights = weights.with_name("conv.safetensors")
-        some_convolutions().save(weights)
-    if name == "sphere":
-        weights = weights.with_name("sphere.safetensors")
-        SphereModel(SphereNetwork(SphereConfig()), SphereConfig(), CAMERA).save(weights)
-    if name == "set":
-        weights = weights.with_name("set.safetensors")
-        SetModel(SetNetwork(NO_STATISTICS, pooled=2), CAMERA).save(weights)
-    if name in EXPECTED_METHODS:
-        weights = weights.with_name("matchability.safetensors")
-        Matchability(MatchabilityNetwork(NO_STATISTICS), CAMERA).save(weights)
+    needed = scorers()[name].weights
+    if needed:
+        weights = weights_of(needed, weights.with_name(f"{needed}.safetensors"), localization_map)
     scorer = make_scorer(name, localization_map, seed=3, weights=weights)
     assert isinstance(scorer, Scorer)
-    assert name in (scorer.name, f"{scorer.name}-{scorer.inputs.replace(' ', '-')}")
+    assert scorer.name == name
     scores = scorer.score(views)
     assert scores.shape == (40,)
     assert scores.dtype == np.float64
     assert np.isfinite(scores).all()
-    assert scorer.name == "fisher" or np.all((scores >= 0) & (scores <= 1))
+    assert name.startswith("fisher") or np.all((scores >= 0) & (scores <= 1))
     assert len(np.unique(scores)) > 15
     order = np.random.default_rng(0).permutation(40)
     np.testing.assert_allclose(scorer.score(views[order]), scores[order], rtol=1e-6)  # a pose's score is its own
@@ -145,7 +149,7 @@ def test_learned_scores_equal_the_network_by_hand(
     localization_map: LocalizationMap, views: Float, weights: Path
 ) -> None:
     scorer = load_scorer(weights, localization_map)
-    assert (scorer.name, scorer.inputs) == ("mlp", "2d+3d")
+    assert scorer.name == "mlp-2d+3d"
     binned = localization_map.bin_views(views)
     network = scorer.network
     mean = np.array(network.spec.statistics.mean, dtype=np.float32)[:, None, None]
@@ -172,7 +176,7 @@ def test_another_field_of_view_is_refused(localization_map: LocalizationMap, wei
 
 
 def test_unknown_methods_and_missing_weights_are_refused(localization_map: LocalizationMap, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"unknown method.*random, .*visible, bins, .*mlp"):
+    with pytest.raises(ConfigError, match=r"unknown method.*random, .*visible, bins, .*mlp-2d"):
         make_scorer("oracle", localization_map)
     with pytest.raises(ConfigError, match="needs weights"):
         make_scorer("mlp", localization_map)

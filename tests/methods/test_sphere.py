@@ -13,31 +13,34 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from sklearn.metrics import roc_auc_score
 
+from learning_options import changed, train_config
 from synthetic_dataset import CAMERA, make_dataset, make_landmarks, make_mapping_poses
 from wheretolook.dataset.folders import Dataset
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.geometry.lattices import axes_of_angles, fibonacci_sphere, yaw_pitch_angles
 from wheretolook.geometry.poses import camera_centers, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.learning.config import TrainConfig
 from wheretolook.learning.provenance import TrainedModel
-from wheretolook.learning.weights import METADATA_KEY, read_training, weights_kind
-from wheretolook.methods.mlp.weights import load_classifier
+from wheretolook.learning.trained_network import TrainedNetwork
+from wheretolook.learning.weights import METADATA_KEY, method_of_weights, read_training
+from wheretolook.methods.mlp.network import ViewpointNetwork
 from wheretolook.methods.registry import load_scorer, make_scorer
 from wheretolook.methods.sphere.config import SphereConfig
-from wheretolook.methods.sphere.learn import PITCHES, YAWS, SphereModel, SphereNetwork, on_lattice
+from wheretolook.methods.sphere.network import PITCHES, YAWS, SphereNetwork, on_lattice
 from wheretolook.methods.sphere.score import SphereScorer
 from wheretolook.methods.sphere.views import FEATURES, OFFSET_M, LocationDescriber, LocationLoader, load_sphere_views
 from wheretolook.stages.evaluate import evaluate_methods as evaluate
-from wheretolook.stages.train import train_variants as train
+from wheretolook.stages.train import train_methods as train
 from wheretolook.utils.errors import ConfigError, MapError, WeightsError
 from wheretolook.utils.tracking import client
 from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import is_good, poses, write_table
 from wheretolook.visibility.occlusion import StoredOcclusion
 
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
 FEW = SphereConfig(points=48, cameras=8, width=32, heads=2, layers=1, dropout=0.0, epochs=10, batch_size=40)
-SMALL = TrainConfig(("sphere",), accelerator="cpu", sphere=FEW)
+SMALL = train_config("sphere", accelerator="cpu", sphere=FEW)
 NAMES = {name: index for index, name in enumerate(FEATURES)}
 
 
@@ -48,10 +51,10 @@ def localization_map() -> LocalizationMap:
 
 
 @pytest.fixture
-def model() -> SphereModel:
+def model() -> TrainedNetwork[SphereNetwork]:
     """Untrained; its logits differ from direction to direction and from place to place."""
     torch.manual_seed(0)
-    return SphereModel(SphereNetwork(FEW), FEW, CAMERA, 1.5, -0.25).to("cpu")
+    return TrainedNetwork("sphere", SphereNetwork(FEW).requires_grad_(False), CAMERA, 1.5, -0.25)
 
 
 def at_angles(*yaw_pitch_deg: tuple[float, float]) -> torch.Tensor:
@@ -164,7 +167,7 @@ def test_batches_hold_whole_locations_and_every_view_once(tmp_path: Path, world_
     assert [batch.labels.tolist() for batch in fresh] == orders[0]
 
 
-def test_padding_does_not_count(localization_map: LocalizationMap, model: SphereModel) -> None:
+def test_padding_does_not_count(localization_map: LocalizationMap, model: TrainedNetwork[SphereNetwork]) -> None:
     (tokens,) = LocationDescriber(localization_map, FEW).describe(np.array([[0.3, 0.2, 1.0]]))
     alone = model.network.encode(tokens[None])
     padded = torch.cat([tokens, torch.full((5, len(FEATURES)), 7.0)])[None]
@@ -173,7 +176,7 @@ def test_padding_does_not_count(localization_map: LocalizationMap, model: Sphere
     assert (model.network.encode(padded) - alone).abs().max() > 1e-3
 
 
-def test_an_empty_share_of_a_batch_has_gradients(model: SphereModel) -> None:
+def test_an_empty_share_of_a_batch_has_gradients(model: TrainedNetwork[SphereNetwork]) -> None:
     network = SphereNetwork(FEW)
     tokens, padding = torch.empty(0, 4, len(FEATURES)), torch.empty(0, 4, dtype=torch.bool)
     logits = network(tokens, padding, torch.empty(0, dtype=torch.int64), torch.empty(0, 3))
@@ -217,7 +220,7 @@ def test_training_learns_where_the_landmarks_are_and_logs_a_run(
     run = client(tracking).get_run(trained.run_id)
     assert run.info.status == "FINISHED" and run.data.params["points"] == "48" and run.data.params["n_val"] == "800"
     assert len(client(tracking).get_metric_history(trained.run_id, "val_bce")) == FEW.epochs
-    views = load_sphere_views(dataset, dataset.split("val"), SMALL, progress=False)
+    views = load_sphere_views(dataset, dataset.split("val"), SMALL, FEW, progress=False)
     scene = dataset.split("val")[0]
     scores = load_scorer(trained.path, scene.localization_map(CAMERA)).score(poses(scene.read_table()))
     assert scores.mean() == pytest.approx(float(views.labels.mean()), abs=1e-3)  # calibrated on these
@@ -228,7 +231,7 @@ def test_what_was_learnt_is_reused_and_evaluated(
     learnt: tuple[Dataset, TrainedModel], tracking: TrackingConfig
 ) -> None:
     dataset, trained = learnt
-    (again,) = train(dataset, replace(SMALL, learning_rate=0.5), tracking, progress=False)
+    (again,) = train(dataset, changed(SMALL, learning_rate=0.5), tracking, progress=False)
     assert again.reused and again.path == trained.path  # the paper's network has its own learning rate
     config = EvaluateConfig(("visible", "sphere"), resamples=20, top_n=(1,))
     rows = evaluate(dataset, config, tracking, progress=False).query("scene == 'all'").set_index("method")
@@ -262,7 +265,7 @@ def test_the_same_seed_gives_the_same_weights(tmp_path: Path, tracking: Tracking
     assert train(dataset, replace(config, seed=1), tracking, progress=False)[0].path.read_bytes() != first
 
 
-def test_a_pose_has_its_own_score(localization_map: LocalizationMap, model: SphereModel) -> None:
+def test_a_pose_has_its_own_score(localization_map: LocalizationMap, model: TrainedNetwork[SphereNetwork]) -> None:
     rng = np.random.default_rng(2)
     locations = rng.uniform((-1, -1, 1), (1, 1, 2), (5, 3))
     mask = rng.random((5, 200)) < 0.5
@@ -285,21 +288,23 @@ def test_a_pose_has_its_own_score(localization_map: LocalizationMap, model: Sphe
     np.testing.assert_allclose(scorer.score(rolled), scores, rtol=1e-9)
 
 
-def test_weights_survive_the_disk(model: SphereModel, localization_map: LocalizationMap, tmp_path: Path) -> None:
+def test_weights_survive_the_disk(
+    model: TrainedNetwork[SphereNetwork], localization_map: LocalizationMap, tmp_path: Path
+) -> None:
     path = tmp_path / "weights" / "sphere.safetensors"
-    model.save(path, {"variant": "sphere"})
-    loaded = SphereModel.load(path)
-    assert (loaded.config, loaded.camera, loaded.scale, loaded.offset) == (FEW, CAMERA, 1.5, -0.25)
+    model.save(path, {"method": "sphere"})
+    loaded = TrainedNetwork.load(path, SphereNetwork, "sphere")
+    assert (loaded.network.config, loaded.camera, loaded.scale, loaded.offset) == (FEW, CAMERA, 1.5, -0.25)
     (tokens,) = LocationDescriber(localization_map, FEW).describe(np.zeros((1, 3)))
-    assert torch.equal(loaded.lattice_logits(tokens), model.lattice_logits(tokens))
+    assert torch.equal(loaded.network.encode(tokens[None]), model.network.encode(tokens[None]))
     content = path.read_bytes()
-    loaded.save(path, {"variant": "sphere"})
+    loaded.save(path, {"method": "sphere"})
     assert path.read_bytes() == content and [file.name for file in path.parent.iterdir()] == [path.name]
-    assert weights_kind(path) == "sphere" and read_training(path) == {"variant": "sphere"}
+    assert method_of_weights(path) == "sphere" and read_training(path) == {"method": "sphere"}
     scorer = load_scorer(path, localization_map)
-    assert isinstance(scorer, SphereScorer) and (scorer.name, scorer.inputs) == ("sphere", "")
+    assert isinstance(scorer, SphereScorer) and scorer.name == "sphere"
     with pytest.raises(WeightsError, match=r"sphere\.safetensors.*not of mlp"):
-        load_classifier(path)
+        TrainedNetwork.load(path, ViewpointNetwork, "mlp-2d")
     with pytest.raises(WeightsError, match="not of trees"):
         make_scorer("trees", localization_map, weights=path)
     wide = replace(localization_map, camera=replace(CAMERA, focal_px=CAMERA.focal_px / 2))
@@ -307,14 +312,14 @@ def test_weights_survive_the_disk(model: SphereModel, localization_map: Localiza
         load_scorer(path, wide)
 
 
-def test_unusable_weights_are_named(model: SphereModel, tmp_path: Path) -> None:
+def test_unusable_weights_are_named(model: TrainedNetwork[SphereNetwork], tmp_path: Path) -> None:
     path = tmp_path / "sphere.safetensors"
     model.save(path)
     tensors = load_file(path)
     with safe_open(path, framework="pt") as file:
         header = json.loads(file.metadata()[METADATA_KEY])
     for change, message in (
-        ({"kind": "mlp"}, "not of sphere"),
+        ({"method": "mlp-2d"}, "not of sphere"),
         ({"features": ["height"]}, "other tokens"),
         ({"options": {**header["options"], "width": 64}}, "do not fit"),
         ({"options": {**header["options"], "width": 33}}, "damaged description.*multiple of heads"),
@@ -323,7 +328,7 @@ def test_unusable_weights_are_named(model: SphereModel, tmp_path: Path) -> None:
     ):
         save_file(tensors, path, metadata={METADATA_KEY: json.dumps({**header, **change})})
         with pytest.raises(WeightsError, match=rf"sphere\.safetensors.*{message}"):
-            SphereModel.load(path)
+            TrainedNetwork.load(path, SphereNetwork, "sphere")
 
 
 @pytest.mark.parametrize("wrong", [{"points": 0}, {"cameras": 0}, {"layers": 0}, {"width": 30, "heads": 4},

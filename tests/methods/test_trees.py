@@ -12,22 +12,25 @@ import pytest
 import torch
 from safetensors.numpy import load_file, save_file
 
+from learning_options import changed, train_config
 from synthetic_dataset import CAMERA, make_dataset
 from wheretolook.dataset.folders import Dataset
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.inputs.landmarks_in_view import POOLED
-from wheretolook.learning.config import TrainConfig
-from wheretolook.learning.weights import METADATA_KEY, read_training, weights_kind
-from wheretolook.methods.mlp.weights import load_classifier
+from wheretolook.learning.trained_network import TrainedNetwork
+from wheretolook.learning.weights import METADATA_KEY, method_of_weights, read_training
+from wheretolook.methods.mlp.network import ViewpointNetwork
 from wheretolook.methods.registry import load_scorer, make_scorer
 from wheretolook.methods.trees.config import TreesConfig
 from wheretolook.methods.trees.learn import BoostedTrees, PooledViews, fit_trees, load_pooled
 from wheretolook.methods.trees.score import TreesScorer
 from wheretolook.stages.evaluate import evaluate_methods as evaluate
-from wheretolook.stages.train import train_variants as train
+from wheretolook.stages.train import train_methods as train
 from wheretolook.utils.errors import ConfigError, WeightsError
 from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import is_good, poses
+
+pytestmark = pytest.mark.usefixtures("no_pictures")
 
 FEW = TreesConfig(max_trees=20, max_leaves=7, min_leaf=5)
 
@@ -114,15 +117,15 @@ def test_a_statistic_that_is_never_known_is_not_asked_for() -> None:
 
 def test_trees_come_back_from_disk(trees: BoostedTrees, tmp_path: Path) -> None:
     path = tmp_path / "weights" / "trees.safetensors"
-    trees.save(path, {"variant": "trees"})
+    trees.save(path, {"method": "trees"})
     views = torch.from_numpy(some_views(300, 2).values)
     torch.testing.assert_close(BoostedTrees.load(path).logits(views), trees.logits(views), rtol=0, atol=0)
     content = path.read_bytes()
-    BoostedTrees.load(path).save(path, {"variant": "trees"})
+    BoostedTrees.load(path).save(path, {"method": "trees"})
     assert path.read_bytes() == content
-    assert weights_kind(path) == "trees" and read_training(path) == {"variant": "trees"}
+    assert method_of_weights(path) == "trees" and read_training(path) == {"method": "trees"}
     with pytest.raises(WeightsError, match=r"trees.safetensors.*not of mlp"):
-        load_classifier(path)
+        TrainedNetwork.load(path, ViewpointNetwork, "mlp-2d")
 
 
 def test_damaged_trees_are_named(trees: BoostedTrees, tmp_path: Path) -> None:
@@ -131,7 +134,7 @@ def test_damaged_trees_are_named(trees: BoostedTrees, tmp_path: Path) -> None:
     arrays = load_file(path)
     header = {"format_version": 1, "kind": "trees", "features": list(POOLED), "camera": vars(CAMERA),
               "depth": trees.depth, "baseline": 0.0, "scale": 1.0, "offset": 0.0}  # fmt: skip
-    for wrong, changed, message in (
+    for wrong, other, message in (
         ({"left": np.full_like(arrays["left"], 10**6)}, {}, "lead out of"),
         ({"value": arrays["value"][:-1]}, {}, "lead out of"),
         ({"feature": np.full_like(arrays["feature"], 200)}, {}, "lead out of"),
@@ -139,8 +142,8 @@ def test_damaged_trees_are_named(trees: BoostedTrees, tmp_path: Path) -> None:
         ({}, {"kind": "mlp"}, "not of trees"),
         ({}, {"camera": {"width": 3}}, "damaged description"),
     ):
-        save_file({**arrays, **wrong}, path, metadata={METADATA_KEY: json.dumps({**header, **changed})})
-        if changed.get("camera"):
+        save_file({**arrays, **wrong}, path, metadata={METADATA_KEY: json.dumps({**header, **other})})
+        if other.get("camera"):
             header_of_camera = {**header, "camera": {"breadth": 3}}
             save_file(arrays, path, metadata={METADATA_KEY: json.dumps(header_of_camera)})
         with pytest.raises(WeightsError, match=message) as error:
@@ -157,18 +160,18 @@ def test_options_that_are_none(wrong: dict[str, float]) -> None:
 def test_trees_are_trained_and_evaluated(tmp_path: Path) -> None:
     dataset = make_dataset(tmp_path / "tiny", ("train", "train", "test", "val"), n_locations=14, n_directions=16)
     tracking = TrackingConfig(str(tmp_path / "mlruns"))
-    config = TrainConfig(("trees", "2d"), epochs=2, hidden=(16,), accelerator="cpu", trees=FEW)
+    config = train_config("trees", "mlp-2d", epochs=2, hidden=(16,), accelerator="cpu", trees=FEW)
     trees, network = train(dataset, config, tracking, progress=False)
     assert trees.path == dataset.root / "weights" / "trees.safetensors"
-    again = train(dataset, replace(config, learning_rate=0.5, epochs=3), tracking, progress=False)
+    again = train(dataset, changed(config, learning_rate=0.5, epochs=3), tracking, progress=False)
     assert again[0].reused and not again[1].reused  # a network's options do not matter to trees
-    assert not train(dataset, replace(config, trees=replace(FEW, l2=3.0)), tracking, progress=False)[0].reused
+    assert not train(dataset, changed(config, trees=replace(FEW, l2=3.0)), tracking, progress=False)[0].reused
 
     methods = ("visible", "trees", "mlp")
     table = evaluate(dataset, EvaluateConfig(methods, resamples=50), tracking, progress=False)
     rows = table[(table["scene"] == "all") & (table["top_n"] == 1)].set_index("method")
     assert rows.loc["trees", "roc_auc"] > 0.9 and 0 <= rows.loc["trees", "ece"] < 0.5
-    assert {*rows.index} == {"visible", "trees", "mlp", "oracle"}
+    assert {*rows.index} == {"visible", "trees", "mlp-2d", "oracle"}
     named = evaluate(
         dataset,
         EvaluateConfig(("visible", "trees"), (trees.path, network.path), resamples=50),
@@ -186,11 +189,11 @@ def test_trees_are_trained_and_evaluated(tmp_path: Path) -> None:
 def test_the_scorer_is_the_trees_on_pooled_views(tmp_path: Path) -> None:
     dataset = make_dataset(tmp_path / "tiny", ("train", "val"), n_locations=10, n_directions=12)
     tracking = TrackingConfig(str(tmp_path / "mlruns"))
-    (model,) = train(dataset, TrainConfig(("trees",), accelerator="cpu", trees=FEW), tracking, progress=False)
+    (model,) = train(dataset, train_config("trees", accelerator="cpu", trees=FEW), tracking, progress=False)
     scene = dataset.scenes[1]
     localization_map = scene.localization_map(dataset.camera)
     scorer = load_scorer(model.path, localization_map)
-    assert isinstance(scorer, TreesScorer) and (scorer.name, scorer.inputs) == ("trees", "")
+    assert isinstance(scorer, TreesScorer) and scorer.name == "trees"
     views = load_pooled(Dataset(dataset.root, dataset.camera, (scene,)), [scene], (0.05, 0.4), progress=False)
     table = scene.read_table()
     np.testing.assert_array_equal(views.labels, is_good(table))

@@ -8,15 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from methods.test_scorers import NO_STATISTICS, some_convolutions, some_trees
-from planning.rooms import CAMERA, DIRECTIONS, GRID, build, free_voxels, joined, occlusion, room_landmarks, room_map
+from methods.test_scorers import weights_of
+from planning.rooms import DIRECTIONS, GRID, build, free_voxels, joined, occlusion, room_landmarks, room_map
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.methods.matchability.learn import Matchability
-from wheretolook.methods.registry import SCORERS, WEIGHTS_OF, make_scorer
-from wheretolook.methods.set.learn import SetModel
-from wheretolook.methods.set.network import MatchabilityNetwork, SetNetwork
+from wheretolook.methods.registry import make_scorer, scorers
 from wheretolook.planning.map_building import build_viewpoint_map, update_viewpoint_map
 from wheretolook.planning.path_comparison import shares_below
 from wheretolook.planning.viewpoint_map import ViewpointMap
@@ -143,7 +140,7 @@ def test_derived_maps_are_not_updated() -> None:
         update_viewpoint_map(shares_below(build(OLD)), scorer)
 
 
-@pytest.mark.parametrize("method", [name for name in SCORERS if name not in WEIGHTS_OF])
+@pytest.mark.parametrize("method", [name for name, known in scorers().items() if not known.weights])
 def test_methods_that_call_themselves_local_are(method: str) -> None:
     landmarks = joined(OLD, seen_by_some())
     old, new = (make_scorer(method, room_map(of)) for of in (OLD, landmarks))
@@ -158,15 +155,8 @@ def test_methods_that_call_themselves_local_are(method: str) -> None:
 
 @pytest.mark.parametrize("method", ["trees", "conv", "set", "expected-bins", "fisher-trace-expected"])
 def test_methods_that_have_learnt_update_as_if_built_anew(method: str, tmp_path: Path) -> None:
-    weights, landmarks = tmp_path / "some.safetensors", joined(OLD, seen_by_some())
-    if method == "trees":
-        some_trees(room_map(OLD)).save(weights)
-    elif method == "conv":
-        some_convolutions().save(weights)
-    elif method == "set":
-        SetModel(SetNetwork(NO_STATISTICS, pooled=2), CAMERA).save(weights)
-    else:
-        Matchability(MatchabilityNetwork(NO_STATISTICS), CAMERA).save(weights)
+    landmarks, needed = joined(OLD, seen_by_some()), scorers()[method].weights
+    weights = weights_of(needed, tmp_path / "some.safetensors", room_map(OLD))
     before, after = (make_scorer(method, room_map(of), weights=weights) for of in (OLD, landmarks))
     old = build_viewpoint_map(before, GRID, free_voxels(), DIRECTIONS)
     new, changed = update_viewpoint_map(old, after)

@@ -56,7 +56,7 @@ def test_every_direction_of_every_free_voxel_has_its_score_and_count(viewpoint_m
     order = np.lexsort([np.tile(np.arange(60), (len(centers), 1)), -scores.reshape(-1, 60)], axis=1)
     np.testing.assert_array_equal(viewpoint_map.ranked, order)
     origin = viewpoint_map.origin
-    assert (origin.scorer, origin.inputs, origin.lattice, origin.occlusion) == ("bins", "", "fibonacci", "mesh")
+    assert (origin.scorer, origin.lattice, origin.occlusion) == ("bins", "fibonacci", "mesh")
     assert origin.camera == {"model": "PINHOLE", "width": 160, "height": 120, "params": [80.0, 80.0, 80.0, 60.0]}
     assert CAMERA.matrix[0, 2] == 80
 

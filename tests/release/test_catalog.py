@@ -76,6 +76,7 @@ def test_all_that_has_a_run_is_written_and_attached(store: tuple[Dataset, Tracki
     assert "fully connected 4500 × 300" in (tmp_path / "architecture.md").read_text()
 
 
+@pytest.mark.slow
 def test_scenes_of_the_release_are_drawn_with_the_runs_of_their_weights(tmp_path: Path) -> None:
     release, tracking = Dataset.load(RELEASE), TrackingConfig(str(tmp_path / "mlruns"))
     runs = log_release(release, tracking).train
@@ -84,7 +85,7 @@ def test_scenes_of_the_release_are_drawn_with_the_runs_of_their_weights(tmp_path
     notes = {name: note_of(tmp_path / "out" / f"{name}.png") for name in drawn}
     assert notes == {
         "pipeline": f"runs: {runs['set']} (train)", "peaks": f"runs: {runs['set']} (train)",
-        "learning": f"runs: {runs['2d+z']} (train)", "inputs": f"runs: {runs['2d+z']} (train)",
+        "learning": f"runs: {runs['mlp-2d+z']} (train)", "inputs": f"runs: {runs['mlp-2d+z']} (train)",
         "viewpoint_generation": "",
     }  # fmt: skip
     showcase, quick = open_showcase(release), PlanConfig(grid=(4, 4, 2), directions=40, planner=PathConfig(time_s=2.0))
@@ -114,7 +115,7 @@ def test_the_command_says_what_is_missing(
     printed = capsys.readouterr()
     assert "training" in printed.err and "wheretolook train --config configs/release.yaml" in printed.err
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["top_n.png"]
-    history().assign(variant="2d+3d").to_csv(tmp_path / "data" / "release" / "results" / "training.csv", index=False)
+    history().assign(method="mlp-2d+3d").to_csv(tmp_path / "data" / "release" / "results" / "training.csv", index=False)
     assert main([*command, "[top_n, training]"]) == 0
     assert (tmp_path / "out" / "training.png").is_file()
     assert main(["log-release", "--config", str(config)]) == 0
@@ -145,8 +146,8 @@ def test_marks_of_several_viewpoints_are_the_tables() -> None:
     pooled = scores[scores["scene"] == ALL]
     for panel, column in ((panels[0], "normalized_0.05m_0.4deg"), (panels[7], "any_5m_10deg")):
         lines = {line.get_label(): line.get_ydata() for line in panel.lines}
-        for method in (("random", ""), ("bins", ""), ("fisher", "trace exact"), ("mlp", "2d")):
-            rows = pooled[(pooled["method"] == method[0]) & (pooled["inputs"] == method[1])]
+        for method in ("random", "bins", "fisher-trace-exact", "mlp-2d"):
+            rows = pooled[pooled["method"] == method]
             assert lines[method_style(*method).label] == pytest.approx(100 * rows[column])
     printed = {line.get_marker(): line.get_ydata()[0] for line in panels[0].lines if len(line.get_ydata()) == 1}
     assert printed == {"D": 72.9, "s": 54.7}
@@ -170,7 +171,7 @@ def test_paper_tables_for_reading(store: tuple[Dataset, TrackingConfig]) -> None
 
 
 def test_layers_are_those_that_were_trained() -> None:
-    small = paper_architecture_table({"variant": "2d", "bins": "10", "hidden": "[50]", "dropout": "0.2"})
+    small = paper_architecture_table({"method": "mlp-2d", "bins": "10", "hidden": "[50]", "dropout": "0.2"})
     assert small["here"].tolist()[:5] == ["fully connected 200 × 50", "ReLU", "dropout 0.2", "fully connected 50 × 1",
                                           "Sigmoid"]  # fmt: skip
     assert small["layer"].tolist() == ["1", "1.1", "1.2", "2", "2.1", "2.2", "3", "3.1"]

@@ -13,6 +13,7 @@ import pandas as pd
 import pytest
 from sklearn.metrics import roc_auc_score
 
+from learning_options import changed, train_config
 from synthetic_dataset import CAMERA, make_dataset
 from wheretolook import stages
 from wheretolook.cli import main, parse_experiment
@@ -20,10 +21,11 @@ from wheretolook.config import Experiment, MeshSource, ScenesConfig
 from wheretolook.dataset.folders import RELEASE, RELEASE_FILE, Dataset
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.report import score_markdown
-from wheretolook.learning.config import TrainConfig
 from wheretolook.learning.data import load_views
+from wheretolook.learning.trained_network import TrainedNetwork
+from wheretolook.learning.weights import save_in_half
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.methods.mlp.weights import load_classifier
+from wheretolook.methods.mlp.network import ViewpointNetwork
 from wheretolook.methods.registry import load_scorer, make_scorer
 from wheretolook.methods.set.config import SetConfig
 from wheretolook.methods.trees.config import TreesConfig
@@ -31,14 +33,17 @@ from wheretolook.release import copy as releases
 from wheretolook.release.card import release_card
 from wheretolook.stages.evaluate import evaluate_methods as evaluate
 from wheretolook.stages.release import release_settings
-from wheretolook.stages.train import train_variants as train
+from wheretolook.stages.train import train_methods as train
 from wheretolook.utils.errors import ConfigError, StorageError, TableError, WeightsError
 from wheretolook.utils.files import write_json
 from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import is_good, poses, write_table
 from wheretolook.visibility.occlusion import StoredOcclusion
 
-TRAIN = TrainConfig(("2d", "2d+z"), epochs=3, hidden=(16,), accelerator="cpu")
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
+TRAIN = train_config("mlp-2d", "mlp-2d+z", epochs=3, hidden=(16,), accelerator="cpu")
+EVALUATE = EvaluateConfig(("random", "visible", "bins", "fisher-trace-exact", "mlp"), resamples=100, top_n=(1, 5))
 CONFIGS = Path(__file__).parents[1] / "configs"
 VERSIONS = {"numpy": "2.9.9", "pycolmap": "4.1.0"}
 
@@ -60,7 +65,7 @@ def label_stamped(root: Path, **options: int) -> Dataset:
 def experiment_of(folder: Path, name: str = "tiny") -> Experiment:
     return Experiment(
         name=name, data=folder / "data", device="cpu", camera=CAMERA, train=TRAIN,
-        scenes=ScenesConfig(train=2, test=2, seed=70), evaluate=EvaluateConfig(resamples=100, top_n=(1, 5)),
+        scenes=ScenesConfig(train=2, test=2, seed=70), evaluate=EVALUATE,
         tracking=TrackingConfig(str(folder / "mlruns")),
     )  # fmt: skip
 
@@ -133,9 +138,13 @@ def test_a_release_leaves_matches_out(tmp_path: Path) -> None:
     assert releases_of[0] == releases_of[1]
 
 
+def load(path: Path) -> ViewpointNetwork:
+    return TrainedNetwork.load(path, ViewpointNetwork, "mlp-2d", "mlp-2d+z").network
+
+
 def test_a_release_scores_as_the_original(finished: Path, tmp_path: Path) -> None:
     """The same weights, in half precision too, on both."""
-    config, tracking = EvaluateConfig(resamples=50), TrackingConfig(str(tmp_path / "mlruns"))
+    config, tracking = replace(EVALUATE, resamples=50), TrackingConfig(str(tmp_path / "mlruns"))
     root = finished / "data" / "release"
     original, release = Dataset.load(finished / "data" / "tiny"), Dataset.load(root)
     shutil.copytree(root, tmp_path / "release")
@@ -150,12 +159,10 @@ def test_a_release_scores_as_the_original(finished: Path, tmp_path: Path) -> Non
 
     halved = weights.with_name("half.safetensors")
     shutil.copyfile(weights, halved)
-    from wheretolook.methods.mlp.weights import save_classifier
-
-    save_classifier(load_classifier(halved).half(), halved)
+    save_in_half(halved)
     assert halved.stat().st_size < 0.55 * weights.stat().st_size
-    for name, value in load_classifier(halved).state_dict().items():
-        np.testing.assert_allclose(value, load_classifier(weights).state_dict()[name], rtol=5e-4, atol=1e-7)
+    for name, value in load(halved).state_dict().items():
+        np.testing.assert_allclose(value, load(weights).state_dict()[name], rtol=5e-4, atol=1e-7)
         assert str(value.dtype) == "torch.float32" or name.endswith("index")
     rounded = evaluate(release, config, tracking, [halved], progress=False)
     np.testing.assert_allclose(rounded[shares], tables[1][shares], atol=0.02)
@@ -176,7 +183,7 @@ def test_the_best_on_validation_ships(finished: Path) -> None:
     # the record still fits, so that training again reuses what ships
     models = train(
         Dataset.load(finished / "data" / "release"),
-        replace(TRAIN, variants=(shipped.stem.removeprefix("mlp-"),)),
+        changed(TRAIN, methods=(shipped.stem,)),
         TrackingConfig(str(finished / "mlruns")),
         progress=False,
     )
@@ -186,20 +193,23 @@ def test_the_best_on_validation_ships(finished: Path) -> None:
 def test_what_is_best_of_all_ships_beside_the_network(folder: Path, tmp_path: Path) -> None:
     root = folder / "data" / "release"
     release, tracking = Dataset.load(root), TrackingConfig(str(folder / "mlruns"))
-    few = replace(TRAIN, set=SetConfig(epochs=4, batch_size=32), trees=TreesConfig(max_trees=3, min_leaf=5))
-    train(release, replace(few, variants=("set", "trees")), tracking, progress=False)
+    few = replace(TRAIN, set=SetConfig(epochs=4, batch_size=16), trees=TreesConfig(max_trees=3, min_leaf=5))
+    train(release, changed(few, methods=("set", "trees")), tracking, progress=False)
     records = {name: root / "weights" / f"{name}.json" for name in ("set", "trees")}
     for name, precision in (("set", 0.9999), ("trees", 0.5)):  # whatever they have learnt from so little
         record = json.loads(records[name].read_text())
         record["metrics"]["val_average_precision"] = precision
         records[name].write_text(json.dumps(record))
-    stages.release(experiment_of(folder, "release"), say=quiet)
+    experiment = replace(
+        experiment_of(folder, "release"), evaluate=replace(EVALUATE, methods=(*EVALUATE.methods, "set"))
+    )
+    stages.release(experiment, say=quiet)
     (network,) = (path for path in (root / "weights").glob("mlp-*.safetensors"))
     assert sorted(path.name for path in (root / "weights").glob("*.safetensors")) == [network.name, "set.safetensors"]
     assert (root / "weights" / releases.SHELF / "trees.safetensors").is_file()
     scores, variants = (pd.read_csv(root / "results" / f"{name}.csv") for name in ("scores", "variants"))
-    assert {"mlp", "set"} <= {*scores["method"]} and "trees" not in {*scores["method"]}
-    assert {"mlp", "set", "trees"} <= {*variants["method"]}
+    assert {network.stem, "set"} <= {*scores["method"]} and "trees" not in {*scores["method"]}
+    assert {network.stem, "set", "trees"} <= {*variants["method"]}
     card = (root / "README.md").read_text()
     assert card == card_of(release)
     for said in (f"{network.name} and set.safetensors", "set of landmarks; and of the paper's best network", "0.9999"):
@@ -207,7 +217,7 @@ def test_what_is_best_of_all_ships_beside_the_network(folder: Path, tmp_path: Pa
     scorer = load_scorer(root / "weights", release.scenes[0].localization_map(release.camera))
     assert scorer.name == "set"
     before = contents(root)
-    stages.release(experiment_of(folder, "release"), say=quiet)
+    stages.release(experiment, say=quiet)
     assert contents(root) == before
 
 
@@ -229,7 +239,6 @@ def test_the_card_tells_what_lies_there(folder: Path, monkeypatch: pytest.Monkey
     root = folder / "data" / "release"
     release, card = Dataset.load(root), (root / "README.md").read_text()
     scores = pd.read_csv(root / "results" / "scores.csv", keep_default_na=False, na_values=[""])
-    scores["inputs"] = scores["inputs"].fillna("")
     tables = [line for line in score_markdown(scores).splitlines() if line.startswith("|")]
     assert len(tables) > 15 and all(line in card for line in tables)
     row = scores[(scores["method"] == "random") & (scores["scene"] == "all") & (scores["top_n"] == 1)].iloc[0]
@@ -377,6 +386,7 @@ def test_the_shipped_best_scorer_scores_as_the_card_says(shipped: Dataset) -> No
     assert abs(views.mean() - good.mean()) < 0.03
 
 
+@pytest.mark.slow
 def test_the_shipped_weights_score_as_the_card_says(shipped: Dataset, tmp_path: Path) -> None:
     shutil.copytree(shipped.root, tmp_path / "data" / "release")
     experiment = parse_experiment(
@@ -387,10 +397,8 @@ def test_the_shipped_weights_score_as_the_card_says(shipped: Dataset, tmp_path: 
     )  # fmt: skip
     assert experiment is not None
     scores = stages.evaluate(experiment, say=quiet)
-    said = pd.read_csv(shipped.root / "results" / "scores.csv").fillna({"inputs": ""})
-    said = (
-        said[said["occlusion"] == "mesh"].merge(scores[["method", "inputs"]].drop_duplicates()).reset_index(drop=True)
-    )
+    said = pd.read_csv(shipped.root / "results" / "scores.csv")
+    said = said[said["occlusion"] == "mesh"].merge(scores[["method"]].drop_duplicates()).reset_index(drop=True)
     # what is compared with the reference is another here: that of the card is not among the methods
     random = "(raw|normalized|any|regret)_(low|high)_|difference_|good_|p_|reference"
     exact = [name for name in said if not re.match(random, name)]

@@ -20,13 +20,7 @@ from wheretolook.release.notebook import open_store
 from wheretolook.release.runs import ReleaseRuns, log_release
 from wheretolook.stages.evaluate import evaluate_methods as evaluate
 from wheretolook.utils.errors import MissingRunError
-from wheretolook.utils.tracking import (
-    client,
-    experiment_ids,
-    finished_runs,
-    newest_artifact,
-    newest_run,
-)
+from wheretolook.utils.tracking import client, experiment_ids, finished_runs, newest_artifact, newest_run
 from wheretolook.utils.tracking_config import TrackingConfig
 
 PAGE = Path(__file__).parents[1] / "mlruns" / "README.md"
@@ -58,7 +52,7 @@ def children(tracking: TrackingConfig, parent: str) -> dict[str, tuple[dict[str,
 
 def test_every_kind_of_result_becomes_a_run_once(logged: tuple[Dataset, TrackingConfig, ReleaseRuns]) -> None:
     release, tracking, runs = logged
-    assert [*runs.evaluate] == ["release", "interiors"] and [*runs.train] == ["2d+3d"]
+    assert [*runs.evaluate] == ["release", "interiors"] and [*runs.train] == ["mlp-2d+3d"]
     ids = [*runs.evaluate.values(), *runs.train.values(), runs.learners, runs.paths, runs.benchmark]
     assert None not in ids and len({*ids}) == runs.new == 6
     again = log_release(release, tracking)
@@ -77,9 +71,9 @@ def test_rows_over_all_scenes_are_nested(logged: tuple[Dataset, TrackingConfig, 
     scores = read_scores(release.root / "results" / "scores.csv")
     nested = children(tracking, runs.evaluate["release"])
     assert len(nested) == 2 * (len(METHODS) + 1)
-    params, metrics = nested["mlp 2d+z (none)"]
+    params, metrics = nested["mlp-2d+z (none)"]
     assert params["occlusion"] == "none" and params["dataset"] == "release" and params["scenes"] == "scene-0 scene-1"
-    rows = scores.query("method == 'mlp' and inputs == '2d+z' and occlusion == 'none'").set_index(["top_n", "scene"])
+    rows = scores.query("method == 'mlp-2d+z' and occlusion == 'none'").set_index(["top_n", "scene"])
     for n in (1, 5, 10):
         assert metrics[f"top-{n}/raw_0.05m_0.4deg"] == rows.loc[(n, "all"), "raw_0.05m_0.4deg"]
         assert metrics[f"top-{n}/scene-1/regret_5m_10deg"] == rows.loc[(n, "scene-1"), "regret_5m_10deg"]
@@ -125,18 +119,18 @@ def test_only_what_is_new_is_logged(store: tuple[Dataset, TrackingConfig]) -> No
 def test_histories_travel_with_a_release(store: tuple[Dataset, TrackingConfig]) -> None:
     release, tracking = store
     assert histories(tracking, "release") == {}
-    history().assign(variant="2d+3d").to_csv(release.root / "results" / "training.csv", index=False)
-    run = log_release(release, tracking).train["2d+3d"]
+    history().assign(method="mlp-2d+3d").to_csv(release.root / "results" / "training.csv", index=False)
+    run = log_release(release, tracking).train["mlp-2d+3d"]
     assert log_release(release, tracking).new == 0
     (found,) = histories(tracking, "release").values()
     pd.testing.assert_frame_equal(found, history())
     steps = client(tracking).get_metric_history(run, "val_average_precision")
     assert [(step.step, step.value) for step in steps] == [(0, 0.5), (1, 0.75), (2, 0.7)]
     assert trained(tracking, "release").iloc[0].to_dict() | {"calibration_error": None} == {
-        "variant": "2d+3d", "epoch": 1, "average_precision": 0.75, "roc_auc": 0.8, "calibration_error": None,
+        "method": "mlp-2d+3d", "epoch": 1, "average_precision": 0.75, "roc_auc": 0.8, "calibration_error": None,
     }  # fmt: skip
     (release.root / "results" / "training.csv").unlink()  # and from the store back into the release
-    pd.testing.assert_frame_equal(keep_histories(release, tracking).drop(columns="variant"), history())
+    pd.testing.assert_frame_equal(keep_histories(release, tracking).drop(columns="method"), history())
     assert (release.root / "results" / "training.csv").is_file()
 
 
@@ -165,7 +159,7 @@ def test_notebooks_open_a_filled_store(
     monkeypatch.setenv("WHERETOLOOK_RELEASE", str(logged[0].root))
     tracking = open_store()
     assert tracking.root == tmp_path / "mlruns"
-    assert newest_run(tracking, "train", params={"variant": "2d+3d"}, file="mlp-2d+3d.json") is not None
+    assert newest_run(tracking, "train", params={"method": "mlp-2d+3d"}, file="mlp-2d+3d.json") is not None
     assert newest_run(tracking, "train", file=HISTORY_CSV) is None
     with pytest.raises(MissingRunError, match="no run of train with nothing"):
         newest_artifact(tracking, "train", "nothing")

@@ -16,10 +16,11 @@ from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
 from wheretolook.inputs.bins import InputStatistics
+from wheretolook.learning.trained_network import TrainedNetwork
 from wheretolook.mapping.cameras import save_mapping_poses
 from wheretolook.methods.base import Scorer
+from wheretolook.methods.binned_network import BinnedNetworkScorer
 from wheretolook.methods.mlp.network import NetworkSpec, ViewpointNetwork
-from wheretolook.methods.mlp.score import LearnedScorer
 from wheretolook.methods.visible import VisibleScorer
 from wheretolook.release.showcase import Showcase, open_showcase
 from wheretolook.release.showcase_figures import (
@@ -220,8 +221,8 @@ def test_the_mistaken_location_is_where_scores_are_farthest_from_labels(showcase
 
 def test_learning_follows_the_best_and_the_worst_view(showcase: Showcase) -> None:
     statistics = InputStatistics(("u", "v"), (48.0, 36.0), (20.0, 20.0))
-    network = ViewpointNetwork(NetworkSpec("2d", CAMERA, statistics, bins=6))
-    scorer = LearnedScorer(showcase.localization_map, network)
+    network = TrainedNetwork("mlp-2d", ViewpointNetwork(NetworkSpec(statistics, bins=6)), CAMERA)
+    scorer = BinnedNetworkScorer(showcase.localization_map, network)
     location = showcase.instructive_location()
     rows = showcase.viewpoints(location)
     scores = scorer.score(poses(rows))

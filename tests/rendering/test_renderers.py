@@ -256,6 +256,7 @@ def _render_in_worker(seed):
     return WarpRenderer(random_triangles(seed)).render(camera, LOOK_ALONG_Y).rgb
 
 
+@pytest.mark.slow
 def test_renders_in_spawned_processes():
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
         images = list(pool.map(_render_in_worker, [0, 1]))

@@ -12,15 +12,15 @@ import pandas as pd
 import pytest
 from scipy.special import expit, logit
 
+from learning_options import train_config
 from synthetic_dataset import make_dataset
 from wheretolook.dataset.folders import Dataset
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.results import latest_scores
-from wheretolook.learning.config import TrainConfig
 from wheretolook.methods.registry import load_scorer
 from wheretolook.methods.visible import VisibleScorer
 from wheretolook.stages.evaluate import evaluate_methods as evaluate
-from wheretolook.stages.train import train_variants as train
+from wheretolook.stages.train import train_methods as train
 from wheretolook.utils.errors import ConfigError, SceneError, TableError, WeightsError
 from wheretolook.utils.tracking import (
     artifact,
@@ -34,7 +34,10 @@ from wheretolook.utils.tracking import (
 from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import UNLABELLED, is_good, poses, write_table
 
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
 CONFIG = EvaluateConfig(("random", "visible", "bins", "mlp"), resamples=100, top_n=(1, 5))
+TWO = train_config("mlp-2d", "mlp-2d+z", epochs=2, hidden=(16,), accelerator="cpu")
 RULES = replace(CONFIG, methods=("random", "visible", "bins"))
 
 
@@ -51,21 +54,23 @@ def test_evaluation_writes_prints_and_logs(
     cwd.mkdir()
     monkeypatch.chdir(cwd)
     tracking = TrackingConfig(str(tmp_path / "mlruns"), "tiny")
-    models = train(dataset, TrainConfig(("2d", "2d+z"), epochs=2, hidden=(16,), accelerator="cpu"), tracking, False)
+    models = train(
+        dataset, train_config("mlp-2d", "mlp-2d+z", epochs=2, hidden=(16,), accelerator="cpu"), tracking, False
+    )
     table = evaluate(dataset, CONFIG, tracking, models=models, progress=True)
     assert {*table["occlusion"]} == {"mesh"} and {*table["candidates"]} == {"all"}
-    assert list(table)[:5] == ["method", "inputs", "occlusion", "candidates", "top_n"]
-    methods = {("random", ""), ("visible", ""), ("bins", ""), ("mlp", "2d"), ("mlp", "2d+z"), ("oracle", "")}
-    assert {*zip(table["method"], table["inputs"], strict=True)} == methods
+    assert list(table)[:4] == ["method", "occlusion", "candidates", "top_n"]
+    methods = {"random", "visible", "bins", "mlp-2d", "mlp-2d+z", "oracle"}
+    assert {*table["method"]} == methods
     assert {*table["scene"]} == {"all", "scene-2", "scene-3"}
     assert len(table) == 6 * 2 * 3
 
-    pooled = table[table["scene"] == "all"].set_index(["method", "inputs", "top_n"])
+    pooled = table[table["scene"] == "all"].set_index(["method", "top_n"])
     labels = pd.concat([scene.read_table() for scene in dataset.split("test")])
-    assert pooled.loc[("random", "", 1)]["raw_0.05m_0.4deg"] == pytest.approx(is_good(labels).mean())
+    assert pooled.loc[("random", 1)]["raw_0.05m_0.4deg"] == pytest.approx(is_good(labels).mean())
     # labels follow the number of filled bins, scene by scene
     assert table[(table["method"] == "bins") & (table["scene"] != "all")]["roc_auc"].min() == pytest.approx(1)
-    assert pooled.loc[("bins", "", 1)]["normalized_0.05m_0.4deg"] == 1
+    assert pooled.loc[("bins", 1)]["normalized_0.05m_0.4deg"] == 1
     shares = [name for name in table.columns if name.startswith(("raw", "normalized", "any"))]
     assert ((table[shares] >= 0) & (table[shares] <= 1)).all(axis=None)
     for key in ("0.05m_0.4deg", "5m_10deg"):
@@ -86,11 +91,11 @@ def test_evaluation_writes_prints_and_logs(
     assert parent is not None
     parent_id = parent.info.run_id
     runs = client(tracking).search_runs([parent.info.experiment_id], f"tags.mlflow.parentRunId = '{parent_id}'")
-    assert {(run.data.params["method"], run.data.params["inputs"]) for run in runs} == {*methods}
+    assert {run.data.params["method"] for run in runs} == {*methods}
     assert len(runs) == 6
     for run, n in ((run, n) for run in runs for n in (1, 5)):
         params, metrics = run.data.params, run.data.metrics
-        row = pooled.loc[(params["method"], params["inputs"], n)]
+        row = pooled.loc[(params["method"], n)]
         assert run.info.status == "FINISHED"
         assert metrics[f"top-{n}/raw_0.25m_2deg"] == pytest.approx(row["raw_0.25m_2deg"])
         assert metrics["average_precision"] == pytest.approx(row["average_precision"])
@@ -107,8 +112,7 @@ def test_evaluation_writes_prints_and_logs(
         assert {"split", "seed", "thresholds", "weights", "reference", "dataset_fingerprint"} <= set(params)
         for scene in ("scene-2", "scene-3"):
             (part,) = table[
-                (table[["method", "inputs"]] == [params["method"], params["inputs"]]).all(axis=1)
-                & (table["top_n"] == n) & (table["scene"] == scene)
+                (table["method"] == params["method"]) & (table["top_n"] == n) & (table["scene"] == scene)
             ].to_dict("records")  # fmt: skip
             assert metrics[f"top-{n}/{scene}/regret_0.05m_0.4deg"] == pytest.approx(part["regret_0.05m_0.4deg"])
     # the README's search finds the best of them, which is no oracle
@@ -119,7 +123,7 @@ def test_evaluation_writes_prints_and_logs(
         [parent.info.experiment_id], query, order_by=["metrics.`top-1/regret_0.05m_0.4deg`"], max_results=1
     )
     assert best.data.params["method"] != "oracle"
-    assert best.data.metrics["top-1/regret_0.05m_0.4deg"] == pooled.loc["bins", "", 1]["regret_0.05m_0.4deg"] == 0
+    assert best.data.metrics["top-1/regret_0.05m_0.4deg"] == pooled.loc[("bins", 1)]["regret_0.05m_0.4deg"] == 0
     artifacts = Path(parent.info.artifact_uri)
     assert {path.name for path in artifacts.iterdir()} == {path.name for path in results.iterdir()}
     assert not list(cwd.iterdir())
@@ -140,7 +144,7 @@ def test_evaluation_writes_prints_and_logs(
 
 def test_learned_methods_are_calibrated_on_the_val_scenes(dataset: Dataset, tmp_path: Path) -> None:
     tracking = TrackingConfig(str(tmp_path / "mlruns"))
-    (model,) = train(dataset, TrainConfig(("2d+z",), epochs=2, hidden=(16,), accelerator="cpu"), tracking, False)
+    (model,) = train(dataset, train_config("mlp-2d+z", epochs=2, hidden=(16,), accelerator="cpu"), tracking, False)
     config = replace(CONFIG, methods=("bins", "mlp"))
     table = evaluate(dataset, config, tracking, models=[model], progress=False)
     curves = pd.read_csv(dataset.root / "results" / "calibration.csv")
@@ -153,10 +157,10 @@ def test_learned_methods_are_calibrated_on_the_val_scenes(dataset: Dataset, tmp_
             parts.append((scorer.score(poses(views)), is_good(views)))
         return np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
 
-    rows = table[table["method"] == "mlp"]
+    rows = table[table["method"] == "mlp-2d+z"]
     temperature = rows["temperature"].iloc[0]
     assert (rows["temperature"] == temperature).all()
-    assert table.loc[table["method"] != "mlp", ["ece", "ece_scaled", "temperature"]].isna().all(axis=None)
+    assert table.loc[table["method"] != "mlp-2d+z", ["ece", "ece_scaled", "temperature"]].isna().all(axis=None)
     val, good = predicted("val")
     assert abs(np.mean((expit(logit(val) / temperature) - good) * logit(val))) < 1e-4  # the likelihood is greatest
     test, good = predicted("test")
@@ -174,7 +178,7 @@ def test_learned_methods_are_calibrated_on_the_val_scenes(dataset: Dataset, tmp_
 
     # those evaluated do not fit themselves
     table = evaluate(dataset, replace(config, split="val"), tracking, models=[model], progress=False)
-    rows = table[table["method"] == "mlp"]
+    rows = table[table["method"] == "mlp-2d+z"]
     assert rows["ece"].notna().all() and rows[["ece_scaled", "temperature"]].isna().all(axis=None)
     results = dataset.root / "results"
     assert {*pd.read_csv(results / "val" / "calibration.csv")["when"]} == {"before"}
@@ -188,7 +192,7 @@ def test_learned_methods_are_calibrated_on_the_val_scenes(dataset: Dataset, tmp_
     for scene in unlabelled.split("val"):
         write_table(scene.read_table().assign(status=UNLABELLED), scene.table)
     table = evaluate(unlabelled, config, tracking, models=[model], progress=False)
-    assert table["temperature"].isna().all() and table.loc[table["method"] == "mlp", "ece"].notna().all()
+    assert table["temperature"].isna().all() and table.loc[table["method"] == "mlp-2d+z", "ece"].notna().all()
 
 
 def test_what_a_location_sees_by_the_mesh_needs_no_mesh_where_it_is_stored(dataset: Dataset, tmp_path: Path) -> None:
@@ -224,7 +228,9 @@ def test_scores_that_are_not_finite_are_named(
 
 def test_the_papers_tables_have_networks_that_do_not_ship(dataset: Dataset, tmp_path: Path) -> None:
     tracking, results = TrackingConfig(str(tmp_path / "mlruns")), dataset.root / "results"
-    both = train(dataset, TrainConfig(("2d", "2d+z"), epochs=2, hidden=(16,), accelerator="cpu"), tracking, False)
+    both = train(
+        dataset, train_config("mlp-2d", "mlp-2d+z", epochs=2, hidden=(16,), accelerator="cpu"), tracking, False
+    )
     config = replace(CONFIG, occlusions=("mesh", "none"))
     evaluate(dataset, config, tracking, models=both, progress=False)
     tables = {path.name: path.read_bytes() for path in results.glob("table_*")}
@@ -321,8 +327,8 @@ def test_bad_input_is_named(dataset: Dataset, tmp_path: Path) -> None:
     ):  # fmt: skip
         with pytest.raises(ConfigError, match=next(iter(wrong))):
             EvaluateConfig(**wrong)  # type: ignore[arg-type]
-    with pytest.raises(ConfigError, match=r"reference.*'mlp 2d'.*random, visible, bins"):
-        evaluate(dataset, replace(RULES, reference="mlp 2d"), tracking, progress=False)
+    with pytest.raises(ConfigError, match=r"reference.*'mlp-2d'.*random, visible, bins"):
+        evaluate(dataset, replace(RULES, reference="mlp-2d"), tracking, progress=False)
     untrained = make_dataset(tmp_path / "untrained", ("test",), n_locations=2, n_directions=4)
     with pytest.raises(WeightsError, match="leave mlp out"):
         evaluate(untrained, CONFIG, tracking, progress=False)

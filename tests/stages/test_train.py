@@ -14,22 +14,36 @@ import pandas as pd
 import pytest
 import torch
 
+from learning_options import changed, train_config
 from synthetic_dataset import make_dataset
 from wheretolook.dataset.folders import Dataset, SceneFolder
 from wheretolook.inputs.bins import InputStatistics
-from wheretolook.learning.config import TrainConfig
 from wheretolook.learning.data import BatchLoader, ViewpointDataModule, balance_classes, hold_out_locations, with_also
 from wheretolook.learning.fit import EpochRecord
 from wheretolook.learning.provenance import training_fingerprint, was_trained_on
-from wheretolook.methods.mlp.weights import load_classifier
+from wheretolook.learning.trained_network import TrainedNetwork
+from wheretolook.methods.mlp.network import ViewpointNetwork
 from wheretolook.methods.registry import load_scorer
-from wheretolook.stages.train import train_variants as train
+from wheretolook.methods.train_config import TrainConfig
+from wheretolook.stages.train import train_methods as train
 from wheretolook.utils.errors import ConfigError, TableError
 from wheretolook.utils.tracking import client
 from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import LOCALIZED, NO_POSE, UNLABELLED, is_good, write_table
 
-SMALL = TrainConfig(variants=("2d",), epochs=3, hidden=(32,), accelerator="cpu")
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
+SMALL = train_config("mlp-2d", epochs=3, hidden=(32,), accelerator="cpu")
+
+
+def load(path: Path) -> ViewpointNetwork:
+    """The paper's network that lies in a file."""
+    return TrainedNetwork.load(path, ViewpointNetwork, path.stem).network
+
+
+def data_of(dataset: Dataset, config: TrainConfig) -> ViewpointDataModule:
+    """The views that the paper's network learns from."""
+    return ViewpointDataModule(dataset, config, config.mlp, progress=False)
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +77,7 @@ def test_data_module_reads_labelled_train_views_only(dataset: Dataset) -> None:
     table = scene.read_table()
     table.loc[table.index[::3], "status"] = UNLABELLED
     write_table(table, scene.table)
-    data = ViewpointDataModule(dataset, TrainConfig(accelerator="cpu"), progress=False)
+    data = data_of(dataset, train_config(accelerator="cpu"))
     data.setup()
     kept = table[table["status"] != UNLABELLED]
     other = dataset.scenes[1].read_table()
@@ -85,14 +99,14 @@ def test_data_module_reads_labelled_train_views_only(dataset: Dataset) -> None:
 
 def test_validation_scenes_are_used_where_there_are_some(tmp_path: Path) -> None:
     dataset = make_dataset(tmp_path / "tiny", ("train", "val", "test"), n_locations=6, n_directions=12)
-    data = ViewpointDataModule(dataset, SMALL, progress=False)
+    data = data_of(dataset, SMALL)
     data.setup()
     assert {*data.views.scene[data.train_rows]} == {0}
     assert {*data.views.scene[data.val_rows]} == {1}
 
 
 def test_every_pass_visits_every_training_view_once_in_its_own_order(dataset: Dataset) -> None:
-    data = ViewpointDataModule(dataset, replace(SMALL, batch_size=100), progress=False)
+    data = data_of(dataset, changed(SMALL, batch_size=100))
     data.setup()
     loader, again = data.train_dataloader(), data.train_dataloader()
     first, second = (torch.cat([batch.labels for batch in loader]) for _ in range(2))
@@ -104,7 +118,7 @@ def test_every_pass_visits_every_training_view_once_in_its_own_order(dataset: Da
 
 
 def test_batches_hold_the_channels_asked_for(dataset: Dataset) -> None:
-    data = ViewpointDataModule(dataset, replace(SMALL, batch_size=7), progress=False)
+    data = data_of(dataset, changed(SMALL, batch_size=7))
     data.setup()
     data.channels = ("z", "u")
     batches = list(data.val_dataloader())
@@ -117,7 +131,7 @@ def test_batches_hold_the_channels_asked_for(dataset: Dataset) -> None:
 
 @pytest.mark.parametrize("world_size", [2, 3])
 def test_processes_share_out_every_batch(dataset: Dataset, world_size: int) -> None:
-    data = ViewpointDataModule(dataset, SMALL, progress=False)
+    data = data_of(dataset, SMALL)
     data.setup()
     rows = data.train_rows[:101]  # the last batch has one view: some processes get none
     whole = list(BatchLoader(data.views, rows, 10, shuffle_seed=5))
@@ -135,9 +149,7 @@ def test_balanced_training_views_are_equally_many_and_all_of_the_rarer_class(dat
     for scene in dataset.split("train"):
         table = scene.read_table()
         write_table(table.assign(status=np.where(table.index % 4 == 0, table["status"], NO_POSE)), scene.table)
-    plain, balanced = (
-        ViewpointDataModule(dataset, replace(SMALL, balance=balance), progress=False) for balance in (False, True)
-    )
+    plain, balanced = (data_of(dataset, changed(SMALL, balance=balance)) for balance in (False, True))
     plain.setup()
     balanced.setup()
     positives = {*plain.train_rows[plain.views.labels[plain.train_rows] > 0].tolist()}
@@ -168,7 +180,7 @@ def test_labels_of_one_class_are_refused(dataset: Dataset, status: str) -> None:
         table = scene.read_table()
         table["status"], table["error_m"], table["error_deg"] = status, 0.001, 0.001
         write_table(table, scene.table)
-    config = replace(SMALL, val_fraction=1e-9)
+    config = changed(SMALL, val_fraction=1e-9)
     with pytest.raises(TableError, match="training labels are of one class") as caught:
         train(dataset, config, TrackingConfig(str(dataset.root / "mlruns")), progress=False)
     total = 2 * (24 - 1) * 20  # one location of each scene is held out
@@ -180,18 +192,18 @@ def test_labels_of_one_class_are_refused(dataset: Dataset, status: str) -> None:
 def test_no_label_and_no_train_scene_are_refused(tmp_path: Path, dataset: Dataset) -> None:
     only_test = make_dataset(tmp_path / "only-test", ("test",), n_locations=2, n_directions=4)
     with pytest.raises(TableError, match="no train scene"):
-        ViewpointDataModule(only_test, SMALL, progress=False).setup()
+        data_of(only_test, SMALL).setup()
     scene = dataset.scenes[0]
     write_table(scene.read_table().assign(status=UNLABELLED), scene.table)
     with pytest.raises(TableError, match=r"scene-0.*no viewpoint has a label"):
-        ViewpointDataModule(dataset, SMALL, progress=False).setup()
+        data_of(dataset, SMALL).setup()
 
 
 @pytest.mark.parametrize(
     "options",
     [
-        {"variants": ("2d", "5d")},
-        {"variants": ()},
+        {"methods": ("mlp-2d", "mlp-5d")},
+        {"methods": ()},
         {"epochs": 0},
         {"dropout": 1.0},
         {"val_fraction": 0.0},
@@ -204,7 +216,7 @@ def test_no_label_and_no_train_scene_are_refused(tmp_path: Path, dataset: Datase
 )
 def test_options_out_of_range_are_refused(options: dict) -> None:
     with pytest.raises(ConfigError):
-        TrainConfig(**options)
+        changed(SMALL, **options)
 
 
 def test_training_learns_the_rule_logs_a_run_and_is_reused(
@@ -214,15 +226,15 @@ def test_training_learns_the_rule_logs_a_run_and_is_reused(
     empty.mkdir()
     monkeypatch.chdir(empty)
     tracking = TrackingConfig(store, "tiny")
-    config = replace(SMALL, variants=("2d", "2d+3d"), epochs=4, noise_px=0.5, noise_m=0.02, schedule="cosine")
+    config = changed(SMALL, methods=("mlp-2d", "mlp-2d+3d"), epochs=4, noise_px=0.5, noise_m=0.02, schedule="cosine")
     models = train(dataset, config, tracking, progress=False)
-    assert [model.variant for model in models] == ["2d", "2d+3d"]
+    assert [model.method for model in models] == ["mlp-2d", "mlp-2d+3d"]
     for model in models:
         assert model.metrics["val_average_precision"] > 0.9
         assert model.metrics["train_bce"] < 0.69
         run = client(tracking).get_run(model.run_id)
         assert run.info.status == "FINISHED"
-        assert run.data.params["variant"] == model.variant
+        assert run.data.params["method"] == model.method
         assert run.data.params["epochs"] == "4"
         assert len(run.data.params["dataset_fingerprint"]) == 16
         assert run.data.tags["code_version"]
@@ -251,7 +263,7 @@ def test_training_learns_the_rule_logs_a_run_and_is_reused(
 
 def test_other_datasets_are_learnt_from_too(dataset: Dataset, store: str) -> None:
     other = make_dataset(dataset.root.parent / "other", ("val", "test", "test", "test", "train"), n_locations=5)
-    tracking, config = TrackingConfig(store, "also"), replace(SMALL, epochs=1, also=("other",))
+    tracking, config = TrackingConfig(store, "also"), changed(SMALL, epochs=1, also=("other",))
     (model,) = train(dataset, config, tracking, progress=False)
     about = json.loads(model.path.with_suffix(".json").read_text())["about"]
     together = Dataset(dataset.root, dataset.camera, (*dataset.scenes, *other.split("train")))
@@ -260,10 +272,10 @@ def test_other_datasets_are_learnt_from_too(dataset: Dataset, store: str) -> Non
     assert int(views["n_train"]) + int(views["n_val"]) == (2 * 24 + 5) * 20
     assert was_trained_on(dataset, about) and not was_trained_on(dataset, {**about, "also": []})
     (again,) = train(dataset, config, tracking, progress=False)
-    (without,) = train(dataset, replace(config, also=()), tracking, progress=False)
+    (without,) = train(dataset, changed(config, also=()), tracking, progress=False)
     assert again.reused and not without.reused
     with pytest.raises(TableError, match=r"nowhere.*no dataset"):
-        train(dataset, replace(config, also=("nowhere",)), tracking, progress=False)
+        train(dataset, changed(config, also=("nowhere",)), tracking, progress=False)
     elsewhere = Dataset(dataset.root.parent / "moved" / "tiny", dataset.camera, dataset.scenes)  # without the other one
     assert was_trained_on(elsewhere, about)
     assert not was_trained_on(Dataset(elsewhere.root, dataset.camera, dataset.scenes[1:]), about)
@@ -284,25 +296,26 @@ def test_other_datasets_are_learnt_from_too(dataset: Dataset, store: str) -> Non
 
 
 def test_the_same_seed_gives_the_same_weights(dataset: Dataset, store: str) -> None:
-    config, tracking = replace(SMALL, noise_px=1.0), TrackingConfig(store, "same seed")
+    config, tracking = changed(SMALL, noise_px=1.0), TrackingConfig(store, "same seed")
     torch.manual_seed(123)
     first = train(dataset, config, tracking, progress=False)[0].path.read_bytes()
     torch.manual_seed(456)
     state = torch.get_rng_state()
     assert train(dataset, config, tracking, progress=False, force=True)[0].path.read_bytes() == first
     assert torch.equal(torch.get_rng_state(), state)  # training leaves the caller's random numbers alone
-    assert train(dataset, replace(config, seed=1), tracking, progress=False)[0].path.read_bytes() != first
+    assert train(dataset, changed(config, seed=1), tracking, progress=False)[0].path.read_bytes() != first
 
 
+@pytest.mark.slow
 def test_two_processes_train_as_one_does(dataset: Dataset, store: str, capfd: pytest.CaptureFixture[str]) -> None:
     # 920 training views: the last batch has one view, so that one of two processes has none
-    tracking, one = TrackingConfig(store, "devices"), replace(SMALL, dropout=0.0, batch_size=919)
+    tracking, one = TrackingConfig(store, "devices"), changed(SMALL, dropout=0.0, batch_size=919)
     (alone,) = train(dataset, one, tracking, progress=False)
-    expected = load_classifier(alone.path).state_dict()
+    expected = load(alone.path).state_dict()
     capfd.readouterr()
-    (shared,) = train(dataset, replace(one, devices=2), tracking, progress=False, force=True)
+    (shared,) = train(dataset, changed(one, devices=2), tracking, progress=False, force=True)
     assert not "".join(capfd.readouterr())  # the processes are as quiet as one
-    for name, weights in load_classifier(shared.path).state_dict().items():
+    for name, weights in load(shared.path).state_dict().items():
         torch.testing.assert_close(weights, expected[name], rtol=1e-4, atol=1e-5)
     assert shared.metrics == pytest.approx(alone.metrics, rel=1e-4)
     experiment = client(tracking).get_experiment_by_name("devices")
@@ -323,7 +336,7 @@ def test_more_gpus_than_there_are_are_refused(
     dataset: Dataset, accelerator: Any, gpus: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(torch.cuda, "device_count", lambda: gpus)
-    config = replace(SMALL, accelerator=accelerator, devices=2)
+    config = changed(SMALL, accelerator=accelerator, devices=2)
     with pytest.raises(ConfigError, match=rf"more GPUs than there are: {gpus} \(got 2\)"):
         train(dataset, config, TrackingConfig(str(dataset.root / "mlruns")), progress=False)
 
@@ -336,7 +349,7 @@ def test_views_that_do_not_fit_into_shared_memory_are_refused(
 
     monkeypatch.setattr(torch.Tensor, "share_memory_", full)
     with pytest.raises(ConfigError, match=r"do not fit into shared memory.*No space left.*devices to 1"):
-        ViewpointDataModule(dataset, replace(SMALL, devices=2), progress=False).setup()
+        data_of(dataset, changed(SMALL, devices=2)).setup()
 
 
 def test_an_interrupted_training_is_reported_as_such(
@@ -357,17 +370,20 @@ def test_an_interrupted_training_is_reported_as_such(
 
 
 def test_the_released_variant_trains_as_the_released_code(dataset: Dataset, store: str) -> None:
-    config = replace(SMALL, variants=("2d+3d", "released"), epochs=2, hidden=(16,))
+    config = changed(SMALL, methods=("mlp-2d+3d", "mlp-released"), epochs=2, hidden=(16,))
     ours, released = train(dataset, config, TrackingConfig(store), progress=False)
     assert released.path.name == "mlp-released.safetensors"
-    spec = load_classifier(released.path).spec
-    assert (spec.variant, spec.layout, spec.input_dropout, spec.hidden) == ("2d+3d", "compact", 0.5, (300, 300))
+    spec = load(released.path).spec
+    assert (spec.layout, spec.input_dropout, spec.hidden) == ("compact", 0.5, (300, 300))
+    assert spec.channels == ("u", "v", "x", "y", "z")
     params = client(TrackingConfig(store)).get_run(released.run_id).data.params
     expected = {"learning_rate": "0.0001", "l2": "0.0", "balance": "True", "keep": "last", "epochs": "2"}
     assert {name: params[name] for name in expected} == expected
     assert float(params["positives_train"]) == 0.5  # so that no class weighs more than the other
     assert released.metrics["epoch"] == 1  # the last, whichever was best
-    assert load_classifier(ours.path).spec.layout == "in_place"
+    assert load(ours.path).spec.layout == "in_place"
     assert all(model.reused for model in train(dataset, config, TrackingConfig(store), progress=False))
     localization_map = dataset.scenes[0].localization_map(dataset.camera)
-    assert [load_scorer(model.path, localization_map).inputs for model in (ours, released)] == ["2d+3d", "released"]
+    assert [load_scorer(model.path, localization_map).name for model in (ours, released)] == [
+        "mlp-2d+3d", "mlp-released",
+    ]  # fmt: skip

@@ -12,6 +12,7 @@ from scipy.optimize import minimize_scalar
 from scipy.special import expit, logit
 
 from wheretolook.geometry.poses import Float
+from wheretolook.learning.old_names import with_names
 
 Good = NDArray[np.bool_]
 """Whether each view localizes, (B,)."""
@@ -130,6 +131,5 @@ def _mean_loss(logits: Float, good: Good) -> float:
 
 
 def read_calibration(path: Path) -> pd.DataFrame:
-    """Reliability curves from the CSV file that the evaluate stage writes. Methods without inputs have ""."""
-    table = pd.read_csv(path, keep_default_na=False, na_values=[""])
-    return table.assign(inputs=table["inputs"].fillna(""))
+    """Reliability curves from the CSV file that the evaluate stage writes, in this version or an older one."""
+    return with_names(pd.read_csv(path, keep_default_na=False, na_values=[""]))

@@ -9,15 +9,14 @@ from typing import Literal
 
 import numpy as np
 
+from wheretolook.methods.registry import methods_named, scorers
 from wheretolook.utils.errors import ConfigError
 from wheretolook.viewpoints.thresholds import THRESHOLDS, threshold_key
 from wheretolook.visibility.config import OcclusionName, check_occlusion_names
 
 
 def _all_methods() -> tuple[str, ...]:
-    from wheretolook.methods.registry import OPTIONAL, SCORERS
-
-    return tuple(name for name in SCORERS if name not in OPTIONAL)
+    return tuple(name for name, method in scorers().items() if not method.only_if_named)
 
 
 @dataclass(frozen=True)
@@ -25,9 +24,8 @@ class EvaluateConfig:
     """Options of evaluation.
 
     Args:
-        methods: methods to compare; if not named, all that need no naming. Keys of
-            `wheretolook.methods.registry.SCORERS`, by default all but those in `OPTIONAL` there. Methods that have
-            learnt, such as "mlp" and "trees", stand for every weights file of their kind.
+        methods: methods to compare, by name or family, such as set and mlp. See `wheretolook evaluate --list-methods`;
+            if none is named, all but those that are compared only if named.
         weights: files of weights to evaluate; empty for all in the dataset's `weights` folder.
         split: whose scenes to evaluate on: "test", "val" or "train".
         top_n: how many of a location's best-scored viewpoints count; every value gives a row of the table.
@@ -45,8 +43,8 @@ class EvaluateConfig:
         heading: heading of the method "forward": one direction, or the waypoints of a path. In the world; the direction
             of travel nearest to a location is the heading there. Empty for a horizontal heading drawn for each
             location.
-        reference: method that every other is compared with, such as "bins" or "mlp 2d+z". By name and inputs as in the
-            table. Empty for "set", or else the learned one with the inputs "2d+3d", or the first learned one.
+        reference: method that every other is compared with, by its name, such as "bins" or "mlp-2d+z". Empty for
+            "set", or else "mlp-2d+3d", or else the first learned one.
     """
 
     methods: tuple[str, ...] = field(default_factory=_all_methods)
@@ -63,12 +61,7 @@ class EvaluateConfig:
     reference: str = ""
 
     def __post_init__(self) -> None:
-        from wheretolook.methods.registry import SCORERS
-
-        unknown = [name for name in self.methods if name not in SCORERS]
-        if unknown or not self.methods or len(set(self.methods)) < len(self.methods):
-            known = f"There are {', '.join(SCORERS)}."
-            raise ConfigError("methods must be known and named once", value=self.methods, fix=known)
+        methods_named(self.methods, scorers())
         if self.split not in ("train", "val", "test"):
             raise ConfigError("unknown split", value=self.split, fix="Use train, val or test.")
         if not self.top_n or min(self.top_n) < 1 or len(set(self.top_n)) < len(self.top_n):

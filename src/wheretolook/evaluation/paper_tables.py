@@ -10,7 +10,7 @@ import pandas as pd
 
 from wheretolook.evaluation.score_table import main_rows, methods_of
 from wheretolook.evaluation.scores import RELEASED_DIVISOR
-from wheretolook.methods.names import LEARNED, Method
+from wheretolook.methods.registry import find
 from wheretolook.methods.styles import method_style
 from wheretolook.utils.files import write_text
 from wheretolook.utils.markdown import markdown_table
@@ -31,32 +31,32 @@ class _PaperRow:
     """A printed row: the paper's name, the method here, and its numbers in %, none where the paper prints a dash."""
 
     name: str
-    method: Method
+    method: str
     printed: tuple[float, ...] = ()
 
 
-PROPOSED: Method = (LEARNED, "2d+3d")
+PROPOSED = "mlp-2d+3d"
 
 PAPER = {
     "vs_others": (
-        _PaperRow("random", ("random", ""), (54.7, 60.9, 60.9, 61.1)),
-        _PaperRow("FIF mineig exact", ("fisher", "mineig exact"), (60.1, 67.7, 69.0, 69.6)),
-        _PaperRow("FIF mineig app", ("fisher", "mineig quadratic"), (57.3, 64.7, 66.2, 66.4)),
-        _PaperRow("FIF mineig GP app", ("fisher", "mineig gp"), (59.8, 65.4, 65.7, 66.8)),
-        _PaperRow("FIF det exact", ("fisher", "logdet exact"), (59.2, 65.4, 66.2, 66.2)),
-        _PaperRow("FIF det app", ("fisher", "logdet quadratic"), (60.7, 67.5, 69.1, 69.4)),
-        _PaperRow("FIF det GP app", ("fisher", "logdet gp"), (58.8, 67.0, 67.1, 67.2)),
-        _PaperRow("FIF trace app", ("fisher", "trace quadratic"), (55.4, 61.1, 61.8, 62.0)),
-        _PaperRow("FIF trace GP app", ("fisher", "trace gp")),
-        _PaperRow("FIF trace appr worst", ("fisher-worst-trace", ""), (17.8, 23.3, 23.3, 23.3)),
-        _PaperRow("FIF trace appr zero deriv labels", ("fisher-stationary-trace", ""), (12.5, 16.7, 17.3, 17.3)),
-        _PaperRow("FIF trace exact", ("fisher", "trace exact")),
-        _PaperRow("reprojections with bins", ("bins", ""), (68.7, 71.7, 71.7, 71.9)),
+        _PaperRow("random", "random", (54.7, 60.9, 60.9, 61.1)),
+        _PaperRow("FIF mineig exact", "fisher-mineig-exact", (60.1, 67.7, 69.0, 69.6)),
+        _PaperRow("FIF mineig app", "fisher-mineig-quadratic", (57.3, 64.7, 66.2, 66.4)),
+        _PaperRow("FIF mineig GP app", "fisher-mineig-gp", (59.8, 65.4, 65.7, 66.8)),
+        _PaperRow("FIF det exact", "fisher-logdet-exact", (59.2, 65.4, 66.2, 66.2)),
+        _PaperRow("FIF det app", "fisher-logdet-quadratic", (60.7, 67.5, 69.1, 69.4)),
+        _PaperRow("FIF det GP app", "fisher-logdet-gp", (58.8, 67.0, 67.1, 67.2)),
+        _PaperRow("FIF trace app", "fisher-trace-quadratic", (55.4, 61.1, 61.8, 62.0)),
+        _PaperRow("FIF trace GP app", "fisher-trace-gp"),
+        _PaperRow("FIF trace appr worst", "fisher-worst-trace", (17.8, 23.3, 23.3, 23.3)),
+        _PaperRow("FIF trace appr zero deriv labels", "fisher-stationary-trace", (12.5, 16.7, 17.3, 17.3)),
+        _PaperRow("FIF trace exact", "fisher-trace-exact"),
+        _PaperRow("reprojections with bins", "bins", (68.7, 71.7, 71.7, 71.9)),
         _PaperRow("proposed", PROPOSED, (72.9, 80.4, 81.2, 81.7)),
     ),
     "input_variants": (
-        _PaperRow("ours (pts 2d)", (LEARNED, "2d"), (70.2, 75.7, 76.2, 76.2)),
-        _PaperRow("ours (pts 2d + z)", (LEARNED, "2d+z"), (74.6, 80.3, 80.4, 80.6)),
+        _PaperRow("ours (pts 2d)", "mlp-2d", (70.2, 75.7, 76.2, 76.2)),
+        _PaperRow("ours (pts 2d + z)", "mlp-2d+z", (74.6, 80.3, 80.4, 80.6)),
         _PaperRow("ours (pts 2d + pts 3d)", PROPOSED, (72.9, 80.4, 81.2, 81.7)),
     ),
 }
@@ -85,19 +85,20 @@ def paper_tables(scores: pd.DataFrame) -> dict[str, pd.DataFrame]:
         `method` (its name here) and for each threshold, in %: score_* (share divided by the oracle's) with
         score_low_* and score_high_* (95 % bootstrap interval), released_* (share divided by 0.527) and paper_*
         (printed); then `note`. NaN where either has no number. Where the network with the input "2d+3d" is missing,
-        the first learned method stands in for the row "proposed", and `method` says so.
+        the first of the paper's networks stands in for the row "proposed", and `method` says so.
     """
     rows = main_rows(scores)
     rows = rows[(rows["scene"] == ALL) & (rows["top_n"] == 1)]
-    learned = [method for method in methods_of(rows) if method[0] == LEARNED]
-    ours = {(row["method"], row["inputs"]): row for row in rows.to_dict("records")}
+    paper_networks = [method for method in methods_of(rows) if _is_network(method)]
+    ours = {row["method"]: row for row in rows.to_dict("records")}
     tables = {}
     for name, paper in PAPER.items():
         lines = []
         for one in paper:
-            method, label = one.method, method_style(*one.method).label
-            if one.name == "proposed" and learned and method not in learned:
-                method, label = learned[0], f"{method_style(*learned[0]).label} (in place of {PROPOSED[1]})"
+            method, label = one.method, method_style(one.method).label
+            if one.name == "proposed" and paper_networks and method not in paper_networks:
+                method = paper_networks[0]
+                label = f"{method_style(method).label} (in place of {PROPOSED.partition('-')[2]})"
             line: dict[str, object] = {"paper_row": one.name, "method": label}
             for index, key in enumerate(KEYS):
                 for column, source in zip(_OURS, _SOURCES, strict=True):
@@ -106,6 +107,12 @@ def paper_tables(scores: pd.DataFrame) -> dict[str, pd.DataFrame]:
             lines.append({**line, "note": NOTE})
         tables[name] = pd.DataFrame(lines)
     return tables
+
+
+def _is_network(method: str) -> bool:
+    """Whether a method is of the family of the paper's proposal."""
+    known, proposed = find(method), find(PROPOSED)
+    return known is not None and proposed is not None and known.family == proposed.family
 
 
 def write_paper_tables(scores: pd.DataFrame, folder: Path) -> list[Path]:

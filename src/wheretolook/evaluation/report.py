@@ -10,8 +10,7 @@ import pandas as pd
 
 from wheretolook.evaluation.score_table import main_rows, methods_of, reference_of, threshold_keys
 from wheretolook.evaluation.scores import RELEASED_DIVISOR
-from wheretolook.methods.names import Method
-from wheretolook.methods.styles import method_group, method_style
+from wheretolook.methods.styles import ORACLE, method_group, method_style
 from wheretolook.utils.markdown import markdown_table
 from wheretolook.viewpoints.thresholds import ALL, threshold_label
 
@@ -91,9 +90,9 @@ def _explained(first: pd.DataFrame, key: str) -> list[str]:
             f"regret: the oracle's undivided share within {limits} less the method's, in percentage points [interval]; "
             "lower is better."
         )
-    if reference is not None:
+    if reference:
         lines.append(
-            f"difference: the method's undivided share within {limits} less that of {method_style(*reference).label}, "
+            f"difference: the method's undivided share within {limits} less that of {method_style(reference).label}, "
             "in percentage points [interval, paired by location], and the p-value of a paired permutation test over "
             "neighbourhoods of locations (none for random's expectation)."
         )
@@ -125,10 +124,7 @@ _RANKING: list[Column] = [
 def _table(rows: pd.DataFrame, columns: Sequence[Column], first: str = "method") -> str:
     """A row for each method; columns of which nothing is known are left out."""
     shown = [(header, text) for header, needs, text in columns if needs in rows and rows[needs].notna().any()]
-    lines = [
-        [method_style(row["method"], row["inputs"]).label, *(text(row) for _, text in shown)]
-        for row in rows.to_dict("records")
-    ]
+    lines = [[method_style(row["method"]).label, *(text(row) for _, text in shown)] for row in rows.to_dict("records")]
     return markdown_table([first, *(header for header, _ in shown)], lines)
 
 
@@ -136,10 +132,9 @@ def _any_table(pooled: pd.DataFrame, key: str, counts: Sequence[int]) -> list[st
     """The share of locations where at least one of the chosen views is good; of one view that is its score."""
     if max(counts) == 1:
         return []
-    by_key = {(row["method"], row["inputs"], row["top_n"]): row for row in pooled.to_dict("records")}
+    by_key = {(row["method"], row["top_n"]): row for row in pooled.to_dict("records")}
     lines = [
-        [method_style(*method).label, *(_any(by_key[(*method, n)], key) for n in counts)]
-        for method in methods_of(pooled)
+        [method_style(method).label, *(_any(by_key[method, n], key) for n in counts)] for method in methods_of(pooled)
     ]
     return [
         "## At least one good",
@@ -158,7 +153,7 @@ def _scene_tables(methods: pd.DataFrame, key: str, n: int) -> list[str]:
     if len(scenes) < 2:
         return []
     rows = methods[methods["top_n"] == n]
-    by_key = {(row["scene"], row["method"], row["inputs"]): row for row in rows.to_dict("records")}
+    by_key = {(row["scene"], row["method"]): row for row in rows.to_dict("records")}
     parts = [
         f"## By scene: {_best(n).lower()} of each location, within {threshold_label(key)}",
         "Score [interval], good of chosen viewpoints.",
@@ -166,7 +161,7 @@ def _scene_tables(methods: pd.DataFrame, key: str, n: int) -> list[str]:
     for begin in range(0, len(scenes), SCENES_ABREAST):
         some = scenes[begin : begin + SCENES_ABREAST]
         lines = [
-            [method_style(*method).label, *(_counted(by_key[(scene, *method)], key) for scene in some)]
+            [method_style(method).label, *(_counted(by_key[scene, method], key) for scene in some)]
             for method in methods_of(rows)
         ]
         parts.append(markdown_table(["method", *some], lines))
@@ -186,14 +181,14 @@ def _comparison(scores: pd.DataFrame, column: str, name: str, about: str, key: s
         return []
     n, others = scores["top_n"].iloc[0], [name for name in ("occlusion", "candidates") if name != column]
     rows = main_rows(scores[(scores["scene"] == ALL) & (scores["top_n"] == n)], others)
-    rows = rows[(rows["method"] != "oracle") & (rows["method"].map(method_group) != "probes")]
-    by_key = {(row["method"], row["inputs"], row[column]): row for row in rows.to_dict("records")}
+    rows = rows[(rows["method"] != ORACLE) & (rows["method"].map(method_group) != "probes")]
+    by_key = {(row["method"], row[column]): row for row in rows.to_dict("records")}
 
     def cell(row: Row | None) -> str:
         return "–" if row is None else f"{_number(row['average_precision'])}, {_score(row, key, True)}"
 
     lines = [
-        [method_style(*method).label, *(cell(by_key.get((*method, value))) for value in values)]
+        [method_style(method).label, *(cell(by_key.get((method, value))) for value in values)]
         for method in methods_of(rows)
     ]
     return [
@@ -222,7 +217,7 @@ def _calibration(first: pd.DataFrame) -> list[str]:
         return []
     lines = []
     for row in first[first["ece"].notna()].to_dict("records"):
-        text = f"- {method_style(row['method'], row['inputs']).label}: {_number(row['ece'])}"
+        text = f"- {method_style(row['method']).label}: {_number(row['ece'])}"
         if pd.notna(row["temperature"]):
             text += f" → {_number(row['ece_scaled'])} with T = {row['temperature']:.2f}"
         lines.append(text)
@@ -247,8 +242,8 @@ def _share(row: Row, name: str) -> str:
     return _percent(row[name])
 
 
-def _difference(row: Row, key: str, reference: Method | None) -> str:
-    if (row["method"], row["inputs"]) == reference:
+def _difference(row: Row, key: str, reference: str) -> str:
+    if row["method"] == reference:
         return "reference"
     if pd.isna(row[f"difference_{key}"]):
         return "–"

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -13,14 +14,16 @@ import pandas as pd
 
 from wheretolook.dataset.folders import Dataset, SceneFolder
 from wheretolook.evaluation.config import EvaluateConfig
-from wheretolook.evaluation.scores import Choices, read_scores
+from wheretolook.evaluation.ranking import TestViews
+from wheretolook.evaluation.scores import Choices, by_chance, read_scores
 from wheretolook.evaluation.views import CandidateSet
 from wheretolook.geometry.poses import Float
-from wheretolook.methods.names import Method
+from wheretolook.methods.registry import methods_named, scorers
 from wheretolook.utils.files import fingerprint
-from wheretolook.utils.tracking import NestedRun, artifact, newest_run
+from wheretolook.utils.tracking import NestedRun, artifact, log, log_nested, newest_run, start_run
 from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.thresholds import ALL, threshold_key
+from wheretolook.visibility.config import OcclusionConfig
 
 SCORES_CSV, SCORES_MD, SCORES_PNG, OCCLUSION_PNG = "scores.csv", "scores.md", "scores.png", "occlusion.png"
 CALIBRATION_CSV, CALIBRATION_PNG, REGRET_PNG = "calibration.csv", "calibration.png", "regret.png"
@@ -47,9 +50,30 @@ class ScoredSet:
 
     occlusion: str
     candidates: CandidateSet
-    scores: Mapping[Method, Float]
+    scores: Mapping[str, Float]
     choices: Choices
     table: pd.DataFrame
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """What an evaluation found.
+
+    Attributes:
+        scenes: of the split.
+        weights: files of methods that have learnt, and the name of the method that each serves.
+        views: all labelled views.
+        scored: of each occlusion model and candidate set.
+        table: their score tables, one below the other, with columns `occlusion` and `candidates`.
+        calibration: reliability curves of learned methods, see `calibration_rows`; empty without any.
+    """
+
+    scenes: Sequence[SceneFolder]
+    weights: Mapping[Path, str]
+    views: TestViews
+    scored: Sequence[ScoredSet]
+    table: pd.DataFrame
+    calibration: pd.DataFrame
 
 
 def results_folder(dataset: Dataset, config: EvaluateConfig) -> Path:
@@ -74,7 +98,7 @@ def evaluation_params(dataset: Dataset, scenes: Sequence[SceneFolder], weights: 
     }
 
 
-_NAMED = ("method", "inputs", "occlusion", "candidates")
+_NAMED = ("method", "occlusion", "candidates")
 """What names a nested run."""
 
 _OF_ALL_VIEWS = ("n_locations", "average_precision", "roc_auc", "ece", "ece_scaled", "temperature")
@@ -89,7 +113,7 @@ _OF_SCENE = re.compile("regret_(?!low_|high_)")
 
 
 def runs_of_rows(table: pd.DataFrame, params: Mapping[str, Any]) -> Iterator[NestedRun]:
-    """The runs that score tables are logged as: for each method, inputs, occlusion model and candidate set one.
+    """The runs that score tables are logged as: for each method, occlusion model and candidate set one.
 
     Its metrics are named by N, the scene unless it is all of them, and the column, such as
     `top-1/regret_0.05m_0.4deg` and `top-5/apartment-210/regret_5m_10deg`, or by the column if N does not matter.
@@ -111,8 +135,8 @@ def runs_of_rows(table: pd.DataFrame, params: Mapping[str, Any]) -> Iterator[Nes
                 elif not pooled and _OF_SCENE.match(name):
                     numbers[f"{place}/{row['scene']}/{name}"] = float(value)
         candidates = [own["candidates"]] if own["candidates"] != ALL else []
-        shown = (own["method"], own["inputs"], f"({', '.join([own['occlusion'], *candidates])})")
-        yield NestedRun(" ".join(filter(None, shown)), {**params, **own}, numbers)
+        name = f"{own['method']} ({', '.join([own['occlusion'], *candidates])})"
+        yield NestedRun(name, {**params, **own}, numbers)
 
 
 def _runs_with_locations(
@@ -125,14 +149,13 @@ def _runs_with_locations(
     """The runs of `runs_of_rows`, each with a `file` that holds what was chosen until the next is asked for."""
     for one in scored:
         for nested in runs_of_rows(one.table, params):
-            method = nested.params["method"], nested.params["inputs"]
-            chosen = [_location_table(one, method, n, scenes, config) for n in config.top_n]
+            chosen = [location_table(one, nested.params["method"], n, scenes, config) for n in config.top_n]
             pd.concat(chosen).to_parquet(file, index=False)
             yield replace(nested, files=(file,))
 
 
-def _location_table(
-    scored: ScoredSet, method: Method, n: int, scenes: Sequence[SceneFolder], config: EvaluateConfig
+def location_table(
+    scored: ScoredSet, method: str, n: int, scenes: Sequence[SceneFolder], config: EvaluateConfig
 ) -> pd.DataFrame:
     """What a method chooses at each location, one row each.
 
@@ -150,9 +173,55 @@ def _location_table(
     for index, key in enumerate(map(threshold_key, config.thresholds)):
         columns |= {f"good_{key}": top.good[:, index], f"any_{key}": top.any_good[:, index]}
     best = np.full(views.n_locations, np.nan)
-    if method in scored.scores and method[0] != "random":
+    if method in scored.scores and not by_chance(method):
         np.fmax.at(best, views.location, scored.scores[method])
     return pd.DataFrame({**columns, "best_score": best})
+
+
+def log_evaluation(
+    dataset: Dataset,
+    evaluation: Evaluation,
+    config: EvaluateConfig,
+    tracking: TrackingConfig,
+    occlusion: OcclusionConfig,
+    results: Path,
+) -> None:
+    """Log an evaluation: a run with the files of `results`, and nested in it those of `runs_of_rows`.
+
+    Args:
+        dataset: evaluated.
+        evaluation: what it found.
+        config: of the evaluation.
+        tracking: where to log.
+        occlusion: settings of occlusion models, logged if the configuration names any.
+        results: folder of the files.
+    """
+    views, scenes = evaluation.views, evaluation.scenes
+    params = {
+        **evaluation_params(dataset, scenes, evaluation.weights),
+        **{name: value for name, value in asdict(config).items() if name not in ("weights", "methods")},
+        **(
+            {f"occlusion_{name}": value for name, value in asdict(occlusion).items() if name != "model"}
+            if config.occlusions
+            else {}
+        ),
+    }
+    for method in methods_named(config.methods, scorers()):
+        params |= method.params(dataset.camera)
+    positives = float(views.good[:, 0].mean())
+    metrics = {"n_locations": views.n_locations, "n_views": len(views.good), "positives": positives}
+    with (
+        TemporaryDirectory() as folder,
+        start_run(
+            tracking, f"evaluate {dataset.name}", "evaluate", params, tags={"dataset": dataset.name}
+        ) as (client, run),
+    ):  # fmt: skip
+        log(client, run, metrics=metrics)
+        for file in results.iterdir():
+            if file.is_file():
+                client.log_artifact(run, str(file))
+        file = Path(folder) / LOCATIONS_PARQUET
+        log_nested(tracking, run, "evaluate", _runs_with_locations(evaluation.scored, params, scenes, config, file))
 
 
 def latest_scores(tracking: TrackingConfig, dataset: str | None = None) -> pd.DataFrame | None:

@@ -6,8 +6,6 @@ from collections.abc import Sequence
 
 import pandas as pd
 
-from wheretolook.methods.names import Method
-
 
 def threshold_keys(scores: pd.DataFrame) -> list[str]:
     """Thresholds of a score table, by the names its columns use."""
@@ -23,12 +21,12 @@ def main_rows(scores: pd.DataFrame, columns: Sequence[str] = ("occlusion", "cand
     return scores
 
 
-def methods_of(scores: pd.DataFrame) -> list[Method]:
-    """The methods of a score table with their inputs, in order."""
-    return list(dict.fromkeys(zip(scores["method"], scores["inputs"], strict=True)))
+def methods_of(scores: pd.DataFrame) -> list[str]:
+    """The methods of a score table, in order."""
+    return list(scores["method"].unique())
 
 
-def reference_of(scores: pd.DataFrame) -> Method | None:
-    """The method that a score table compares the others with. None if there is none."""
+def reference_of(scores: pd.DataFrame) -> str:
+    """The method that a score table compares the others with; "" if there is none."""
     name = scores["reference"].iloc[0] if "reference" in scores else ""
-    return next((method for method in methods_of(scores) if name and " ".join(method).strip() == name), None)
+    return str(name) if name in methods_of(scores) else ""

@@ -15,7 +15,9 @@ from wheretolook.evaluation.calibration import expected_calibration_error, scale
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.ranking import TestViews, TopN, choose_at_random, choose_best, choose_by_truth, rank_views
 from wheretolook.geometry.poses import Float
-from wheretolook.methods.names import BEST, LEARNED, ORACLE, PROBABILITIES, Method
+from wheretolook.learning.old_names import with_names
+from wheretolook.methods.registry import find
+from wheretolook.methods.styles import ORACLE
 from wheretolook.utils.errors import ConfigError
 from wheretolook.viewpoints.thresholds import ALL, threshold_key
 
@@ -26,28 +28,39 @@ RELEASED_DIVISOR = 0.527
 _PAIRED = ("difference", "difference_low", "difference_high", "p")
 _CALIBRATION = ("ece", "ece_scaled", "temperature")
 
-Choices = Mapping[tuple[Method, int], TopN]
+Choices = Mapping[tuple[str, int], TopN]
 """What each method, the oracle too, chooses for each N."""
 
 
 def read_scores(path: Path) -> pd.DataFrame:
-    """A score table from its CSV file. Methods without inputs have "", as when it was made."""
-    table = pd.read_csv(path, keep_default_na=False, na_values=[""])
-    texts = [name for name in ("inputs", "reference") if name in table]
-    return table.assign(**{name: table[name].fillna("") for name in texts})
+    """A score table from its CSV file, of this version or an older one; see `score_table`."""
+    table = with_names(pd.read_csv(path, keep_default_na=False, na_values=[""]))
+    return table.assign(reference=table["reference"].fillna("")) if "reference" in table else table
 
 
-def choose(views: TestViews, scores: Mapping[Method, Float], top_n: Sequence[int]) -> Choices:
+def by_chance(method: str) -> bool:
+    """Whether a method draws at random, so that an evaluation tells its exact expectation."""
+    known = find(method)
+    return known is not None and known.by_chance
+
+
+def is_probability(method: str) -> bool:
+    """Whether a method's score is the probability that a view localizes."""
+    known = find(method)
+    return known is not None and known.probability
+
+
+def choose(views: TestViews, scores: Mapping[str, Float], top_n: Sequence[int]) -> Choices:
     """Let every method choose N views of every location; see `score_table`, whose rows come in the same order.
 
     Args:
         views: the candidates.
-        scores: (B,) scores by method and inputs.
+        scores: (B,) scores by method.
         top_n: values of N.
     """
-    choices: dict[tuple[Method, int], TopN] = {}
+    choices: dict[tuple[str, int], TopN] = {}
     for method, values in scores.items():
-        if method[0] == "random":
+        if by_chance(method):
             choices |= {(method, n): choose_at_random(views, n) for n in top_n}
         else:
             ranks = rank_views(views, values)
@@ -55,27 +68,27 @@ def choose(views: TestViews, scores: Mapping[Method, Float], top_n: Sequence[int
     return choices | {(ORACLE, n): choose_by_truth(views, n) for n in top_n}
 
 
-def reference_method(methods: Iterable[Method], name: str) -> Method | None:
-    """The method that the others are compared with: see `EvaluateConfig.reference`. None if there is none.
+def reference_method(methods: Iterable[str], name: str) -> str:
+    """The method that the others are compared with: see `EvaluateConfig.reference`. "" if there is none.
 
     Raises:
         ConfigError: no method has that name.
     """
-    named = {" ".join(filter(None, method)): method for method in methods}
-    if name and name not in named:
-        known = f"There are {', '.join(named)}."
+    methods = list(methods)
+    if name and name not in methods:
+        known = f"There are {', '.join(methods)}."
         raise ConfigError("the reference is none of the methods evaluated", value=name, fix=known)
-    learned = [method for method in named.values() if method[0] in PROBABILITIES]
-    preferred = [method for method in (BEST, (LEARNED, "2d+3d")) if method in learned]
-    return named[name] if name else next(iter([*preferred, *learned]), None)
+    found = {other: find(other) for other in methods}
+    ranks = {other: known.reference for other, known in found.items() if known is not None and known.probability}
+    return name or max(ranks, key=lambda other: ranks[other], default="")
 
 
 def score_table(
     views: TestViews,
-    scores: Mapping[Method, Float],
+    scores: Mapping[str, Float],
     scenes: Sequence[str],
     config: EvaluateConfig,
-    temperatures: Mapping[Method, float] | None = None,
+    temperatures: Mapping[str, float] | None = None,
     choices: Choices | None = None,
 ) -> pd.DataFrame:
     """Compare methods (paper, Sec. 4.1 and its tables 2 and 3).
@@ -89,7 +102,7 @@ def score_table(
 
     Args:
         views: the candidates.
-        scores: (B,) scores by method and inputs.
+        scores: (B,) scores by method.
         scenes: names of the scenes, by their number in `views`.
         config: values of N, thresholds, bootstrap, reference.
         temperatures: of learned methods, as far as known; see `wheretolook.evaluation.calibration`.
@@ -97,7 +110,7 @@ def score_table(
 
     Returns:
         One row for each method (and the oracle), N and scene, `scene` being "all" in rows over all scenes. Columns:
-        method, inputs, top_n, scene, n_locations, n_views (chosen views), and for each threshold, such as
+        method, top_n, scene, n_locations, n_views (chosen views), and for each threshold, such as
         "0.05m_0.4deg":
 
         - good_*: number of chosen views that are good.
@@ -110,7 +123,7 @@ def score_table(
         - low_* and high_* of raw_, normalized_, any_, regret_ and difference_, such as raw_low_*: bootstrap interval
           over blocks of locations, paired where two methods meet (`LocationBootstrap.ratio`).
 
-        Then reference (name and inputs of what differences are from, "" for none); average_precision and roc_auc of the
+        Then reference (the method that differences are from, "" for none); average_precision and roc_auc of the
         scores against the first threshold, NaN where all views are of one class; and for learned methods, NaN for
         others, ece (expected calibration error, against the first threshold), ece_scaled (with logits divided by the
         temperature) and temperature, both NaN where it is not known. A scene without candidates has rows with 0
@@ -126,7 +139,6 @@ def score_table(
         pools += [(scenes[0], pools[0][1])]
     reference = reference_method(scores, config.reference)
     choices = choose(views, scores, config.top_n) if choices is None else choices
-    compared = {"reference": " ".join(reference or ()).strip()}
     rows: list[dict[str, object]] = []
     for name, locations in pools:
         inside = locations[views.location]
@@ -140,12 +152,12 @@ def score_table(
         shares = {n: _shares(_only(choices, n, locations), reference, bootstrap, config) for n in config.top_n}
         for method in [*scores, ORACLE]:
             for n in config.top_n:
-                row = {"method": method[0], "inputs": method[1], "top_n": n, "scene": name}
-                rows.append(row | shares[n][method] | compared | metrics[method])
+                row = {"method": method, "top_n": n, "scene": name}
+                rows.append(row | shares[n][method] | {"reference": reference} | metrics[method])
     return pd.DataFrame(rows)
 
 
-def _only(choices: Choices, n: int, locations: NDArray[np.bool_]) -> dict[Method, TopN]:
+def _only(choices: Choices, n: int, locations: NDArray[np.bool_]) -> dict[str, TopN]:
     """What the methods choose for one N at some of the locations."""
     return {
         method: TopN(top.chosen[locations], top.good[locations], top.any_good[locations])
@@ -155,8 +167,8 @@ def _only(choices: Choices, n: int, locations: NDArray[np.bool_]) -> dict[Method
 
 
 def _shares(
-    tops: Mapping[Method, TopN], reference: Method | None, bootstrap: LocationBootstrap, config: EvaluateConfig
-) -> dict[Method, dict[str, float]]:
+    tops: Mapping[str, TopN], reference: str, bootstrap: LocationBootstrap, config: EvaluateConfig
+) -> dict[str, dict[str, float]]:
     """Columns of all methods for one N and one pool of locations; M methods are computed together."""
     good = np.stack([top.good for top in tops.values()], axis=1)  # (L, M, T)
     any_good = np.stack([top.any_good for top in tops.values()], axis=1)
@@ -172,14 +184,14 @@ def _shares(
     columns["released"] = columns["raw"] / RELEASED_DIVISOR
     columns["regret"] = _quotient((best - good).sum(0), n_views)
     columns["regret_low"], columns["regret_high"] = _interval(bootstrap, best - good, chosen)
-    if reference is None:
+    if not reference:
         columns |= dict.fromkeys(_PAIRED, np.full(good.shape[1:], np.nan))
     else:
         difference = good - tops[reference].good[:, None]
         columns["difference"] = _quotient(difference.sum(0), n_views)
         columns["difference_low"], columns["difference_high"] = _interval(bootstrap, difference, chosen)
         columns["p"] = bootstrap.paired_p(_flat(difference)).reshape(good.shape[1:])
-        expected = [reference[0] == "random" or method[0] == "random" for method in tops]
+        expected = [by_chance(reference) or by_chance(method) for method in tops]
         columns["p"][expected] = np.nan  # an expectation is no draw
     keys = list(enumerate(map(threshold_key, config.thresholds)))
     return {
@@ -214,10 +226,10 @@ def _ranking_metrics(good: NDArray[np.bool_], scores: Float) -> dict[str, float]
 
 
 def _calibration_metrics(
-    method: Method, good: NDArray[np.bool_], scores: Float, temperature: float | None
+    method: str, good: NDArray[np.bool_], scores: Float, temperature: float | None
 ) -> dict[str, float]:
     metrics = dict.fromkeys(_CALIBRATION, float("nan"))
-    if method[0] in PROBABILITIES:
+    if is_probability(method):
         metrics["ece"] = expected_calibration_error(scores, good)
         if temperature is not None and np.isfinite(temperature):
             scaled = scale_probability(scores, temperature)

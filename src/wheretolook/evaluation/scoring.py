@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -17,24 +16,20 @@ from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.scores import reference_method
 from wheretolook.geometry.poses import Float
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.learning.config import MATCHABILITY, VARIANTS, weights_name
-from wheretolook.learning.weights import read_training, weights_kind
+from wheretolook.learning.provenance import TrainedModel, was_trained_on, weights_path
+from wheretolook.learning.weights import method_of_weights, read_training
 from wheretolook.methods.base import Scorer
-from wheretolook.methods.names import Method
-from wheretolook.methods.registry import WEIGHTS_OF, make_scorer
+from wheretolook.methods.registry import learned, make_scorer, members, methods_named, scorers
 from wheretolook.utils.errors import TableError, WeightsError
 from wheretolook.utils.files import fingerprint
 from wheretolook.viewpoints.table import poses
 from wheretolook.visibility.config import OcclusionConfig
 
-if TYPE_CHECKING:
-    from wheretolook.learning.provenance import TrainedModel
-
 BLOCK = 4096
 """Views binned and scored at a time."""
 
 Weights = Mapping[Path, str]
-"""Files of weights, and the kind of each (`wheretolook.learning.weights.weights_kind`)."""
+"""Files of weights, and the name of the method that each serves."""
 
 
 def choose_weights(dataset: Dataset, config: EvaluateConfig, models: Sequence[TrainedModel | Path] | None) -> Weights:
@@ -43,43 +38,41 @@ def choose_weights(dataset: Dataset, config: EvaluateConfig, models: Sequence[Tr
     Raises:
         WeightsError: there are none for a method that needs them, or the dataset's were trained on other data.
     """
-    if not {*WEIGHTS_OF} & {*config.methods}:
+    asked = {name: {method.weights for method in members(name, scorers())} for name in config.methods}
+    wanted = set().union(*asked.values()) - {""}
+    if not wanted:
         return {}
     if models is not None:
-        weights = [model if isinstance(model, Path) else model.path for model in models]
+        paths = [model if isinstance(model, Path) else model.path for model in models]
     else:
-        weights = list(config.weights) or _own_weights(dataset)
-    if not weights:
-        raise WeightsError(
-            "there are no weights to evaluate", path=dataset.root / "weights",
-            fix="Run the train stage first, name weights, or leave mlp out of the methods.",
-        )  # fmt: skip
-    kinds = {path: weights_kind(path) for path in weights}
-    wanted = {name: WEIGHTS_OF[name] for name in config.methods if name in WEIGHTS_OF}
-    for name, kind in wanted.items():
+        paths = list(config.weights) or _own_weights(dataset)
+    served = {path: method_of_weights(path) for path in paths}
+    folder = dataset.root / "weights"
+    if not served:
+        fix = "Run the train stage first, name weights, or leave methods that have learnt out."
+        raise WeightsError("there are no weights to evaluate", path=folder, fix=fix)
+    for name, kinds in asked.items():
         # who asks for all methods gets those that have been trained
-        if kind not in kinds.values() and config.methods != EvaluateConfig().methods:
+        if "" not in kinds and not kinds & {*served.values()} and config.methods != EvaluateConfig().methods:
+            fix = f"Run the train stage first, name weights, or leave {name} out of the methods."
             raise WeightsError(
-                f"there are no weights of {kind} to evaluate", path=dataset.root / "weights",
-                fix=f"Run the train stage first, name weights, or leave {name} out of the methods.",
-            )  # fmt: skip
-    return {path: kind for path, kind in kinds.items() if kind in wanted.values()}
+                f"there are no weights of {' or '.join(sorted(kinds))} to evaluate", path=folder, fix=fix
+            )
+    return {path: kind for path, kind in served.items() if kind in wanted}
 
 
 def _own_weights(dataset: Dataset) -> list[Path]:
     """The weights in the dataset's folder, which must be trained on what the dataset now holds."""
-    from wheretolook.learning.provenance import was_trained_on
-
-    named = (dataset.root / "weights" / weights_name(variant) for variant in VARIANTS)
-    weights = [path for path in named if path.is_file()]
-    for path in weights:
+    paths = {name: weights_path(dataset, name) for name in learned()}
+    found = {name: path for name, path in paths.items() if path.is_file()}
+    for name, path in found.items():
         # compact tables hold no matches: what has learnt from these has learnt from the dataset they were copied from
-        if weights_kind(path) != MATCHABILITY and not was_trained_on(dataset, read_training(path)):
+        if name in scorers() and not was_trained_on(dataset, read_training(path)):
             raise WeightsError(
                 "these weights were trained on other data than the dataset now holds", path=path,
                 fix="Run the train stage again, remove the file, or name weights in evaluate.weights.",
             )  # fmt: skip
-    return weights
+    return list(found.values())
 
 
 def check_unseen(scenes: Sequence[SceneFolder], weights: Weights) -> None:
@@ -103,7 +96,7 @@ def score_scenes(
     device: str,
     progress: bool,
     occlusion: OcclusionConfig | None,
-) -> tuple[dict[Method, Float], str]:
+) -> tuple[dict[str, Float], str]:
     """Scores of every method. Views are binned once for all.
 
     Args:
@@ -117,7 +110,7 @@ def score_scenes(
         occlusion: model to see the landmarks by; None for the one that is stored with the sampled locations.
 
     Returns:
-        (B,) scores by method and inputs, and the name of the occlusion model.
+        (B,) scores by method, and the name of the occlusion model.
 
     Raises:
         TableError: a method gives scores that are not finite.
@@ -125,7 +118,7 @@ def score_scenes(
         MapError, SceneError: a scene has no landmarks, or no mesh where one is needed.
         ConfigError: the reference is none of the methods.
     """
-    scores: dict[Method, list[Float]] = {}
+    scores: dict[str, list[Float]] = {}
     used: set[str] = set()
     text = f"score {scenes[0].split} views" + ("" if occlusion is None else f", {occlusion.model}")
     with tqdm(total=sum(map(len, tables)), desc=text, unit="view", disable=not progress) as bar:
@@ -146,7 +139,7 @@ def score_scenes(
                     values = scorer.score_binned(block, binned)
                     if not np.isfinite(values).all():
                         raise TableError(
-                            "a method gives scores that are not finite", path=scene.folder, value=" ".join(method),
+                            "a method gives scores that are not finite", path=scene.folder, value=method,
                             fix="Check the scene's landmarks and poses, and the weights; or leave the method out.",
                         )  # fmt: skip
                     scores.setdefault(method, []).append(values)
@@ -154,14 +147,12 @@ def score_scenes(
     return {method: np.concatenate(parts) for method, parts in scores.items()}, " ".join(sorted(used))
 
 
-def _scorers(localization_map: LocalizationMap, config: EvaluateConfig, weights: Weights) -> dict[Method, Scorer]:
-    scorers: dict[Method, Scorer] = {}
-    for name in config.methods:
-        of_method = [path for path, kind in weights.items() if kind == WEIGHTS_OF.get(name)]
-        for path in of_method if name in WEIGHTS_OF else [None]:
-            scorer = make_scorer(name, localization_map, config.seed, path, config.heading)
-            key = (scorer.name, scorer.inputs)
-            if key in scorers:  # two files of one variant: told apart by their names
-                key = (scorer.name, f"{scorer.inputs} {path}")
-            scorers[key] = scorer
-    return scorers
+def _scorers(localization_map: LocalizationMap, config: EvaluateConfig, weights: Weights) -> dict[str, Scorer]:
+    found: dict[str, Scorer] = {}
+    for method in methods_named(config.methods, scorers()):
+        paths = [path for path, kind in weights.items() if kind == method.weights]
+        for path in paths if method.weights else [None]:
+            scorer = make_scorer(method.name, localization_map, config.seed, path, config.heading)
+            # two files of one method are told apart by their names
+            found[f"{method.name} {path}" if method.name in found else method.name] = scorer
+    return found

@@ -1,4 +1,4 @@
-"""SIFT keypoints and descriptors. The same extractor serves the images of the map and the queries."""
+"""Extraction of SIFT keypoints and descriptors, for the images of the map and for queries alike."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class KeypointExtractor:
         return self.extract_batch([rgb])[0]
 
     def extract_batch(self, images: Sequence[NDArray[np.uint8]]) -> list[Keypoints]:
-        """Extract keypoints of images (H, W, 3) uint8 of one size, at once if this is on a GPU. See `extract`."""
+        """Extract keypoints of images (H, W, 3) uint8 of one size, on a GPU all at once. See `extract`."""
         grey = [_grey(rgb) for rgb in images]
         if self.on_gpu:
             found: list[Keypoints] = self._extractor.extract_many(np.stack([bitmap.to_array() for bitmap in grey]))
@@ -71,7 +71,7 @@ class KeypointExtractor:
         if len(keypoints) == 0:
             return Keypoints.none()
         table = np.array([(k.x, k.y, k.compute_scale()) for k in keypoints], dtype=np.float32)
-        # COLMAP's own cap keeps whole scale levels from the largest down, so it can overshoot; cut what is beyond.
+        # COLMAP keeps whole scale levels, from the largest down, so there can be more than the limit.
         keep = np.argsort(-table[:, 2], kind="stable")[: self.config.max_keypoints]
         return Keypoints(table[keep, :2], unit_descriptors(descriptors.data[keep]), table[keep, 2])
 
@@ -94,7 +94,7 @@ _GPU_BATCH = 8
 
 
 def _grey(rgb: NDArray[np.uint8]) -> Any:
-    """COLMAP's own conversion to grey (Rec. 709 weights): with other weights other keypoints pass the thresholds."""
+    """Convert to grey as COLMAP does (Rec. 709 weights); with other weights other keypoints pass the thresholds."""
     import pycolmap
 
     if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3:

@@ -1,4 +1,4 @@
-"""Keypoints with their descriptors, and how they are extracted: settings and results."""
+"""Settings of the keypoint extractor, and its result: keypoints with their descriptors."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ class ExtractorConfig:
             rounding.
         first_octave: -1 doubles the image first, which gives about three times as many (and smaller) keypoints, for
             `colmap` at four times the cost; 0 starts at the image's own size. COLMAP's default is -1.
-        max_keypoints: the most keypoints kept an image. `colmap` prefers large scales, `opencv` strong contrast.
+        max_keypoints: largest number of keypoints for each image. `colmap` prefers large scales, `opencv` strong
+            contrast.
         peak_threshold: least contrast (difference of Gaussians, grey values in [0, 1]). COLMAP's default is 0.02 / 3.
 
     Attributes:

@@ -1,4 +1,4 @@
-"""SIFT in Warp, for CUDA: OpenCV's keypoints and descriptors up to rounding, the same bit for bit every time."""
+"""SIFT in Warp, for CUDA: OpenCV's keypoints and descriptors up to rounding, with bit-identical repetitions."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class WarpSift:
             raise ValueError(f"expected images of at most {MAX_SIDE // 2} pixels a side, got {grey.shape}")
         if n_images == 0 or min(rows, columns) <= BORDER:
             return [Keypoints.none() for _ in range(n_images)]
-        # kernels count the values of a block in 31 bits
+        # kernels index the values of a block with 31 bits
         block = max(1, min(n_images, self.block_bytes // (4 * size), (1 << 31) // size - 1))
         space = self._space
         if space is None or (space.rows, space.columns) != (rows, columns) or space.n_images < block:
@@ -69,7 +69,7 @@ class WarpSift:
             self._space = space = ScaleSpace(rows, columns, block, self.config.first_octave, self._limits, self.device)
         found: list[Keypoints] = []
         for start in range(0, n_images, space.n_images):
-            stop = min(start + space.n_images, n_images)  # Warp does not cut a slice at the end
+            stop = min(start + space.n_images, n_images)  # a Warp slice may not exceed the array
             found += self._extract_block(space, grey[start:stop])
         return found
 

@@ -32,8 +32,8 @@ class Places:
     level: wp.array[wp.int32]  # first value of its Gaussian level in the pyramids
     octave: wp.array[wp.int32]
     at: wp.array[wp.vec2i]  # column, row
-    centre: wp.array[wp.vec2]  # the same, refined
-    sigma: wp.array[wp.float32]  # of its Gaussian
+    centre: wp.array[wp.vec2]  # column, row, refined
+    sigma: wp.array[wp.float32]  # standard deviation of its Gaussian, in pixels of the octave
 
 
 PLACE_TYPES = {"level": wp.int32, "octave": wp.int32, "at": wp.vec2i, "centre": wp.vec2, "sigma": wp.float32}
@@ -110,7 +110,7 @@ def turn_histogram_kernel(pyramid: Pyramid, places: Places, histograms: wp.array
 
 @wp.kernel
 def turn_kernel(histograms: wp.array3d[wp.float32], n_turns: wp.array[wp.int32], angles: wp.array2d[wp.float32]):
-    """Peaks of the smoothed histogram, in degrees as OpenCV's (clockwise in the image, from x to the right)."""
+    """Peaks of the smoothed histogram, in degrees clockwise from the image's x axis, as OpenCV's."""
     row = wp.tid()
     histogram = TurnHistogram()
     for turn in range(TURN_BINS):

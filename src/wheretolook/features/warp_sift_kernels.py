@@ -29,7 +29,7 @@ class Pyramid:
     """Gaussian levels: image by image, octave by octave, level by level, row by row."""
 
     values: wp.array[wp.float32]
-    image_size: wp.int32  # values an image
+    image_size: wp.int32  # number of values of an image
     starts: wp.array[wp.int32]  # first value of each octave of an image
     rows: wp.array[wp.int32]
     columns: wp.array[wp.int32]
@@ -153,7 +153,7 @@ def smooth_kernel(
 
 @wp.func
 def is_extremum(values: wp.array[wp.float32], at: wp.int32, size: wp.int32, columns: wp.int32, limit: wp.float32):
-    """Whether the difference of Gaussians at `at` is the largest, or the smallest, of its 27 (equal ones allowed)."""
+    """Whether the difference of Gaussians at `at` is the largest or smallest in its 3 x 3 x 3 neighbourhood."""
     value = values[at + size] - values[at]
     sign = wp.where(value > 0.0, 1.0, -1.0)
     highest = sign * value
@@ -268,7 +268,7 @@ def refined(
 
 @wp.func
 def key_of(image: wp.int32, octave: wp.int32, layer: wp.int32, row: wp.int32, column: wp.int32):
-    """A place in the pyramids as one number, by which places are sorted."""
+    """Image, octave, layer and pixel as one number, by which keypoints are sorted."""
     level = (image * MAX_OCTAVES + octave) * MAX_LAYERS + layer
     return (wp.int64(level) * wp.int64(MAX_SIDE) + wp.int64(row)) * wp.int64(MAX_SIDE) + wp.int64(column)
 

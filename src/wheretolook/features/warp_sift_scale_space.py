@@ -1,4 +1,4 @@
-"""The Gaussian scale space of many images at once, on a device, and the extrema in it (Lowe, IJCV 2004)."""
+"""The Gaussian scale spaces of many images on a device, and their extrema (Lowe, IJCV 2004)."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class ScaleSpace:
         n_images: for how many to make room.
         first_octave: -1 looks for keypoints in the doubled image too, 0 only from the image's own size on.
         limits: `Limits`.
-        device: as Warp calls it.
+        device: Warp's name of a device.
     """
 
     def __init__(self, rows: int, columns: int, n_images: int, first_octave: int, limits: Any, device: str) -> None:
@@ -129,7 +129,7 @@ class ScaleSpace:
 
 
 def octave_sizes(rows: int, columns: int) -> list[tuple[int, int]]:
-    """Rows and columns of the octaves in which a keypoint can be, the first of twice the image's size."""
+    """Rows and columns of the octaves that can hold a keypoint; the first has twice the image's size."""
     sizes = [(2 * rows, 2 * columns)]
     while min(sizes[-1]) > 2 * BORDER:
         sizes.append((sizes[-1][0] // 2, sizes[-1][1] // 2))
@@ -150,7 +150,7 @@ def _sigmas() -> list[float]:
 
 
 def _half_gaussian(sigma: float) -> NDArray[np.float64]:
-    """Weights of a Gaussian filter from its middle outwards, cut where `cv2.GaussianBlur` cuts them."""
+    """Weights of a Gaussian filter from its middle outwards, truncated where `cv2.GaussianBlur` does."""
     radius = (round(8 * sigma + 1) | 1) // 2
     weights = np.exp(-(np.arange(-radius, radius + 1) ** 2) / (2 * sigma**2))
     return (weights / weights.sum())[radius:]

@@ -8,24 +8,23 @@ from matplotlib.figure import Figure
 from matplotlib.style import context
 
 from wheretolook.evaluation.score_table import main_rows, methods_of
+from wheretolook.figures.config import Look
 from wheretolook.figures.style import INK, RC, new_figure
-from wheretolook.methods.styles import MethodStyle, method_style
+from wheretolook.methods.method import MethodStyle
+from wheretolook.methods.styles import method_style
 
 _BEFORE, _AFTER = "before", "after"
 
 
 def calibration_figure(table: pd.DataFrame) -> Figure:
-    """Reliability of each learned method before and after temperature scaling.
+    """Reliability diagram of each learned method before (open marks) and after temperature scaling (filled).
+
+    One column for each method: above, the share of good views over the mean prediction of each bin; below, the number
+    of views in each bin.
 
     Args:
-        table: one row for each method, inputs, `when` ("before", "after") and bin, with `bin_low`, `bin_high`,
-            `mean_predicted` and `share_good` (NaN in empty bins), `n` (views), `ece` and `temperature`: what the
-            evaluate stage writes as `calibration.csv`. A method without "after" has no temperature. Of several
-            occlusion models or sets of candidates the first is drawn.
-
-    Returns:
-        One column for each method: above, the share of good views against the mean prediction in each bin, open marks
-        before and filled ones after, the diagonal where both are equal; below, how many views fall in each bin.
+        table: `calibration.csv` of the evaluate stage: a row for each method, `when` ("before", "after") and
+            bin. Of several occlusion models or sets of candidates the first is drawn.
     """
     table = main_rows(table)
     methods = methods_of(table)
@@ -33,8 +32,8 @@ def calibration_figure(table: pd.DataFrame) -> Figure:
         figure = new_figure(0.9 + 2.8 * len(methods), 4.3)
         panels = figure.subplots(2, len(methods), sharex=True, sharey="row", squeeze=False, height_ratios=(3, 1))
         for (curve, counts), method in zip(panels.T, methods, strict=True):
-            style = method_style(*method)
-            rows = table[(table["method"] == method[0]) & (table["inputs"] == method[1])]
+            style = method_style(method)
+            rows = table[table["method"] == method]
             curve.plot([0, 1], [0, 1], color=INK, linewidth=1, linestyle="--")
             for when in (_BEFORE, _AFTER):
                 part = rows[rows["when"] == when].sort_values("bin_low")
@@ -51,11 +50,11 @@ def calibration_figure(table: pd.DataFrame) -> Figure:
 
 def _draw(curve: Axes, counts: Axes, part: pd.DataFrame, style: MethodStyle, when: str) -> None:
     scaled = when == _AFTER
+    line: Look = {"color": style.color, "linewidth": 1.2, "linestyle": "-" if scaled else ":"}
+    mark: Look = {"marker": style.marker, "markersize": 5, "markerfacecolor": style.color if scaled else "white"}
     label = f"T = {part['temperature'].iloc[0]:.2f}" if scaled else "as predicted"
     label += f": ECE {part['ece'].iloc[0]:.3f}"
     known = part[part["n"] > 0]
-    curve.plot(known["mean_predicted"], known["share_good"], "-" if scaled else ":", color=style.color,
-               marker=style.marker, markersize=5, markerfacecolor=style.color if scaled else "white", linewidth=1.2,
-               label=label, clip_on=False, zorder=3 if scaled else 2.5)  # fmt: skip
-    edges = [*part["bin_low"], part["bin_high"].iloc[-1]]
-    counts.stairs(part["n"], edges, color=style.color, linewidth=1.2, linestyle="-" if scaled else ":")
+    where: Look = {"clip_on": False, "zorder": 3 if scaled else 2.5}
+    curve.plot(known["mean_predicted"], known["share_good"], label=label, **line, **mark, **where)
+    counts.stairs(part["n"], [*part["bin_low"], part["bin_high"].iloc[-1]], **line)

@@ -20,7 +20,7 @@ FAR = 25.0
 
 @dataclass(frozen=True, eq=False)
 class Dollhouse:
-    """A picture of a scene that points of the world can be drawn on.
+    """A picture of a scene on which world points can be drawn.
 
     Attributes:
         rgb: (H, W, 3) uint8; white where there is no surface.

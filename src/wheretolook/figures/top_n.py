@@ -1,4 +1,4 @@
-"""What several viewpoints of a location are worth: the paper's figure "Multiple viewpoints results"."""
+"""Scores of the best N viewpoints of a location: the paper's figure "Multiple viewpoints results"."""
 
 from __future__ import annotations
 
@@ -14,37 +14,35 @@ from matplotlib.style import context
 from wheretolook.evaluation.paper_tables import PAPER
 from wheretolook.evaluation.score_table import main_rows, methods_of, threshold_keys
 from wheretolook.figures.style import PRINT, TWO_COLUMNS_IN, new_figure
-from wheretolook.methods.names import LEARNED, ORACLE, Method
-from wheretolook.methods.styles import method_style
+from wheretolook.methods.registry import find
+from wheretolook.methods.styles import ORACLE, method_style
 from wheretolook.viewpoints.thresholds import ALL, threshold_label
 
-SHOWN: tuple[Method, ...] = (("set", ""), (LEARNED, ""), ("fisher", "trace exact"), ("bins", ""), ("random", ""))
-"""Methods that are drawn where no others are asked for; the network is the first there is."""
+SHOWN = ("set", "mlp", "fisher-trace-exact", "bins", "random")
+"""Methods that are drawn where no others are asked for; of a family, the first there is."""
 
 ROWS = {
     "normalized": "good ones among the best N\n(% of the oracle's share)",
     "any": "locations with a good one\namong N (%)",
 }
-"""The two meanings of a score of several viewpoints: columns of the score table, and what they tell."""
+"""The two scores of several viewpoints: columns of the score table, and their labels."""
 
 _PRINTED = {row.name: row.printed for row in PAPER["vs_others"]}
 _PAPER_MARKS = {"proposed": ("D", "paper, proposed"), "random": ("s", "paper, random")}
 _GREY = "#7a7a7a"
 
 
-def top_n_figure(scores: pd.DataFrame, methods: Sequence[Method] = ()) -> Figure:
+def top_n_figure(scores: pd.DataFrame, methods: Sequence[str] = ()) -> Figure:
     """Scores over the number N of best viewpoints, at each threshold.
+
+    Above, the share of good viewpoints among the best N of all locations, in % of the oracle's; below, the share of
+    locations with a good one among N, the oracle's as lines. Whiskers are 95 % bootstrap intervals. Open grey marks are
+    the paper's numbers, which it prints for N = 1 only, on other scenes and divided by its released code's constant.
 
     Args:
         scores: a table of `wheretolook.evaluation.scores.score_table`; its rows over all scenes are drawn, those of the
             first occlusion model and the first set of candidates if there are several.
         methods: those to draw; `SHOWN` if empty.
-
-    Returns:
-        A column for each threshold. Above the share of good viewpoints among the best N of all locations, in % of the
-        oracle's; below the share of locations with a good one among N, the oracle's as lines. Whiskers are 95 %
-        bootstrap intervals. Open grey marks: what the paper prints for N = 1, on other scenes and divided by the
-        constant of its released code; of other N it prints no numbers.
     """
     scores = main_rows(scores)
     pooled, keys = scores[scores["scene"] == ALL], threshold_keys(scores)
@@ -69,7 +67,7 @@ def top_n_figure(scores: pd.DataFrame, methods: Sequence[Method] = ()) -> Figure
         return figure
 
 
-def top_n_table(scores: pd.DataFrame, methods: Sequence[Method] = ()) -> pd.DataFrame:
+def top_n_table(scores: pd.DataFrame, methods: Sequence[str] = ()) -> pd.DataFrame:
     """What `top_n_figure` draws at the finest threshold, in %, and the oracle's: a row a method, columns by N."""
     scores = main_rows(scores)
     pooled, key = scores[scores["scene"] == ALL], threshold_keys(scores)[0]
@@ -77,29 +75,30 @@ def top_n_table(scores: pd.DataFrame, methods: Sequence[Method] = ()) -> pd.Data
     columns = {}
     for column, name in names.items():
         for n in pooled["top_n"].unique():
-            rows = pooled[pooled["top_n"] == n].set_index(["method", "inputs"])
+            rows = pooled[pooled["top_n"] == n].set_index("method")
             columns[name, f"N = {n}"] = 100 * rows[f"{column}_{key}"]
     shown = [*_present(pooled, methods or SHOWN), ORACLE]
     table = pd.DataFrame(columns).loc[shown]
-    table.index = pd.Index([method_style(*method).label for method in shown])
+    table.index = pd.Index([method_style(method).label for method in shown])
     return table
 
 
-def _present(pooled: pd.DataFrame, methods: Sequence[Method]) -> list[Method]:
-    """Those of the methods that a table has; the network without inputs stands for the first with any."""
-    there = methods_of(pooled)
-    network = next((method for method in there if method[0] == LEARNED), None)
-    named = [network if method == (LEARNED, "") and network else method for method in methods]
-    return [method for method in dict.fromkeys(named) if method in there]
+def _present(pooled: pd.DataFrame, methods: Sequence[str]) -> list[str]:
+    """Those of the methods that a table has; a family stands for the first of its methods that is there."""
+    first: dict[str, str] = {}
+    for name in methods_of(pooled):
+        known = find(name)
+        first |= {name: name} | ({known.family: name} if known and known.family not in first else {})
+    return list(dict.fromkeys(first[name] for name in methods if name in first))
 
 
-def _draw(axes: Axes, pooled: pd.DataFrame, methods: Sequence[Method], top_n: Sequence[int], column: str) -> None:
+def _draw(axes: Axes, pooled: pd.DataFrame, methods: Sequence[str], top_n: Sequence[int], column: str) -> None:
     """Marks of all methods over N; `column` with "low_", "high_" or nothing inserted names the table's columns."""
     places = np.arange(len(top_n), dtype=float)
     for number, method in enumerate(methods):
-        rows = pooled[(pooled["method"] == method[0]) & (pooled["inputs"] == method[1])].set_index("top_n")
+        rows = pooled[pooled["method"] == method].set_index("top_n")
         rows = rows.reindex(list(top_n))
-        style = method_style(*method)
+        style = method_style(method)
         at = places + 0.14 * (number - (len(methods) - 1) / 2)  # side by side, or whiskers would hide one another
         value, low, high = (100 * rows[column.format(end)].to_numpy(dtype=float) for end in ("", "low_", "high_"))
         axes.vlines(at, low, high, color=style.color, linewidth=0.9)
@@ -111,7 +110,7 @@ def _draw(axes: Axes, pooled: pd.DataFrame, methods: Sequence[Method], top_n: Se
 
 
 def _draw_oracle(axes: Axes, pooled: pd.DataFrame, top_n: Sequence[int], column: str) -> None:
-    style, best = method_style(*ORACLE), pooled[pooled["method"] == ORACLE[0]].set_index("top_n").reindex(list(top_n))
+    style, best = method_style(ORACLE), pooled[pooled["method"] == ORACLE].set_index("top_n").reindex(list(top_n))
     places = np.arange(len(top_n))
     axes.hlines(100 * best[column], places - 0.42, places + 0.42, color=style.color, linewidth=1, label=style.label)
 

@@ -19,12 +19,7 @@ from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.colmap_camera import Camera, ColmapCamera
 from wheretolook.geometry.poses import Float, split_poses
 from wheretolook.inputs.bins_kernel import BinGrid, bin_kernel, count_bins_kernel
-from wheretolook.inputs.channels import ALL_CHANNELS as ALL_CHANNELS
-from wheretolook.inputs.channels import CHANNELS as CHANNELS
-from wheretolook.inputs.channels import INPUT_VARIANTS as INPUT_VARIANTS
-from wheretolook.inputs.channels import LANDMARK_CHANNELS as LANDMARK_CHANNELS
-from wheretolook.inputs.channels import PAPER_VARIANTS as PAPER_VARIANTS
-from wheretolook.inputs.channels import Layout as Layout
+from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS, Layout
 from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.warp import start_warp
@@ -251,7 +246,7 @@ class InputStatistics:
     """Mean and standard deviation of each kind of input over the filled bins of the training views.
 
     Attributes:
-        channels: names of the channels, as in `wheretolook.inputs.bins.ALL_CHANNELS`.
+        channels: names of the channels, as in `wheretolook.inputs.channels.ALL_CHANNELS`.
         mean: mean of each channel, in its unit (such as pixels or metres), over the values that are known.
         std: standard deviation of each channel, in its unit; 1 where it would be 0. Infinite where no value is known,
             so that a network does not look at a channel that it has never seen.

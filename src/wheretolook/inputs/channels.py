@@ -1,4 +1,4 @@
-"""Names of what bins hold, apart from `wheretolook.inputs.bins` so that options can be read without PyTorch."""
+"""Names of what bins and landmarks in view tell: apart from what makes them, so that options need no PyTorch."""
 
 from __future__ import annotations
 
@@ -9,9 +9,16 @@ from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 CHANNELS = ("u", "v", "x", "y", "z")
 """Channels of every landmark: pixel (u, v) and position (x, y, z) in the camera frame in metres."""
 
+POSE_ATTRIBUTES = ("across", "down", "distance", "mapped_angle", "distance_ratio")
+"""Of a landmark in a view: x/z and y/z in the camera; the distance in metres, its logarithm; the cosine between the ray
+from the camera and the mean direction it was mapped from; the logarithm of the distance over the mean mapping one."""
+
+ATTRIBUTES = POSE_ATTRIBUTES + MAP_ATTRIBUTES
+"""All that is known of a landmark in a view."""
+
 LANDMARK_CHANNELS = ("mapped_angle", "distance_ratio", *MAP_ATTRIBUTES)
-"""Channels of what landmarks are like, on request only: two of `inputs.landmarks_in_view.POSE_ATTRIBUTES`, and what the
-map knows. A bin's mean is NaN where one of its landmarks' values is not known."""
+"""Channels of what landmarks are like, on request only: two of `POSE_ATTRIBUTES`, and what the map knows. A bin's mean
+is NaN where one of its landmarks' values is not known."""
 
 ALL_CHANNELS = CHANNELS + LANDMARK_CHANNELS
 
@@ -24,6 +31,3 @@ PAPER_VARIANTS: dict[str, tuple[str, ...]] = {
 
 Layout = Literal["in_place", "compact"]
 """Order of the bins in a flat input, see `wheretolook.inputs.bins.arrange`."""
-
-INPUT_VARIANTS: dict[str, tuple[str, ...]] = {**PAPER_VARIANTS, "2d+3d+landmark": ALL_CHANNELS}
-"""All inputs of the paper's network by name: the paper's own, and with what landmarks are like."""

@@ -16,31 +16,29 @@ from torch import Tensor
 
 from wheretolook.geometry.colmap_camera import Camera, ColmapCamera
 from wheretolook.geometry.poses import Float, split_poses
+from wheretolook.inputs.channels import ATTRIBUTES
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 from wheretolook.visibility.frustum import LandmarkSets
 
 BLOCK_ENTRIES = {"cpu": 1 << 15, "cuda": 1 << 22}  # landmarks in view a block: fits the cache, or takes 1 GB of a GPU
 
-POSE_ATTRIBUTES = (
-    "across",  # x / z in the camera frame
-    "down",  # y / z in the camera frame
-    "distance",  # logarithm of the distance in metres
-    "mapped_angle",  # cosine between the ray from the camera and the mean direction it was mapped from
-    "distance_ratio",  # logarithm of the distance over the mean mapping distance
-)
-"""Attributes of a landmark that depend on the view."""
-
-ATTRIBUTES = POSE_ATTRIBUTES + MAP_ATTRIBUTES
-
 
 @dataclass(frozen=True, eq=False)
 class ViewLandmarks:
-    """The landmarks in view of each of B views, E entries in all, one view after the other."""
+    """The landmarks in view of each of B views, E entries in all, one view after the other.
 
-    starts: Tensor  # (B + 1,) int64; view b has entries `starts[b]` to `starts[b + 1]`
-    rows: Tensor  # (E,) int64, rows of the landmarks in the map
-    values: Tensor  # (E, len(ATTRIBUTES)) float32
+    Attributes:
+        starts: (B + 1,) int64; view b has entries `starts[b]` to `starts[b + 1]`.
+        rows: (E,) int64, rows of the landmarks in the map.
+        values: (E, A) float32.
+        attributes: names of the A attributes.
+    """
+
+    starts: Tensor
+    rows: Tensor
+    values: Tensor
+    attributes: tuple[str, ...] = ATTRIBUTES
 
     def __len__(self) -> int:
         return len(self.starts) - 1
@@ -57,10 +55,16 @@ class ViewLandmarks:
 
 
 class LandmarkDescriber:
-    """Finds the landmarks that views of a map see, and their attributes, on the map's device."""
+    """Finds the landmarks that views of a map see, and their attributes, on the map's device.
 
-    def __init__(self, localization_map: LocalizationMap) -> None:
-        self.localization_map = localization_map
+    Args:
+        localization_map: landmarks, camera, occlusion, and the device to work on.
+        attributes: what to tell of each landmark: some of `ATTRIBUTES`, by name, in the order asked for.
+    """
+
+    def __init__(self, localization_map: LocalizationMap, attributes: tuple[str, ...] = ATTRIBUTES) -> None:
+        self.localization_map, self.attributes = localization_map, attributes
+        self._columns = [ATTRIBUTES.index(name) for name in attributes]
         landmarks, device = localization_map.landmarks, localization_map.device
         self._points = torch.from_numpy(landmarks.points).to(device)
         self._directions = torch.from_numpy(landmarks.mapping_direction).to(device)
@@ -90,7 +94,10 @@ class LandmarkDescriber:
         mapped_angle = (offsets * self._directions[rows]).sum(1) / distance
         ratio = log_distance - map_values[:, MAP_ATTRIBUTES.index("mapped_distance")]
         pose_values = torch.stack([x / z, y / z, log_distance, mapped_angle, ratio], dim=1)
-        return ViewLandmarks(starts, rows, torch.cat([pose_values, map_values], dim=1))
+        values = torch.cat([pose_values, map_values], dim=1)
+        if self.attributes != ATTRIBUTES:
+            values = values[:, self._columns]
+        return ViewLandmarks(starts, rows, values, self.attributes)
 
     def in_blocks(
         self, cam_from_world: Float, most: int | None = None
@@ -182,8 +189,8 @@ def _occupied(landmarks: ViewLandmarks, views: Tensor, camera: Camera, bins: int
 
 
 def image_cells(landmarks: ViewLandmarks, camera: Camera, bins: int) -> Tensor:
-    """Which of bins x bins cells of the image each landmark falls into, counted row by row, (E,) int64."""
-    rays = landmarks.values[:, :2]
+    """Which of bins x bins cells of the image, row by row, each landmark falls into, (E,) int64."""
+    rays = torch.stack([landmarks.values[:, landmarks.attributes.index(name)] for name in ("across", "down")], dim=1)
     if isinstance(camera, ColmapCamera):
         along = torch.cat([rays, torch.ones_like(rays[:, :1])], dim=1)
         pixels = torch.from_numpy(camera.project(along.cpu().double().numpy())).to(rays)

@@ -35,8 +35,7 @@ class LocalizerConfig:
             raise ConfigError("max_ratio must be in (0, 1]", value=self.max_ratio)
         if self.min_inliers < 4 or self.max_error_px <= 0:
             raise ConfigError(
-                "the localizer needs min_inliers >= 4 and max_error_px > 0",
-                value=(self.min_inliers, self.max_error_px),
+                "the localizer needs min_inliers >= 4 and max_error_px > 0", value=(self.min_inliers, self.max_error_px)
             )
 
 

@@ -11,7 +11,7 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 from torchmetrics.functional.classification import binary_auroc, binary_average_precision, binary_calibration_error
 from torchmetrics.utilities.distributed import gather_all_tensors
 
-from wheretolook.learning.config import TrainConfig
+from wheretolook.learning.config import FittingConfig
 from wheretolook.learning.data import Batch
 
 CALIBRATION_BINS = 15
@@ -45,14 +45,14 @@ def weight_penalty(module: nn.Module) -> Tensor:
 class Augmented(Protocol):
     """A network that changes its inputs while it learns."""
 
-    def augment(self, config: TrainConfig, *inputs: Tensor) -> tuple[Tensor, ...]:
+    def augment(self, options: FittingConfig, *inputs: Tensor) -> tuple[Tensor, ...]:
         """The inputs to learn from in place of a batch's."""
 
 
 class ViewpointClassifier(LightningModule):
     """Learns whether a viewpoint localizes, from batches of the network's inputs.
 
-    A network with a method `augment(config, *inputs)` gets its inputs through that while it learns.
+    A network with a method `augment(options, *inputs)` gets its inputs through that while it learns.
 
     Logged every epoch: `{train,val}_loss`, `{train,val}_bce`, `l2` (the weighted penalty), `train_average_precision`
     (with dropout on), `val_average_precision`, `val_roc_auc` and `val_calibration_error`. Balancing the classes shifts
@@ -60,13 +60,16 @@ class ViewpointClassifier(LightningModule):
 
     Args:
         network: what to train; takes a batch's inputs and gives logits (B,).
-        config: optimizer and loss options.
+        options: of optimizer and loss.
         class_weights: weights of the negative and the positive class.
+        seed: of dropout and noise, where several processes train.
     """
 
-    def __init__(self, network: nn.Module, config: TrainConfig, class_weights: tuple[float, float]) -> None:
+    def __init__(
+        self, network: nn.Module, options: FittingConfig, class_weights: tuple[float, float], seed: int = 0
+    ) -> None:
         super().__init__()
-        self.network, self.config, self.class_weights = network, config, class_weights
+        self.network, self.options, self.class_weights, self.seed = network, options, class_weights, seed
         # logits and labels of an epoch's batches: metrics of every step would take longer than the steps
         self._train_seen: list[Tensor] = []
         self._val_seen: list[Tensor] = []
@@ -80,15 +83,15 @@ class ViewpointClassifier(LightningModule):
     def on_fit_start(self) -> None:
         """Give every process its own dropout and noise."""
         if self.trainer.world_size > 1:
-            torch.manual_seed(self.config.seed + self.trainer.global_rank)
+            torch.manual_seed(self.seed + self.trainer.global_rank)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Loss of one process's share of a batch. The mean over processes is the loss of the batch."""
         inputs, labels, total = batch
         if isinstance(self.network, Augmented):
-            inputs = self.network.augment(self.config, *inputs)
+            inputs = self.network.augment(self.options, *inputs)
         logits = self(*inputs)
-        penalty = self.config.l2 * weight_penalty(self.network)
+        penalty = self.options.l2 * weight_penalty(self.network)
         self._train_seen.append(torch.stack([logits.detach(), labels]))
         self._penalties.append(penalty.detach() * total)
         return weighted_bce(logits, labels, self.class_weights, total / self.trainer.world_size) + penalty
@@ -101,7 +104,7 @@ class ViewpointClassifier(LightningModule):
         """Log the metrics of all validation views."""
         logits, labels = self._gather(self._val_seen)
         bce = weighted_bce(logits, labels, self.class_weights)
-        penalty = self.config.l2 * weight_penalty(self.network)
+        penalty = self.options.l2 * weight_penalty(self.network)
         probabilities, truth = logits.sigmoid(), labels.long()
         self._log(
             {
@@ -127,10 +130,10 @@ class ViewpointClassifier(LightningModule):
 
     def configure_optimizers(self) -> Any:
         """Adam (paper, Sec. 4), with a constant or a cosine learning rate."""
-        optimizer = torch.optim.Adam(self.parameters(), lr=self.config.learning_rate, fused=True)
-        if self.config.schedule == "constant":
+        optimizer = torch.optim.Adam(self.parameters(), lr=self.options.learning_rate, fused=True)
+        if self.options.schedule == "constant":
             return optimizer
-        return [optimizer], [torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, T_max=self.config.epochs)]
+        return [optimizer], [torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, T_max=self.options.epochs)]
 
     def _gather(self, seen: list[Tensor]) -> tuple[Tensor, Tensor]:
         """Logits and labels of an epoch, (B,) each, over all processes."""

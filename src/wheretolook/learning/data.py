@@ -16,8 +16,9 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from wheretolook.dataset.folders import Dataset, SceneFolder
-from wheretolook.inputs.bins import ALL_CHANNELS, CHANNELS, InputStatistics
-from wheretolook.learning.config import TrainConfig
+from wheretolook.inputs.bins import InputStatistics
+from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS
+from wheretolook.learning.config import FittingConfig, SharedConfig
 from wheretolook.utils.errors import ConfigError, TableError
 from wheretolook.utils.files import fingerprint
 from wheretolook.viewpoints.table import UNLABELLED, is_good, poses
@@ -89,7 +90,8 @@ def has_room(device: torch.device | str, n_bytes: int) -> bool:
 def load_views(
     dataset: Dataset,
     scenes: Sequence[SceneFolder],
-    config: TrainConfig,
+    config: SharedConfig,
+    bins: int = 30,
     device: str = "cpu",
     progress: bool = True,
     landmark_channels: bool = False,
@@ -99,7 +101,8 @@ def load_views(
     Args:
         dataset: gives the camera.
         scenes: scenes of the dataset.
-        config: number of bins, error limits of a positive label, and the number of devices to train on.
+        config: error limits of a positive label, and the number of devices to train on.
+        bins: along each side of the image.
         device: where the binning runs, "cpu" or a CUDA device. The views come back on this device if one device trains
             and it has room for them, else on the CPU; for several, in memory that processes can share.
         progress: show a progress bar.
@@ -111,7 +114,7 @@ def load_views(
         ConfigError: the views do not fit into shared memory.
     """
     tables = [labelled_rows(scene) for scene in scenes]
-    total, bins = sum(map(len, tables)), config.bins
+    total = sum(map(len, tables))
     channels = ALL_CHANNELS if landmark_channels else CHANNELS
     n_bytes = total * bins**2 * (len(channels) * torch.float32.itemsize + torch.bool.itemsize)
     home = device if config.devices == 1 and has_room(device, n_bytes) else "cpu"
@@ -209,7 +212,7 @@ def training_scenes(dataset: Dataset) -> list[SceneFolder]:
 
 
 def validation_views(
-    dataset: Dataset, scene: NDArray[np.int64], location: NDArray[np.int64], config: TrainConfig
+    dataset: Dataset, scene: NDArray[np.int64], location: NDArray[np.int64], config: SharedConfig
 ) -> NDArray[np.bool_]:
     """Which views of `training_scenes` are for validation: those of val scenes, or else of held-out locations.
 
@@ -227,7 +230,7 @@ def validation_views(
     return hold_out_locations(scene, location, config.val_fraction, config.seed)
 
 
-def check_classes(split: str, labels: NDArray[np.bool_], dataset: Dataset, config: TrainConfig) -> None:
+def check_classes(split: str, labels: NDArray[np.bool_], dataset: Dataset, config: SharedConfig) -> None:
     """Raise a TableError if the labels (B,) of the views for "training" or "validation" are of one class."""
     if labels.any() and not labels.all():
         return
@@ -345,7 +348,9 @@ class ViewpointDataModule(LightningDataModule):
     Args:
         dataset: its train scenes are learnt from; its val scenes, or else held-out locations of the train scenes, tell
             which epoch was best.
-        config: batch size, bins, label limits, share held out, balance, devices, seed.
+        config: label limits, share held out, devices, seed.
+        options: batch size, balance.
+        bins: along each side of the image.
         device: where the binning runs, and where the views are kept if one device trains and it has room for them.
         progress: show progress bars.
         landmark_channels: whether the views also tell what landmarks are like, for about three times the memory.
@@ -370,13 +375,16 @@ class ViewpointDataModule(LightningDataModule):
     def __init__(
         self,
         dataset: Dataset,
-        config: TrainConfig,
+        config: SharedConfig,
+        options: FittingConfig,
+        bins: int = 30,
         device: str = "cpu",
         progress: bool = True,
         landmark_channels: bool = False,
     ) -> None:
         super().__init__()
-        self.dataset, self.config, self.device, self.progress = dataset, config, device, progress
+        self.dataset, self.config, self.options, self.bins = dataset, config, options, bins
+        self.device, self.progress = device, progress
         self.landmark_channels = landmark_channels
         self.channels: tuple[str, ...] = ALL_CHANNELS if landmark_channels else CHANNELS
 
@@ -395,15 +403,17 @@ class ViewpointDataModule(LightningDataModule):
 
     def train_dataloader(self) -> BatchLoader:
         """Shuffled batches of the training views."""
-        return self._loader(self.train_rows, self.config.batch_size, self.config.seed)
+        return self._loader(self.train_rows, self.options.batch_size, self.config.seed)
 
     def val_dataloader(self) -> BatchLoader:
         """Batches of the validation views, in order."""
-        return self._loader(self.val_rows, 8 * self.config.batch_size)
+        return self._loader(self.val_rows, 8 * self.options.batch_size)
 
     def _load(self) -> None:
         scenes = training_scenes(self.dataset)
-        views = load_views(self.dataset, scenes, self.config, self.device, self.progress, self.landmark_channels)
+        views = load_views(
+            self.dataset, scenes, self.config, self.bins, self.device, self.progress, self.landmark_channels
+        )
         self.use(views, validation_views(self.dataset, views.scene, views.location, self.config))
 
     def use(self, views: LabelledViews, held_out: NDArray[np.bool_]) -> None:
@@ -420,7 +430,7 @@ class ViewpointDataModule(LightningDataModule):
         labels = views.labels.cpu()
         for name, rows in (("training", self.train_rows), ("validation", self.val_rows)):
             check_classes(name, labels[rows].numpy() > 0, self.dataset, self.config)
-        if self.config.balance:
+        if self.options.balance:
             self.train_rows = self.train_rows[balance_classes(labels[self.train_rows], self.config.seed)]
         self.class_weights = class_weights(labels[self.train_rows])
         self.statistics = InputStatistics.of(views.means, views.filled, self.train_rows, views.channels)

@@ -23,7 +23,7 @@ from torch.multiprocessing.spawn import ProcessException
 from tqdm.auto import tqdm
 
 from wheretolook.learning.classifier import ViewpointClassifier
-from wheretolook.learning.config import TrainConfig
+from wheretolook.learning.config import FittingConfig, SharedConfig
 from wheretolook.utils.errors import ConfigError, WorkerError
 from wheretolook.utils.tracking import client
 from wheretolook.utils.tracking_config import TrackingConfig
@@ -43,7 +43,7 @@ LOG_AT_MOST = 1000
 """Metrics MLflow takes at a time."""
 
 
-def home_device(config: TrainConfig) -> str:
+def home_device(config: SharedConfig) -> str:
     """Torch device of the process that calls: "cuda:0" or "cpu".
 
     Raises:
@@ -60,7 +60,7 @@ def home_device(config: TrainConfig) -> str:
     return "cuda:0" if gpus else "cpu"
 
 
-def fit(classifier: ViewpointClassifier, data: LightningDataModule, record: EpochRecord) -> None:
+def fit(classifier: ViewpointClassifier, data: LightningDataModule, record: EpochRecord, config: SharedConfig) -> None:
     """Train a classifier; afterwards `record` has the history and the weights to keep.
 
     With `config.devices > 1`, every device has its own process, started here and ended here: a script that calls this
@@ -70,11 +70,12 @@ def fit(classifier: ViewpointClassifier, data: LightningDataModule, record: Epoc
         classifier: what to train.
         data: batches of its network's inputs.
         record: gathers the results.
+        config: where to train.
     """
-    config = classifier.config
+    options = classifier.options
     callbacks: list[Callback] = [record]
-    if config.patience is not None:
-        callbacks.append(EarlyStopping(MONITORED, mode="max", patience=config.patience))
+    if options.patience is not None:
+        callbacks.append(EarlyStopping(MONITORED, mode="max", patience=options.patience))
     several = config.devices > 1
     with _quiet(), TemporaryDirectory() as folder:
         if several:
@@ -84,7 +85,7 @@ def fit(classifier: ViewpointClassifier, data: LightningDataModule, record: Epoc
             devices=config.devices,
             # spawned processes run nothing but the fit; processes that run the program anew would repeat all else
             strategy=_Spawned(start_method="spawn") if several else "auto",
-            max_epochs=config.epochs,
+            max_epochs=options.epochs,
             logger=False,
             callbacks=callbacks,
             default_root_dir=folder,
@@ -137,7 +138,7 @@ class EpochRecord(Checkpoint):
 
     Args:
         title: title of the progress bar.
-        config: tells which weights to keep.
+        options: tell which weights to keep.
         progress: show a bar.
         run_log: where to log, if anywhere.
 
@@ -147,9 +148,9 @@ class EpochRecord(Checkpoint):
         file: where a process that trains leaves the record for the one that started it; None if they are the same.
     """
 
-    def __init__(self, title: str, config: TrainConfig, progress: bool, run_log: RunLog | None = None) -> None:
-        self.title, self.epochs, self.progress, self.run_log = title, config.epochs, progress, run_log
-        self.keep_best = config.keep == "best"
+    def __init__(self, title: str, options: FittingConfig, progress: bool, run_log: RunLog | None = None) -> None:
+        self.title, self.epochs, self.progress, self.run_log = title, options.epochs, progress, run_log
+        self.keep_best = options.keep == "best"
         self.rows: list[dict[str, float]] = []
         self.kept = -1
         self.file: Path | None = None

@@ -17,7 +17,7 @@ from tqdm.auto import tqdm
 
 from wheretolook.dataset.folders import Dataset, SceneFolder
 from wheretolook.inputs.landmarks_in_view import ATTRIBUTES, LandmarkDescriber, ViewLandmarks
-from wheretolook.learning.config import TrainConfig
+from wheretolook.learning.config import SharedConfig
 from wheretolook.learning.data import Batch, has_room, labelled_rows, training_scenes, validation_views
 from wheretolook.learning.fit import home_device
 from wheretolook.learning.learner import Task
@@ -35,12 +35,14 @@ class AttributeStatistics:
     """Mean and standard deviation of what is known of each landmark, over those in view while training.
 
     Attributes:
-        mean: (len(ATTRIBUTES),), 0 for what is not known of any.
-        std: (len(ATTRIBUTES),), 1 where it would be 0.
+        mean: (A,), 0 for what is not known of any.
+        std: (A,), 1 where it would be 0.
+        attributes: names of the A attributes.
     """
 
     mean: tuple[float, ...]
     std: tuple[float, ...]
+    attributes: tuple[str, ...] = ATTRIBUTES
 
     @classmethod
     def of(cls, values: Tensor) -> AttributeStatistics:
@@ -102,7 +104,7 @@ class LandmarkViews:
 def load_landmark_views(
     dataset: Dataset,
     scenes: Sequence[SceneFolder],
-    config: TrainConfig,
+    config: SharedConfig,
     most: int,
     device: str = "cpu",
     progress: bool = True,
@@ -286,7 +288,8 @@ class LandmarkDataModule(LightningDataModule):
 
     def __init__(self, task: Task, most: int, matches: bool = False) -> None:
         super().__init__()
-        self.config, dataset, device = task.config, task.dataset, home_device(task.config)
+        self.config, self.options = task.config, task.options
+        dataset, device = task.dataset, home_device(task.config)
         scenes = training_scenes(dataset)
         self.views = load_landmark_views(dataset, scenes, self.config, most, device, task.progress, matches)
         held_out = torch.from_numpy(validation_views(dataset, self.views.scene, self.views.location, self.config))

@@ -1,8 +1,7 @@
-"""What every way of learning beside the paper's network has in common: data in, a model and its metrics out."""
+"""What all ways of learning have in common: data in, a model and its metrics out."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -15,7 +14,7 @@ from torch import nn
 
 from wheretolook.dataset.folders import Dataset
 from wheretolook.learning.classifier import ViewpointClassifier
-from wheretolook.learning.config import TrainConfig
+from wheretolook.learning.config import SharedConfig
 from wheretolook.learning.fit import EpochRecord, RunLog, fit
 
 
@@ -43,26 +42,29 @@ class Learnt:
     history: pd.DataFrame | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Task:
     """What a learner is asked to do.
 
     Attributes:
         dataset: labelled train scenes, and val scenes if it has any.
-        config: options, those of the variant in place.
+        method: name of the method to learn.
+        config: options that all learners share.
+        options: the method's own, such as a `FittingConfig`.
         title: of its progress bar.
         progress: whether to show it.
-        run_log: takes the metrics of epochs.
+        run_log: takes the metrics of epochs; None logs none.
+        kept: what learners that follow one another leave for the next, such as views that are binned already.
     """
 
     dataset: Dataset
-    config: TrainConfig
-    title: str
-    progress: bool
-    run_log: RunLog
-
-
-Learner = Callable[[Task], Learnt]
+    method: str
+    config: SharedConfig
+    options: Any
+    title: str = ""
+    progress: bool = False
+    run_log: RunLog | None = None
+    kept: dict[str, Any] = field(default_factory=dict)
 
 
 def fit_network(
@@ -73,9 +75,9 @@ def fit_network(
     Returns:
         Metrics of the epoch kept, and of all epochs.
     """
-    classifier = ViewpointClassifier(network, task.config, class_weights)
-    record = EpochRecord(task.title, task.config, task.progress, task.run_log)
-    fit(classifier, data, record)
+    classifier = ViewpointClassifier(network, task.options, class_weights, task.config.seed)
+    record = EpochRecord(task.title, task.options, task.progress, task.run_log)
+    fit(classifier, data, record, task.config)
     metrics = record.restore(classifier)
     network.eval()
     return metrics, record.history

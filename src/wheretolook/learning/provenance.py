@@ -2,33 +2,91 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from wheretolook.dataset.folders import Dataset
+from wheretolook.dataset.folders import Dataset, SceneFolder
+from wheretolook.learning.config import DECIDING, SharedConfig
 from wheretolook.learning.data import with_also
+from wheretolook.learning.old_names import with_name
 from wheretolook.utils.errors import ConfigError, TableError
+from wheretolook.utils.files import fingerprint, sha256
+from wheretolook.utils.version import VERSION
 
 
 @dataclass(frozen=True)
 class TrainedModel:
-    """What training one variant left.
+    """What training one method left.
 
     Attributes:
-        variant: the input variant.
+        method: its name.
         path: its weights.
         run_id: its MLflow run, at the time of training.
         metrics: metrics of the epoch whose weights were kept, and that epoch's number (from 0) as "epoch".
         reused: whether it was trained before and only found again.
     """
 
-    variant: str
+    method: str
     path: Path
     run_id: str
     metrics: dict[str, float]
     reused: bool = False
+
+
+def weights_path(dataset: Dataset, method: str) -> Path:
+    """Where the weights of a method lie in a dataset's folder; beside them `.json`, the record of their training."""
+    return dataset.root / "weights" / f"{method}.safetensors"
+
+
+def about_training(dataset: Dataset, method: str, config: SharedConfig, options: Any) -> dict[str, Any]:
+    """What decides which weights come out, as JSON values.
+
+    Args:
+        dataset: with the scenes of others that are learnt from as well, see `with_also`.
+        method: name of the method.
+        config: options that all learners share.
+        options: the method's own, a dataclass. What training starts from (`FittingConfig.starts_from`) decides, too.
+    """
+    shared = {name: value for name, value in asdict(config).items() if name in DECIDING}
+    about: dict[str, Any] = {
+        "dataset": dataset.name,
+        "dataset_fingerprint": training_fingerprint(dataset),
+        "landmarks": {
+            _name(scene, dataset): fingerprint(scene.landmarks) for scene in dataset.scenes if scene.split != "test"
+        },
+        "code_version": VERSION,
+        "method": method,
+        "camera": asdict(dataset.camera),
+        "config": {**asdict(options), **shared},
+    }
+    if config.also:
+        about["also"] = list(config.also)
+        own = tuple(scene for scene in dataset.scenes if scene.folder.parent == dataset.root)
+        about["own_fingerprint"] = training_fingerprint(Dataset(dataset.root, dataset.camera, own))
+    if start := getattr(options, "starts_from", ""):
+        path = weights_path(dataset, start)
+        about[f"{start}_sha256"] = sha256(path) if path.is_file() else None
+    return dict(json.loads(json.dumps(about)))
+
+
+def _name(scene: SceneFolder, dataset: Dataset) -> str:
+    """Name of a scene, with that of its dataset if it is of another one."""
+    folder = scene.folder.parent
+    return scene.name if folder == dataset.root else f"{folder.name}/{scene.name}"
+
+
+def trained_before(path: Path, about: Mapping[str, Any]) -> TrainedModel | None:
+    """The model at `path` if it was trained as `about` says and has not been changed since."""
+    try:
+        record = json.loads(path.with_suffix(".json").read_text())
+        if with_name(record["about"]) == about and record["weights_sha256"] == sha256(path):
+            return TrainedModel(about["method"], path, record["run_id"], record["metrics"], reused=True)
+    except (OSError, ValueError, KeyError, TypeError):
+        pass  # no record, or a damaged one: train
+    return None
 
 
 def training_fingerprint(dataset: Dataset) -> str:

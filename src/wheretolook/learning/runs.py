@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
 from wheretolook.dataset.folders import Dataset
+from wheretolook.learning.old_names import name_of_variant, with_name, with_names
 from wheretolook.utils.files import write_text
 from wheretolook.utils.tracking import artifact, client, finished_runs
 from wheretolook.utils.tracking_config import TrackingConfig
+
+if TYPE_CHECKING:
+    from mlflow.entities import Run
 
 HISTORY_CSV = "history.csv"
 """Artifact of a train run: a row an epoch."""
 
 TRAINING_CSV = "training.csv"
-"""In a release's `results/`: the histories of all that was trained, one below the other, with a column `variant`."""
+"""In a release's `results/`: the histories of all that was trained, one below the other, with a column `method`."""
 
 LOG_AT_MOST = 1000
 """Metrics MLflow takes at a time."""
@@ -26,37 +30,54 @@ LOG_AT_MOST = 1000
 
 def params_of(about: Mapping[str, Any]) -> dict[str, Any]:
     """Parameters of a train run, from what its weights' record tells about it."""
-    config, variant = about["config"], about["variant"]
-    return {
-        **{name: about[name] for name in ("variant", "dataset", "dataset_fingerprint")},
-        **config.get(variant, {}),  # a learner has its own
-        **{name: value for name, value in config.items() if name != variant},
-    }
+    return {name: about[name] for name in ("method", "dataset", "dataset_fingerprint")} | about["config"]
+
+
+def method_of_run(run: Run) -> str:
+    """The name of the method that a train run has trained."""
+    params = run.data.params
+    return str(params["method"]) if "method" in params else name_of_variant(params.get("variant", ""))
+
+
+def train_runs(
+    tracking: TrackingConfig, dataset: str = "", method: str = "", file: str = ""
+) -> Iterator[tuple[str, Run]]:
+    """Finished train runs, the newest first, with the names of their methods.
+
+    Args:
+        tracking: the store.
+        dataset: that they were trained on; "" for any.
+        method: name of the method; "" for any.
+        file: artifact that they must have; "" for none.
+    """
+    for run in finished_runs(tracking, "train", params={"dataset": dataset} if dataset else None, file=file):
+        name = method_of_run(run)
+        if not method or name == method:
+            yield name, run
 
 
 def histories(tracking: TrackingConfig, dataset: str) -> dict[str, pd.DataFrame]:
-    """The history of the newest run of each variant trained on a dataset, by the variant; empty without any."""
+    """The history of the newest run of each method trained on a dataset, by the method; empty without any."""
     found: dict[str, pd.DataFrame] = {}
-    for run in finished_runs(tracking, "train", params={"dataset": dataset}, file=HISTORY_CSV):
-        variant = run.data.params["variant"]
-        if variant not in found:
-            found[variant] = pd.read_csv(artifact(tracking, run.info.run_id, HISTORY_CSV))
+    for method, run in train_runs(tracking, dataset, file=HISTORY_CSV):
+        if method not in found:
+            found[method] = pd.read_csv(artifact(tracking, run.info.run_id, HISTORY_CSV))
     return dict(sorted(found.items()))
 
 
 def trained(tracking: TrackingConfig, dataset: str) -> pd.DataFrame:
-    """What the newest run of each variant trained on a dataset kept.
+    """What the newest run of each method trained on a dataset kept.
 
     Returns:
-        A row a variant, the best first: `variant`, `epoch` whose weights were kept, and on the validation views
+        A row a method, the best first: `method`, `epoch` whose weights were kept, and on the validation views
         `average_precision`, `roc_auc` and `calibration_error`, NaN where the learner does not measure it.
     """
     found: dict[str, dict[str, Any]] = {}
-    for run in finished_runs(tracking, "train", params={"dataset": dataset}):
-        kept, variant = run.data.metrics, run.data.params["variant"]
+    for method, run in train_runs(tracking, dataset):
+        kept = run.data.metrics
         measures = {name: kept.get(f"kept_val_{name}", float("nan")) for name in _MEASURES}
-        found.setdefault(variant, {"variant": variant, "epoch": kept.get("kept_epoch", float("nan")), **measures})
-    table = pd.DataFrame(list(found.values()), columns=["variant", "epoch", *_MEASURES])
+        found.setdefault(method, {"method": method, "epoch": kept.get("kept_epoch", float("nan")), **measures})
+    table = pd.DataFrame(list(found.values()), columns=["method", "epoch", *_MEASURES])
     table["epoch"] = table["epoch"].astype("Int64")
     return table.sort_values("average_precision", ascending=False, ignore_index=True)
 
@@ -87,27 +108,37 @@ def log_history(tracking: TrackingConfig, run_id: str, history: pd.DataFrame) ->
 
 def records(folder: Path) -> dict[Path, dict[str, Any]]:
     """Records of training in a folder of weights and the folders in it, by their files."""
-    return {path: json.loads(path.read_text()) for path in sorted(folder.rglob("*.json"))}
+    found = {path: json.loads(path.read_text()) for path in sorted(folder.rglob("*.json"))}
+    return {path: record | {"about": with_name(record["about"])} for path, record in found.items()}
+
+
+def read_histories(path: Path) -> pd.DataFrame:
+    """`TRAINING_CSV`; empty if there is none."""
+    return with_names(pd.read_csv(path)) if path.is_file() else pd.DataFrame({"method": []})
 
 
 def keep_histories(release: Dataset, tracking: TrackingConfig) -> pd.DataFrame:
     """Write `results/training.csv` of a release: histories of what was trained on it, as far as the store has them.
 
-    A history is that of the run that trained the weights, or else of the newest with the same parameters. Variants
+    A history is that of the run that trained the weights, or else of the newest with the same parameters. Methods
     without any keep the rows that the file has already.
     """
     path = release.root / "results" / TRAINING_CSV
-    known = pd.read_csv(path) if path.is_file() else pd.DataFrame({"variant": []})
+    known = read_histories(path)
     kept = []
     for record in records(release.root / "weights").values():
-        variant, history = record["about"]["variant"], None
-        same = {name: str(value) for name, value in params_of(record["about"]).items()}
-        alike = list(finished_runs(tracking, "train", params=same, file=HISTORY_CSV))
+        method, history = record["about"]["method"], None
+        same = {name: str(value) for name, value in params_of(record["about"]).items() if name != "method"}
+        alike = [
+            run
+            for _, run in train_runs(tracking, same["dataset"], method, HISTORY_CSV)
+            if same.items() <= run.data.params.items()
+        ]
         own = [run for run in alike if run.info.run_id == record["run_id"]]
         for run in (own or alike)[:1]:
             history = pd.read_csv(artifact(tracking, run.info.run_id, HISTORY_CSV))
-        rows = known[known["variant"] == variant] if history is None else history.assign(variant=variant)
-        kept.append(rows[["variant", *rows.columns.drop("variant")]])
+        rows = known[known["method"] == method] if history is None else history.assign(method=method)
+        kept.append(rows[["method", *rows.columns.drop("method")]])
     table = pd.concat([rows for rows in kept if len(rows)], ignore_index=True) if any(map(len, kept)) else known
     if len(table):
         write_text(path, table.to_csv(index=False, float_format="%.5g", lineterminator="\n"))

@@ -12,31 +12,28 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from wheretolook.inputs.bins import InputStatistics
-from wheretolook.learning.config import MATCHABILITY
+from wheretolook.learning.old_names import name_of_header, with_name
 from wheretolook.utils.errors import WeightsError
 
 FORMAT_VERSION = 1
 """Version of the layout of the metadata."""
 
-MLP = "mlp"
-"""Kind of weights without a kind in their header."""
-
 METADATA_KEY = "wheretolook"
 """Key of the JSON text in the header of the file."""
 
 
-def write_weights(path: str | Path, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> None:
+def write_weights(path: str | Path, method: str, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> None:
     """Write tensors and a description (JSON values) as one safetensors file, atomically. The same give the same bytes.
 
     Args:
         path: file to write; its folder is made when needed.
+        method: name of the method that the weights serve.
         tensors: by name, on any device.
-        header: the description; "kind" names the method that the weights serve.
+        header: the description; "camera" is that of the training views, "training" what is known of the training.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    text = json.dumps({"format_version": FORMAT_VERSION, **header})
+    text = json.dumps({"format_version": FORMAT_VERSION, **header, "method": method})
     partial = path.with_name(path.name + ".partial")
     # not by `save_file`, which makes a file that other users cannot read
     content = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
@@ -44,22 +41,21 @@ def write_weights(path: str | Path, tensors: Mapping[str, Tensor], header: Mappi
     os.replace(partial, path)
 
 
-def check_kind(path: str | Path, header: Mapping[str, Any], kind: str) -> None:
-    """Raise a WeightsError unless the description of weights says that they serve this method."""
-    if header.get("kind", MLP) != kind:
-        raise WeightsError(
-            f"these weights are not of {kind}", path=path, value=header.get("kind", MLP),
-            fix=f"Give weights of {kind}, or train them.",
-        )  # fmt: skip
+def check_serves(path: str | Path, header: Mapping[str, Any], *methods: str) -> None:
+    """Raise a WeightsError unless the description of weights says that they serve one of these methods."""
+    found = name_of_header(header)
+    if found not in methods:
+        fix = f"Give weights of {methods[0]}, or train them."
+        raise WeightsError(f"these weights are not of {' or '.join(methods)}", path=path, value=found, fix=fix)
 
 
 def read_training(path: str | Path) -> dict[str, Any]:
-    """What `save_classifier` was told about the training.
+    """What the train stage has written into the header of weights about their training.
 
     Raises:
         WeightsError: the file is missing, damaged or foreign.
     """
-    return dict(read_weights(Path(path))[1].get("training", {}))
+    return with_name(read_weights(Path(path))[1].get("training", {}))
 
 
 def read_record(path: str | Path) -> dict[str, Any]:
@@ -71,33 +67,30 @@ def read_record(path: str | Path) -> dict[str, Any]:
     beside = Path(path).with_suffix(".json")
     try:
         record = dict(json.loads(beside.read_text()))
-        float(record["metrics"]["val_average_precision"]), record["about"]
-        return record
+        float(record["metrics"]["val_average_precision"])
+        return record | {"about": with_name(record["about"])}
     except (OSError, ValueError, TypeError, KeyError) as error:
         raise WeightsError(
             f"the record of training is missing or damaged: {error}", path=beside, fix="Train again."
         ) from error
 
 
-def best_weights(folder: str | Path) -> Path:
-    """The weights of a folder with the best validation average precision; of matchability none, which scores no views.
-
-    Raises:
-        WeightsError: there are none, or a record of training is missing or damaged.
-    """
-    scorers = [path for path in sorted(Path(folder).glob("*.safetensors")) if path.stem != MATCHABILITY]
-    if not scorers:
-        raise WeightsError("there are no weights of a scorer", path=folder, fix="Run the train stage first.")
-    return max(scorers, key=lambda path: float(read_record(path)["metrics"]["val_average_precision"]))
-
-
-def weights_kind(path: str | Path) -> str:
-    """The method that a weights file serves, such as "mlp" or "trees".
+def method_of_weights(path: str | Path) -> str:
+    """The name of the method that a weights file serves, such as "mlp-2d+z" or "set".
 
     Raises:
         WeightsError: the file is missing, damaged or foreign.
     """
-    return str(read_weights(Path(path))[1].get("kind", MLP))
+    return name_of_header(read_weights(Path(path))[1])
+
+
+def save_in_half(path: Path) -> None:
+    """Store weights in half precision, atomically, with the same description. Done again, nothing changes."""
+    tensors, header = read_weights(path)
+    if any(tensor.is_floating_point() and tensor.element_size() > 2 for tensor in tensors.values()):
+        halved = {name: tensor.half() if tensor.is_floating_point() else tensor for name, tensor in tensors.items()}
+        header.pop("format_version")
+        write_weights(path, name_of_header(header), halved, header)
 
 
 def read_weights(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -130,8 +123,3 @@ def read_weights(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
             fix="Train again, or install the version that wrote them.",
         )
     return tensors, header
-
-
-def stored_statistics(stored: Mapping[str, Any]) -> InputStatistics:
-    """Input statistics from a header."""
-    return InputStatistics(tuple(stored["channels"]), tuple(stored["mean"]), tuple(stored["std"]))

@@ -1,1 +1,1 @@
-"""Methods that score viewpoints, all with the same interface (`Scorer`)."""
+"""Methods that score viewpoints: one module or folder each, with its record (`wheretolook.methods.method.Method`)."""

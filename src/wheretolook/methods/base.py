@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import ClassVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wheretolook.geometry.poses import Float
-from wheretolook.inputs.bins import ALL_CHANNELS, CHANNELS, BinnedViews
-from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS
+
+if TYPE_CHECKING:
+    from wheretolook.inputs.bins import BinnedViews
+    from wheretolook.inputs.localization_map import LocalizationMap
 
 BLOCK = 4096
 """Views scored at a time: about 80 MB of bins."""
@@ -26,18 +29,16 @@ class Scorer(ABC):
     - Higher is better. Scores lie in [0, 1] where the method allows; only their order counts for choosing a view.
     - The same scorer gives the same scores to the same poses.
 
-    A new method is one file with a subclass, registered in `methods.registry.SCORERS`. One that needs binned
-    landmarks derives from `BinnedScorer` instead.
+    A new method is one file with a subclass and a record (`wheretolook.methods.method.Method`), named in
+    `registry.MODULES`. One that needs binned landmarks derives from `BinnedScorer` instead.
 
     Attributes:
-        name: short name of the method, as in tables and on the command line.
-        inputs: input variant of a learned method, "" for others.
+        name: of the method, as in tables and on the command line.
         local: whether a score depends on no landmarks but those with a free line of sight from the view's location. A
             viewpoint map then need not be built anew where added landmarks are hidden. False where it is not known.
     """
 
-    name: ClassVar[str]
-    inputs: str = ""
+    name: str
     local: bool = False
 
     def __init__(self, localization_map: LocalizationMap) -> None:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 from numpy.typing import NDArray
 
 from wheretolook.geometry.poses import Float
 from wheretolook.methods.base import CountingScorer
+from wheretolook.methods.method import Method, MethodStyle
 
 
 class BinsScorer(CountingScorer):
@@ -17,10 +16,20 @@ class BinsScorer(CountingScorer):
     Among views with as many filled bins, the one that sees more landmarks scores higher, by less than one bin is worth.
     """
 
-    name: ClassVar[str] = "bins"
+    name = "bins"
     local = True
 
     def score_counts(self, n_visible: NDArray[np.int32], n_filled: NDArray[np.int32]) -> Float:
         """(B,) in [0, 1)."""
         visible = n_visible.astype(np.float64)
         return (n_filled + visible / (1 + visible)) / (self.bins**2 + 1)
+
+
+METHODS = (
+    Method(
+        name=BinsScorer.name,
+        about='Share of the image\'s bins with a visible landmark in them (paper, Sec. 4.1, "reprojection with bins").',
+        style=MethodStyle("reprojections with bins", "#009E73", "D", "-."),
+        build=lambda localization_map, options: BinsScorer(localization_map),
+    ),
+)

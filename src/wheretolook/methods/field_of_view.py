@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
-
 import numpy as np
 
 from wheretolook.geometry.camera import PinholeCamera
@@ -14,21 +10,6 @@ from wheretolook.utils.errors import WeightsError
 
 FIELD_OF_VIEW_TOLERANCE = 1e-3
 """Relative difference in width / focal length and height / focal length up to which fields of view are the same."""
-
-
-def channel_scales(trained: PinholeCamera, camera: Camera, channels: tuple[str, ...]) -> list[float]:
-    """What channels of a camera's views are multiplied by to be as those of the camera of the training views."""
-    scale = {"u": trained.width / camera.width, "v": trained.height / camera.height}
-    return [scale.get(name, 1.0) for name in channels]
-
-
-@contextmanager
-def naming(weights: str | Path) -> Iterator[None]:
-    """Let a WeightsError name the file of the weights that are used."""
-    try:
-        yield
-    except WeightsError as error:
-        raise WeightsError(error.problem, path=weights, value=error.value, fix=error.fix) from None
 
 
 def check_field_of_view(trained: PinholeCamera, camera: Camera) -> None:

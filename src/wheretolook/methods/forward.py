@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from wheretolook.geometry.poses import Float, camera_centers, check_poses
-from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.methods.base import Scorer
+from wheretolook.methods.method import Method, MethodStyle, ScorerOptions
 from wheretolook.methods.random import uniform
+
+if TYPE_CHECKING:
+    from wheretolook.inputs.localization_map import LocalizationMap
 
 
 class ForwardScorer(Scorer):
@@ -27,7 +30,7 @@ class ForwardScorer(Scorer):
         ValueError: a heading is zero or not finite, or two waypoints in a row are the same.
     """
 
-    name: ClassVar[str] = "forward"
+    name = "forward"
     local = True
 
     def __init__(self, localization_map: LocalizationMap, heading: ArrayLike | None = None, seed: int = 0) -> None:
@@ -65,3 +68,19 @@ class ForwardScorer(Scorer):
         poses = check_poses(cam_from_world)
         cosines = np.einsum("bi,bi->b", poses[:, 2, :3], self.headings(camera_centers(poses)))
         return np.asarray((1 + np.clip(cosines, -1, 1)) / 2)
+
+
+def _build(localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
+    heading = None if not options.heading else options.heading[0] if len(options.heading) == 1 else options.heading
+    return ForwardScorer(localization_map, heading, options.seed)
+
+
+METHODS = (
+    Method(
+        name=ForwardScorer.name,
+        about="Views by how near they look to a heading: the classical camera that knows nothing of the map (paper, "
+        "Sec. 4.3).",
+        style=MethodStyle("forward", "#6B6B6B", ">", (0, (6, 2))),
+        build=_build,
+    ),
+)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wheretolook.geometry.poses import Float
-from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.methods.base import Scorer
+from wheretolook.methods.method import Method, MethodStyle
+
+if TYPE_CHECKING:
+    from wheretolook.inputs.localization_map import LocalizationMap
 
 POSE_DECIMALS = 6
 """Poses that agree to this many decimals (of a metre, and in the rotation matrix) get the same score."""
@@ -23,7 +26,7 @@ class RandomScorer(Scorer):
         seed: another seed gives other scores.
     """
 
-    name: ClassVar[str] = "random"
+    name = "random"
     local = True
 
     def __init__(self, localization_map: LocalizationMap, seed: int = 0) -> None:
@@ -50,3 +53,15 @@ def _splitmix64(state: NDArray[np.uint64]) -> NDArray[np.uint64]:
     state = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return state ^ (state >> np.uint64(31))
+
+
+METHODS = (
+    Method(
+        name=RandomScorer.name,
+        about="Uniform random scores, a function of pose and seed, so that they do not depend on the order of the "
+        "batch.",
+        style=MethodStyle("random", "#999999", "x", ":"),
+        build=lambda localization_map, options: RandomScorer(localization_map, options.seed),
+        by_chance=True,
+    ),
+)

@@ -1,156 +1,135 @@
-"""All methods by name."""
+"""All methods, by name: those of this package and those that other packages register."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Iterable
+from functools import cache
+from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING
 
-from wheretolook.fisher.metrics import METRICS
-from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.learning.weights import best_weights, weights_kind
-from wheretolook.methods.base import Scorer
-from wheretolook.methods.bins import BinsScorer
-from wheretolook.methods.fisher import (
-    FISHER_METHODS,
-    ORIGIN_METHODS,
-    FisherScorer,
-    StationaryTraceScorer,
-    WorstTraceScorer,
-)
-from wheretolook.methods.forward import ForwardScorer
-from wheretolook.methods.max_visibility import MaxVisibilityScorer, SwappedMaxVisibilityScorer
-from wheretolook.methods.mlp.score import LearnedScorer
-from wheretolook.methods.random import RandomScorer
-from wheretolook.methods.visible import VisibleScorer
+from wheretolook.methods.method import Method, ScorerOptions
 from wheretolook.utils.errors import ConfigError, WeightsError
 
+if TYPE_CHECKING:
+    from collections.abc import Mapping
 
-def _with_weights(name: str) -> Callable[[LocalizationMap, ScorerOptions], Scorer]:
-    def build(localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
+    from wheretolook.inputs.localization_map import LocalizationMap
+    from wheretolook.methods.base import Scorer
 
-        scorer = load_scorer(_given(name, options.weights), localization_map)
-        if scorer.name != name:
-            fix = f"Give weights of {name}, or train them."
-            raise WeightsError(f"these weights are not of {name}", path=options.weights, value=scorer.name, fix=fix)
-        return scorer
+MODULES = (
+    "random", "forward", "visible", "bins", "max_visibility", "fisher", "mlp", "matchability", "trees", "conv", "set",
+    "sphere",
+)  # fmt: skip
+"""Modules of `wheretolook.methods` whose `METHODS` are the package's own, in the order of tables."""
 
-    return build
-
-
-def _given(name: str, weights: str | Path | None) -> str | Path:
-    if weights is None:
-        raise ConfigError("the method needs weights", value=name, fix="Give a file that the train stage wrote.")
-    return weights
+GROUP = "wheretolook.methods"
+"""Entry points of this group give a `Method`, or several, of another package."""
 
 
-@dataclass(frozen=True)
-class ScorerOptions:
-    """What some methods need beside the map; see `make_scorer`."""
+@cache
+def all_methods() -> Mapping[str, Method]:
+    """Every method by its name, this package's own first.
 
-    seed: int = 0
-    weights: str | Path | None = None
-    heading: tuple[tuple[float, float, float], ...] = ()
-
-
-def _fisher(name: str) -> Callable[[LocalizationMap, ScorerOptions], Scorer]:
-    return lambda localization_map, options: FisherScorer(localization_map, *_ALL_FISHER[name])
-
-
-def _forward(localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
-    heading = None if not options.heading else options.heading[0] if len(options.heading) == 1 else options.heading
-    return ForwardScorer(localization_map, heading, options.seed)
-
-
-def _expected(name: str) -> Callable[[LocalizationMap, ScorerOptions], Scorer]:
-    def build(localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
-        from wheretolook.methods.matchability.score import (  # PyTorch takes seconds to load
-            ExpectedFisherScorer,
-            ExpectedScorer,
-        )
-
-        weights = _given(name, options.weights)
-        if name in EXPECTED_FISHER_METHODS:
-            return ExpectedFisherScorer(localization_map, weights, EXPECTED_FISHER_METHODS[name])
-        return ExpectedScorer(localization_map, weights, name.removeprefix("expected-"))
-
-    return build
+    Raises:
+        ConfigError: what another package registers cannot be loaded, is no method, or has the name of another.
+    """
+    found: dict[str, Method] = {}
+    for module in MODULES:
+        for method in import_module(f"wheretolook.methods.{module}").METHODS:
+            _add(found, method, f"wheretolook.methods.{module}")
+    for entry in entry_points(group=GROUP):
+        for method in _loaded(entry):
+            _add(found, method, f"the entry point {entry.name} = {entry.value}")
+    return MappingProxyType(found)
 
 
-EXPECTED_FISHER_METHODS = {f"fisher-{metric}-expected": metric for metric in METRICS}
-"""Metric of the information that is weighted by the landmarks' chance of being found, by the names of the methods."""
+def _loaded(entry: EntryPoint) -> Iterable[Method]:
+    try:
+        given = entry.load()
+        methods = [given] if isinstance(given, Method) else list(given)
+    except Exception as error:  # whatever a foreign module raises
+        problem = f"a method of another package cannot be loaded: {type(error).__name__}: {error}"
+        fix = "Mend or uninstall that package."
+        raise ConfigError(problem, value=f"{entry.name} = {entry.value}", fix=fix) from error
+    for method in methods:
+        if not isinstance(method, Method):
+            fix = f"The entry point must give a wheretolook.methods.method.Method, or several, not {type(method)}."
+            raise ConfigError("no method", value=f"{entry.name} = {entry.value}", fix=fix)
+    return methods
 
-EXPECTED_METHODS = ("expected-inliers", "expected-bins", *EXPECTED_FISHER_METHODS)
-"""Methods that weight landmarks by their chance of being found."""
 
-_ALL_FISHER = {**FISHER_METHODS, **ORIGIN_METHODS}
+def _add(found: dict[str, Method], method: Method, source: str) -> None:
+    if method.name in found or any(method.name == other.family for other in found.values()):
+        fix = f"Rename the one of {source}, or uninstall its package."
+        raise ConfigError("two methods have the same name", value=method.name, fix=fix)
+    if " " in method.name or not method.name:
+        raise ConfigError("a method's name is one word", value=method.name, fix=f"Rename the one of {source}.")
+    if (method.learn is None) != (method.config is None) or (method.learn is not None and not method.folder):
+        fix = f"Complete the one of {source}."
+        raise ConfigError("a method that learns needs learn, config and folder", value=method.name, fix=fix)
+    found[method.name] = method
 
-SCORERS: dict[str, Callable[[LocalizationMap, ScorerOptions], Scorer]] = {
-    "random": lambda localization_map, options: RandomScorer(localization_map, options.seed),
-    "forward": _forward,
-    "visible": lambda localization_map, options: VisibleScorer(localization_map),
-    "bins": lambda localization_map, options: BinsScorer(localization_map),
-    "max-visibility": lambda localization_map, options: MaxVisibilityScorer(localization_map),
-    "max-visibility-swapped": lambda localization_map, options: SwappedMaxVisibilityScorer(localization_map),
-    **{name: _fisher(name) for name in _ALL_FISHER},
-    "fisher-worst-trace": lambda localization_map, options: WorstTraceScorer(localization_map),
-    "fisher-stationary-trace": lambda localization_map, options: StationaryTraceScorer(localization_map),
-    "mlp": _with_weights("mlp"),
-    **{name: _expected(name) for name in EXPECTED_METHODS},
-    **{name: _with_weights(name) for name in ("trees", "conv", "set", "sphere")},
-}
-"""How each method is built from a map and options."""
 
-WEIGHTS_OF = {
-    **dict.fromkeys(EXPECTED_METHODS, "matchability"),
-    **{name: name for name in ("mlp", "trees", "conv", "set", "sphere")},
-}
-"""Methods that have learnt, and the kind of weights (`wheretolook.learning.weights.weights_kind`) that each needs."""
+def find(name: str) -> Method | None:
+    """The method of a table's row; None for the oracle, and for what is not installed here.
 
-OPTIONAL = tuple(ORIGIN_METHODS)
-"""Methods that an evaluation has only if it names them: no rows of the paper."""
+    Args:
+        name: of the method; several files of one method are told apart by what follows a space.
+    """
+    return all_methods().get(name.partition(" ")[0])
 
-PROBES = ("fisher-worst-trace", "fisher-stationary-trace")
-"""Methods that show the worst side of a field; tables show them apart."""
+
+def scorers() -> dict[str, Method]:
+    """The methods that score views, by name."""
+    return {name: method for name, method in all_methods().items() if method.build is not None}
+
+
+def learned() -> dict[str, Method]:
+    """What can be trained, by name."""
+    return {name: method for name, method in all_methods().items() if method.learn is not None}
+
+
+def members(name: str, among: Mapping[str, Method]) -> list[Method]:
+    """The methods that a name stands for: one, or those of a family; empty if there are none among these."""
+    if name in among:
+        return [among[name]]
+    return (
+        [] if not name else [method for method in among.values() if method.family == name and not method.only_if_named]
+    )
+
+
+def methods_named(names: Iterable[str], among: Mapping[str, Method]) -> list[Method]:
+    """The methods that names of methods and families stand for, each once, in the order asked for.
+
+    Raises:
+        ConfigError: a name is not known, stands there twice, or there is none.
+    """
+    names = tuple(names)
+    parts = {name: members(name, among) for name in names}
+    if not names or not all(parts.values()) or len(parts) < len(names):
+        families = dict.fromkeys(method.family for method in among.values() if method.family)
+        known = f"There are {', '.join(among)}; families {', '.join(families)}."
+        raise ConfigError("methods must be known and named once", value=names, fix=known)
+    return list({method.name: method for part in parts.values() for method in part}.values())
 
 
 def describe_methods() -> dict[str, str]:
-    """What each method of `SCORERS` is, by its name: the first line of its class's docstring."""
-    from wheretolook.methods.conv.score import ConvScorer
-    from wheretolook.methods.matchability.score import ExpectedFisherScorer
-    from wheretolook.methods.mlp.score import LearnedScorer
-    from wheretolook.methods.set.score import SetScorer
-    from wheretolook.methods.sphere.score import SphereScorer
-    from wheretolook.methods.trees.score import TreesScorer
-
-    scorers: tuple[type[Scorer], ...] = (
-        RandomScorer, ForwardScorer, VisibleScorer, BinsScorer, MaxVisibilityScorer, SwappedMaxVisibilityScorer,
-        WorstTraceScorer, StationaryTraceScorer, LearnedScorer, TreesScorer, ConvScorer, SetScorer,
-        SphereScorer,
-    )  # fmt: skip
-    texts = {scorer.name: _first_line(scorer) for scorer in scorers}
-    for name, (metric, approximation, about_origin) in _ALL_FISHER.items():
-        about = ", turned about the world's origin (only if named)" if about_origin else ""
-        texts[name] = f"{_first_line(FisherScorer).removesuffix('.')}: {metric}, {approximation}{about}."
-    texts["expected-inliers"] = "Landmarks in view, each by its learned chance of being found."
-    texts["expected-bins"] = "Bins of the image, each by the learned chance that a landmark in it is found."
-    for name, metric in EXPECTED_FISHER_METHODS.items():
-        texts[name] = f"{_first_line(ExpectedFisherScorer).removesuffix('.')}: {metric}."
-    return {name: texts[name] for name in SCORERS}
+    """What each method that scores views is, by its name, in one sentence."""
+    return {name: method.about for name, method in scorers().items()}
 
 
-def _first_line(scorer: type[Scorer]) -> str:
-    return (scorer.__doc__ or "").partition("\n")[0]
-
-
-def check_method(name: str) -> None:
-    """Check that there is a method of a name.
+def check_method(name: str) -> Method:
+    """The method of a name.
 
     Raises:
-        ConfigError: there is none.
+        ConfigError: no method that scores views has it.
     """
-    if name not in SCORERS:
-        raise ConfigError("unknown method", value=name, fix=f"There are {', '.join(SCORERS)}.")
+    if name not in scorers():
+        raise ConfigError("unknown method", value=name, fix=f"There are {', '.join(scorers())}.")
+    return scorers()[name]
 
 
 def make_scorer(
@@ -163,7 +142,7 @@ def make_scorer(
     """Build a method by its name.
 
     Args:
-        name: a key of `SCORERS`.
+        name: of the method; or of its family, for which the weights tell which one it is.
         localization_map: the map and the camera that will look.
         seed: for methods with randomness.
         weights: for learned methods.
@@ -172,9 +151,21 @@ def make_scorer(
     Raises:
         ConfigError: no such method, or it needs weights.
         WeightsError: the weights cannot be used.
+        MapError: the map lacks what the method needs.
     """
-    check_method(name)
-    return SCORERS[name](localization_map, ScorerOptions(seed, weights, heading))
+    known = scorers()
+    family = members(name, known)
+    if name not in known and len({method.weights for method in family} - {""}) == len(family) > 0:
+        method = _of_weights(name, family, weights)
+    else:
+        method = check_method(name)
+    path = None if weights is None else Path(weights)
+    if not method.weights:
+        return _build(method, localization_map, ScorerOptions(seed, None, heading))
+    if path is None:
+        raise ConfigError("the method needs weights", value=name, fix="Give a file that the train stage wrote.")
+    _of_weights(name, [method], path)
+    return _build(method, localization_map, ScorerOptions(seed, path, heading))
 
 
 def load_scorer(weights: str | Path, localization_map: LocalizationMap) -> Scorer:
@@ -189,17 +180,52 @@ def load_scorer(weights: str | Path, localization_map: LocalizationMap) -> Score
         WeightsError: the file cannot be used, or was trained for another field of view than the map's camera.
         MapError: the map lacks what the method needs.
     """
-    from wheretolook.methods.conv.score import ConvScorer
-    from wheretolook.methods.set.score import SetScorer
-    from wheretolook.methods.sphere.score import SphereScorer
-    from wheretolook.methods.trees.score import TreesScorer
+    path = best_weights(weights) if Path(weights).is_dir() else Path(weights)
+    method = _of_weights("a scorer", [method for method in scorers().values() if method.name == method.weights], path)
+    return _build(method, localization_map, ScorerOptions(weights=path))
 
-    loaders: dict[str, Callable[[str | Path, LocalizationMap], Scorer]] = {
-        scorer.name: scorer.load for scorer in (LearnedScorer, TreesScorer, ConvScorer, SetScorer, SphereScorer)
-    }
-    weights = best_weights(weights) if Path(weights).is_dir() else weights
-    kind = weights_kind(weights)
-    if kind not in loaders:
-        known = f"Give weights of {', '.join(loaders)}."
-        raise WeightsError("these weights are not of one scorer", path=weights, value=kind, fix=known)
-    return loaders[kind](weights, localization_map)
+
+def best_weights(folder: str | Path) -> Path:
+    """The weights of a folder that score views by themselves and have the best validation average precision.
+
+    Raises:
+        WeightsError: there are none, or a record of training is missing or damaged.
+    """
+    from wheretolook.learning.weights import read_record
+
+    paths = [path for path in sorted(Path(folder).glob("*.safetensors")) if not _scores_nothing(path.stem)]
+    if not paths:
+        raise WeightsError("there are no weights of a scorer", path=folder, fix="Run the train stage first.")
+    return max(paths, key=lambda path: float(read_record(path)["metrics"]["val_average_precision"]))
+
+
+def _scores_nothing(name: str) -> bool:
+    method = find(name)
+    return method is not None and method.build is None
+
+
+def _of_weights(name: str, methods: list[Method], weights: str | Path | None) -> Method:
+    """The one of several methods that a file of weights serves."""
+    from wheretolook.learning.weights import method_of_weights
+
+    if weights is None:
+        raise ConfigError("the method needs weights", value=name, fix="Give a file that the train stage wrote.")
+    kind = method_of_weights(weights)
+    for method in methods:
+        if method.weights == kind:
+            return method
+    fix = f"Give weights of {' or '.join(dict.fromkeys(method.weights for method in methods))}, or train them."
+    raise WeightsError(f"these weights are not of {name}", path=weights, value=kind, fix=fix)
+
+
+def _build(method: Method, localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
+    """Build a scorer; errors name the file of weights."""
+    assert method.build is not None
+    try:
+        scorer = method.build(localization_map, options)
+    except WeightsError as error:
+        if error.path is not None or options.weights is None:
+            raise
+        raise WeightsError(error.problem, path=options.weights, value=error.value, fix=error.fix) from None
+    scorer.name = method.name
+    return scorer

@@ -2,20 +2,29 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 from numpy.typing import NDArray
 
 from wheretolook.geometry.poses import Float
 from wheretolook.methods.base import CountingScorer
+from wheretolook.methods.method import Method, MethodStyle
 
 
 class VisibleScorer(CountingScorer):
     """Share of the map's landmarks that a view sees (paper, Sec. 3.2)."""
 
-    name: ClassVar[str] = "visible"
+    name = "visible"
 
     def score_counts(self, n_visible: NDArray[np.int32], n_filled: NDArray[np.int32]) -> Float:
         """(B,) in [0, 1]."""
         return n_visible / max(1, len(self.localization_map.landmarks.points))
+
+
+METHODS = (
+    Method(
+        name=VisibleScorer.name,
+        about="Share of the map's landmarks that a view sees (paper, Sec. 3.2).",
+        style=MethodStyle("most visible landmarks", "#E69F00", "s", "--"),
+        build=lambda localization_map, options: VisibleScorer(localization_map),
+    ),
+)

@@ -8,8 +8,7 @@ from pathlib import Path
 from wheretolook.dataset.folders import Dataset
 from wheretolook.dataset.scene import Scene
 from wheretolook.geometry.lattices import ViewLattice
-from wheretolook.methods.names import PROBABILITIES
-from wheretolook.methods.registry import WEIGHTS_OF, check_method
+from wheretolook.methods.registry import find, members, methods_named, scorers
 from wheretolook.planning.borrowing import with_borrowed_views
 from wheretolook.planning.path_comparison import shares_below
 from wheretolook.planning.scene_map import scene_viewpoint_map
@@ -32,10 +31,11 @@ def planner_map(
     Raises:
         ConfigError: the method needs weights. Else as `wheretolook.planning.scene_map.scene_viewpoint_map`.
     """
-    if method in WEIGHTS_OF and weights is None:
+    if weights is None and any(known.weights for known in members(method, scorers())):
         raise ConfigError(f"{method} needs weights", path=dataset.root, fix="Train it, or name weights.")
     scored = scene_viewpoint_map(scene, views, method, weights)
-    if scored.origin.scorer.split()[0] not in PROBABILITIES:
+    scored_by = find(scored.origin.scorer)
+    if scored_by is None or not scored_by.probability:
         scored = shares_below(scored)
     return with_borrowed_views(scored, scene.space)
 
@@ -51,4 +51,4 @@ def check_methods(methods: Iterable[str]) -> None:
     """
     for name in methods:
         if name:
-            check_method(name)
+            methods_named([name], scorers())

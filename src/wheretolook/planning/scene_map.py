@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 
 from wheretolook.dataset.folders import RELEASE, Dataset
 from wheretolook.dataset.scene import Scene
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import ViewLattice
-from wheretolook.learning.config import MATCHABILITY
 from wheretolook.learning.provenance import was_trained_on
-from wheretolook.learning.weights import read_record, read_training, read_weights, weights_kind
+from wheretolook.learning.weights import method_of_weights, read_record, read_training, read_weights
 from wheretolook.methods.field_of_view import same_field_of_view
-from wheretolook.methods.registry import WEIGHTS_OF, load_scorer, make_scorer
+from wheretolook.methods.registry import load_scorer, make_scorer, members, scorers
 from wheretolook.planning.map_building import build_viewpoint_map
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.utils.errors import ConfigError, WeightsError
@@ -59,30 +58,30 @@ def weights_for(
     Raises:
         WeightsError: the file given is missing or damaged.
     """
-    if method and method not in WEIGHTS_OF:
+    kinds = {known.weights for known in members(method, scorers())}
+    if "" in kinds or (method and not kinds):
         return None
-    if given is not None and (not method or weights_kind(given) == WEIGHTS_OF[method]):
+    if given is not None and (not method or method_of_weights(given) in kinds):
         return given
-    return default_weights(dataset, say, WEIGHTS_OF[method] if method else "")
+    return default_weights(dataset, say, kinds)
 
 
-def default_weights(dataset: Dataset, say: Callable[[str], None] = print, kind: str = "") -> Path | None:
+def default_weights(dataset: Dataset, say: Callable[[str], None] = print, kinds: Collection[str] = ()) -> Path | None:
     """The best weights of a dataset, or else of the release beside it, that serve its camera's field of view.
 
     Args:
         dataset: whose `weights` folder is looked into first.
         say: told of files that cannot be used, and why.
-        kind: of method that they must serve; empty for any that scores views by itself.
+        kinds: names of methods of which they may be; empty for all that score views by themselves.
     """
+    kinds = kinds or {name for name, method in scorers().items() if method.weights == name}
     for root in (dataset.root, dataset.root.parent / RELEASE):
         fitting: dict[Path, float] = {}
         for path in sorted((root / "weights").glob("*.safetensors")):
-            if path.stem == MATCHABILITY != kind:
-                continue
             try:
-                header, training = read_weights(path)[1], read_training(path)
-                if kind and weights_kind(path) != kind:
+                if method_of_weights(path) not in kinds:
                     continue
+                header, training = read_weights(path)[1], read_training(path)
                 trained = PinholeCamera(**header["camera"])
                 precision = float(read_record(path)["metrics"]["val_average_precision"])
             except (WeightsError, ConfigError, KeyError, TypeError, ValueError) as error:

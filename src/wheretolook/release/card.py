@@ -16,8 +16,9 @@ from wheretolook.evaluation.report import score_markdown
 from wheretolook.evaluation.results import SCORES_CSV, VARIANTS_CSV
 from wheretolook.evaluation.scores import read_scores
 from wheretolook.labelling.report import POSITIVE, label_summary
-from wheretolook.learning.config import LEARNERS, NETWORKS, weights_name
+from wheretolook.learning.config import DECIDING
 from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.methods.registry import learned
 from wheretolook.methods.styles import method_style
 from wheretolook.release.copy import CARD, SHELF, read_about, size_text, sizes
 from wheretolook.utils.errors import TableError, WeightsError
@@ -80,7 +81,8 @@ def write_card(release: Dataset, defaults: Mapping[str, Any]) -> Path:
 def release_card(release: Dataset, defaults: Mapping[str, Any]) -> str:
     """The card. Raises as `write_card`."""
     from wheretolook.learning.provenance import training_fingerprint
-    from wheretolook.learning.weights import best_weights, read_record, read_training
+    from wheretolook.learning.weights import read_record, read_training
+    from wheretolook.methods.registry import best_weights
 
     about, weights = read_about(release), _network(release)
     best = best_weights(weights.parent)
@@ -93,10 +95,9 @@ def release_card(release: Dataset, defaults: Mapping[str, Any]) -> str:
     results = release.root / "results"
     if not (results / SCORES_CSV).is_file():
         raise TableError("there are no scores", path=results / SCORES_CSV, fix="Run the evaluate stage.")
-    variant = _label(training["variant"])
-    shipped = f"{variant}, half precision"
+    shipped = f"{method_style(training['method']).label}, half precision"
     if best != weights:
-        shipped = f"{_label(read_training(best)['variant'])}; and of the paper's best network, {shipped}"
+        shipped = f"{method_style(read_training(best)['method']).label}; and of the paper's best network, {shipped}"
 
     lines = [f"# {source}: tables, landmarks and weights"]
     lines += [
@@ -138,8 +139,8 @@ def release_card(release: Dataset, defaults: Mapping[str, Any]) -> str:
         *([_CAMERAS] if all(scene.mapping_cameras.is_file() for scene in release.scenes) else []),
         "## Training",
         _training_text(weights, training, record, shares),
-        _variant_table(weights, training),
-        *_learner_text(weights.parent),
+        _network_table(weights, training),
+        *_learner_text(weights),
         "Validation metrics are those of the epoch kept, before the weights were rounded to half precision; the scores "
         "above are of the weights as they ship.",
         "## To make it again",
@@ -179,19 +180,14 @@ def _names(release: Dataset) -> str:
 
 def _network(release: Dataset) -> Path:
     """The weights of the paper's network."""
-    named = [release.root / "weights" / weights_name(variant) for variant in NETWORKS]
-    found = [path for path in _weights(release) if path in named]
+    networks = [name for name, method in learned().items() if method.ships == "network"]
+    found = [path for path in _weights(release) if path.stem in networks]
     if len(found) != 1:
         raise WeightsError(
             "a release ships the weights of one of the paper's networks", path=release.root / "weights",
             value=[path.name for path in found], fix=f"Run `wheretolook release --config configs/{release.name}.yaml`.",
         )  # fmt: skip
     return found[0]
-
-
-def _label(variant: str) -> str:
-    """Name of a variant for people."""
-    return method_style(variant).label if variant in LEARNERS else method_style("mlp", variant).label
 
 
 def _demoted(markdown: str) -> str:
@@ -276,44 +272,47 @@ def _training_text(weights: Path, training: Mapping[str, Any], record: Mapping[s
     )
 
 
-def _variant_table(weights: Path, training: Mapping[str, Any]) -> str:
+def _network_table(weights: Path, training: Mapping[str, Any]) -> str:
     """Validation metrics of the shipped network and of the others that were trained the same way."""
-    records = [_json(weights.with_suffix(".json"))]
-    for path in sorted((weights.parent / SHELF).glob("*.json")):
-        record = _json(path)
+    from wheretolook.learning.runs import records as read_records
+    from wheretolook.learning.weights import read_record
+
+    trained = [read_record(weights)]
+    for record in read_records(weights.parent / SHELF).values():
         about = record["about"]
-        if about["variant"] != training["variant"] and {**about, "variant": training["variant"]} == training:
-            records.append(record)
-    names = [name for name in records[0]["metrics"] if name.startswith("val_")]
+        if about["method"] != training["method"] and {**about, "method": training["method"]} == training:
+            trained.append(record)
+    names = [name for name in trained[0]["metrics"] if name.startswith("val_")]
     lines = [
         [
-            _label(record["about"]["variant"]),
+            method_style(record["about"]["method"]).label,
             "yes" if number == 0 else "no",
             f"{record['metrics']['epoch'] + 1:.0f}",
             *[f"{record['metrics'].get(name, float('nan')):.4f}" for name in names],
         ]
-        for number, record in enumerate(records)
+        for number, record in enumerate(trained)
     ]
     header = ["network", "ships", "epoch", *[name.removeprefix("val_").replace("_", " ") for name in names]]
     return markdown_table(header, lines)
 
 
-def _learner_text(folder: Path) -> list[str]:
+def _learner_text(network: Path) -> list[str]:
     """Options and validation metrics of what was trained beside the paper's network, if anything was."""
     from wheretolook.learning.weights import read_record
 
-    places = {True: folder, False: folder / SHELF}
+    places = {True: network.parent, False: network.parent / SHELF}
+    names = [name for name, method in learned().items() if method.folder != learned()[network.stem].folder]
     records = [
-        (ships, read_record(place / weights_name(variant)))
-        for variant in LEARNERS
+        (ships, read_record(place / f"{name}.safetensors"))
+        for name in names
         for ships, place in places.items()
-        if (place / weights_name(variant)).with_suffix(".json").is_file()
+        if (place / f"{name}.json").is_file()
     ]
     if not records:
         return []
     lines = [
         [
-            _label(record["about"]["variant"]),
+            method_style(record["about"]["method"]).label,
             "yes" if ships else "no",
             *[f"{record['metrics'].get(f'val_{name}', float('nan')):.4f}" for name in _LEARNER_METRICS],
         ]
@@ -321,12 +320,12 @@ def _learner_text(folder: Path) -> list[str]:
     ]
     header = ["beside it", "ships", *[name.replace("_", " ") for name in _LEARNER_METRICS]]
     options = [
-        f"{_label(variant)}: {_pairs(record['about']['config'][variant])}, seed {record['about']['config']['seed']}."
+        f"{method_style(record['about']['method']).label}: {_pairs(own)}, seed {record['about']['config']['seed']}."
         for ships, record in records
-        if ships and (variant := record["about"]["variant"]) in record["about"]["config"]
+        if ships and (own := {name: x for name, x in record["about"]["config"].items() if name not in DECIDING})
     ]
     further = [
-        f"{_label(record['about']['variant'])}: {', '.join(record['about']['also'])}."
+        f"{method_style(record['about']['method']).label}: {', '.join(record['about']['also'])}."
         for _, record in records
         if record["about"].get("also")
     ]

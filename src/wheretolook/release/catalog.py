@@ -23,9 +23,8 @@ from wheretolook.evaluation.results import CALIBRATION_CSV, SCORES_CSV
 from wheretolook.evaluation.scores import read_scores
 from wheretolook.figures.config import FiguresConfig
 from wheretolook.figures.style import save_figure
-from wheretolook.inputs.bins import PAPER_VARIANTS
-from wheretolook.learning.config import weights_name
-from wheretolook.learning.runs import HISTORY_CSV, histories
+from wheretolook.learning.runs import HISTORY_CSV, histories, method_of_run, train_runs
+from wheretolook.methods.registry import learned
 from wheretolook.planning.path_report import PATHS_CSV
 from wheretolook.release.benchmark_runs import RUNTIMES_CSV, SCALING_CSV
 from wheretolook.release.copy import is_release, read_about
@@ -39,7 +38,7 @@ if TYPE_CHECKING:
     from mlflow.entities import Run
 
     from wheretolook.methods.base import Scorer
-    from wheretolook.methods.mlp.score import LearnedScorer
+    from wheretolook.methods.binned_network import BinnedNetworkScorer
     from wheretolook.release.showcase import Showcase
 
 Texts = Mapping[str, str]
@@ -101,12 +100,17 @@ class Item:
     of_source: bool = False
 
     def runs(self, dataset: Dataset, tracking: TrackingConfig) -> tuple[Run, ...]:
-        """The newest run of those that it can be drawn from; of train runs the newest of each variant."""
+        """The newest run of those that it can be drawn from; of train runs the newest of each method."""
         found: dict[str, Run] = {}
         for name in (dataset.name, *([_source_of(dataset)] if self.of_source else [])):
             params = {key: value.format(dataset=name) for key, value in self.params}
-            for run in finished_runs(tracking, self.stage, params=params, file=self.file) if self.stage else ():
-                found.setdefault(run.data.params.get("variant", ""), run)
+            if self.stage == "train":
+                trained = train_runs(tracking, params["dataset"], params.get("method", ""), self.file)
+            else:
+                runs = finished_runs(tracking, self.stage, params=params, file=self.file) if self.stage else ()
+                trained = (("", run) for run in runs)
+            for method, run in trained:
+                found.setdefault(method, run)
         return tuple(found.values())
 
     def command_for(self, dataset: Dataset) -> str:
@@ -163,11 +167,11 @@ def _training(source: Source) -> Figure:
 def _architecture(source: Source) -> Texts:
     from wheretolook.release.paper_architecture import paper_architecture_table
 
-    by_variant = {run.data.params["variant"]: run.data.params for run in source.runs}
-    networks = [by_variant[variant] for variant in reversed(PAPER_VARIANTS) if variant in by_variant]
+    params = {method_of_run(run): run.data.params for run in source.runs}
+    networks = [params[name] for name, method in learned().items() if method.ships == "network" and name in params]
     if not networks:
         raise MissingRunError("none of the paper's networks was trained")
-    table = paper_architecture_table(networks[0])  # that of most inputs, the paper's proposal
+    table = paper_architecture_table(networks[-1])  # that of most inputs, the paper's proposal
     return {
         "md": markdown_table(list(table.columns), table.to_numpy().tolist()) + "\n",
         "csv": table.to_csv(index=False),
@@ -230,8 +234,8 @@ def _learning(source: Source) -> Figure:
     from wheretolook.figures.learning import learning_figure
     from wheretolook.release.showcase_figures import learning_of
 
-    showcase, scorer, location = _shown(source, weights_name("2d+z"))
-    return learning_figure(*learning_of(showcase, cast("LearnedScorer", scorer), location).drawn)
+    showcase, scorer, location = _shown(source, "mlp-2d+z.safetensors")
+    return learning_figure(*learning_of(showcase, cast("BinnedNetworkScorer", scorer), location))
 
 
 def _sampling(source: Source) -> Figure:
@@ -246,15 +250,15 @@ def _inputs(source: Source) -> Figure:
     from wheretolook.figures.inputs import inputs_figure
     from wheretolook.release.showcase_figures import learning_of
 
-    showcase, scorer, location = _shown(source, weights_name("2d+z"))
-    return inputs_figure(learning_of(showcase, cast("LearnedScorer", scorer), location).image)
+    showcase, scorer, location = _shown(source, "mlp-2d+z.safetensors")
+    return inputs_figure(learning_of(showcase, cast("BinnedNetworkScorer", scorer), location).image)
 
 
 def _peaks(source: Source) -> Figure:
     from wheretolook.figures.peaks import peaks_figure
     from wheretolook.release.showcase_figures import peaks_of
 
-    return peaks_figure(*peaks_of(*_shown(source)).drawn)
+    return peaks_figure(*peaks_of(*_shown(source)))
 
 
 def _planning(source: Source) -> Figure:
@@ -271,10 +275,10 @@ _BENCH = "python tests/benchmarks/bench_visibility.py{} --out cpu.json && python
 _LOG_RELEASE = "wheretolook log-release --config {config}"
 _OTHERS = (("dataset", "interiors"),)
 
-_SET, _PAPERS, _WIDEST = ((("dataset", "{dataset}"), ("variant", variant)) for variant in ("set", "2d+z", "2d+3d"))
+_SET, _PAPERS, _WIDEST = ((("dataset", "{dataset}"), ("method", method)) for method in ("set", "mlp-2d+z", "mlp-2d+3d"))
 _TRAIN_SET, _TRAIN_WIDEST = (
     "wheretolook train --config configs/release-set.yaml",
-    f"{_TRAIN} --train.variants '[2d+3d]'",
+    f"{_TRAIN} --train.methods '[mlp-2d+3d]'",
 )
 
 ITEMS: tuple[Item, ...] = (

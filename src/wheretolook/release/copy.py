@@ -15,9 +15,10 @@ from pathlib import Path
 from typing import Any
 
 from wheretolook.dataset.folders import RELEASE_FILE, Dataset, SceneFolder
-from wheretolook.learning.config import MATCHABILITY, NETWORKS, RELEASED, VARIANTS, weights_name
 from wheretolook.mapping.cameras import CAMERAS_FILE, save_mapping_poses
 from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.methods.method import Method
+from wheretolook.methods.registry import learned, scorers
 from wheretolook.utils.errors import ConfigError, StorageError, TableError, WeightsError
 from wheretolook.utils.files import sha256, write_json
 from wheretolook.utils.version import VERSION
@@ -27,7 +28,7 @@ from wheretolook.visibility.occlusion import StoredOcclusion
 CARD = "README.md"
 
 SHELF = "others"
-"""Folder beside the shipped weights for those of other variants. Only their records ship."""
+"""Folder beside the shipped weights for those of other methods. Only their records ship."""
 
 MAX_BYTES = 16_000_000
 """A release is smaller than this."""
@@ -97,7 +98,7 @@ class Choice:
     """What of the weights in a release's folder ships.
 
     Attributes:
-        network: the paper's network with the inputs of the best validation average precision.
+        network: of the paper's networks that with the best validation average precision.
         best: the weights with the best one of all, which a user gets who names none; may be the network.
         shelved: the rest.
         precision: validation average precision of all by their file's name without its ending.
@@ -109,10 +110,12 @@ class Choice:
     precision: dict[str, float]
 
 
-def trained_weights(release: Dataset) -> list[Path]:
-    """Weights in a release's folder, one for each variant trained but matchability, which is no scorer by itself."""
-    named = (release.root / "weights" / weights_name(variant) for variant in VARIANTS if variant != MATCHABILITY)
-    return [path for path in named if path.is_file()]
+def trained_weights(release: Dataset) -> dict[Path, Method]:
+    """Weights in a release's folder and their methods, of all that were trained and score views by themselves."""
+    from wheretolook.learning.provenance import weights_path
+
+    paths = {weights_path(release, name): method for name, method in learned().items() if name in scorers()}
+    return {path: method for path, method in paths.items() if path.is_file()}
 
 
 def choose_weights_to_ship(release: Dataset) -> Choice:
@@ -127,22 +130,20 @@ def choose_weights_to_ship(release: Dataset) -> Choice:
     folder = release.root / "weights"
     fix = f"Run `wheretolook train --config configs/{release.name}.yaml`."
     precision: dict[Path, float] = {}
-    for path in trained_weights(release):
+    methods = trained_weights(release)
+    for path in methods:
         record, training = read_record(path), read_training(path)
         if record["about"] != training or not was_trained_on(release, training):
             raise WeightsError("these weights were not trained on this release", path=path, fix=fix)
         precision[path] = float(record["metrics"]["val_average_precision"])
     if not precision:
         raise WeightsError("there are no weights to ship", path=folder, fix=fix)
-    networks = [folder / weights_name(variant) for variant in NETWORKS if variant != RELEASED]  # to compare with
-    networks = [path for path in networks if path in precision]
+    networks = [path for path, method in methods.items() if method.ships == "network"]
     if not networks:
         raise WeightsError("there are no weights to ship of the paper's network", path=folder, fix=fix)
     network = max(networks, key=lambda path: precision[path])
-    best = max(
-        (path for path in precision if path == network or path not in [folder / weights_name(v) for v in NETWORKS]),
-        key=lambda path: precision[path],
-    )
+    able = [path for path, method in methods.items() if path == network or method.ships == "best"]
+    best = max(able, key=lambda path: precision[path])
     shelved = tuple(path for path in precision if path not in (network, best))
     return Choice(network, best, shelved, {path.stem: value for path, value in precision.items()})
 
@@ -156,8 +157,7 @@ def ship_weights(release: Dataset) -> Choice:
     Raises:
         WeightsError: as `choose_weights_to_ship`.
     """
-    from wheretolook.learning.weights import read_record, read_training
-    from wheretolook.methods.mlp.weights import load_classifier, save_classifier
+    from wheretolook.learning.weights import read_record, save_in_half
 
     choice, folder = choose_weights_to_ship(release), release.root / "weights"
     for path in choice.shelved:
@@ -165,7 +165,7 @@ def ship_weights(release: Dataset) -> Choice:
         for file in (path, path.with_suffix(".json")):
             os.replace(file, folder / SHELF / file.name)
     record = read_record(choice.network)
-    save_classifier(load_classifier(choice.network).half(), choice.network, read_training(choice.network))
+    save_in_half(choice.network)
     write_json(choice.network.with_suffix(".json"), {**record, "weights_sha256": sha256(choice.network)})
     return choice
 

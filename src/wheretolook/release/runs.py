@@ -19,8 +19,16 @@ import pandas as pd
 from wheretolook.dataset.folders import Dataset
 from wheretolook.evaluation.results import SCORES_CSV, evaluation_params, runs_of_rows
 from wheretolook.evaluation.scores import read_scores
-from wheretolook.learning.config import VARIANTS, weights_name
-from wheretolook.learning.runs import HISTORY_CSV, TRAINING_CSV, log_history, params_of, records
+from wheretolook.learning.runs import (
+    HISTORY_CSV,
+    TRAINING_CSV,
+    log_history,
+    params_of,
+    read_histories,
+    records,
+    train_runs,
+)
+from wheretolook.methods.registry import learned
 from wheretolook.planning.path_report import PATHS_CSV, log_paths
 from wheretolook.release.benchmark_runs import RUNTIMES_CSV, SCALING_CSV, log_runtimes
 from wheretolook.release.card import GENERALIZATION_CSV
@@ -53,7 +61,7 @@ class ReleaseRuns:
 
     Attributes:
         evaluate: by the dataset evaluated on, the release first.
-        train: by the variant.
+        train: by the method.
         learners: the comparison of learners; None if the release has none, as with what follows.
         paths: planned paths.
         benchmark: measured times.
@@ -129,13 +137,12 @@ def _log_missing(dataset: Dataset, tracking: TrackingConfig, say: Say) -> Releas
             name, table = str(key), rows.drop(columns=["dataset", "weights_sha256"]).reset_index(drop=True)
             found = _found(tracking, "evaluate", SCORES_CSV, table.to_csv(index=False).encode())
             runs.evaluate[name] = keep(f"the evaluation on {name}", found, _log_others, name, table, dataset)
-    training = results / TRAINING_CSV
-    histories = dict(iter(pd.read_csv(training).groupby("variant"))) if training.is_file() else {}
+    histories = dict(iter(read_histories(results / TRAINING_CSV).groupby("method")))
     for path, record in records(dataset.root / "weights").items():
-        variant = record["about"]["variant"]
-        history = histories.get(variant)
+        method = record["about"]["method"]
+        history = histories.get(method)
         found = _train_run(tracking, path, record, history is not None)
-        runs.train[variant] = keep(f"the training of {variant}", found, _log_training, path, record, history)
+        runs.train[method] = keep(f"the training of {method}", found, _log_training, path, record, history)
     for file, stage, log_file in (
         (LEARNERS_CSV, "learners", _log_learners),
         (PATHS_CSV, "paths", _log_paths),
@@ -157,8 +164,8 @@ def _found(tracking: TrackingConfig, stage: str, name: str, content: bytes) -> s
 
 def _train_run(tracking: TrackingConfig, path: Path, record: dict[str, Any], with_history: bool) -> str | None:
     """The run that trained these weights, or the one that was logged from their record."""
-    variant = record["about"]["variant"]
-    for run in finished_runs(tracking, "train", params={"variant": variant}, file=HISTORY_CSV if with_history else ""):
+    method = record["about"]["method"]
+    for _, run in train_runs(tracking, method=method, file=HISTORY_CSV if with_history else ""):
         logged = artifact(tracking, run.info.run_id, path.name)
         if run.info.run_id == record["run_id"] or (logged.is_file() and logged.read_bytes() == path.read_bytes()):
             return str(run.info.run_id)
@@ -169,7 +176,7 @@ def _log_scores(dataset: Dataset, tracking: TrackingConfig) -> str:
     """The evaluation on the release's own test scenes, as `wheretolook evaluate` logs it, but for single locations."""
     results, scenes = dataset.root / "results", dataset.split("test")
     table = read_scores(results / SCORES_CSV)
-    named = (dataset.root / "weights" / weights_name(variant) for variant in VARIANTS)
+    named = (dataset.root / "weights" / f"{name}.safetensors" for name in learned())
     params = {**evaluation_params(dataset, scenes, [path for path in named if path.is_file()]), **_choices(table)}
     views = pd.concat([scene.read_table() for scene in scenes])
     views = views[views["status"] != UNLABELLED]
@@ -213,11 +220,11 @@ def _log_training(path: Path, record: dict[str, Any], history: pd.DataFrame | No
     """A train run without its weights, which lie in the release."""
     about = record["about"]
     tags = {**TAGS, "trained_as": str(record["run_id"])}
-    with start_run(tracking, f"train {about['variant']}", "train", params_of(about), tags=tags) as (mlflow, run):
+    with start_run(tracking, f"train {about['method']}", "train", params_of(about), tags=tags) as (mlflow, run):
         log(mlflow, run, metrics={f"kept_{name}": value for name, value in record["metrics"].items()})
         mlflow.log_artifact(run, str(path))
         if history is not None:
-            history = history.drop(columns="variant").dropna(axis=1, how="all")
+            history = history.drop(columns="method").dropna(axis=1, how="all")
             log_history(tracking, run, history)
             mlflow.log_text(run, history.to_csv(index=False), HISTORY_CSV)
     return run

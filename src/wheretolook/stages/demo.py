@@ -15,6 +15,7 @@ from wheretolook.config import Experiment
 from wheretolook.dataset.folders import Dataset
 from wheretolook.dataset.stamps import STAGES
 from wheretolook.geometry.poses import camera_centers, poses_looking_along
+from wheretolook.methods.registry import load_scorer, methods_named, scorers
 from wheretolook.stages.inputs import open_scene
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.tracking import ui_command
@@ -44,10 +45,11 @@ def run_demo(experiment: Experiment) -> None:
     }
     if config.train == 0 and not any(mesh.split == "train" for mesh in config.meshes):
         del steps["train"], cost["train"]  # meshes of one's own, evaluated with weights from elsewhere
-        if "mlp" in experiment.evaluate.methods and not experiment.evaluate.weights:
+        asked = methods_named(experiment.evaluate.methods, scorers())
+        if any(method.weights for method in asked) and not experiment.evaluate.weights:
             raise ConfigError(
                 "no scene to learn from, and no weights to evaluate",
-                fix="Name weights in evaluate.weights, or leave mlp out of evaluate.methods.",
+                fix="Name weights in evaluate.weights, or leave methods that have learnt out of evaluate.methods.",
             )
     start = time.monotonic()
     layout = "{desc}: {percentage:3.0f}%|{bar}| {elapsed} elapsed, about {remaining} remain"
@@ -82,7 +84,6 @@ def draw_overview(experiment: Experiment, weights: Path) -> Path:
     """
     from wheretolook.figures.overview import overview_figure
     from wheretolook.figures.style import save_figure
-    from wheretolook.methods.registry import load_scorer
     from wheretolook.release.showcase_figures import rendered_views
     from wheretolook.viewpoints.locations import instructive_location, shares_good
     from wheretolook.viewpoints.table import outcome_in_words, poses

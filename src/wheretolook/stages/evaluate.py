@@ -2,64 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-import pandas as pd
-from numpy.typing import NDArray
-
-from wheretolook.dataset.folders import Dataset, SceneFolder
-from wheretolook.evaluation.calibration import calibration_rows, fit_temperature
+from wheretolook.config import Experiment
+from wheretolook.dataset.folders import Dataset
 from wheretolook.evaluation.config import EvaluateConfig
-from wheretolook.evaluation.report import score_markdown
-from wheretolook.evaluation.results import ScoredSet, results_folder
-from wheretolook.evaluation.scores import choose, score_table
-from wheretolook.evaluation.scoring import Weights, check_unseen, choose_weights, score_scenes
-from wheretolook.evaluation.views import candidate_sets, views_of
-from wheretolook.geometry.poses import Float
-from wheretolook.methods.names import PROBABILITIES, Method
-from wheretolook.utils.errors import TableError
+from wheretolook.stages.inputs import Say, Tick, dataset_after
+from wheretolook.utils.files import write_text
 from wheretolook.utils.tracking_config import TrackingConfig
-from wheretolook.viewpoints.table import UNLABELLED, is_good
 from wheretolook.visibility.config import OcclusionConfig
 
 if TYPE_CHECKING:
-    from wheretolook.learning.provenance import TrainedModel
-from typing import TYPE_CHECKING
-
-from wheretolook.config import Experiment
-from wheretolook.stages.inputs import Say, Tick, dataset_after
-
-if TYPE_CHECKING:
     import pandas as pd
-from dataclasses import asdict
-from tempfile import TemporaryDirectory
 
-import pandas as pd
+    from wheretolook.learning.provenance import TrainedModel
 
-from wheretolook.evaluation.paper_tables import write_paper_tables
-from wheretolook.evaluation.ranking import TestViews
-from wheretolook.evaluation.results import (
-    CALIBRATION_CSV,
-    CALIBRATION_PNG,
-    LOCATIONS_PARQUET,
-    OCCLUSION_PNG,
-    REGRET_PNG,
-    SCORES_CSV,
-    SCORES_MD,
-    SCORES_PNG,
-    VARIANTS_CSV,
-    _runs_with_locations,
-    evaluation_params,
-)
-from wheretolook.evaluation.score_table import main_rows
-from wheretolook.evaluation.scores import read_scores
-from wheretolook.fisher.soft_visibility import GaussianProcessVisibility, cone_half_angle
-from wheretolook.utils.files import write_text
-from wheretolook.utils.tracking import log, log_nested, start_run
+
+def evaluate(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> pd.DataFrame:
+    """Stage 6: the score table of all methods on the test scenes, `<dataset>/results/`, and nested MLflow runs."""
+    dataset = dataset_after(experiment, "label")
+    scores = evaluate_methods(
+        dataset, experiment.evaluate, experiment.tracking, device=experiment.warp_device, occlusion=experiment.occlusion
+    )
+    tick(1)
+    return scores
 
 
 def evaluate_methods(
@@ -74,7 +42,7 @@ def evaluate_methods(
     """Compare all methods on the scenes of one split.
 
     Writes the table as `<dataset>/results/scores.csv` and `scores.md`, a figure `scores.png`, the reliability curves of
-    learned methods as `calibration.csv`, and an MLflow run with one nested run for each method, inputs, occlusion model
+    learned methods as `calibration.csv`, and an MLflow run with one nested run for each method, occlusion model
     and candidate set, each with a table of what was chosen at each location for each N, `locations.parquet`. With
     several occlusion models `occlusion.png` compares them.
 
@@ -101,92 +69,18 @@ def evaluate_methods(
         MapError: a scene has no landmarks.
         ConfigError: the reference is none of the methods.
     """
-    scenes = dataset.split(config.split)
-    if not scenes:
-        fix = "Make one, or choose another split."
-        raise TableError(f"the dataset has no {config.split} scene", path=dataset.root, fix=fix)
-    weights = choose_weights(dataset, config, models)
-    if config.split == "test":
-        check_unseen(scenes, weights)
-    tables = [scene.read_table() for scene in scenes]
-    views, location_id = views_of(scenes, tables, config)
-    sets = candidate_sets(views, location_id, scenes, tables, config)
-    occlusions = [None if name is None else replace(occlusion, model=name) for name in config.occlusions or (None,)]
-    temperatures, n_val = _fit_temperatures(dataset, config, weights, device, progress, occlusions[0])
-    scored: list[ScoredSet] = []
-    calibration = pd.DataFrame()
-    for model in occlusions:
-        scores, used = score_scenes(dataset, scenes, tables, config, weights, device, progress, model)
-        if not scored:
-            calibration = _calibration(scores, views.good[:, 0], temperatures, n_val)
-        for candidates in sets:
-            subset = {method: values[candidates.mask] for method, values in scores.items()}
-            choices = choose(candidates.views, subset, config.top_n)
-            names = [scene.name for scene in scenes]
-            part = score_table(candidates.views, subset, names, config, temperatures, choices)
-            part.insert(2, "occlusion", used)
-            part.insert(3, "candidates", candidates.name)
-            scored.append(ScoredSet(used, candidates, subset, choices, part))
-    table = pd.concat([one.table for one in scored], ignore_index=True)
+    from wheretolook.evaluation.report import score_markdown
+    from wheretolook.evaluation.results import log_evaluation, results_folder
+    from wheretolook.evaluation.run import compare_methods
+
+    found = compare_methods(dataset, config, models, progress, device, occlusion)
     title = f"Localization score on {dataset.name}" + (f", {config.split} scenes" if config.split != "test" else "")
     folder = results_folder(dataset, config)
-    write_results(folder, table, calibration, title)
-    log_evaluation(dataset, scenes, config, tracking, weights, views, scored, occlusion, folder)
+    write_results(folder, found.table, found.calibration, title)
+    log_evaluation(dataset, found, config, tracking, occlusion, folder)
     if progress:
-        print(score_markdown(table, title))
-    return table
-
-
-def _fit_temperatures(
-    dataset: Dataset,
-    config: EvaluateConfig,
-    weights: Weights,
-    device: str,
-    progress: bool,
-    occlusion: OcclusionConfig | None,
-) -> tuple[dict[Method, float], int]:
-    """Temperature of each learned method, and the number of labelled views of the val scenes it was fitted on."""
-    labelled: list[tuple[SceneFolder, pd.DataFrame]] = []
-    if weights and config.split != "val":  # fitted on what it is judged by, it would flatter
-        for scene in dataset.split("val"):
-            table = scene.read_table() if scene.table.is_file() else None
-            if table is not None and (table["status"] != UNLABELLED).any():
-                labelled.append((scene, table[table["status"] != UNLABELLED]))
-    if not labelled:
-        return {}, 0
-    scenes, tables = zip(*labelled, strict=True)
-    learned = replace(config, methods=tuple(name for name in config.methods if name in PROBABILITIES), reference="")
-    scores, _ = score_scenes(dataset, scenes, tables, learned, weights, device, progress, occlusion)
-    good = np.concatenate([is_good(table, *config.thresholds[0]) for table in tables])
-    return {method: fit_temperature(values, good) for method, values in scores.items()}, len(good)
-
-
-def _calibration(
-    scores: Mapping[Method, Float], good: NDArray[np.bool_], temperatures: Mapping[Method, float], n_val: int
-) -> pd.DataFrame:
-    """Reliability curves of the learned methods over all labelled views, one below the other; empty without any.
-
-    Columns: method, inputs, temperature, n_val (views that it was fitted on), then those of `calibration_rows`.
-    """
-    parts = []
-    for (name, inputs), values in scores.items():
-        if name in PROBABILITIES:
-            temperature = temperatures.get((name, inputs), float("nan"))
-            about = {"method": name, "inputs": inputs, "temperature": temperature, "n_val": n_val}
-            curves = calibration_rows(values, good, temperature)
-            parts.append(pd.DataFrame({**about, **{str(column): curves[column] for column in curves}}))
-    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
-
-
-def evaluate(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> pd.DataFrame:
-    """Stage 6: the score table of all methods on the test scenes, `<dataset>/results/`, and nested MLflow runs."""
-
-    dataset = dataset_after(experiment, "label")
-    scores = evaluate_methods(
-        dataset, experiment.evaluate, experiment.tracking, device=experiment.warp_device, occlusion=experiment.occlusion
-    )
-    tick(1)
-    return scores
+        print(score_markdown(found.table, title))
+    return found.table
 
 
 def write_results(folder: Path, table: pd.DataFrame, calibration: pd.DataFrame, title: str) -> None:
@@ -198,6 +92,20 @@ def write_results(folder: Path, table: pd.DataFrame, calibration: pd.DataFrame, 
         calibration: reliability curves of learned methods, as `calibration_figure` wants them; empty without any.
         title: of the report.
     """
+    from wheretolook.evaluation.paper_tables import write_paper_tables
+    from wheretolook.evaluation.report import score_markdown
+    from wheretolook.evaluation.results import (
+        CALIBRATION_CSV,
+        CALIBRATION_PNG,
+        OCCLUSION_PNG,
+        REGRET_PNG,
+        SCORES_CSV,
+        SCORES_MD,
+        SCORES_PNG,
+        VARIANTS_CSV,
+    )
+    from wheretolook.evaluation.score_table import main_rows
+    from wheretolook.evaluation.scores import read_scores
     from wheretolook.figures.calibration import calibration_figure
     from wheretolook.figures.occlusion import occlusion_figure
     from wheretolook.figures.scores import regret_figure, score_figure
@@ -208,10 +116,8 @@ def write_results(folder: Path, table: pd.DataFrame, calibration: pd.DataFrame, 
         write_text(folder / name, text)
     variants = folder / VARIANTS_CSV
     if variants.is_file():  # the paper's tables have a row for each of the network's inputs, which a release knows
-        known = {*zip(table["method"], table["inputs"], strict=True)}
         others = main_rows(read_scores(variants))
-        methods = zip(others["method"], others["inputs"], strict=True)
-        others = others[[method not in known for method in methods]]
+        others = others[~others["method"].isin(table["method"])]
         write_paper_tables(pd.concat([table, others], ignore_index=True), folder)
     else:
         write_paper_tables(table, folder)
@@ -227,56 +133,3 @@ def write_results(folder: Path, table: pd.DataFrame, calibration: pd.DataFrame, 
     else:
         for name in (CALIBRATION_CSV, CALIBRATION_PNG):
             (folder / name).unlink(missing_ok=True)
-
-
-def log_evaluation(
-    dataset: Dataset,
-    scenes: Sequence[SceneFolder],
-    config: EvaluateConfig,
-    tracking: TrackingConfig,
-    weights: Weights,
-    views: TestViews,
-    scored: Sequence[ScoredSet],
-    occlusion: OcclusionConfig,
-    results: Path,
-) -> None:
-    """Log an evaluation: a run with the files of `results`, and nested in it those of `runs_of_rows`.
-
-    Args:
-        dataset: evaluated.
-        scenes: of the split.
-        config: of the evaluation.
-        tracking: where to log.
-        weights: of methods that have learnt.
-        views: all labelled views.
-        scored: of each occlusion model and candidate set.
-        occlusion: settings of occlusion models, logged if the configuration names any.
-        results: folder of the files.
-    """
-    params = {
-        **evaluation_params(dataset, scenes, weights),
-        **{name: value for name, value in asdict(config).items() if name not in ("weights", "methods")},
-        **(
-            {f"occlusion_{name}": value for name, value in asdict(occlusion).items() if name != "model"}
-            if config.occlusions
-            else {}
-        ),
-    }
-    if any(name.startswith("fisher") and "gp" in name for name in config.methods):
-        process = GaussianProcessVisibility.fitted(cone_half_angle(dataset.camera))
-        params |= {"gp_factors": process.n_factors, "gp_length": round(process.length, 4)}
-        params["gp_held_out_rmse"] = round(process.held_out_error(), 4)
-    positives = float(views.good[:, 0].mean())
-    metrics = {"n_locations": views.n_locations, "n_views": len(views.good), "positives": positives}
-    with (
-        TemporaryDirectory() as folder,
-        start_run(
-            tracking, f"evaluate {dataset.name}", "evaluate", params, tags={"dataset": dataset.name}
-        ) as (client, run),
-    ):  # fmt: skip
-        log(client, run, metrics=metrics)
-        for file in results.iterdir():
-            if file.is_file():
-                client.log_artifact(run, str(file))
-        file = Path(folder) / LOCATIONS_PARQUET
-        log_nested(tracking, run, "evaluate", _runs_with_locations(scored, params, scenes, config, file))

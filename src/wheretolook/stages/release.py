@@ -27,7 +27,6 @@ def release(experiment: Experiment, say: Say = print, tick: Tick = lambda work: 
     """
     from wheretolook.evaluation.results import SCORES_CSV, VARIANTS_CSV
     from wheretolook.learning.runs import keep_histories
-    from wheretolook.learning.weights import weights_kind
     from wheretolook.release.card import write_card
     from wheretolook.release.copy import (
         choose_weights_to_ship,
@@ -53,7 +52,7 @@ def release(experiment: Experiment, say: Say = print, tick: Tick = lambda work: 
     on_cpu = replace(experiment, device="cpu", evaluate=replace(experiment.evaluate, weights=()))
     results = dataset.root / "results"
     if choose_weights_to_ship(dataset).shelved:  # all that were trained, before only the best are left
-        methods = tuple(dict.fromkeys(weights_kind(path) for path in trained_weights(dataset)))
+        methods = tuple(method.name for method in trained_weights(dataset).values())
         evaluate(replace(on_cpu, evaluate=replace(on_cpu.evaluate, methods=methods, reference="")), say)
         shutil.copyfile(results / SCORES_CSV, results / VARIANTS_CSV)
     choice = ship_weights(dataset)

@@ -1,4 +1,4 @@
-"""COLMAP's log, kept quiet."""
+"""Quieter logs of COLMAP."""
 
 from __future__ import annotations
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from wheretolook.learning.fitting_config import FittingConfig
+from wheretolook.learning.config import FittingConfig, check_at_least, check_share
 from wheretolook.utils.errors import ConfigError
 
 
@@ -13,7 +13,6 @@ class ConvConfig(FittingConfig):
     """Options of the convolutional network over the bins.
 
     Args:
-        epochs, batch_size, learning_rate, l2: see `FittingConfig`.
         widths: channels after each convolution; every one but the first halves the sides of the grid.
         dropout: share of pooled values dropped in training.
         bins: bins along each side of the image.
@@ -29,8 +28,5 @@ class ConvConfig(FittingConfig):
             raise ConfigError(
                 "convolutions must be at least one channel wide, and there must be one", value=self.widths
             )
-        if not 0 <= self.dropout < 1 or self.bins < 1:
-            raise ConfigError(
-                "a convolutional network needs bins >= 1 and a dropout from 0 to less than 1",
-                value=(self.bins, self.dropout),
-            )
+        check_at_least(self, 1, "bins")
+        check_share(self, "dropout")

@@ -1,1 +1,74 @@
 """The chance that a landmark in view is found, and methods that weight landmarks by it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from wheretolook.methods.matchability.config import MatchabilityConfig
+from wheretolook.methods.method import Method, MethodStyle, ScorerOptions
+
+if TYPE_CHECKING:
+    from wheretolook.inputs.localization_map import LocalizationMap
+    from wheretolook.learning.learner import Learnt, Task
+    from wheretolook.methods.base import Scorer
+
+
+def _learn(task: Task) -> Learnt:
+    from wheretolook.methods.matchability.learn import learn_matchability
+
+    return learn_matchability(task)
+
+
+def _expected(kind: str, about: str, style: MethodStyle) -> Method:
+    def build(localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
+        from wheretolook.methods.matchability.score import ExpectedScorer
+
+        assert options.weights is not None
+        return ExpectedScorer(localization_map, options.weights, kind)
+
+    return Method(f"expected-{kind}", about, style, "learned", build, weights="matchability", family="expected")
+
+
+def _expected_fisher(metric: str, name: str, marker: str) -> Method:
+    def build(localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
+        from wheretolook.methods.matchability.score import ExpectedFisherScorer
+
+        assert options.weights is not None
+        return ExpectedFisherScorer(localization_map, options.weights, metric)
+
+    return Method(
+        name=f"fisher-{metric}-expected",
+        about="Expected Fisher information of the pose, each landmark in view weighted by its learned chance of being "
+        f"found: {metric}.",
+        style=MethodStyle(f"Fisher, {name}, expected", "#332288", marker, (0, (3, 1))),
+        group="Fisher",
+        build=build,
+        weights="matchability",
+        family="expected",
+    )
+
+
+METHODS = (
+    Method(
+        name="matchability",
+        about="The chance that a landmark in view is found.",
+        style=MethodStyle("matchability", "#CC79A7", "8", (0, (1, 1))),
+        group="learned",
+        learn=_learn,
+        config=MatchabilityConfig,
+        folder="matchability",
+    ),
+    _expected(
+        "inliers",
+        "Landmarks in view, each by its learned chance of being found.",
+        MethodStyle("expected inliers", "#44AA99", "s", (0, (3, 1))),
+    ),
+    _expected(
+        "bins",
+        "Bins of the image, each by the learned chance that a landmark in it is found.",
+        MethodStyle("expected bins", "#117733", "D", (0, (3, 1))),
+    ),
+    _expected_fisher("mineig", "min. eigenvalue", "P"),
+    _expected_fisher("logdet", "log det", "X"),
+    _expected_fisher("trace", "trace", "h"),
+)

@@ -4,31 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from math import ceil, log
-from typing import ClassVar
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from wheretolook.learning.config import MATCHABILITY
 from wheretolook.learning.data import Batch
-from wheretolook.learning.landmark_model import LandmarkModel
 from wheretolook.learning.landmark_views import DISTANCES, LandmarkDataModule
 from wheretolook.learning.learner import Learnt, Task, class_counts, fit_network, predict
 from wheretolook.learning.platt import fit_platt
-from wheretolook.methods.set.network import MatchabilityNetwork
-
-
-class Matchability(LandmarkModel):
-    """The probability that a landmark in view is found, from how it was mapped and where it is seen from."""
-
-    kind: ClassVar[str] = MATCHABILITY
-    network_class: ClassVar[type[nn.Module]] = MatchabilityNetwork
-
-    def log_odds(self, values: Tensor) -> Tensor:
-        """Calibrated log-odds (E,) of landmarks (E, len(ATTRIBUTES)) on the network's device."""
-        with torch.inference_mode():
-            logits: Tensor = self.network(values)
-            return self.scale * logits + self.offset
+from wheretolook.learning.trained_network import TrainedNetwork
+from wheretolook.methods.matchability.network import MatchabilityNetwork
 
 
 class LandmarkBatches:
@@ -91,7 +76,7 @@ class MatchabilityData(LandmarkDataModule):
     """
 
     def __init__(self, task: Task) -> None:
-        super().__init__(task, task.config.matchability.landmarks, matches=True)
+        super().__init__(task, task.options.landmarks, matches=True)
 
     @property
     def found(self) -> Tensor:
@@ -114,11 +99,9 @@ class MatchabilityData(LandmarkDataModule):
         return self._loader(self.val_rows, 8)
 
     def _loader(self, rows: Tensor, batches: int, shuffle_seed: int | None = None) -> LandmarkBatches:
-        size = batches * self.config.batch_size * self.config.matchability.landmarks
-        return LandmarkBatches(
-            self.views.values, self.found, self.entries(rows), size, shuffle_seed, *self.share,
-            self.config.matchability.enlarged,
-        )  # fmt: skip
+        size = batches * self.options.batch_size * self.options.landmarks
+        entries, enlarged = self.entries(rows), self.options.enlarged
+        return LandmarkBatches(self.views.values, self.found, entries, size, shuffle_seed, *self.share, enlarged)
 
 
 def learn_matchability(task: Task) -> Learnt:
@@ -128,9 +111,9 @@ def learn_matchability(task: Task) -> Learnt:
         TableError: no train scene, no labels, or no stored matches.
     """
     data = MatchabilityData(task)
-    options = task.config.matchability
-    network = MatchabilityNetwork(data.statistics, options.width, options.hidden)
+    network = MatchabilityNetwork(data.statistics, task.options.width, task.options.hidden)
     metrics, history = fit_network(network, data, task)
     logits, found = predict(network, data)
     counts = class_counts(train=data.found.cpu()[data.entries(data.train_rows)].numpy(), val=found)
-    return Learnt(Matchability(network, task.dataset.camera, *fit_platt(logits, found)), metrics, counts, history)
+    model = TrainedNetwork(task.method, network, task.dataset.camera, *fit_platt(logits, found))
+    return Learnt(model, metrics, counts, history)

@@ -14,10 +14,10 @@ from wheretolook.fisher.metrics import METRICS, metric_of
 from wheretolook.geometry.poses import Float, check_poses
 from wheretolook.inputs.landmarks_in_view import LandmarkDescriber, ViewLandmarks, image_cells
 from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.learning.trained_network import TrainedNetwork
 from wheretolook.methods.base import Scorer
-from wheretolook.methods.field_of_view import check_field_of_view, naming
-from wheretolook.methods.matchability.learn import Matchability
-from wheretolook.methods.set.network import expected_parts
+from wheretolook.methods.field_of_view import check_field_of_view
+from wheretolook.methods.matchability.network import MatchabilityNetwork, expected_parts
 from wheretolook.utils.errors import ConfigError
 
 BINS = 30
@@ -36,31 +36,32 @@ class Expectation:
 
     _of_maps: ClassVar[WeakKeyDictionary[LocalizationMap, dict[str, Expectation]]] = WeakKeyDictionary()
 
-    def __init__(self, localization_map: LocalizationMap, matchability: Matchability) -> None:
+    def __init__(self, localization_map: LocalizationMap, matchability: TrainedNetwork[MatchabilityNetwork]) -> None:
         check_field_of_view(matchability.camera, localization_map.camera)
-        # not the map itself: who is its only owner could never go
+        # not the map itself: a value that refers to its key would keep both alive
         self.matchability, self.camera = matchability, localization_map.camera
         self._poses: Float = np.empty((0, 3, 4))
         self._sums: Float = np.empty((0, 17))
 
     @classmethod
     def of_map(cls, localization_map: LocalizationMap, weights: str | Path) -> Expectation:
-        """The one of a map and a weights file.
+        """What the views of a map can be expected to find by a file of weights, made once for both.
 
         Raises:
             WeightsError: the file cannot be used, or was trained for another field of view than the map's camera.
         """
         known = cls._of_maps.setdefault(localization_map, {})
         if str(weights) not in known:
-            with naming(weights):
-                known[str(weights)] = cls(localization_map, Matchability.load(weights, localization_map.device))
+            device = localization_map.device
+            trained = TrainedNetwork.load(weights, MatchabilityNetwork, "matchability", device=device)
+            known[str(weights)] = cls(localization_map, trained)
         return known[str(weights)]
 
     def sums(self, describer: LandmarkDescriber, cam_from_world: Float) -> Float:
         """What views can be expected to find.
 
         Args:
-            describer: of the map.
+            describer: of the map, for the attributes that the model takes.
             cam_from_world: (B, 3, 4).
 
         Returns:
@@ -71,12 +72,17 @@ class Expectation:
         if not np.array_equal(cam_from_world, self._poses):  # several methods ask for the same block of views
             sums = np.empty((len(cam_from_world), 17))
             for rows, described, _ in describer.in_blocks(cam_from_world):
-                log_odds = self.matchability.log_odds(described.values)
-                parts = expected_parts(described.values, log_odds)[:, :16].double()
+                log_odds = self._log_odds(described.values)
+                parts = expected_parts(described.values, log_odds, described.attributes)[:, :16].double()
                 sums[rows, :16] = torch.segment_reduce(parts, "sum", lengths=described.counts, initial=0.0).cpu()
                 sums[rows, 16] = self._filled(described, log_odds).cpu()
             self._poses, self._sums = cam_from_world.copy(), sums
         return self._sums
+
+    def _log_odds(self, values: Tensor) -> Tensor:
+        """Calibrated log-odds (E,) of being found of landmarks (E, A)."""
+        with torch.inference_mode():
+            return self.matchability.calibrated(self.matchability.network(values))
 
     def _filled(self, described: ViewLandmarks, log_odds: Tensor) -> Tensor:
         """Bins expected to hold at least one landmark that is found, each found or not on its own, (B,)."""
@@ -100,21 +106,19 @@ class ExpectedScorer(Scorer):
         ConfigError: no such kind.
     """
 
-    name: ClassVar[str] = "expected"
-
     def __init__(self, localization_map: LocalizationMap, weights: str | Path, kind: str) -> None:
         super().__init__(localization_map)
         if kind not in (INLIERS, FILLED):
             raise ConfigError("unknown expectation", value=kind, fix=f"There are {INLIERS} and {FILLED}.")
-        self.inputs = kind
+        self.kind, self.name = kind, f"expected-{kind}"
         self.local = kind == FILLED  # the share of the map's landmarks falls with every landmark that is added
         self._expectation = Expectation.of_map(localization_map, weights)
-        self._describer = LandmarkDescriber(localization_map)
+        self._describer = LandmarkDescriber(localization_map, self._expectation.matchability.network.attributes)
 
     def score(self, cam_from_world: Float) -> Float:
         """(B,) in [0, 1]."""
         sums = self._expectation.sums(self._describer, cam_from_world)
-        if self.inputs == FILLED:
+        if self.kind == FILLED:
             return sums[:, 16] / BINS**2
         return sums[:, 0] / max(1, len(self.localization_map.landmarks))
 
@@ -132,16 +136,15 @@ class ExpectedFisherScorer(Scorer):
         ConfigError: no such metric.
     """
 
-    name: ClassVar[str] = "fisher"
     local = True
 
     def __init__(self, localization_map: LocalizationMap, weights: str | Path, metric: str) -> None:
         super().__init__(localization_map)
         if metric not in METRICS:
             raise ConfigError("unknown metric of information", value=metric, fix=f"There are {', '.join(METRICS)}.")
-        self.metric, self.inputs = metric, f"{metric} expected"
+        self.metric, self.name = metric, f"fisher-{metric}-expected"
         self._expectation = Expectation.of_map(localization_map, weights)
-        self._describer = LandmarkDescriber(localization_map)
+        self._describer = LandmarkDescriber(localization_map, self._expectation.matchability.network.attributes)
 
     def score(self, cam_from_world: Float) -> Float:
         """(B,), not bounded by 1."""

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.inputs.bins import ALL_CHANNELS, CHANNELS, INPUT_VARIANTS, InputStatistics, Layout
-from wheretolook.learning.config import TrainConfig
-from wheretolook.utils.errors import ConfigError
+from wheretolook.inputs.bins import InputStatistics
+from wheretolook.inputs.channels import CHANNELS, Layout
+from wheretolook.methods.binned_network import BinnedNetwork, n_certain, standardize, stored_statistics
+from wheretolook.methods.mlp.config import MlpConfig
 
 
 @dataclass(frozen=True)
@@ -18,9 +20,7 @@ class NetworkSpec:
     """Everything that defines a network but its weights.
 
     Attributes:
-        variant: name of the input variant.
-        camera: camera of the training views; pixels mean something only with it.
-        statistics: of the variant's channels over the training views.
+        statistics: of its channels over the training views; their names are those of its input.
         bins: bins along each side of the image.
         layout: order of the bins in the input.
         hidden: widths of the hidden layers.
@@ -28,8 +28,6 @@ class NetworkSpec:
         input_dropout: share of input values dropped in training.
     """
 
-    variant: str
-    camera: PinholeCamera
     statistics: InputStatistics
     bins: int = 30
     layout: Layout = "in_place"
@@ -37,17 +35,10 @@ class NetworkSpec:
     dropout: float = 0.5
     input_dropout: float = 0.0
 
-    def __post_init__(self) -> None:
-        if self.variant not in INPUT_VARIANTS:
-            known = f"There are {', '.join(INPUT_VARIANTS)}."
-            raise ConfigError("unknown input variant", value=self.variant, fix=known)
-        if self.statistics.channels != self.channels:
-            raise ConfigError(f"statistics of {self.statistics.channels} do not fit the input", value=self.variant)
-
     @property
     def channels(self) -> tuple[str, ...]:
         """Channels of the input, in order."""
-        return INPUT_VARIANTS[self.variant]
+        return self.statistics.channels
 
     @property
     def input_size(self) -> int:
@@ -55,53 +46,26 @@ class NetworkSpec:
         return len(self.channels) * self.bins**2
 
 
-def standardize(means: Tensor, filled: Tensor, mean: Tensor, std: Tensor) -> Tensor:
-    """Standardize each channel by its kind (paper, Sec. 3.3 "Data").
-
-    Empty bins are exactly zero afterwards, that is, the mean of their kind; so are landmark channels where a value is
-    not known.
-
-    Args:
-        means: (B, C, bins, bins).
-        filled: (B, bins, bins) bool.
-        mean, std: (C, 1, 1).
-
-    Returns:
-        (B, C, bins, bins).
-    """
-    values = (means - mean) / std * filled[:, None]
-    if values.shape[1] > len(CHANNELS):  # where landmarks lie is always known: a NaN there is an error to be seen
-        of_landmarks = values[:, len(CHANNELS) :]
-        of_landmarks.masked_fill_(of_landmarks.isnan(), 0.0)
-    return values
-
-
 class BinnedInput(nn.Module):
     """Turns binned views into a network's standardized, flat input.
 
     Args:
-        spec: variant, statistics, bins and layout.
+        spec: statistics, bins and layout.
     """
 
-    index: Tensor
     mean: Tensor
     std: Tensor
 
     def __init__(self, spec: NetworkSpec) -> None:
         super().__init__()
-        self.layout, self.input_size = spec.layout, spec.input_size
+        self.layout, self.input_size, self.n_certain = spec.layout, spec.input_size, n_certain(spec.channels)
         # these follow from the specification, which is stored beside the weights: persistent=False
-        self.register_buffer(
-            "index", torch.tensor([ALL_CHANNELS.index(name) for name in spec.channels]), persistent=False
-        )
         self.register_buffer("mean", torch.tensor(spec.statistics.mean)[:, None, None], persistent=False)
         self.register_buffer("std", torch.tensor(spec.statistics.std)[:, None, None], persistent=False)
 
     def forward(self, means: Tensor, filled: Tensor) -> Tensor:
         """Means and filled, as `ViewpointNetwork.forward` takes them, to (B, input_size) float32."""
-        if means.shape[1] != len(self.index):
-            means = means.index_select(1, self.index)
-        values = standardize(means, filled, self.mean, self.std)
+        values = standardize(means, filled, self.mean, self.std, self.n_certain)
         if self.layout == "compact":
             values = move_to_front(values, filled)
         return values.reshape(-1, self.input_size)
@@ -140,7 +104,7 @@ def add_noise(
     return means + torch.randn_like(means) * scale[:, None, None] * filled[:, None]
 
 
-class ViewpointNetwork(nn.Module):
+class ViewpointNetwork(BinnedNetwork):
     """The paper's classifier (its architecture table): linear layers with ReLU and dropout between, one logit out.
 
     Args:
@@ -149,7 +113,7 @@ class ViewpointNetwork(nn.Module):
 
     def __init__(self, spec: NetworkSpec) -> None:
         super().__init__()
-        self.spec = spec
+        self.spec, self.statistics, self.bins = spec, spec.statistics, spec.bins
         self.input = BinnedInput(spec)
         layers: list[nn.Module] = [nn.Dropout(spec.input_dropout)] if spec.input_dropout > 0 else []
         width = spec.input_size
@@ -162,13 +126,35 @@ class ViewpointNetwork(nn.Module):
         """Logits (B,) of binned views.
 
         Args:
-            means: (B, C, bins, bins) float32, with all of `CHANNELS` or `ALL_CHANNELS`, or the variant's own alone.
+            means: (B, C, bins, bins) float32, of its channels.
             filled: (B, bins, bins) bool.
         """
         return self.layers(self.input(means, filled)).squeeze(-1)
 
-    def augment(self, config: TrainConfig, means: Tensor, filled: Tensor) -> tuple[Tensor, Tensor]:
+    def augment(self, options: MlpConfig, means: Tensor, filled: Tensor) -> tuple[Tensor, Tensor]:
         """The views with the noise that the options ask for, if any."""
-        if config.noise_px > 0 or config.noise_m > 0:
-            means = add_noise(means, filled, config.noise_px, config.noise_m, self.spec.channels)
+        if options.noise_px > 0 or options.noise_m > 0:
+            means = add_noise(means, filled, options.noise_px, options.noise_m, self.spec.channels)
         return means, filled
+
+    def description(self) -> dict[str, Any]:
+        """The fields of `NetworkSpec`."""
+        return asdict(self.spec)
+
+    @classmethod
+    def of_description(cls, stored: Mapping[str, Any]) -> ViewpointNetwork:
+        """The untrained network of a description.
+
+        Raises:
+            WeightsError: it looks at a channel that this version's bins do not have.
+        """
+        spec = NetworkSpec(
+            stored_statistics(stored), int(stored["bins"]), stored["layout"], tuple(stored["hidden"]),
+            float(stored["dropout"]), float(stored["input_dropout"]),
+        )  # fmt: skip
+        return cls(spec)
+
+    @property
+    def stored(self) -> nn.Module:
+        """The layers: the rest follows from the description."""
+        return self.layers

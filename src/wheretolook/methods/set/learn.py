@@ -4,33 +4,18 @@ from __future__ import annotations
 
 from dataclasses import replace
 from math import ceil
-from typing import Any, ClassVar
 
-import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from wheretolook.inputs.landmarks_in_view import ViewLandmarks
-from wheretolook.learning.config import MATCHABILITY, SET, TrainConfig, weights_name
 from wheretolook.learning.data import check_classes
-from wheretolook.learning.landmark_model import LandmarkModel
 from wheretolook.learning.landmark_views import LandmarkDataModule, LandmarkLoader
 from wheretolook.learning.learner import Learnt, Task, class_counts, fit_network, predict
 from wheretolook.learning.platt import fit_platt
-from wheretolook.methods.matchability.learn import Matchability
+from wheretolook.learning.provenance import weights_path
+from wheretolook.learning.trained_network import TrainedNetwork
+from wheretolook.methods.matchability.network import MatchabilityNetwork
+from wheretolook.methods.set.config import SetConfig
 from wheretolook.methods.set.network import SetNetwork
-
-
-class SetModel(LandmarkModel):
-    """The probability that a view localizes, from the set of landmarks it sees."""
-
-    kind: ClassVar[str] = SET
-    network_class: ClassVar[type[nn.Module]] = SetNetwork
-
-    def log_odds(self, landmarks: ViewLandmarks, visible: Tensor, axis_height: Tensor) -> Tensor:
-        """Calibrated log-odds (B,) float64 of views by `SetNetwork.score`, all on the network's device."""
-        with torch.inference_mode():
-            logits: Tensor = self.network.score(landmarks, visible, axis_height)
-            return self.scale * logits.double() + self.offset
 
 
 class SetData(LandmarkDataModule):
@@ -44,7 +29,7 @@ class SetData(LandmarkDataModule):
     """
 
     def __init__(self, task: Task) -> None:
-        super().__init__(task, MOST_OF_WINDOW * task.config.set.landmarks)
+        super().__init__(task, MOST_OF_WINDOW * task.options.landmarks)
         for name, rows in (("training", self.train_rows), ("validation", self.val_rows)):
             check_classes(name, self.views.labels[rows].numpy() > 0, task.dataset, self.config)
 
@@ -57,11 +42,11 @@ class SetData(LandmarkDataModule):
         return self._loader(self.val_rows, MOST_OF_WINDOW)
 
     def _loader(self, rows: Tensor, windows: int, shuffle_seed: int | None = None) -> LandmarkLoader:
-        width = windows * self.config.set.landmarks
+        options, limit_m = self.options, self.config.max_error_m
+        width = windows * options.landmarks
         return LandmarkLoader(
-            self.views, rows, self.config.batch_size, width, shuffle_seed, *self.share, self.config.set.enlarged,
-            self.config.max_error_m,
-        )  # fmt: skip
+            self.views, rows, options.batch_size, width, shuffle_seed, *self.share, options.enlarged, limit_m
+        )
 
 
 MOST_OF_WINDOW = 2
@@ -72,13 +57,13 @@ LEAST_BATCHES, LEAST_BATCH, LEAST_STEPS = 16, 64, 600
 """Batches that the training views are cut into at least, views of a batch at least, steps in all at least."""
 
 
-def of_size(config: TrainConfig, n_train: int) -> TrainConfig:
+def of_size(options: SetConfig, n_train: int) -> SetConfig:
     """Options for so many training views: few are gone through in smaller batches, and more often."""
-    batch_size = min(config.batch_size, max(LEAST_BATCH, n_train // LEAST_BATCHES))
+    batch_size = min(options.batch_size, max(LEAST_BATCH, n_train // LEAST_BATCHES))
     enough = ceil(LEAST_STEPS / ceil(n_train / batch_size))
-    if n_train // LEAST_BATCHES >= config.batch_size:
-        return config
-    return replace(config, batch_size=batch_size, epochs=max(config.epochs, enough))
+    if n_train // LEAST_BATCHES >= options.batch_size:
+        return options
+    return replace(options, batch_size=batch_size, epochs=max(options.epochs, enough))
 
 
 def learn_set(task: Task, data: SetData | None = None) -> Learnt:
@@ -95,16 +80,18 @@ def learn_set(task: Task, data: SetData | None = None) -> Learnt:
         TableError: no train scene, no labels, or labels of one class only.
         WeightsError: the matchability model is damaged.
     """
-    data, options = data or SetData(task), task.config.set
-    task = replace(task, config=of_size(task.config, len(data.train_rows)))
-    data.config = task.config
-    path = task.dataset.root / "weights" / weights_name(MATCHABILITY)
-    start = Matchability.load(path).network if options.from_matchability and path.is_file() else None
-    statistics = data.statistics if start is None else start.statistics
+    data = data or SetData(task)
+    options = data.options = of_size(task.options, len(data.train_rows))
+    statistics = data.statistics
+    path, start = weights_path(task.dataset, options.starts_from), None
+    if options.starts_from and path.is_file():
+        start = TrainedNetwork.load(path, MatchabilityNetwork, options.starts_from).network
+        statistics = start.statistics if start.attributes == statistics.attributes else statistics
     network = SetNetwork(statistics, options.width, options.pooled, options.head, options.dropout, options.hidden)
-    if start is not None and network.matchability.options == start.options:
+    if start is not None and (start.statistics, start.options) == (statistics, network.matchability.options):
         network.matchability.load_state_dict(start.state_dict())
-    metrics, history = fit_network(network, data, task)
+    metrics, history = fit_network(network, data, replace(task, options=options))
     logits, labels = predict(network, data)
-    counts: dict[str, Any] = class_counts(train=data.views.labels[data.train_rows].cpu().numpy(), val=labels)
-    return Learnt(SetModel(network, task.dataset.camera, *fit_platt(logits, labels)), metrics, counts, history)
+    counts = class_counts(train=data.views.labels[data.train_rows].cpu().numpy(), val=labels)
+    model = TrainedNetwork(task.method, network, task.dataset.camera, *fit_platt(logits, labels))
+    return Learnt(model, metrics, counts, history)

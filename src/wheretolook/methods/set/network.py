@@ -1,4 +1,4 @@
-"""Networks over the landmarks that a view sees: whether each will be found, and whether the view localizes."""
+"""The network over the set of landmarks that a view sees: whether the view localizes."""
 
 from __future__ import annotations
 
@@ -8,15 +8,19 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import batch_norm
 
-from wheretolook.inputs.landmarks_in_view import ATTRIBUTES, POSE_ATTRIBUTES, ViewLandmarks
+from wheretolook.inputs.landmarks_in_view import ViewLandmarks
 from wheretolook.learning.landmark_views import AttributeStatistics
+from wheretolook.methods.matchability.network import (
+    N_EXPECTED,
+    LandmarkNetwork,
+    MatchabilityNetwork,
+    StandardAttributes,
+    expected_parts,
+)
 
 PRIOR = 1e-3
 """Information on every coordinate of a pose before anything is seen: keeps the covariance finite (1/m^2 and 1/rad^2
 for a bearing's noise of one radian)."""
-
-LIKELY = -2.0
-"""Log-odds of being found that an untrained network gives a landmark: about one in eight, as in real views."""
 
 _PLACES = torch.tensor([
     [0, 1, 2, 0, 8, 7],
@@ -37,24 +41,6 @@ _SIGNS = torch.tensor([
 """Which of the 15 numbers stands where in an information matrix, and its sign, 0 where none does."""
 
 
-def bearing_numbers(values: Tensor) -> Tensor:
-    """Information of each landmark on the pose, `wheretolook.fisher.information.bearing_numbers` in the camera's axes.
-
-    Args:
-        values: (..., len(ATTRIBUTES)).
-
-    Returns:
-        (..., 15).
-    """
-    across, down, log_distance = (values[..., ATTRIBUTES.index(name)] for name in ("across", "down", "distance"))
-    bearing = torch.stack([across, down, torch.ones_like(across)], -1)
-    bearing = bearing / bearing.norm(dim=-1, keepdim=True)
-    inverse = (-log_distance).exp()[..., None]
-    x, y, z = bearing.unbind(-1)
-    plane = torch.stack([1 - x * x, -x * y, -x * z, 1 - y * y, -y * z, 1 - z * z], -1)
-    return torch.cat([plane * inverse**2, bearing * inverse, plane], -1)
-
-
 def information_matrices(numbers: Tensor) -> Tensor:
     """`wheretolook.fisher.information.information_matrices` of sums (..., 15), shift first, turn second."""
     places, signs = _layout(numbers.device)
@@ -67,57 +53,7 @@ def _layout(device: torch.device) -> tuple[Tensor, Tensor]:
         return _PLACES.to(device), _SIGNS.to(device)
 
 
-class StandardAttributes(nn.Module):
-    """What is known of landmarks, standardized; what is not known becomes 0, the mean of its kind.
-
-    Args:
-        statistics: of the training views.
-        hidden: names of attributes not to look at, which are 0 always.
-    """
-
-    mean: Tensor
-    scale: Tensor
-
-    def __init__(self, statistics: AttributeStatistics, hidden: tuple[str, ...] = ()) -> None:
-        super().__init__()
-        scale = [0.0 if name in hidden else 1 / std for name, std in zip(ATTRIBUTES, statistics.std, strict=True)]
-        # these follow from the description that is stored beside the weights: persistent=False
-        self.register_buffer("mean", torch.tensor(statistics.mean), persistent=False)
-        self.register_buffer("scale", torch.tensor(scale), persistent=False)
-
-    def forward(self, values: Tensor) -> Tensor:
-        """(..., len(ATTRIBUTES))."""
-        return ((values - self.mean) * self.scale).nan_to_num(nan=0.0)
-
-
-class MatchabilityNetwork(nn.Module):
-    """The probability that a landmark in view is found: matched, and an inlier of the pose.
-
-    Args:
-        statistics: of the training views.
-        width: units of each of two hidden layers.
-        hidden: names of attributes not to look at.
-
-    Attributes:
-        options: the arguments after the statistics, by name.
-    """
-
-    def __init__(self, statistics: AttributeStatistics, width: int = 48, hidden: tuple[str, ...] = ()) -> None:
-        super().__init__()
-        self.statistics, self.options = statistics, {"width": width, "hidden": hidden}
-        self.input = StandardAttributes(statistics, hidden)
-        last = nn.Linear(width, 1)
-        nn.init.constant_(last.bias, LIKELY)
-        self.layers = nn.Sequential(
-            nn.Linear(len(ATTRIBUTES), width), nn.ReLU(), nn.Linear(width, width), nn.ReLU(), last
-        )
-
-    def forward(self, values: Tensor) -> Tensor:
-        """Log-odds (...,) of landmarks (..., len(ATTRIBUTES))."""
-        return self.layers(self.input(values)).squeeze(-1)
-
-
-class SetNetwork(nn.Module):
+class SetNetwork(LandmarkNetwork):
     """Scores a view by the set of landmarks it sees, without bins.
 
     Each landmark has a probability of being found. Weighted by it, the landmarks' Fisher information sums up to the
@@ -133,23 +69,18 @@ class SetNetwork(nn.Module):
         head: units of the layers that decide.
         dropout: share of the deciding layers' units dropped in training.
         hidden: names of attributes not to look at. Of "across", "down" and "distance" the information remains.
-
-    Attributes:
-        options: the arguments after the statistics, by name.
     """
 
     def __init__(
         self, statistics: AttributeStatistics, width: int = 48, pooled: int = 0, head: int = 48, dropout: float = 0.1,
         hidden: tuple[str, ...] = (),
     ) -> None:  # fmt: skip
-        super().__init__()
-        self.statistics = statistics
-        self.options = {"width": width, "pooled": pooled, "head": head, "dropout": dropout, "hidden": hidden}
+        super().__init__(statistics, width=width, pooled=pooled, head=head, dropout=dropout, hidden=hidden)
         self.matchability = MatchabilityNetwork(statistics, width, hidden)
         self.attention = None
         if pooled:
             self.attention = nn.Sequential(
-                StandardAttributes(statistics, hidden), nn.Linear(len(ATTRIBUTES), width), nn.ReLU(),
+                StandardAttributes(statistics, hidden), nn.Linear(len(self.attributes), width), nn.ReLU(),
                 nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 1 + pooled),
             )  # fmt: skip
         self.standard = nn.BatchNorm1d(len(EXPECTED) + 1 + pooled)
@@ -164,7 +95,7 @@ class SetNetwork(nn.Module):
         """Logits (B,) from samples of each view's landmarks.
 
         Args:
-            values: (B, K, len(ATTRIBUTES)).
+            values: (B, K, A).
             taken: (B,) int64, how many of the K are the view's.
             visible: (B,) landmarks it sees in all.
             axis_height: (B,) z of the optical axis in the world.
@@ -179,8 +110,8 @@ class SetNetwork(nn.Module):
         return self.logits(sums * (visible / landmarks.counts.clamp(min=1))[:, None], visible, axis_height)
 
     def parts(self, values: Tensor) -> Tensor:
-        """What each landmark (..., len(ATTRIBUTES)) adds to its view's sums, (..., D)."""
-        expected = expected_parts(values, self.matchability(values))
+        """What each landmark (..., A) adds to its view's sums, (..., D)."""
+        expected = expected_parts(values, self.matchability(values), self.attributes)
         if self.attention is None:
             return expected
         attended = self.attention(values)
@@ -201,9 +132,6 @@ class SetNetwork(nn.Module):
         return (self.linear(joined) + self.decide(joined)).squeeze(-1)
 
 
-N_EXPECTED = 1 + 15 + 5
-"""Numbers that `expected_parts` gives of a landmark."""
-
 EXPECTED = (
     "log_expected_inliers", "log_visible", "expected_share", "log_position_variance", "log_orientation_variance",
     "log_det_information", "log_variance_x", "log_variance_y", "log_variance_z", "log_spread",
@@ -212,22 +140,6 @@ EXPECTED = (
 plus those visible; the former's share; logarithms of the expected variance of the position (its trace), of the
 orientation, of the determinant of the information, of the variance along each axis of the camera; and of the area of
 the image that the landmarks expected to be found spread over (the determinant of their second moment)."""
-
-
-def expected_parts(values: Tensor, log_odds: Tensor) -> Tensor:
-    """What each landmark adds to the sums that `expected_statistics` takes.
-
-    Args:
-        values: (..., len(ATTRIBUTES)).
-        log_odds: (...,) of being found.
-
-    Returns:
-        (..., N_EXPECTED).
-    """
-    found = log_odds.sigmoid()[..., None]
-    across, down = (values[..., POSE_ATTRIBUTES.index(name), None] for name in ("across", "down"))
-    moments = torch.cat([across, down, across * across, across * down, down * down], -1)
-    return torch.cat([found, found * bearing_numbers(values), found * moments], -1)
 
 
 def expected_statistics(sums: Tensor, visible: Tensor) -> Tensor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from wheretolook.learning.fitting_config import FittingConfig
+from wheretolook.learning.config import FittingConfig, check_at_least, check_share
 from wheretolook.utils.errors import ConfigError
 
 
@@ -33,10 +33,7 @@ class SphereConfig(FittingConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("points", "cameras", "width", "heads", "layers"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"sphere needs {name} of at least 1", value=getattr(self, name))
+        check_at_least(self, 1, "points", "cameras", "width", "heads", "layers")
+        check_share(self, "dropout")
         if self.width % self.heads:
             raise ConfigError("sphere needs a width that is a multiple of heads", value=(self.width, self.heads))
-        if not 0 <= self.dropout < 1:
-            raise ConfigError("dropout must be at least 0 and less than 1", value=self.dropout)

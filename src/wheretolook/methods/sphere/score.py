@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import ClassVar
-
 import numpy as np
 import torch
+from torch import Tensor
 
 from wheretolook.geometry.poses import Float, check_poses
 from wheretolook.inputs.localization_map import LocalizationMap, shared_locations
+from wheretolook.learning.trained_network import TrainedNetwork
 from wheretolook.methods.base import Scorer
-from wheretolook.methods.field_of_view import check_field_of_view, naming
-from wheretolook.methods.sphere.learn import SphereModel, on_lattice
+from wheretolook.methods.field_of_view import check_field_of_view
+from wheretolook.methods.sphere.network import SphereNetwork, on_lattice
 from wheretolook.methods.sphere.views import LocationDescriber
 
 
@@ -23,32 +22,19 @@ class SphereScorer(Scorer):
 
     Args:
         localization_map: the map, with its mapping cameras.
-        model: trained for cameras of the same field of view.
+        trained: for cameras of the same field of view.
 
     Raises:
         WeightsError: trained for another field of view than the map's camera.
         MapError: the map has no mapping cameras.
     """
 
-    name: ClassVar[str] = "sphere"
-
-    def __init__(self, localization_map: LocalizationMap, model: SphereModel) -> None:
+    def __init__(self, localization_map: LocalizationMap, trained: TrainedNetwork[SphereNetwork]) -> None:
         super().__init__(localization_map)
-        check_field_of_view(model.camera, localization_map.camera)
-        self._describer = LocationDescriber(localization_map, model.config)
-        self.model = model.to(localization_map.device)
-
-    @classmethod
-    def load(cls, weights: str | Path, localization_map: LocalizationMap) -> SphereScorer:
-        """Build a scorer from a weights file that the train stage wrote.
-
-        Raises:
-            WeightsError: the file cannot be used, or was trained for another field of view than the map's camera.
-            MapError: the map has no mapping cameras.
-        """
-        model = SphereModel.load(weights)
-        with naming(weights):
-            return cls(localization_map, model)
+        check_field_of_view(trained.camera, localization_map.camera)
+        self.name, self.trained = trained.method, trained
+        self.network = trained.network.to(localization_map.device)
+        self._describer = LocationDescriber(localization_map, self.network.config)
 
     def score(self, cam_from_world: Float) -> Float:
         """(B,) probabilities in [0, 1]."""
@@ -58,7 +44,15 @@ class SphereScorer(Scorer):
         locations, rows = shared_locations(cam_from_world)
         device = self.localization_map.device
         described = self._describer.describe(locations)
-        lattices = torch.stack([self.model.lattice_logits(tokens.to(device)) for tokens in described])
+        lattices = torch.stack([self._log_odds(tokens.to(device)) for tokens in described])
         axes = torch.from_numpy(np.ascontiguousarray(cam_from_world[:, 2, :3], dtype=np.float64)).to(device)
         logits = on_lattice(lattices, torch.from_numpy(rows).to(device), axes)
         return np.asarray(logits.sigmoid().cpu().numpy())
+
+    def _log_odds(self, tokens: Tensor) -> Tensor:
+        """Calibrated log-odds (PITCHES, YAWS) float64 of all directions at the location of tokens (T, len(FEATURES)).
+
+        A location is encoded alone: beside others its logits would differ in their last digits.
+        """
+        with torch.inference_mode():
+            return self.trained.calibrated(self.network.encode(tokens[None])[0].double())

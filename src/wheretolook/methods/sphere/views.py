@@ -18,7 +18,7 @@ from tqdm.auto import tqdm
 from wheretolook.dataset.folders import Dataset, SceneFolder
 from wheretolook.geometry.poses import Float, split_poses
 from wheretolook.inputs.localization_map import LocalizationMap, shared_locations
-from wheretolook.learning.config import TrainConfig
+from wheretolook.learning.config import SharedConfig
 from wheretolook.learning.data import Batch, has_room, labelled_rows
 from wheretolook.mapping.cameras import CAMERAS_FILE
 from wheretolook.methods.sphere.config import SphereConfig
@@ -134,14 +134,20 @@ class SphereViews:
 
 
 def load_sphere_views(
-    dataset: Dataset, scenes: Sequence[SceneFolder], config: TrainConfig, device: str = "cpu", progress: bool = True
+    dataset: Dataset,
+    scenes: Sequence[SceneFolder],
+    config: SharedConfig,
+    options: SphereConfig,
+    device: str = "cpu",
+    progress: bool = True,
 ) -> SphereViews:
     """Read the labelled viewpoints of some scenes and describe their locations.
 
     Args:
         dataset: gives the camera.
         scenes: of the dataset.
-        config: options of "sphere", limits of a positive label.
+        config: limits of a positive label.
+        options: how many landmarks and cameras at most.
         device: of the maps. The views come back on the CPU.
         progress: show a progress bar.
 
@@ -159,7 +165,7 @@ def load_sphere_views(
         rows.append(row + len(tokens))
         axes.append(cam_from_world[:, 2, :3])
         localization_map = scene.localization_map(dataset.camera, device)
-        describer = LocationDescriber(localization_map, config.sphere, scene.mapping_cameras)
+        describer = LocationDescriber(localization_map, options, scene.mapping_cameras)
         bar = tqdm(describer.describe(locations), f"describe {scene.name}", len(locations), disable=not progress)
         tokens += bar
     counts = torch.tensor([len(one) for one in tokens])
@@ -235,12 +241,13 @@ class SphereDataModule(LightningDataModule):
     Args:
         views: of train and val scenes.
         held_out: (B,) True where a view is for validation.
-        config: batch size, seed.
+        batch_size: viewpoints of a batch, on average.
+        seed: of the order of locations.
     """
 
-    def __init__(self, views: SphereViews, held_out: NDArray[np.bool_], config: TrainConfig) -> None:
+    def __init__(self, views: SphereViews, held_out: NDArray[np.bool_], batch_size: int, seed: int = 0) -> None:
         super().__init__()
-        self.views, self.config = views, config
+        self.views, self.batch_size, self.seed = views, batch_size, seed
         self.train_rows, self.val_rows = np.flatnonzero(~held_out), np.flatnonzero(held_out)
 
     def setup(self, stage: str | None = None) -> None:
@@ -252,7 +259,7 @@ class SphereDataModule(LightningDataModule):
 
     def train_dataloader(self) -> LocationLoader:
         """Shuffled batches of the training views."""
-        return self._loader(self.train_rows, self.config.seed)
+        return self._loader(self.train_rows, self.seed)
 
     def val_dataloader(self) -> LocationLoader:
         """Batches of the validation views, in order."""
@@ -260,4 +267,4 @@ class SphereDataModule(LightningDataModule):
 
     def _loader(self, chosen: NDArray[np.int64], shuffle_seed: int | None = None) -> LocationLoader:
         rank, world_size = (0, 1) if self.trainer is None else (self.trainer.global_rank, self.trainer.world_size)
-        return LocationLoader(self.views, chosen, self.config.batch_size, shuffle_seed, rank, world_size)
+        return LocationLoader(self.views, chosen, self.batch_size, shuffle_seed, rank, world_size)

@@ -1,1 +1,44 @@
 """Boosted trees on pooled statistics of the landmarks in view."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from wheretolook.methods.method import Method, MethodStyle, ScorerOptions
+from wheretolook.methods.trees.config import TreesConfig
+
+if TYPE_CHECKING:
+    from wheretolook.inputs.localization_map import LocalizationMap
+    from wheretolook.learning.learner import Learnt, Task
+    from wheretolook.methods.base import Scorer
+
+
+def _build(localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
+    from wheretolook.methods.trees.learn import BoostedTrees
+    from wheretolook.methods.trees.score import TreesScorer
+
+    assert options.weights is not None
+    return TreesScorer(localization_map, BoostedTrees.load(options.weights))
+
+
+def _learn(task: Task) -> Learnt:
+    from wheretolook.methods.trees.learn import learn_trees
+
+    return learn_trees(task)
+
+
+METHODS = (
+    Method(
+        name="trees",
+        about="Boosted trees on where the visible landmarks lie and how they were mapped: the probability that a view "
+        "localizes.",
+        style=MethodStyle("boosted trees, landmark attributes", "#882255", "*", "-"),
+        group="learned",
+        build=_build,
+        weights="trees",
+        probability=True,
+        learn=_learn,
+        config=TreesConfig,
+        folder="trees",
+    ),
+)

@@ -16,12 +16,11 @@ from tqdm.auto import tqdm
 from wheretolook.dataset.folders import Dataset, SceneFolder
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.inputs.landmarks_in_view import POOLED, LandmarkDescriber, pool
-from wheretolook.learning.config import TREES
 from wheretolook.learning.data import check_classes, labelled_rows, training_scenes, validation_views
 from wheretolook.learning.fit import home_device
 from wheretolook.learning.learner import Learnt, Task, class_counts
 from wheretolook.learning.platt import fit_platt
-from wheretolook.learning.weights import check_kind, read_weights, write_weights
+from wheretolook.learning.weights import check_serves, read_weights, write_weights
 from wheretolook.methods.trees.config import TreesConfig
 from wheretolook.utils.errors import ConfigError, WeightsError
 from wheretolook.viewpoints.table import is_good, poses
@@ -116,13 +115,15 @@ class BoostedTrees:
             training: what else to keep about the training (JSON values).
         """
         header = {
-            "kind": TREES, "features": list(POOLED), "camera": asdict(self.camera),
+            "features": list(POOLED), "camera": asdict(self.camera),
             **{name: getattr(self, name) for name in _NUMBERS}, "training": training or {},
         }  # fmt: skip
         narrow = {"roots": torch.int32, "left": torch.int32, "right": torch.int32, "feature": torch.uint8}
         narrow["missing_left"] = torch.uint8
         arrays = {name: getattr(self, name) for name in _ARRAYS}
-        write_weights(path, {name: one.to(narrow.get(name, one.dtype)) for name, one in arrays.items()}, header)
+        write_weights(
+            path, "trees", {name: one.to(narrow.get(name, one.dtype)) for name, one in arrays.items()}, header
+        )
 
     @classmethod
     def load(cls, path: str | Path) -> BoostedTrees:
@@ -132,7 +133,7 @@ class BoostedTrees:
             WeightsError: the file is missing, damaged, foreign, of another kind, or its trees are none.
         """
         tensors, header = read_weights(Path(path))
-        check_kind(path, header, TREES)
+        check_serves(path, header, "trees")
         fix = "Train again, or give weights of trees."
         if header.get("features") != list(POOLED):
             raise WeightsError("these trees ask for other statistics of a view", path=path, fix=fix)
@@ -234,7 +235,7 @@ def learn_trees(task: Task) -> Learnt:
     train, val = views.only(~held_out), views.only(held_out)
     for name, side in (("training", train), ("validation", val)):
         check_classes(name, side.labels, dataset, config)
-    trees, metrics = fit_trees(train, val, dataset.camera, config.trees, config.seed)
+    trees, metrics = fit_trees(train, val, dataset.camera, task.options, config.seed)
     return Learnt(trees, metrics, class_counts(train=train.labels, val=val.labels))
 
 

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import ClassVar
-
 import numpy as np
 
 from wheretolook.geometry.poses import Float, check_poses
 from wheretolook.inputs.landmarks_in_view import LandmarkDescriber, pool
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.methods.base import BLOCK, Scorer
-from wheretolook.methods.field_of_view import check_field_of_view, naming
+from wheretolook.methods.field_of_view import check_field_of_view
 from wheretolook.methods.trees.learn import BoostedTrees
 
 
@@ -26,7 +23,7 @@ class TreesScorer(Scorer):
         WeightsError: trained for another field of view than the map's camera.
     """
 
-    name: ClassVar[str] = "trees"
+    name = "trees"
     local = True
 
     def __init__(self, localization_map: LocalizationMap, trees: BoostedTrees) -> None:
@@ -34,17 +31,6 @@ class TreesScorer(Scorer):
         check_field_of_view(trees.camera, localization_map.camera)
         self.trees = trees.to(localization_map.device)
         self._describer = LandmarkDescriber(localization_map)
-
-    @classmethod
-    def load(cls, weights: str | Path, localization_map: LocalizationMap) -> TreesScorer:
-        """Build a scorer from a weights file that the train stage wrote.
-
-        Raises:
-            WeightsError: the file cannot be used, or was trained for another field of view than the map's camera.
-        """
-        trees = BoostedTrees.load(weights)
-        with naming(weights):
-            return cls(localization_map, trees)
 
     def score(self, cam_from_world: Float) -> Float:
         """(B,) probabilities in [0, 1]."""

@@ -4,7 +4,7 @@ probes of the field that its tables list among them."""
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from wheretolook.fisher.exact import exact_information
 from wheretolook.fisher.field import FisherField, stationary_axis_of_trace, worst_axis_of_trace
-from wheretolook.fisher.metrics import METRICS, eigenvalues, metric_of, metric_of_eigenvalues
+from wheretolook.fisher.metrics import eigenvalues, metric_of, metric_of_eigenvalues
 from wheretolook.fisher.soft_visibility import (
     GaussianProcessVisibility,
     QuadraticVisibility,
@@ -21,12 +21,10 @@ from wheretolook.fisher.soft_visibility import (
 )
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import Float, check_poses, split_poses
-from wheretolook.inputs.localization_map import SAME_LOCATION_DECIMALS, LocalizationMap
+from wheretolook.inputs.localization_map import LocalizationMap, shared_locations
 from wheretolook.methods.base import Scorer
+from wheretolook.methods.fisher import Approximation
 from wheretolook.visibility.frustum import LandmarkSets
-
-Approximation = Literal["exact", "quadratic", "gp"]
-APPROXIMATIONS: tuple[Approximation, ...] = ("exact", "quadratic", "gp")
 
 PROBE_AXES = 2000
 """Axes among which the worst view is sought."""
@@ -42,7 +40,7 @@ class PoseInformation:
     _of_maps: ClassVar[WeakKeyDictionary[LocalizationMap, PoseInformation]] = WeakKeyDictionary()
 
     def __init__(self, localization_map: LocalizationMap) -> None:
-        # not the map itself: who is its only owner could never go
+        # not the map itself: a value that refers to its key would keep both alive
         self.points, self.camera = localization_map.landmarks.points, localization_map.camera
         self.occlusion, self.device = localization_map.occlusion, localization_map.device
         half_angle = cone_half_angle(self.camera)
@@ -55,7 +53,7 @@ class PoseInformation:
 
     @classmethod
     def of_map(cls, localization_map: LocalizationMap) -> PoseInformation:
-        """The one of a map."""
+        """The information of a map's views, made once a map."""
         if localization_map not in cls._of_maps:
             cls._of_maps[localization_map] = cls(localization_map)
         return cls._of_maps[localization_map]
@@ -95,9 +93,8 @@ class PoseInformation:
     def _locations(self) -> tuple[Float, NDArray[np.int64], NDArray[np.bool_]]:
         """Locations (L, 3) of the poses, each pose's row, and the landmarks (L, N) with a free line of sight."""
         if "locations" not in self._known:
-            centers = np.round(split_poses(self._poses)[1], SAME_LOCATION_DECIMALS)
-            locations, rows = np.unique(centers, axis=0, return_inverse=True)
-            self._known["locations"] = locations, rows.reshape(-1), self.occlusion.unoccluded(locations, self.points)
+            locations, rows = shared_locations(self._poses)
+            self._known["locations"] = locations, rows, self.occlusion.unoccluded(locations, self.points)
         locations, rows, mask = self._known["locations"]
         return locations, rows, mask
 
@@ -124,7 +121,6 @@ class FisherScorer(Scorer):
             against 63 to 69; by min. eigenvalue alike, but for the quadratic's 51 against 75).
     """
 
-    name: ClassVar[str] = "fisher"
     local = True
 
     def __init__(
@@ -136,7 +132,7 @@ class FisherScorer(Scorer):
     ) -> None:
         super().__init__(localization_map)
         self.metric, self.approximation, self.about_origin = metric, approximation, about_origin
-        self.inputs = f"{metric} {approximation}" + (" origin" if about_origin else "")
+        self.name = f"fisher-{metric}-{approximation}" + ("-origin" if about_origin else "")
         self._information = PoseInformation.of_map(localization_map)
 
     def score(self, cam_from_world: Float) -> Float:
@@ -150,7 +146,6 @@ class FisherScorer(Scorer):
 class ProbeScorer(Scorer):
     """Views by how near their axis is to a certain axis of each location; such a method chooses without comparing."""
 
-    name: ClassVar[str] = "probe"
     local = True
 
     def __init__(self, localization_map: LocalizationMap) -> None:
@@ -173,7 +168,7 @@ class ProbeScorer(Scorer):
 class WorstTraceScorer(ProbeScorer):
     """The view with the least trace by the quadratic field ("trace app worst"): what the field says not to do."""
 
-    name: ClassVar[str] = "fisher-worst-trace"
+    name = "fisher-worst-trace"
 
     def axis(self, field: FisherField, row: int) -> Float:
         """(3,)."""
@@ -183,23 +178,8 @@ class WorstTraceScorer(ProbeScorer):
 class StationaryTraceScorer(ProbeScorer):
     """The stationary point of the quadratic field's trace ("trace app zero deriv"), which is its minimum's side."""
 
-    name: ClassVar[str] = "fisher-stationary-trace"
+    name = "fisher-stationary-trace"
 
     def axis(self, field: FisherField, row: int) -> Float:
         """(3,)."""
         return stationary_axis_of_trace(field, row)
-
-
-FISHER_METHODS: dict[str, tuple[str, Approximation, bool]] = {
-    f"fisher-{metric}-{approximation}": (metric, approximation, False)
-    for metric in METRICS
-    for approximation in APPROXIMATIONS
-}
-"""Metric, approximation and `about_origin` of the paper's nine rows, by the names of the methods."""
-
-ORIGIN_METHODS: dict[str, tuple[str, Approximation, bool]] = {
-    f"{name}-origin": (metric, approximation, True)
-    for name, (metric, approximation, _) in FISHER_METHODS.items()
-    if metric != "logdet"  # which is the same
-}
-"""The rows that differ when the pose is turned about the world's origin."""

@@ -1,0 +1,111 @@
+"""A trained network with all that is needed to use it again, on disk and back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Generic, Self, TypeVar
+
+from torch import Tensor, nn
+
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.learning.old_names import name_of_header
+from wheretolook.learning.weights import check_serves, read_weights, write_weights
+from wheretolook.utils.errors import ConfigError, WeightsError
+
+
+class StoredNetwork(nn.Module):
+    """A network that can be built anew from what it tells of itself."""
+
+    def description(self) -> dict[str, Any]:
+        """All that defines the network but its weights, as JSON values."""
+        raise NotImplementedError
+
+    @classmethod
+    def of_description(cls, stored: Mapping[str, Any]) -> Self:
+        """The network with this description, untrained.
+
+        Raises:
+            WeightsError: it asks for what this version does not know.
+        """
+        raise NotImplementedError
+
+    @property
+    def stored(self) -> nn.Module:
+        """The part whose weights are stored."""
+        return self
+
+
+NetworkT = TypeVar("NetworkT", bound=StoredNetwork)
+
+
+class TrainedNetwork(Generic[NetworkT]):
+    """A network, the camera of its training views, and what makes its logits calibrated log-odds.
+
+    Args:
+        method: name of the method that it serves.
+        network: trained.
+        camera: of the training views.
+        scale, offset: calibrated log-odds are scale * logit + offset.
+    """
+
+    def __init__(
+        self, method: str, network: NetworkT, camera: PinholeCamera, scale: float = 1.0, offset: float = 0.0
+    ) -> None:
+        self.method, self.network, self.camera = method, network.eval(), camera
+        self.scale, self.offset = scale, offset
+
+    def calibrated(self, logits: Tensor) -> Tensor:
+        """Calibrated log-odds of the network's logits, in the same shape and precision."""
+        return self.scale * logits + self.offset
+
+    def save(self, path: Path, training: Mapping[str, Any] | None = None) -> None:
+        """Write one safetensors file, atomically. The same network gives the same bytes.
+
+        Args:
+            path: file to write; its folder is made when needed.
+            training: what else to keep about the training (JSON values).
+        """
+        header = {
+            **self.network.description(),
+            "camera": asdict(self.camera),
+            "scale": self.scale,
+            "offset": self.offset,
+            "training": dict(training or {}),
+        }
+        write_weights(path, self.method, self.network.stored.state_dict(), header)
+
+    @classmethod
+    def load(
+        cls, path: str | Path, network_class: type[NetworkT], *methods: str, device: str = "cpu"
+    ) -> TrainedNetwork[NetworkT]:
+        """Read what `save` wrote, ready to score (dropout off, no gradients).
+
+        Args:
+            path: a safetensors file.
+            network_class: what to build.
+            methods: names of the methods of which the weights may be.
+            device: torch device of the network.
+
+        Raises:
+            WeightsError: the file is missing, damaged, foreign, of another method, or does not fit its own description.
+        """
+        tensors, header = read_weights(Path(path))
+        check_serves(path, header, *methods)
+        fix = f"Train again, or give other weights of {methods[0]}."
+        try:
+            network = network_class.of_description(header)
+            camera = PinholeCamera(**header["camera"])
+            scale, offset = float(header.get("scale", 1.0)), float(header.get("offset", 0.0))
+        except WeightsError as error:
+            raise WeightsError(error.problem, path=path, value=error.value, fix=error.fix or fix) from error
+        except (KeyError, TypeError, ValueError, IndexError, ConfigError) as error:
+            raise WeightsError(f"damaged description in the header: {error}", path=path, fix=fix) from error
+        try:
+            network.stored.load_state_dict(tensors)
+        except RuntimeError as error:
+            problem = f"the weights do not fit the network they describe: {error}"
+            raise WeightsError(problem, path=path, fix=fix) from error
+        found = network.to(device).requires_grad_(False)
+        return TrainedNetwork(name_of_header(header), found, camera, scale, offset)

@@ -1,0 +1,118 @@
+"""Networks over binned landmarks: what is stored of their input, and the score of a trained one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from wheretolook.geometry.poses import Float
+from wheretolook.inputs.bins import BinnedViews, InputStatistics
+from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS
+from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.learning.trained_network import StoredNetwork, TrainedNetwork
+from wheretolook.methods.base import BinnedScorer
+from wheretolook.methods.field_of_view import check_field_of_view
+from wheretolook.utils.errors import WeightsError
+
+
+class BinnedNetwork(StoredNetwork):
+    """A network that takes the means (B, C, bins, bins) of its channels and filled bins (B, bins, bins).
+
+    Attributes:
+        statistics: of its C channels over the training views; by their names it takes its channels.
+        bins: along each side of the image.
+        scored_at_once: views that it scores at a time.
+    """
+
+    statistics: InputStatistics
+    bins: int
+    scored_at_once: int = 4096
+
+
+def stored_statistics(stored: Mapping[str, Any]) -> InputStatistics:
+    """Input statistics from the header of weights.
+
+    Raises:
+        WeightsError: there is a channel that this version's bins do not have.
+    """
+    values = stored["statistics"]
+    for name in values["channels"]:
+        if name not in ALL_CHANNELS:
+            fix = "Use the version that wrote them, or train again."
+            raise WeightsError("these weights ask for an unknown channel of the bins", value=name, fix=fix)
+    return InputStatistics(tuple(values["channels"]), tuple(values["mean"]), tuple(values["std"]))
+
+
+def standardize(means: Tensor, filled: Tensor, mean: Tensor, std: Tensor, n_certain: int) -> Tensor:
+    """Standardize each channel by its kind (paper, Sec. 3.3 "Data").
+
+    Empty bins are exactly zero afterwards, that is, the mean of their kind; so are landmark channels where a value is
+    not known.
+
+    Args:
+        means: (B, C, bins, bins).
+        filled: (B, bins, bins) bool.
+        mean, std: (C, 1, 1).
+        n_certain: the first channels, of where landmarks lie, are always known: a NaN there is an error to be seen.
+
+    Returns:
+        (B, C, bins, bins).
+    """
+    values = (means - mean) / std * filled[:, None]
+    if values.shape[1] > n_certain:
+        of_landmarks = values[:, n_certain:]
+        of_landmarks.masked_fill_(of_landmarks.isnan(), 0.0)
+    return values
+
+
+def n_certain(channels: tuple[str, ...]) -> int:
+    """How many of the first channels tell where landmarks lie, which is always known."""
+    return next((place for place, name in enumerate(channels) if name not in CHANNELS), len(channels))
+
+
+class BinnedNetworkScorer(BinnedScorer):
+    """The probability that a view localizes, by a network over its binned landmarks.
+
+    A network knows the field of view it was trained with. A camera of another resolution but the same field of view is
+    served by scaling its pixels; another field of view is refused, since the network has never seen one.
+
+    Args:
+        localization_map: the map.
+        trained: the network.
+
+    Raises:
+        WeightsError: trained for another field of view than the map's camera.
+    """
+
+    local = True
+
+    def __init__(self, localization_map: LocalizationMap, trained: TrainedNetwork[Any]) -> None:
+        network: BinnedNetwork = trained.network
+        self.channels = network.statistics.channels
+        super().__init__(localization_map, network.bins, not {*self.channels} <= {*CHANNELS})
+        camera, self.device = localization_map.camera, localization_map.device
+        check_field_of_view(trained.camera, camera)
+        self.name, self.trained = trained.method, trained
+        self.network: Any = network.to(self.device).eval()
+        pixels = {"u": trained.camera.width / camera.width, "v": trained.camera.height / camera.height}
+        scales = [pixels.get(name, 1.0) for name in self.channels]
+        self._scale = torch.tensor(scales, device=self.device)[:, None, None]
+
+    def score_bins(self, binned: BinnedViews) -> Float:
+        """(B,) probabilities in [0, 1]."""
+        binned = binned if binned.channels == self.channels else binned.select(self.channels)
+        scores, block = np.empty(len(binned)), self.network.scored_at_once
+        # TF32 would let a score depend on how many views are scored with it
+        with torch.inference_mode(), torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
+            for begin in range(0, len(scores), block):
+                rows = slice(begin, begin + block)
+                means = torch.from_numpy(binned.means[rows]).to(self.device) * self._scale
+                filled = torch.from_numpy(binned.counts[rows] > 0).to(self.device)
+                # float64 keeps views apart whose probabilities round to 1 in float32
+                logits = self.network(means, filled).double()
+                scores[rows] = self.trained.calibrated(logits).sigmoid().cpu().numpy()
+        return scores

@@ -1,0 +1,90 @@
+"""A small convolutional network over the grid of bins: the paper's input kept as the image that it is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import relu
+
+from wheretolook.inputs.bins import InputStatistics
+from wheretolook.methods.binned_network import BinnedNetwork, n_certain, standardize, stored_statistics
+
+
+@dataclass(frozen=True)
+class ConvSpec:
+    """Everything that defines a convolutional network but its weights.
+
+    Attributes:
+        statistics: of its channels over the training views; their names are those of its input.
+        bins: bins along each side of the image.
+        widths: channels after each convolution.
+        dropout: share of pooled values dropped in training.
+    """
+
+    statistics: InputStatistics
+    bins: int
+    widths: tuple[int, ...]
+    dropout: float
+
+
+class ConvNetwork(BinnedNetwork):
+    """Convolutions of 3 x 3 bins with ReLU between, the mean and the maximum over the image, one logit out.
+
+    It looks at its channels, standardized, and at which bins are filled. Nothing is normalized on the way: how much
+    there is to see is what matters most, and a normalization would hide it.
+
+    Args:
+        spec: what defines it.
+    """
+
+    scored_at_once = 512  # the first convolution of one view takes 115 kB
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, spec: ConvSpec) -> None:
+        super().__init__()
+        self.spec, self.statistics, self.bins = spec, spec.statistics, spec.bins
+        self.n_certain = n_certain(spec.statistics.channels)
+        # these follow from the specification, which is stored beside the weights: persistent=False
+        self.register_buffer("mean", torch.tensor(spec.statistics.mean)[:, None, None], persistent=False)
+        self.register_buffer("std", torch.tensor(spec.statistics.std)[:, None, None], persistent=False)
+        before = (len(spec.statistics.channels) + 1, *spec.widths)
+        self.convolutions = nn.ModuleList(
+            nn.Conv2d(width_in, width_out, 3, stride=1 if index == 0 else 2, padding=1)
+            for index, (width_in, width_out) in enumerate(zip(before, spec.widths, strict=False))
+        )
+        self.dropout = nn.Dropout(spec.dropout)
+        self.last = nn.Linear(2 * spec.widths[-1], 1)
+
+    def forward(self, means: Tensor, filled: Tensor) -> Tensor:
+        """Logits (B,) of binned views, not calibrated.
+
+        Args:
+            means: (B, C, bins, bins) float32, of its channels.
+            filled: (B, bins, bins) bool.
+        """
+        standard = standardize(means, filled, self.mean, self.std, self.n_certain)
+        values = torch.cat([standard, filled[:, None].to(means.dtype)], dim=1)
+        for convolution in self.convolutions:
+            values = relu(convolution(values))
+        pooled = torch.cat([values.mean((2, 3)), values.amax((2, 3))], dim=1)
+        logits: Tensor = self.last(self.dropout(pooled))
+        return logits.squeeze(-1)
+
+    def description(self) -> dict[str, Any]:
+        """The fields of `ConvSpec`."""
+        return asdict(self.spec)
+
+    @classmethod
+    def of_description(cls, stored: Mapping[str, Any]) -> ConvNetwork:
+        """The untrained network of a description.
+
+        Raises:
+            WeightsError: it looks at a channel that this version's bins do not have.
+        """
+        widths = tuple(stored["widths"])
+        return cls(ConvSpec(stored_statistics(stored), int(stored["bins"]), widths, float(stored["dropout"])))

@@ -1,0 +1,93 @@
+"""Fisher information of the pose (Zhang and Scaramuzza, Fisher Information Field, 2020): the paper's nine rows, and two
+probes of the field that its tables list among them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Literal
+
+from wheretolook.methods.method import Method, MethodStyle, ScorerOptions, no_params
+
+if TYPE_CHECKING:
+    from wheretolook.geometry.colmap_camera import Camera
+    from wheretolook.inputs.localization_map import LocalizationMap
+    from wheretolook.methods.base import Scorer
+
+Approximation = Literal["exact", "quadratic", "gp"]
+
+METRICS = {"mineig": ("min. eigenvalue", "P"), "logdet": ("log det", "X"), "trace": ("trace", "h")}
+"""Metrics of the information: name for people, marker."""
+
+APPROXIMATIONS: dict[Approximation, tuple[str, str, Any]] = {
+    "exact": ("exact", "#5E2750", "-"),
+    "quadratic": ("quadratic", "#B65C93", (0, (5, 1))),
+    "gp": ("GP", "#DDA3C6", (0, (2, 1))),
+}
+"""How the sum over landmarks is taken: name for people, shade of one colour (the exact one darkest), line style."""
+
+
+def _metric(metric: str, approximation: Approximation, about_origin: bool) -> Method:
+    def build(localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
+        from wheretolook.methods.fisher.score import FisherScorer
+
+        return FisherScorer(localization_map, metric, approximation, about_origin)
+
+    def params(camera: Camera) -> dict[str, Any]:
+        from wheretolook.fisher.soft_visibility import GaussianProcessVisibility, cone_half_angle
+
+        process = GaussianProcessVisibility.fitted(cone_half_angle(camera))
+        factors = {"gp_factors": process.n_factors, "gp_length": round(process.length, 4)}
+        return {**factors, "gp_held_out_rmse": round(process.held_out_error(), 4)}
+
+    (name, marker), (kind, color, dashes) = METRICS[metric], APPROXIMATIONS[approximation]
+    about = ", turned about the world's origin (only if named)" if about_origin else ""
+    return Method(
+        name=f"fisher-{metric}-{approximation}" + ("-origin" if about_origin else ""),
+        about=f"A metric of the information that a view has on its own pose: {metric}, {approximation}{about}.",
+        style=MethodStyle(
+            f"Fisher, {name}, {kind}" + (", about the origin" if about_origin else ""), color, marker, dashes
+        ),
+        group="Fisher",
+        build=build,
+        family="fisher",
+        only_if_named=about_origin,
+        params=params if approximation == "gp" else no_params,
+    )
+
+
+def _worst(localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
+    from wheretolook.methods.fisher.score import WorstTraceScorer
+
+    return WorstTraceScorer(localization_map)
+
+
+def _stationary(localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
+    from wheretolook.methods.fisher.score import StationaryTraceScorer
+
+    return StationaryTraceScorer(localization_map)
+
+
+METHODS = (
+    *(_metric(metric, approximation, False) for metric in METRICS for approximation in APPROXIMATIONS),
+    *(
+        _metric(metric, approximation, True)
+        for metric in METRICS
+        for approximation in APPROXIMATIONS
+        if metric != "logdet"  # which is the same about any point
+    ),
+    Method(
+        name="fisher-worst-trace",
+        about='The view with the least trace by the quadratic field ("trace app worst"): what the field says not '
+        "to do.",
+        style=MethodStyle("probe: worst trace", "#4D4D4D", "1", (0, (1, 2))),
+        group="probes",
+        build=_worst,
+    ),
+    Method(
+        name="fisher-stationary-trace",
+        about="The stationary point of the quadratic field's trace (\"trace app zero deriv\"), which is its minimum's "
+        "side.",
+        style=MethodStyle("probe: stationary trace", "#7A7A7A", "2", (0, (1, 3))),
+        group="probes",
+        build=_stationary,
+    ),
+)

@@ -1,0 +1,149 @@
+"""Whether a landmark in view will be found, and what landmarks tell of the pose."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any, Self
+
+import torch
+from torch import Tensor, nn
+
+from wheretolook.inputs.landmarks_in_view import ATTRIBUTES
+from wheretolook.learning.landmark_views import AttributeStatistics
+from wheretolook.learning.trained_network import StoredNetwork
+from wheretolook.utils.errors import WeightsError
+
+LIKELY = -2.0
+"""Log-odds of being found that an untrained network gives a landmark: about one in eight, as in real views."""
+
+
+class LandmarkNetwork(StoredNetwork):
+    """A network over single landmarks, which takes what is known of them by name.
+
+    Args:
+        statistics: of the training views; its attributes are what the network is told of a landmark, in order.
+        options: by which it can be built anew beside the statistics.
+    """
+
+    def __init__(self, statistics: AttributeStatistics, **options: Any) -> None:
+        super().__init__()
+        self.statistics, self.options = statistics, options
+
+    @property
+    def attributes(self) -> tuple[str, ...]:
+        """Names of the A attributes that it takes."""
+        return self.statistics.attributes
+
+    def description(self) -> dict[str, Any]:
+        """Attributes, their statistics, and the options."""
+        stored = asdict(self.statistics)
+        return {"attributes": list(stored.pop("attributes")), "statistics": stored, "options": self.options}
+
+    @classmethod
+    def of_description(cls, stored: Mapping[str, Any]) -> Self:
+        """The untrained network of a description.
+
+        Raises:
+            WeightsError: it asks for an attribute that this version's maps do not know, or lacks one that tells where a
+                landmark lies.
+        """
+        names, statistics = tuple(stored["attributes"]), stored["statistics"]
+        for name in names:
+            if name not in ATTRIBUTES:
+                fix = "Use the version that wrote them, or train again."
+                raise WeightsError("these weights ask for an unknown attribute of landmarks", value=name, fix=fix)
+        for name in ("across", "down", "distance"):
+            if name not in names:
+                raise WeightsError("these weights do not ask where a landmark lies", value=name)
+        options = {
+            name: tuple(value) if isinstance(value, list) else value for name, value in stored["options"].items()
+        }
+        return cls(AttributeStatistics(tuple(statistics["mean"]), tuple(statistics["std"]), names), **options)
+
+
+class StandardAttributes(nn.Module):
+    """What is known of landmarks, standardized; what is not known becomes 0, the mean of its kind.
+
+    Args:
+        statistics: of the training views.
+        hidden: names of attributes not to look at, which are 0 always.
+    """
+
+    mean: Tensor
+    scale: Tensor
+
+    def __init__(self, statistics: AttributeStatistics, hidden: tuple[str, ...] = ()) -> None:
+        super().__init__()
+        known = zip(statistics.attributes, statistics.std, strict=True)
+        scale = [0.0 if name in hidden else 1 / std for name, std in known]
+        # these follow from the description that is stored beside the weights: persistent=False
+        self.register_buffer("mean", torch.tensor(statistics.mean), persistent=False)
+        self.register_buffer("scale", torch.tensor(scale), persistent=False)
+
+    def forward(self, values: Tensor) -> Tensor:
+        """(..., A)."""
+        return ((values - self.mean) * self.scale).nan_to_num(nan=0.0)
+
+
+class MatchabilityNetwork(LandmarkNetwork):
+    """The probability that a landmark in view is found: matched, and an inlier of the pose.
+
+    Args:
+        statistics: of the training views.
+        width: units of each of two hidden layers.
+        hidden: names of attributes not to look at.
+    """
+
+    def __init__(self, statistics: AttributeStatistics, width: int = 48, hidden: tuple[str, ...] = ()) -> None:
+        super().__init__(statistics, width=width, hidden=hidden)
+        self.input = StandardAttributes(statistics, hidden)
+        last = nn.Linear(width, 1)
+        nn.init.constant_(last.bias, LIKELY)
+        self.layers = nn.Sequential(
+            nn.Linear(len(self.attributes), width), nn.ReLU(), nn.Linear(width, width), nn.ReLU(), last
+        )
+
+    def forward(self, values: Tensor) -> Tensor:
+        """Log-odds (...,) of landmarks (..., A)."""
+        return self.layers(self.input(values)).squeeze(-1)
+
+
+def bearing_numbers(values: Tensor, attributes: tuple[str, ...] = ATTRIBUTES) -> Tensor:
+    """Information of each landmark on the pose, `wheretolook.fisher.information.bearing_numbers` in the camera's axes.
+
+    Args:
+        values: (..., A).
+        attributes: names of the A attributes.
+
+    Returns:
+        (..., 15).
+    """
+    across, down, log_distance = (values[..., attributes.index(name)] for name in ("across", "down", "distance"))
+    bearing = torch.stack([across, down, torch.ones_like(across)], -1)
+    bearing = bearing / bearing.norm(dim=-1, keepdim=True)
+    inverse = (-log_distance).exp()[..., None]
+    x, y, z = bearing.unbind(-1)
+    plane = torch.stack([1 - x * x, -x * y, -x * z, 1 - y * y, -y * z, 1 - z * z], -1)
+    return torch.cat([plane * inverse**2, bearing * inverse, plane], -1)
+
+
+N_EXPECTED = 1 + 15 + 5
+"""Numbers that `expected_parts` gives of a landmark."""
+
+
+def expected_parts(values: Tensor, log_odds: Tensor, attributes: tuple[str, ...] = ATTRIBUTES) -> Tensor:
+    """What each landmark adds to the sums that `expected_statistics` takes.
+
+    Args:
+        values: (..., A).
+        log_odds: (...,) of being found.
+        attributes: names of the A attributes.
+
+    Returns:
+        (..., N_EXPECTED).
+    """
+    found = log_odds.sigmoid()[..., None]
+    across, down = (values[..., attributes.index(name), None] for name in ("across", "down"))
+    moments = torch.cat([across, down, across * across, across * down, down * down], -1)
+    return torch.cat([found, found * bearing_numbers(values, attributes), found * moments], -1)

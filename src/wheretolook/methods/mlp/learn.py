@@ -1,0 +1,55 @@
+"""Learning the paper's network from binned landmarks."""
+
+from __future__ import annotations
+
+from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS
+from wheretolook.learning.data import ViewpointDataModule
+from wheretolook.learning.fit import home_device
+from wheretolook.learning.learner import Learnt, Task, class_counts, fit_network
+from wheretolook.learning.trained_network import TrainedNetwork
+from wheretolook.methods.mlp.config import MlpConfig
+from wheretolook.methods.mlp.network import NetworkSpec, ViewpointNetwork
+
+KEPT = "binned views"
+"""What one network leaves for the next in `Task.kept`: the views, with the options that they were made by."""
+
+
+def learn_mlp(task: Task, channels: tuple[str, ...]) -> Learnt:
+    """The paper's network from a dataset's train scenes.
+
+    Args:
+        task: what to do.
+        channels: what the network looks at.
+
+    Raises:
+        TableError: no train scene, no labels, or labels of one class only.
+        MapError: a scene has no landmarks.
+        ConfigError: there are fewer GPUs than asked for, or the views do not fit into memory shared by processes.
+    """
+    data, options = _views(task, channels), task.options
+    statistics = data.statistics.select(channels)
+    network = ViewpointNetwork(
+        NetworkSpec(
+            statistics, options.bins, options.layout, options.hidden, options.dropout, options.input_dropout
+        )
+    )  # fmt: skip
+    data.channels = channels
+    metrics, history = fit_network(network, data, task, data.class_weights)
+    labels = data.views.labels.cpu()
+    counts = class_counts(train=labels[data.train_rows].numpy(), val=labels[data.val_rows].numpy())
+    return Learnt(TrainedNetwork(task.method, network.cpu(), task.dataset.camera), metrics, counts, history)
+
+
+def _views(task: Task, channels: tuple[str, ...]) -> ViewpointDataModule:
+    """The dataset's views: those of the network before, if they were made by the same options and have the channels."""
+    options: MlpConfig = task.options
+    known: ViewpointDataModule | None = task.kept.get(KEPT)
+    if known is None or known.options != options or not {*channels} <= {*known.views.channels}:
+        wide = not {*channels} <= {*CHANNELS}
+        known = ViewpointDataModule(
+            task.dataset, task.config, options, options.bins, home_device(task.config), task.progress, wide
+        )
+        assert not wide or {*channels} <= {*ALL_CHANNELS}
+        task.kept[KEPT] = known
+    known.setup()
+    return known

@@ -79,8 +79,9 @@ class ViewLattice:
     Args:
         grid: voxels along x, y and z over the scene's bounds.
         directions: directions at each location.
-        lattice: how they are spread: "fibonacci" is even, "azimuth-elevation" is the paper's comparison, "released" is
-            what the released code does, "yaw-pitch" are ActLoc's 6 pitches x 18 yaws, whatever `directions` says.
+        lattice: how directions are spread: fibonacci, azimuth-elevation, released or yaw-pitch. The first is even, the
+            second the paper's comparison, the third what the released code does, and "yaw-pitch" are ActLoc's 6 pitches
+            x 18 yaws, whatever `directions` says.
 
     Raises:
         ConfigError: no voxel, no direction, or no such lattice.

@@ -60,7 +60,7 @@ def looking_north() -> ViewpointMap:
         n_visible=np.ones_like(scores, dtype=np.uint32),
         landmark_ids=np.zeros(0, np.int64),
         landmark_digests=np.zeros((0, 2), np.uint64),
-        origin=MapOrigin("made", "", "fibonacci", {}, "none", "0" * 16),
+        origin=MapOrigin("made", "fibonacci", {}, "none", "0" * 16),
     )
 
 

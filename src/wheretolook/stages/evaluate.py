@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import pandas as pd
+
 from wheretolook.config import Experiment
 from wheretolook.dataset.folders import Dataset
 from wheretolook.evaluation.config import EvaluateConfig
@@ -15,8 +17,6 @@ from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.visibility.config import OcclusionConfig
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from wheretolook.learning.provenance import TrainedModel
 
 

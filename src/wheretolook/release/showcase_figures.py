@@ -23,8 +23,8 @@ from wheretolook.methods.binned_network import BinnedNetworkScorer
 from wheretolook.planning.config import PathsConfig, PlanConfig
 from wheretolook.planning.method_paths import path_views, plan_by_methods
 from wheretolook.planning.path_comparison import draw_pairs
-from wheretolook.planning.path_view import PathView
 from wheretolook.planning.refine import score_directions
+from wheretolook.planning.route_views import PathView
 from wheretolook.release.showcase import EYE_M, Showcase
 from wheretolook.utils.errors import ConfigError
 from wheretolook.viewpoints.table import UNLABELLED, is_good, outcome_in_brief, outcome_in_words, poses

@@ -41,7 +41,7 @@ def compare_paths(experiment: Experiment, say: Say = print, tick: Tick = lambda 
         ConfigError: no such scene or method, or no weights. WeightsError: the weights cannot be used.
         SceneError: a scene has no mesh, or too little room for starts and goals.
     """
-    from wheretolook.planning.planner_map import check_methods
+    from wheretolook.planning.scene_map import check_methods
 
     dataset, config = dataset_after(experiment, "map"), experiment.paths
     check_methods(config.methods)
@@ -69,8 +69,7 @@ def _plan(scene: Scene, dataset: Dataset, config: PathsConfig, say: Say) -> Comp
     """The paths of a scene: those that are there if they were planned with the same settings."""
     from wheretolook.labelling.labeller import storing
     from wheretolook.planning.path_comparison import FORWARD, ComparedPaths, draw_pairs, plan_pairs
-    from wheretolook.planning.planner_map import planner_map
-    from wheretolook.planning.scene_map import weights_for
+    from wheretolook.planning.scene_map import planner_map, weights_for
 
     files, folder = scene.files, _folder(dataset, scene)
     weights = {method: weights_for(method, dataset, config.weights, say) for method in config.methods}

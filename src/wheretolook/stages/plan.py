@@ -18,8 +18,7 @@ from wheretolook.utils.tracking import log, start_run
 from wheretolook.viewpoints.table import pose_columns
 
 if TYPE_CHECKING:
-    from wheretolook.planning.path_view import PathView
-    from wheretolook.planning.route_views import PlannedPath
+    from wheretolook.planning.route_views import PathView, PlannedPath
 
 
 def plan(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> PlannedPath:

@@ -66,11 +66,8 @@ def copy_dataset(dataset: Dataset, root: Path, settings: Mapping[str, Any]) -> D
         copy.label_manifest.unlink(missing_ok=True)
         if scene.label_manifest.is_file():
             write_json(copy.label_manifest, _manifest(scene.label_manifest))
-    about = {
-        "source": dataset.name, "source_fingerprint": dataset.fingerprint(), "code_version": VERSION,
-        "settings": dict(settings),
-    }  # fmt: skip
-    write_json(root / RELEASE_FILE, about)
+    source = {"source": dataset.name, "source_fingerprint": dataset.fingerprint()}
+    write_json(root / RELEASE_FILE, {**source, "code_version": VERSION, "settings": dict(settings)})
     release = Dataset(root, dataset.camera, tuple(copy for _, copy in copied))
     release.save()
     for scene in before.scenes if before is not None else ():

@@ -115,8 +115,9 @@ class Showcase(Scene):
         n_locations, good = self.table["location_id"].nunique(), is_good(self.table).mean()
         cameras = "" if self.mapping_poses is None else f" of {len(self.mapping_poses)} images"
         return (
-            f"**{self.name}**: {len(self.mesh.triangles):,} triangles; a map{cameras} with {len(self.landmarks):,} landmarks; "
-            f"{len(self.table):,} labelled viewpoints at {n_locations} locations, of which {good:.0%} localize."
+            f"**{self.name}**: {len(self.mesh.triangles):,} triangles; a map{cameras} with "
+            f"{len(self.landmarks):,} landmarks; {len(self.table):,} labelled viewpoints at {n_locations} locations, "
+            f"of which {good:.0%} localize."
         )
 
     def viewpoints(self, location_id: int) -> pd.DataFrame:

@@ -38,7 +38,6 @@ from wheretolook.space.config import FreeSpaceConfig
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.viewpoints.config import SampleConfig
-from wheretolook.viewpoints.locations import shares_good
 from wheretolook.viewpoints.sampling import free_locations, sample_viewpoints
 from wheretolook.viewpoints.table import (
     LOCALIZED,
@@ -47,6 +46,7 @@ from wheretolook.viewpoints.table import (
     outcome_in_brief,
     outcome_in_words,
     poses,
+    shares_good,
     write_table,
 )
 from wheretolook.visibility.config import OcclusionConfig

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from wheretolook.geometry.colmap_camera import Camera, ColmapCamera
+from wheretolook.geometry.camera import Camera, ColmapCamera
 from wheretolook.geometry.poses import Float, split_poses
 from wheretolook.inputs.channels import ATTRIBUTES
 from wheretolook.inputs.localization_map import LocalizationMap

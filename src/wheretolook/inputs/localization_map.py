@@ -10,14 +10,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.geometry.colmap_camera import Camera, ColmapCamera
+from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import Float, camera_centers, check_poses
 from wheretolook.inputs.bins import BinnedViews, bin_views, count_bins
 from wheretolook.mapping.cameras import colmap_poses
 from wheretolook.mapping.colmap_model import read_model
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
-from wheretolook.visibility.frustum import LandmarkSets, in_view_on_device, landmarks_in_view, points_on_device
+from wheretolook.visibility.frustum import (
+    LandmarkSets,
+    PosedViews,
+    in_view_on_device,
+    landmarks_in_view,
+    points_on_device,
+)
 from wheretolook.visibility.occlusion import NoOcclusion, OcclusionModel
 
 if TYPE_CHECKING:
@@ -87,7 +92,7 @@ class LocalizationMap:
             ValueError: the poses have another shape, or entries that are not finite.
         """
         described = self.landmarks if landmark_channels else None
-        return bin_views(*self._views(cam_from_world), bins=bins, device=self.device, landmarks=described)
+        return bin_views(self._views(cam_from_world), bins=bins, device=self.device, landmarks=described)
 
     def count_bins(self, cam_from_world: Float, bins: int = 30) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         """How many landmarks the views (B, 3, 4) see, and how many bins have one in them, (B,) each.
@@ -95,7 +100,7 @@ class LocalizationMap:
         Raises:
             ValueError: the poses have another shape, or entries that are not finite.
         """
-        return count_bins(*self._views(cam_from_world), bins=bins, device=self.device)
+        return count_bins(self._views(cam_from_world), bins=bins, device=self.device)
 
     def landmarks_in_view(self, cam_from_world: Float) -> LandmarkSets:
         """The landmarks that each of the views (B, 3, 4) sees.
@@ -103,7 +108,7 @@ class LocalizationMap:
         Raises:
             ValueError: the poses have another shape, or entries that are not finite.
         """
-        return landmarks_in_view(*self._views(cam_from_world), device=self.device)
+        return landmarks_in_view(self._views(cam_from_world), self.device)
 
     def in_view_on_device(self, cam_from_world: Float) -> tuple[NDArray[np.int64], Tensor]:
         """What `landmarks_in_view` gives, its indices left on the map's device.
@@ -118,22 +123,22 @@ class LocalizationMap:
         import torch  # takes seconds to load
         import warp as wp
 
-        camera, poses, _, unoccluded, rows = self._views(cam_from_world)
-        if isinstance(camera, ColmapCamera):
-            seen = landmarks_in_view(camera, poses, self.landmarks.points, unoccluded, rows)
+        views = self._views(cam_from_world)
+        if isinstance(self.camera, ColmapCamera):
+            seen = landmarks_in_view(views)
             return seen.starts.astype(np.int64), torch.from_numpy(seen.indices).to(self.device)
-        starts, indices = in_view_on_device(camera, poses, self._points_on_device, unoccluded, rows, self.device)
+        starts, indices = in_view_on_device(views, self._points_on_device, self.device)
         return starts.astype(np.int64), wp.to_torch(indices)
 
     @cached_property
     def _points_on_device(self) -> Any:
         return points_on_device(self.landmarks.points, self.device)
 
-    def _views(self, cam_from_world: Float) -> tuple[Camera, Float, Float, LandmarkSets, NDArray[np.int64]]:
-        """Camera, checked poses, points, the unoccluded landmarks of each location, and each pose's location."""
+    def _views(self, cam_from_world: Float) -> PosedViews:
         poses, points = check_poses(cam_from_world), self.landmarks.points
         locations, rows = shared_locations(poses)
-        return self.camera, poses, points, LandmarkSets.from_mask(self.occlusion.unoccluded(locations, points)), rows
+        unoccluded = LandmarkSets.from_mask(self.occlusion.unoccluded(locations, points))
+        return PosedViews(self.camera, poses, points, unoccluded, rows)
 
 
 def shared_locations(cam_from_world: Float) -> tuple[Float, NDArray[np.int64]]:

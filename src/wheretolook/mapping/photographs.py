@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.geometry.colmap_camera import ColmapCamera
+from wheretolook.geometry.camera import ColmapCamera
 from wheretolook.mapping.photograph_config import PhotographsConfig
 from wheretolook.utils.colmap import quiet_colmap
 from wheretolook.utils.errors import ConfigError, MapError

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
-from wheretolook.geometry.colmap_camera import ColmapCamera
+from wheretolook.geometry.camera import ColmapCamera
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float, rotation_looking_along
 from wheretolook.mapping.landmarks import Landmarks

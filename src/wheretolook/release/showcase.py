@@ -25,9 +25,8 @@ from wheretolook.space.config import FreeSpaceConfig
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.utils.options import recorded
 from wheretolook.viewpoints.config import SampleConfig
-from wheretolook.viewpoints.locations import instructive_location
 from wheretolook.viewpoints.sampling import free_locations
-from wheretolook.viewpoints.table import is_good
+from wheretolook.viewpoints.table import instructive_location, is_good
 from wheretolook.visibility.config import OcclusionConfig
 from wheretolook.visibility.occlusion import StoredOcclusion
 

@@ -60,7 +60,7 @@ def run_demo(experiment: Experiment) -> None:
 def draw_overview(experiment: Experiment, weights: Path) -> None:
     """Draw `<dataset>/results/overview.png`: the last scene's map, and what a network thinks of one place in it.
 
-    The place is one where to look matters (`wheretolook.viewpoints.locations.instructive_location`). The weights are a
+    The place is one where to look matters (`wheretolook.viewpoints.table.instructive_location`). The weights are a
     file, or a folder of files of which the best is taken, for a camera of the dataset's field of view.
 
     Raises:
@@ -70,8 +70,7 @@ def draw_overview(experiment: Experiment, weights: Path) -> None:
     from wheretolook.figures.overview import overview_figure
     from wheretolook.figures.style import save_figure
     from wheretolook.release.showcase_figures import rendered_views
-    from wheretolook.viewpoints.locations import instructive_location, shares_good
-    from wheretolook.viewpoints.table import outcome_in_words, poses
+    from wheretolook.viewpoints.table import instructive_location, outcome_in_words, poses, shares_good
 
     dataset = Dataset.load(experiment.root)
     scene = open_scene(experiment, dataset, dataset.scenes[-1])

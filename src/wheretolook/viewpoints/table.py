@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from wheretolook.geometry.poses import Float, camera_centers, quaternion_from_rotation, rotation_from_quaternion
 from wheretolook.utils.errors import TableError
@@ -84,6 +85,21 @@ def is_good(table: pd.DataFrame, max_error_m: float = 0.05, max_error_deg: float
         raise TableError("viewpoints without labels", value=unlabelled, fix="Run the label stage (it resumes).")
     good = (table["status"] == LOCALIZED) & (table["error_m"] < max_error_m) & (table["error_deg"] < max_error_deg)
     return good.to_numpy()
+
+
+def shares_good(table: pd.DataFrame) -> tuple[NDArray[np.int64], Float]:
+    """Ids (L,) of a table's locations, ascending, and the share of each one's viewpoints that localize, (L,)."""
+    ids, rows = np.unique(table["location_id"].to_numpy(np.int64), return_inverse=True)
+    return ids, np.bincount(rows, weights=is_good(table)) / np.bincount(rows)
+
+
+def instructive_location(table: pd.DataFrame) -> int:
+    """The location where the share of viewpoints that localize is nearest to one half: where to look matters there.
+
+    Of several, the first.
+    """
+    ids, shares = shares_good(table)
+    return int(ids[np.argmin(np.abs(shares - 0.5))])
 
 
 def outcome_in_words(label: pd.Series) -> str:

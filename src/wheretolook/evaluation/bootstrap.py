@@ -9,9 +9,7 @@ from numpy.typing import NDArray
 
 from wheretolook.geometry.poses import Float
 
-PERCENTILES = (2.5, 97.5)
-"""Ends of a 95 % interval."""
-
+PERCENTILES = (2.5, 97.5)  # ends of a 95 % interval
 _SIGNS = 1  # sets the random numbers of the sign flips apart from those of the resamples
 
 

@@ -14,17 +14,10 @@ from scipy.special import expit, logit
 from wheretolook.geometry.poses import Float
 from wheretolook.learning.old_names import with_names
 
-Good = NDArray[np.bool_]
-"""Whether each view localizes, (B,)."""
-
-BINS = 15
-"""Bins of equal width that probabilities are sorted into."""
-
-TINY = 1e-15
-"""Probabilities are kept this far from 0 and 1, so that their logits are finite."""
-
-TEMPERATURES = (0.01, 100.0)
-"""Range in which a temperature is sought."""
+Good = NDArray[np.bool_]  # whether each view localizes, (B,)
+BINS = 15  # bins of equal width that probabilities are sorted into
+TINY = 1e-15  # probabilities are kept this far from 0 and 1, so that their logits are finite
+TEMPERATURES = (0.01, 100.0)  # range in which a temperature is sought
 
 
 def reliability(probability: Float, good: Good, bins: int = BINS) -> pd.DataFrame:

@@ -16,8 +16,7 @@ from wheretolook.utils.files import write_text
 from wheretolook.utils.markdown import markdown_table
 from wheretolook.viewpoints.thresholds import ALL, THRESHOLDS, threshold_key, threshold_label
 
-KEYS = tuple(map(threshold_key, THRESHOLDS))
-"""The paper's thresholds."""
+KEYS = tuple(map(threshold_key, THRESHOLDS))  # the paper's thresholds
 
 NOTE = (
     "The paper's numbers were measured on other scenes (12 Habitat-Matterport meshes) and divided by one constant, "

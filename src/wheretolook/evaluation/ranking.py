@@ -13,23 +13,16 @@ from wheretolook.geometry.poses import Float
 
 @dataclass(frozen=True, eq=False)
 class TestViews:
-    """Labelled views to choose from.
-
-    Attributes:
-        location: (B,) int64, number of each view's location, 0 .. L-1 over all scenes.
-        viewpoint_id: (B,) int64, unique within a location.
-        good: (B, T) bool, whether the view localizes within each of T thresholds.
-        location_scene: (L,) int64, number of each location's scene.
-        location_block: (L,) int64, number of the block of neighbouring locations that each is resampled with, see
-            `wheretolook.evaluation.bootstrap.LocationBootstrap`; None for each by itself.
-    """
+    """Labelled views to choose from."""
 
     __test__ = False  # no test class, whatever its name says
 
-    location: NDArray[np.int64]
-    viewpoint_id: NDArray[np.int64]
-    good: NDArray[np.bool_]
-    location_scene: NDArray[np.int64]
+    location: NDArray[np.int64]  # (B,) int64, number of each view's location, 0 .. L-1 over all scenes
+    viewpoint_id: NDArray[np.int64]  # (B,) int64, unique within a location
+    good: NDArray[np.bool_]  # (B, T) bool, whether the view localizes within each of T thresholds
+    location_scene: NDArray[np.int64]  # (L,) int64, number of each location's scene
+    # (L,) int64, number of the block of neighbouring locations that each is resampled with, see
+    # `wheretolook.evaluation.bootstrap.LocationBootstrap`; None for each by itself
     location_block: NDArray[np.int64] | None = None
 
     @property
@@ -49,17 +42,11 @@ class TestViews:
 
 @dataclass(frozen=True, eq=False)
 class TopN:
-    """What the views chosen at each location are worth.
+    """What the views chosen at each location are worth."""
 
-    Attributes:
-        chosen: (L,) views chosen at each location: N, or all there are.
-        good: (L, T) how many of them are good within each threshold (an expectation for random choice).
-        any_good: (L, T) whether at least one is (a probability for random choice).
-    """
-
-    chosen: Float
-    good: Float
-    any_good: Float
+    chosen: Float  # (L,) views chosen at each location: N, or all there are
+    good: Float  # (L, T) how many of them are good within each threshold (an expectation for random choice)
+    any_good: Float  # (L, T) whether at least one is (a probability for random choice)
 
 
 def rank_views(views: TestViews, scores: Float) -> NDArray[np.int64]:

@@ -14,14 +14,12 @@ from wheretolook.methods.styles import ORACLE, method_group, method_style
 from wheretolook.utils.markdown import markdown_table
 from wheretolook.viewpoints.thresholds import ALL, threshold_label
 
-Row = Mapping[Any, Any]
-"""A row of a score table by its columns' names."""
+Row = Mapping[Any, Any]  # a row of a score table by its columns' names
 
 Column = tuple[str, str, Callable[[Row], str]]
 """Header of a Markdown table's column, the score table's column that it needs, and the text of a row."""
 
-SCENES_ABREAST = 8
-"""Scenes in one table; more make another below."""
+SCENES_ABREAST = 8  # scenes in one table; more make another below
 
 
 def score_markdown(scores: pd.DataFrame, title: str = "Localization score") -> str:

@@ -32,48 +32,30 @@ CALIBRATION_CSV, CALIBRATION_PNG, REGRET_PNG = "calibration.csv", "calibration.p
 VARIANTS_CSV = "variants.csv"
 """In a release's `results/`: scores of the networks for all inputs, as `scores.csv`, before one was chosen to ship."""
 
-LOCATIONS_PARQUET = "locations.parquet"
-"""Artifact of each nested run: what was chosen at each location, for each N."""
+LOCATIONS_PARQUET = "locations.parquet"  # artifact of each nested run: what was chosen at each location, for each N
 
 
 @dataclass(frozen=True, eq=False)
 class ScoredSet:
-    """One candidate set with the scores by one occlusion model.
+    """One candidate set with the scores by one occlusion model."""
 
-    Attributes:
-        occlusion: name of the occlusion model.
-        candidates: the views.
-        scores: (B,) scores of these views, by method.
-        choices: what each method chooses.
-        table: the score table, with columns `occlusion` and `candidates`.
-    """
-
-    occlusion: str
-    candidates: CandidateSet
-    scores: Mapping[str, Float]
-    choices: Choices
-    table: pd.DataFrame
+    occlusion: str  # name of the occlusion model
+    candidates: CandidateSet  # the views
+    scores: Mapping[str, Float]  # (B,) scores of these views, by method
+    choices: Choices  # what each method chooses
+    table: pd.DataFrame  # the score table, with columns `occlusion` and `candidates`
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """What an evaluation found.
+    """What an evaluation found."""
 
-    Attributes:
-        scenes: of the split.
-        weights: files of methods that have learnt, and the name of the method that each serves.
-        views: all labelled views.
-        scored: of each occlusion model and candidate set.
-        table: their score tables, one below the other, with columns `occlusion` and `candidates`.
-        calibration: reliability curves of learned methods, see `calibration_rows`; empty without any.
-    """
-
-    scenes: Sequence[SceneFolder]
-    weights: Mapping[Path, str]
-    views: TestViews
-    scored: Sequence[ScoredSet]
-    table: pd.DataFrame
-    calibration: pd.DataFrame
+    scenes: Sequence[SceneFolder]  # of the split
+    weights: Mapping[Path, str]  # files of methods that have learnt, and the name of the method that each serves
+    views: TestViews  # all labelled views
+    scored: Sequence[ScoredSet]  # of each occlusion model and candidate set
+    table: pd.DataFrame  # their score tables, one below the other, with columns `occlusion` and `candidates`
+    calibration: pd.DataFrame  # reliability curves of learned methods, see `calibration_rows`; empty without any
 
 
 def results_folder(dataset: Dataset, config: EvaluateConfig) -> Path:
@@ -98,8 +80,7 @@ def evaluation_params(dataset: Dataset, scenes: Sequence[SceneFolder], weights: 
     }
 
 
-_NAMED = ("method", "occlusion", "candidates")
-"""What names a nested run."""
+_NAMED = ("method", "occlusion", "candidates")  # what names a nested run
 
 _OF_ALL_VIEWS = ("n_locations", "average_precision", "roc_auc", "ece", "ece_scaled", "temperature")
 """Columns of a score table that do not depend on N."""
@@ -108,8 +89,7 @@ _OF_CHOSEN = re.compile("(raw|any|normalized|p)_(?!low_|high_)|(regret|differenc
 """Beginning of the columns that are logged for each N. `scores.csv`, an artifact, has the other intervals and counts;
 each metric costs MLflow 0.3 ms."""
 
-_OF_SCENE = re.compile("regret_(?!low_|high_)")
-"""Beginning of the columns that are logged for each N and scene."""
+_OF_SCENE = re.compile("regret_(?!low_|high_)")  # beginning of the columns that are logged for each N and scene
 
 
 def runs_of_rows(table: pd.DataFrame, params: Mapping[str, Any]) -> Iterator[NestedRun]:

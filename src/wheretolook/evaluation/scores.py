@@ -28,8 +28,7 @@ RELEASED_DIVISOR = 0.527
 _PAIRED = ("difference", "difference_low", "difference_high", "p")
 _CALIBRATION = ("ece", "ece_scaled", "temperature")
 
-Choices = Mapping[tuple[str, int], TopN]
-"""What each method, the oracle too, chooses for each N."""
+Choices = Mapping[tuple[str, int], TopN]  # what each method, the oracle too, chooses for each N
 
 
 def read_scores(path: Path) -> pd.DataFrame:

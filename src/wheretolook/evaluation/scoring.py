@@ -25,11 +25,8 @@ from wheretolook.utils.files import fingerprint
 from wheretolook.viewpoints.table import poses
 from wheretolook.visibility.config import OcclusionConfig
 
-BLOCK = 4096
-"""Views binned and scored at a time."""
-
-Weights = Mapping[Path, str]
-"""Files of weights, and the name of the method that each serves."""
+BLOCK = 4096  # views binned and scored at a time
+Weights = Mapping[Path, str]  # files of weights, and the name of the method that each serves
 
 
 def choose_weights(dataset: Dataset, config: EvaluateConfig, models: Sequence[TrainedModel | Path] | None) -> Weights:

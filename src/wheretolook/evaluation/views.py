@@ -19,19 +19,12 @@ from wheretolook.viewpoints.table import is_good, poses
 
 @dataclass(frozen=True, eq=False)
 class CandidateSet:
-    """Views to choose from.
+    """Views to choose from."""
 
-    Attributes:
-        name: as in the column `candidates`: "all", or such as "best 100".
-        mask: (B,) which of all labelled views they are.
-        views: the views.
-        location_id: (L,) of their locations, unique within a scene.
-    """
-
-    name: str
-    mask: NDArray[np.bool_]
-    views: TestViews
-    location_id: NDArray[np.int64]
+    name: str  # as in the column `candidates`: "all", or such as "best 100"
+    mask: NDArray[np.bool_]  # (B,) which of all labelled views they are
+    views: TestViews  # the views
+    location_id: NDArray[np.int64]  # (L,) of their locations, unique within a scene
 
 
 def views_of(

@@ -14,8 +14,7 @@ from torchmetrics.utilities.distributed import gather_all_tensors
 from wheretolook.learning.config import FittingConfig
 from wheretolook.learning.data import Batch
 
-CALIBRATION_BINS = 15
-"""Equal-width bins of the expected calibration error (Guo et al., ICML 2017)."""
+CALIBRATION_BINS = 15  # equal-width bins of the expected calibration error (Guo et al., ICML 2017)
 
 
 def weighted_bce(

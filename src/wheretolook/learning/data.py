@@ -23,26 +23,18 @@ from wheretolook.utils.errors import ConfigError, TableError
 from wheretolook.utils.files import fingerprint
 from wheretolook.viewpoints.table import UNLABELLED, is_good, poses
 
-BLOCK = 4096
-"""Views binned at a time."""
-
-ROOM = 2
-"""Views are kept on a GPU that has this many times the memory they need."""
+BLOCK = 4096  # views binned at a time
+ROOM = 2  # views are kept on a GPU that has this many times the memory they need
 
 
 class Batch(NamedTuple):
-    """One process's share of a batch.
+    """One process's share of a batch."""
 
-    Attributes:
-        inputs: what the network takes, tensors with B rows; of binned views means (B, C, bins, bins) float32 and
-            filled (B, bins, bins) bool.
-        labels: (B,) float32.
-        total: views in the whole batch, over all processes.
-    """
-
+    # what the network takes, tensors with B rows; of binned views means (B, C, bins, bins) float32 and filled (B, bins,
+    # bins) bool
     inputs: tuple[Tensor, ...]
-    labels: Tensor
-    total: int
+    labels: Tensor  # (B,) float32
+    total: int  # views in the whole batch, over all processes
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,22 +43,14 @@ class LabelledViews:
 
     With `CHANNELS` a view takes about 19 kB at 30 x 30 bins: 0.6 GB for 30,000 views, 6.4 GB for 340,000; with
     `ALL_CHANNELS` 51 kB.
-
-    Attributes:
-        means: (B, C, bins, bins) float32, empty bins zero; see `BinnedViews`.
-        filled: (B, bins, bins) bool.
-        labels: (B,) float32, 1 where the viewpoint localizes.
-        scene: (B,) int64, number of each view's scene in the order given.
-        location: (B,) int64, location_id of each view, unique only within its scene.
-        channels: names of the C channels.
     """
 
-    means: Tensor
-    filled: Tensor
-    labels: Tensor
-    scene: NDArray[np.int64]
-    location: NDArray[np.int64]
-    channels: tuple[str, ...] = CHANNELS
+    means: Tensor  # (B, C, bins, bins) float32, empty bins zero; see `BinnedViews`
+    filled: Tensor  # (B, bins, bins) bool
+    labels: Tensor  # (B,) float32, 1 where the viewpoint localizes
+    scene: NDArray[np.int64]  # (B,) int64, number of each view's scene in the order given
+    location: NDArray[np.int64]  # (B,) int64, location_id of each view, unique only within its scene
+    channels: tuple[str, ...] = CHANNELS  # names of the C channels
 
     def __len__(self) -> int:
         return len(self.labels)

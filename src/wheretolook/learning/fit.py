@@ -31,16 +31,12 @@ from wheretolook.utils.tracking_config import TrackingConfig
 if TYPE_CHECKING:
     from mlflow.entities import Metric
 
-MONITORED = "val_average_precision"
-"""The metric that tells which epoch was best."""
+MONITORED = "val_average_precision"  # the metric that tells which epoch was best
 
 LIGHTNING_LOGGERS = ("lightning.pytorch", "lightning.fabric")
 
-LOG_EVERY_S = 2.0
-"""Epochs are logged together after so many seconds: a transaction takes longer than a short epoch."""
-
-LOG_AT_MOST = 1000
-"""Metrics MLflow takes at a time."""
+LOG_EVERY_S = 2.0  # epochs are logged together after so many seconds: a transaction takes longer than a short epoch
+LOG_AT_MOST = 1000  # metrics MLflow takes at a time
 
 
 def home_device(config: SharedConfig) -> str:

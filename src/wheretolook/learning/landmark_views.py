@@ -26,23 +26,16 @@ from wheretolook.viewpoints.table import LOCALIZED, is_good, poses
 DISTANCES = [ATTRIBUTES.index(name) for name in ("distance", "mapped_distance")]
 """Attributes that are logarithms of distances: those that change when a scene is enlarged."""
 
-BLOCK = 2048
-"""Views described at a time: some million landmarks."""
+BLOCK = 2048  # views described at a time: some million landmarks
 
 
 @dataclass(frozen=True)
 class AttributeStatistics:
-    """Mean and standard deviation of what is known of each landmark, over those in view while training.
+    """Mean and standard deviation of what is known of each landmark, over those in view while training."""
 
-    Attributes:
-        mean: (A,), 0 for what is not known of any.
-        std: (A,), 1 where it would be 0.
-        attributes: names of the A attributes.
-    """
-
-    mean: tuple[float, ...]
-    std: tuple[float, ...]
-    attributes: tuple[str, ...] = ATTRIBUTES
+    mean: tuple[float, ...]  # (A,), 0 for what is not known of any
+    std: tuple[float, ...]  # (A,), 1 where it would be 0
+    attributes: tuple[str, ...] = ATTRIBUTES  # names of the A attributes
 
     @classmethod
     def of(cls, values: Tensor) -> AttributeStatistics:
@@ -62,27 +55,17 @@ class LandmarkViews:
     """Labelled viewpoints of some scenes, by the landmarks they see.
 
     A view's landmarks are in random order, and at most `most` of them are kept: any first few are a random sample.
-
-    Attributes:
-        starts: (B + 1,) int64; view b has entries `starts[b]` to `starts[b + 1]`.
-        values: (E, len(ATTRIBUTES)) float16.
-        visible: (B,) int64, landmarks that each view sees.
-        axis_height: (B,) float32, z of the optical axis in the world.
-        labels: (B,) float32, 1 where the viewpoint localizes.
-        error_m: (B,) float32, error of its position, infinite where it is not localized or its orientation is off.
-        scene: (B,) int64, number of each view's scene in the order given.
-        location: (B,) int64, location_id of each view, unique only within its scene.
-        found: (E,) bool, whether the localizer found the landmark; None where that was not asked for.
     """
 
-    starts: Tensor
-    values: Tensor
-    visible: Tensor
-    axis_height: Tensor
-    labels: Tensor
-    error_m: Tensor
-    scene: NDArray[np.int64]
-    location: NDArray[np.int64]
+    starts: Tensor  # (B + 1,) int64; view b has entries `starts[b]` to `starts[b + 1]`
+    values: Tensor  # (E, len(ATTRIBUTES)) float16
+    visible: Tensor  # (B,) int64, landmarks that each view sees
+    axis_height: Tensor  # (B,) float32, z of the optical axis in the world
+    labels: Tensor  # (B,) float32, 1 where the viewpoint localizes
+    error_m: Tensor  # (B,) float32, error of its position, infinite where it is not localized or its orientation is off
+    scene: NDArray[np.int64]  # (B,) int64, number of each view's scene in the order given
+    location: NDArray[np.int64]  # (B,) int64, location_id of each view, unique only within its scene
+    # (E,) bool, whether the localizer found the landmark; None where that was not asked for
     found: Tensor | None = None
 
     def __len__(self) -> int:

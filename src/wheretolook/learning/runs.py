@@ -18,14 +18,12 @@ from wheretolook.utils.tracking_config import TrackingConfig
 if TYPE_CHECKING:
     from mlflow.entities import Run
 
-HISTORY_CSV = "history.csv"
-"""Artifact of a train run: a row an epoch."""
+HISTORY_CSV = "history.csv"  # artifact of a train run: a row an epoch
 
 TRAINING_CSV = "training.csv"
 """In a release's `results/`: the histories of all that was trained, one below the other, with a column `method`."""
 
-LOG_AT_MOST = 1000
-"""Metrics MLflow takes at a time."""
+LOG_AT_MOST = 1000  # metrics MLflow takes at a time
 
 
 def params_of(about: Mapping[str, Any]) -> dict[str, Any]:

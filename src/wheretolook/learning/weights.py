@@ -15,11 +15,8 @@ from torch import Tensor
 from wheretolook.learning.old_names import name_of_header, with_name
 from wheretolook.utils.errors import WeightsError
 
-FORMAT_VERSION = 1
-"""Version of the layout of the metadata."""
-
-METADATA_KEY = "wheretolook"
-"""Key of the JSON text in the header of the file."""
+FORMAT_VERSION = 1  # version of the layout of the metadata
+METADATA_KEY = "wheretolook"  # key of the JSON text in the header of the file
 
 
 def write_weights(path: str | Path, method: str, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> None:

@@ -15,8 +15,7 @@ if TYPE_CHECKING:
     from wheretolook.inputs.bins import BinnedViews
     from wheretolook.inputs.localization_map import LocalizationMap
 
-BLOCK = 4096
-"""Views scored at a time: about 80 MB of bins."""
+BLOCK = 4096  # views scored at a time: about 80 MB of bins
 
 
 class Scorer(ABC):

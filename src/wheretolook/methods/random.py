@@ -14,8 +14,7 @@ from wheretolook.methods.method import Method, MethodStyle
 if TYPE_CHECKING:
     from wheretolook.inputs.localization_map import LocalizationMap
 
-POSE_DECIMALS = 6
-"""Poses that agree to this many decimals (of a metre, and in the rotation matrix) get the same score."""
+POSE_DECIMALS = 6  # poses that agree to this many decimals (of a metre, and in the rotation matrix) get the same score
 
 
 class RandomScorer(Scorer):

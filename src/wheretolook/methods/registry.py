@@ -25,8 +25,7 @@ MODULES = (
 )  # fmt: skip
 """Modules of `wheretolook.methods` whose `METHODS` are the package's own, in the order of tables."""
 
-GROUP = "wheretolook.methods"
-"""Entry points of this group give a `Method`, or several, of another package."""
+GROUP = "wheretolook.methods"  # entry points of this group give a `Method`, or several, of another package
 
 
 @cache

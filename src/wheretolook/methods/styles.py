@@ -9,11 +9,8 @@ from typing import get_args
 from wheretolook.methods.method import Group, MethodStyle
 from wheretolook.methods.registry import find
 
-ORACLE = "oracle"
-"""Name of what knows the labels and chooses the best there is, in tables and figures."""
-
-GROUPS: tuple[Group, ...] = get_args(Group)
-"""In the order of figures."""
+ORACLE = "oracle"  # name of what knows the labels and chooses the best there is, in tables and figures
+GROUPS: tuple[Group, ...] = get_args(Group)  # in the order of figures
 
 _ORACLE_STYLE = MethodStyle("oracle", "#000000", "*", "-")
 

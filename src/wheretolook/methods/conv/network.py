@@ -16,19 +16,12 @@ from wheretolook.methods.binned_network import BinnedNetwork, n_certain, standar
 
 @dataclass(frozen=True)
 class ConvSpec:
-    """Everything that defines a convolutional network but its weights.
+    """Everything that defines a convolutional network but its weights."""
 
-    Attributes:
-        statistics: of its channels over the training views; their names are those of its input.
-        bins: bins along each side of the image.
-        widths: channels after each convolution.
-        dropout: share of pooled values dropped in training.
-    """
-
-    statistics: InputStatistics
-    bins: int
-    widths: tuple[int, ...]
-    dropout: float
+    statistics: InputStatistics  # of its channels over the training views; their names are those of its input
+    bins: int  # bins along each side of the image
+    widths: tuple[int, ...]  # channels after each convolution
+    dropout: float  # share of pooled values dropped in training
 
 
 class ConvNetwork(BinnedNetwork):

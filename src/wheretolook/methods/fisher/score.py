@@ -26,8 +26,7 @@ from wheretolook.methods.base import Scorer
 from wheretolook.methods.fisher import Approximation
 from wheretolook.visibility.frustum import LandmarkSets
 
-PROBE_AXES = 2000
-"""Axes among which the worst view is sought."""
+PROBE_AXES = 2000  # axes among which the worst view is sought
 
 
 class PoseInformation:

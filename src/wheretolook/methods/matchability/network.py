@@ -128,8 +128,7 @@ def bearing_numbers(values: Tensor, attributes: tuple[str, ...] = ATTRIBUTES) ->
     return torch.cat([plane * inverse**2, bearing * inverse, plane], -1)
 
 
-N_EXPECTED = 1 + 15 + 5
-"""Numbers that `expected_parts` gives of a landmark."""
+N_EXPECTED = 1 + 15 + 5  # numbers that `expected_parts` gives of a landmark
 
 
 def expected_parts(values: Tensor, log_odds: Tensor, attributes: tuple[str, ...] = ATTRIBUTES) -> Tensor:

@@ -20,8 +20,7 @@ from wheretolook.methods.field_of_view import check_field_of_view
 from wheretolook.methods.matchability.network import MatchabilityNetwork, expected_parts
 from wheretolook.utils.errors import ConfigError
 
-BINS = 30
-"""Bins along each side of the image, of which those expected to hold a found landmark are counted."""
+BINS = 30  # bins along each side of the image, of which those expected to hold a found landmark are counted
 
 INLIERS, FILLED = "inliers", "bins"
 

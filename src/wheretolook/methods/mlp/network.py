@@ -17,23 +17,14 @@ from wheretolook.methods.mlp.config import MlpConfig
 
 @dataclass(frozen=True)
 class NetworkSpec:
-    """Everything that defines a network but its weights.
+    """Everything that defines a network but its weights."""
 
-    Attributes:
-        statistics: of its channels over the training views; their names are those of its input.
-        bins: bins along each side of the image.
-        layout: order of the bins in the input.
-        hidden: widths of the hidden layers.
-        dropout: share of hidden units dropped in training.
-        input_dropout: share of input values dropped in training.
-    """
-
-    statistics: InputStatistics
-    bins: int = 30
-    layout: Layout = "in_place"
-    hidden: tuple[int, ...] = (300, 300)
-    dropout: float = 0.5
-    input_dropout: float = 0.0
+    statistics: InputStatistics  # of its channels over the training views; their names are those of its input
+    bins: int = 30  # bins along each side of the image
+    layout: Layout = "in_place"  # order of the bins in the input
+    hidden: tuple[int, ...] = (300, 300)  # widths of the hidden layers
+    dropout: float = 0.5  # share of hidden units dropped in training
+    input_dropout: float = 0.0  # share of input values dropped in training
 
     @property
     def channels(self) -> tuple[str, ...]:

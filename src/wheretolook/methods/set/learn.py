@@ -49,8 +49,7 @@ class SetData(LandmarkDataModule):
         )
 
 
-MOST_OF_WINDOW = 2
-"""Landmarks kept of a view, over those that a training step looks at."""
+MOST_OF_WINDOW = 2  # landmarks kept of a view, over those that a training step looks at
 
 
 LEAST_BATCHES, LEAST_BATCH, LEAST_STEPS = 16, 64, 600

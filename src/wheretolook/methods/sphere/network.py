@@ -20,8 +20,7 @@ from wheretolook.methods.sphere.config import SphereConfig
 from wheretolook.methods.sphere.views import FEATURES, TOWARDS, TURNING
 from wheretolook.utils.errors import WeightsError
 
-PITCHES, YAWS = 6, 18
-"""Rows and columns of the lattice, `wheretolook.geometry.lattices.yaw_pitch_angles`."""
+PITCHES, YAWS = 6, 18  # rows and columns of the lattice, `wheretolook.geometry.lattices.yaw_pitch_angles`
 
 LOWEST_PITCH_DEG, FIRST_YAW_DEG, STEP_DEG = -60.0, -180.0, 20.0
 """Where the lattice begins, and the angle between its neighbours."""

@@ -33,17 +33,10 @@ FEATURES = (
 direction of a camera; log(1 + distance in metres); log(1 + landmarks with a free line of sight from the location); and
 what it is. The first token of a location is neither: it stands for all landmarks and holds their number."""
 
-TOWARDS = slice(3, 6)
-"""The features that are the unit direction."""
-
-TURNING = 9
-"""The first features, three vectors, which turn with the world."""
-
-OFFSET_M = 4.0
-"""Unit of offsets: ActLoc crops the world at so many metres."""
-
-BLOCK = 256
-"""Locations whose lines of sight are asked for at a time."""
+TOWARDS = slice(3, 6)  # the features that are the unit direction
+TURNING = 9  # the first features, three vectors, which turn with the world
+OFFSET_M = 4.0  # unit of offsets: ActLoc crops the world at so many metres
+BLOCK = 256  # locations whose lines of sight are asked for at a time
 
 
 class LocationDescriber:
@@ -102,25 +95,15 @@ def _spread(rows: Float, at_most: int) -> Float:
 
 @dataclass(frozen=True, eq=False)
 class SphereViews:
-    """Labelled viewpoints and the locations that they share: about 33 kB a location at 640 tokens.
+    """Labelled viewpoints and the locations that they share: about 33 kB a location at 640 tokens."""
 
-    Attributes:
-        tokens: (L, T, len(FEATURES)) float32, zero where there is none.
-        padding: (L, T) bool, True where there is none.
-        rows: (B,) int64, location of each view.
-        axes: (B, 3) float32, its optical axis in the world.
-        labels: (B,) float32, 1 where it localizes.
-        scene: (B,) int64, number of each view's scene in the order given.
-        location: (B,) int64, location_id of each view, unique only within its scene.
-    """
-
-    tokens: Tensor
-    padding: Tensor
-    rows: Tensor
-    axes: Tensor
-    labels: Tensor
-    scene: NDArray[np.int64]
-    location: NDArray[np.int64]
+    tokens: Tensor  # (L, T, len(FEATURES)) float32, zero where there is none
+    padding: Tensor  # (L, T) bool, True where there is none
+    rows: Tensor  # (B,) int64, location of each view
+    axes: Tensor  # (B, 3) float32, its optical axis in the world
+    labels: Tensor  # (B,) float32, 1 where it localizes
+    scene: NDArray[np.int64]  # (B,) int64, number of each view's scene in the order given
+    location: NDArray[np.int64]  # (B,) int64, location_id of each view, unique only within its scene
 
     def to(self, device: torch.device | str) -> SphereViews:
         """The same views with what a network takes on a device."""

@@ -28,38 +28,24 @@ from wheretolook.viewpoints.table import is_good, poses
 if TYPE_CHECKING:
     from lightgbm import Booster
 
-BLOCK = 4096
-"""Views described at a time: some million landmarks."""
+BLOCK = 4096  # views described at a time: some million landmarks
 
 
 @dataclass(frozen=True, eq=False)
 class BoostedTrees:
-    """T trees of M nodes in all, as arrays.
+    """T trees of M nodes in all, as arrays."""
 
-    Attributes:
-        camera: whose views they have learnt from.
-        roots: (T,) int64, node of each tree's root.
-        feature: (M,) int64, which of `POOLED` a node asks for.
-        threshold: (M,) float64; values up to it go left.
-        missing_left: (M,) bool, whether a value that is not known goes left.
-        left, right: (M,) int64, next nodes; a leaf's are itself.
-        value: (M,) float64, of leaves, zero elsewhere.
-        depth: steps from a root to the deepest leaf.
-        baseline: log-odds to add to the sum of the trees: 0 of LightGBM's, whose first tree has it in its leaves.
-        scale, offset: what turns the sum into calibrated log-odds: scale * sum + offset.
-    """
-
-    camera: PinholeCamera
-    roots: Tensor
-    feature: Tensor
-    threshold: Tensor
-    missing_left: Tensor
-    left: Tensor
+    camera: PinholeCamera  # whose views they have learnt from
+    roots: Tensor  # (T,) int64, node of each tree's root
+    feature: Tensor  # (M,) int64, which of `POOLED` a node asks for
+    threshold: Tensor  # (M,) float64; values up to it go left
+    missing_left: Tensor  # (M,) bool, whether a value that is not known goes left
+    left: Tensor  # left, right: (M,) int64, next nodes; a leaf's are itself
     right: Tensor
-    value: Tensor
-    depth: int
-    baseline: float
-    scale: float = 1.0
+    value: Tensor  # (M,) float64, of leaves, zero elsewhere
+    depth: int  # steps from a root to the deepest leaf
+    baseline: float  # log-odds to add to the sum of the trees: 0 of LightGBM's, whose first tree has it in its leaves
+    scale: float = 1.0  # scale, offset: what turns the sum into calibrated log-odds: scale * sum + offset
     offset: float = 0.0
 
     @classmethod
@@ -163,19 +149,12 @@ _NUMBERS = ("depth", "baseline", "scale", "offset")
 
 @dataclass(frozen=True, eq=False)
 class PooledViews:
-    """Labelled viewpoints described by `POOLED`.
+    """Labelled viewpoints described by `POOLED`."""
 
-    Attributes:
-        values: (B, len(POOLED)) float32.
-        labels: (B,) bool, whether the viewpoint localizes.
-        scene: (B,) int64, number of each view's scene in the order given.
-        location: (B,) int64, location_id of each view, unique only within its scene.
-    """
-
-    values: NDArray[np.float32]
-    labels: NDArray[np.bool_]
-    scene: NDArray[np.int64]
-    location: NDArray[np.int64]
+    values: NDArray[np.float32]  # (B, len(POOLED)) float32
+    labels: NDArray[np.bool_]  # (B,) bool, whether the viewpoint localizes
+    scene: NDArray[np.int64]  # (B,) int64, number of each view's scene in the order given
+    location: NDArray[np.int64]  # (B,) int64, location_id of each view, unique only within its scene
 
     def only(self, mask: NDArray[np.bool_]) -> PooledViews:
         """The views where `mask` (B,) is set."""

@@ -50,11 +50,8 @@ class TopN:
 
 
 def rank_views(views: TestViews, scores: Float) -> NDArray[np.int64]:
-    """Rank (B,) of every view within its location: 0 has the highest score; the smaller viewpoint_id wins a tie.
-
-    Args:
-        views: the candidates.
-        scores: (B,).
+    """Rank (B,) of every view within its location by scores (B,): 0 is the highest; the smaller viewpoint_id wins a
+    tie.
     """
     order = np.lexsort((views.viewpoint_id, -scores, views.location))
     location = views.location[order]
@@ -65,13 +62,7 @@ def rank_views(views: TestViews, scores: Float) -> NDArray[np.int64]:
 
 
 def choose_best(views: TestViews, ranks: NDArray[np.int64], n: int) -> TopN:
-    """Choose the N views of every location that rank first.
-
-    Args:
-        views: the candidates.
-        ranks: (B,), see `rank_views`.
-        n: N. A location with fewer views contributes all it has.
-    """
+    """Choose the n views of every location that rank first (`rank_views`); where there are fewer, all."""
     good = _sum_by_location(views, views.good & (ranks < n)[:, None])
     return TopN(np.minimum(_n_views(views), n), good, (good > 0).astype(np.float64))
 

@@ -65,13 +65,7 @@ def results_folder(dataset: Dataset, config: EvaluateConfig) -> Path:
 
 
 def evaluation_params(dataset: Dataset, scenes: Sequence[SceneFolder], weights: Iterable[Path]) -> dict[str, Any]:
-    """Parameters of an evaluation's run that tell what was evaluated.
-
-    Args:
-        dataset: evaluated.
-        scenes: those of the split.
-        weights: files of methods that have learnt.
-    """
+    """Parameters of an evaluation's run that tell what was evaluated: a dataset's scenes, and files of weights."""
     return {
         "dataset": dataset.name,
         "dataset_fingerprint": Dataset(dataset.root, dataset.camera, tuple(scenes)).fingerprint(),
@@ -93,14 +87,12 @@ _OF_SCENE = re.compile("regret_(?!low_|high_)")  # beginning of the columns that
 
 
 def runs_of_rows(table: pd.DataFrame, params: Mapping[str, Any]) -> Iterator[NestedRun]:
-    """The runs that score tables are logged as: for each method, occlusion model and candidate set one.
+    """The runs that score tables, one below the other, are logged as: for each method, occlusion model and candidate
+    set one.
 
-    Its metrics are named by N, the scene unless it is all of them, and the column, such as
-    `top-1/regret_0.05m_0.4deg` and `top-5/apartment-210/regret_5m_10deg`, or by the column if N does not matter.
-
-    Args:
-        table: score tables, one below the other, with columns `occlusion` and `candidates`.
-        params: of the evaluation; the row's own are added.
+    Their parameters are those given and the row's own. Metrics are named by N, the scene unless it is all of them, and
+    the column, such as `top-1/regret_0.05m_0.4deg` and `top-5/apartment-210/regret_5m_10deg`, or by the column if N
+    does not matter.
     """
     for key, rows in table.groupby(list(_NAMED), sort=False):
         own = dict(zip(_NAMED, map(str, key), strict=True))
@@ -166,15 +158,9 @@ def log_evaluation(
     occlusion: OcclusionConfig,
     results: Path,
 ) -> None:
-    """Log an evaluation: a run with the files of `results`, and nested in it those of `runs_of_rows`.
+    """Log an evaluation: a run with the files in the folder `results`, and nested in it those of `runs_of_rows`.
 
-    Args:
-        dataset: evaluated.
-        evaluation: what it found.
-        config: of the evaluation.
-        tracking: where to log.
-        occlusion: settings of occlusion models, logged if the configuration names any.
-        results: folder of the files.
+    The settings of occlusion models are logged if the configuration names any.
     """
     views, scenes = evaluation.views, evaluation.scenes
     params = {
@@ -205,12 +191,7 @@ def log_evaluation(
 
 
 def latest_scores(tracking: TrackingConfig, dataset: str | None = None) -> pd.DataFrame | None:
-    """The score table of the newest evaluation in a store, or None if there is none.
-
-    Args:
-        tracking: the store.
-        dataset: name of the dataset evaluated; None for any.
-    """
+    """The score table of the newest evaluation in a store, of one dataset or any, or None if there is none."""
     run = newest_run(tracking, "evaluate", {"dataset": dataset} if dataset else None)
     if run is None:
         return None

@@ -93,25 +93,13 @@ def load_landmark_views(
     progress: bool = True,
     matches: bool = False,
 ) -> LandmarkViews:
-    """Describe what the labelled viewpoints of some scenes see.
+    """Describe what the labelled viewpoints of some scenes see, `most` landmarks of a view at most; on the CPU.
 
-    Args:
-        dataset: gives the camera.
-        scenes: of the dataset.
-        config: limits of a positive label, seed of the choice of landmarks.
-        most: landmarks kept of a view.
-        device: where to describe, "cpu" or a CUDA device.
-        progress: show a progress bar.
-        matches: also tell which landmarks the localizer found: the inliers of a view that was localized, and all that
-            were matched in one that was not. Landmarks that the view does not see by the map's occlusion do not count.
+    With `matches` it is told which landmarks the localizer found: the inliers of a view that was localized, and all
+    that were matched in one that was not. Landmarks that the view does not see by the map's occlusion do not count.
 
-    Returns:
-        On the CPU.
-
-    Raises:
-        TableError: a scene has no table or no labelled viewpoint, its occlusion does not fit, or the matches are asked
-            for but not stored.
-        MapError: a scene has no landmarks.
+    Raises a TableError if a scene has no table or no labelled viewpoint, its occlusion does not fit, or the matches are
+    asked for but not stored; a MapError if it has no landmarks.
     """
     tables = [(scene, labelled_rows(scene, matches)) for scene in scenes]
     blocks: list[LandmarkViews] = []
@@ -186,24 +174,15 @@ def _joined(blocks: Sequence[LandmarkViews]) -> LandmarkViews:
 
 
 class LandmarkLoader:
-    """Batches of views for `wheretolook.methods.set.network.SetNetwork`: a window of each view's landmarks.
+    """Batches of views for `SetNetwork`: a window of each view's landmarks, of `width` at most.
 
-    With several processes, every one cuts the same batches and keeps its share of each; a share can be empty.
+    With several processes, every one cuts the same batches and keeps its share of each; a share can be empty. The
+    `shuffle_seed` is that of order, windows and sizes; None goes through the views in order, from their first landmark.
 
-    Views can come enlarged: a scene and its map, made larger as a whole, look the same and give the same matches. All
-    distances grow with the scene, the error of the position too, and the label follows from that. So a network sees
-    rooms of every size without any of them being mapped.
-
-    Args:
-        views: the views.
-        rows: rows of `views` to go through, (n,).
-        batch_size: views a batch, over all processes.
-        width: landmarks a view at most.
-        shuffle_seed: seed of order, windows and sizes; None goes through the views in order, from their first landmark.
-        enlarged: shuffled views come from 1 / enlarged to enlarged times as large, evenly in the logarithm.
-        max_error_m: limit of a positive label, for enlarged views.
-        rank: number of this process.
-        world_size: number of processes.
+    Shuffled views can come enlarged, from 1 / `enlarged` to `enlarged` times as large, evenly in the logarithm: a scene
+    and its map, made larger as a whole, look the same and give the same matches. All distances grow with the scene, the
+    error of the position too, and the label follows from that and `max_error_m`. So a network sees rooms of every size
+    without any of them being mapped.
     """
 
     def __init__(

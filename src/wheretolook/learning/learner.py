@@ -54,11 +54,7 @@ class Task:
 def fit_network(
     network: nn.Module, data: LightningDataModule, task: Task, class_weights: tuple[float, float] = (1.0, 1.0)
 ) -> tuple[dict[str, float], pd.DataFrame]:
-    """Train a network by the options of a task; it then holds the weights to keep.
-
-    Returns:
-        Metrics of the epoch kept, and of all epochs.
-    """
+    """Train a network by the options of a task; it then holds the weights to keep. Their metrics, and all epochs'."""
     classifier = ViewpointClassifier(network, task.options, class_weights, task.config.seed)
     record = EpochRecord(task.title, task.options, task.progress, task.run_log)
     fit(classifier, data, record, task.config)

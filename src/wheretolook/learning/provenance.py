@@ -37,11 +37,8 @@ def weights_path(dataset: Dataset, method: str) -> Path:
 def about_training(dataset: Dataset, method: str, config: SharedConfig, options: Any) -> dict[str, Any]:
     """What decides which weights come out, as JSON values.
 
-    Args:
-        dataset: with the scenes of others that are learnt from as well, see `with_also`.
-        method: name of the method.
-        config: options that all learners share.
-        options: the method's own, a dataclass. What training starts from (`FittingConfig.starts_from`) decides, too.
+    The dataset comes with the scenes of others that are learnt from, see `with_also`; the options are the method's own,
+    a dataclass. What training starts from (`FittingConfig.starts_from`) decides, too.
     """
     shared = {name: value for name, value in asdict(config).items() if name in DECIDING}
     about: dict[str, Any] = {

@@ -18,12 +18,7 @@ POSE_DECIMALS = 6  # poses that agree to this many decimals (of a metre, and in 
 
 
 class RandomScorer(Scorer):
-    """Uniform random scores, a function of pose and seed, so that they do not depend on the order of the batch.
-
-    Args:
-        localization_map: not looked at.
-        seed: another seed gives other scores.
-    """
+    """Uniform random scores, a function of pose and seed, so that they do not depend on the order of the batch."""
 
     name = "random"
     local = True

@@ -29,9 +29,6 @@ class ConvNetwork(BinnedNetwork):
 
     It looks at its channels, standardized, and at which bins are filled. Nothing is normalized on the way: how much
     there is to see is what matters most, and a normalization would hide it.
-
-    Args:
-        spec: what defines it.
     """
 
     scored_at_once = 512  # the first convolution of one view takes 115 kB
@@ -54,11 +51,8 @@ class ConvNetwork(BinnedNetwork):
         self.last = nn.Linear(2 * spec.widths[-1], 1)
 
     def forward(self, means: Tensor, filled: Tensor) -> Tensor:
-        """Logits (B,) of binned views, not calibrated.
-
-        Args:
-            means: (B, C, bins, bins) float32, of its channels.
-            filled: (B, bins, bins) bool.
+        """Logits (B,), not calibrated, of means (B, C, bins, bins) float32 of its channels and filled bins (B, bins,
+        bins).
         """
         standard = standardize(means, filled, self.mean, self.std, self.n_certain)
         values = torch.cat([standard, filled[:, None].to(means.dtype)], dim=1)
@@ -74,10 +68,6 @@ class ConvNetwork(BinnedNetwork):
 
     @classmethod
     def of_description(cls, stored: Mapping[str, Any]) -> ConvNetwork:
-        """The untrained network of a description.
-
-        Raises:
-            WeightsError: it looks at a channel that this version's bins do not have.
-        """
+        """The untrained network of a description; a WeightsError if it looks at an unknown channel of the bins."""
         widths = tuple(stored["widths"])
         return cls(ConvSpec(stored_statistics(stored), int(stored["bins"]), widths, float(stored["dropout"])))

@@ -42,15 +42,8 @@ BLOCK = 256  # locations whose lines of sight are asked for at a time
 class LocationDescriber:
     """Tells a network of locations: their landmarks with a free line of sight, and the mapping cameras.
 
-    Of more landmarks or cameras than wanted, evenly spread ones are taken, in the order of their ids.
-
-    Args:
-        localization_map: the map, with its mapping cameras.
-        config: how many landmarks and cameras at most.
-        path: of the mapping cameras, for the error.
-
-    Raises:
-        MapError: the map has no mapping cameras.
+    Of more landmarks or cameras than the configuration wants, evenly spread ones are taken, in the order of their ids.
+    Raises a MapError, which names the path, if the map has no mapping cameras.
     """
 
     def __init__(
@@ -124,19 +117,10 @@ def load_sphere_views(
     device: str = "cpu",
     progress: bool = True,
 ) -> SphereViews:
-    """Read the labelled viewpoints of some scenes and describe their locations.
+    """Read the labelled viewpoints of some scenes and describe their locations, on the CPU.
 
-    Args:
-        dataset: gives the camera.
-        scenes: of the dataset.
-        config: limits of a positive label.
-        options: how many landmarks and cameras at most.
-        device: of the maps. The views come back on the CPU.
-        progress: show a progress bar.
-
-    Raises:
-        TableError: a scene has no table or no labelled viewpoint, or its occlusion does not fit.
-        MapError: a scene has no landmarks, or its mapping cameras are not known.
+    Raises a TableError if a scene has no table or no labelled viewpoint, or its occlusion does not fit; a MapError if
+    it has no landmarks, or its mapping cameras are not known.
     """
     tables = [labelled_rows(scene) for scene in scenes]
     tokens: list[Tensor] = []
@@ -165,18 +149,11 @@ def load_sphere_views(
 
 
 class LocationLoader:
-    """Iterates over batches of whole locations, so that each is encoded once for all of its views.
+    """Batches of whole locations of the views `chosen` (n,), so that each is encoded once for all of its views.
 
-    With several processes, every one cuts the same batches and keeps its share of each, whole locations again; a share
-    can be empty.
-
-    Args:
-        views: the views.
-        chosen: which of them, (n,) int64.
-        batch_size: views a batch, over all processes, on average.
-        shuffle_seed: every pass has its own order of locations, the same in every run; None keeps theirs.
-        rank: number of this process.
-        world_size: number of processes.
+    With several processes, every one cuts the same batches, of `batch_size` views on average, and keeps its share of
+    each, whole locations again; a share can be empty. With a `shuffle_seed` every pass has its own order of locations,
+    the same in every run; None keeps theirs.
     """
 
     def __init__(
@@ -219,14 +196,7 @@ class LocationLoader:
 
 
 class SphereDataModule(LightningDataModule):
-    """Views of a dataset in batches of whole locations.
-
-    Args:
-        views: of train and val scenes.
-        held_out: (B,) True where a view is for validation.
-        batch_size: viewpoints of a batch, on average.
-        seed: of the order of locations.
-    """
+    """Views of a dataset in batches of whole locations, without those held out (B,) to learn from."""
 
     def __init__(self, views: SphereViews, held_out: NDArray[np.bool_], batch_size: int, seed: int = 0) -> None:
         super().__init__()

@@ -94,12 +94,7 @@ class BoostedTrees:
         return self.value[nodes].sum(1) + self.baseline
 
     def save(self, path: Path, training: dict[str, Any] | None = None) -> None:
-        """Write one safetensors file, atomically. The same trees give the same bytes.
-
-        Args:
-            path: file to write; its folder is made when needed.
-            training: what else to keep about the training (JSON values).
-        """
+        """Write one safetensors file, atomically, with JSON values on the training; the same trees, the same bytes."""
         header = {
             "features": list(POOLED), "camera": asdict(self.camera),
             **{name: getattr(self, name) for name in _NUMBERS}, "training": training or {},
@@ -113,10 +108,8 @@ class BoostedTrees:
 
     @classmethod
     def load(cls, path: str | Path) -> BoostedTrees:
-        """Read what `save` wrote.
-
-        Raises:
-            WeightsError: the file is missing, damaged, foreign, of another kind, or its trees are none.
+        """Read what `save` wrote; a WeightsError if it is missing, damaged, foreign, of another kind, or its trees are
+        none.
         """
         tensors, header = read_weights(Path(path))
         check_serves(path, header, "trees")
@@ -168,18 +161,10 @@ def load_pooled(
     device: str = "cpu",
     progress: bool = True,
 ) -> PooledViews:
-    """Describe the labelled viewpoints of some scenes.
+    """Describe the labelled viewpoints of some scenes, positive within these limits in metres and degrees.
 
-    Args:
-        dataset: gives the camera.
-        scenes: of the dataset.
-        limits: metres and degrees of a positive label.
-        device: "cpu" or a CUDA device.
-        progress: show a progress bar.
-
-    Raises:
-        TableError: a scene has no table or no labelled viewpoint, or its occlusion does not fit.
-        MapError: a scene has no landmarks.
+    Raises a TableError if a scene has no table or no labelled viewpoint, or its occlusion does not fit; a MapError if
+    it has no landmarks.
     """
     values: list[NDArray[np.float32]] = []
     labels: list[NDArray[np.bool_]] = []
@@ -204,8 +189,7 @@ def load_pooled(
 def learn_trees(task: Task) -> Learnt:
     """Boosted trees from a dataset's train scenes; see `fit_trees`.
 
-    Raises:
-        TableError: no train scene, no labels, or labels of one class only.
+    Raises a TableError if there is no train scene, no labels, or labels of one class only.
     """
     dataset, config = task.dataset, task.config
     limits = config.max_error_m, config.max_error_deg
@@ -221,17 +205,10 @@ def learn_trees(task: Task) -> Learnt:
 def fit_trees(
     train: PooledViews, val: PooledViews, camera: PinholeCamera, config: TreesConfig, seed: int = 0
 ) -> tuple[BoostedTrees, dict[str, float]]:
-    """Boost trees, keep as many as order the validation views best, and calibrate their sum on these.
+    """Boost trees, keep as many as order the validation views best, and calibrate their sum on these; the trees and
+    metrics.
 
-    Args:
-        train: to learn from.
-        val: of other scenes.
-        camera: of both.
-        config: options.
-        seed: of LightGBM, which samples views to choose bins.
-
-    Returns:
-        The trees, and their metrics on the validation views.
+    LightGBM samples views by the seed to choose bins.
     """
     import lightgbm
     from sklearn.metrics import average_precision_score, log_loss, roc_auc_score

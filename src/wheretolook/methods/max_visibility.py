@@ -14,8 +14,7 @@ from wheretolook.methods.method import Method, MethodStyle
 if TYPE_CHECKING:
     from wheretolook.inputs.localization_map import LocalizationMap
 
-MAX_DEPTH_M = 3.0
-"""Landmarks farther along the optical axis do not count, in place of occlusion."""
+MAX_DEPTH_M = 3.0  # landmarks farther along the optical axis do not count, in place of occlusion
 
 VIEWS_AT_ONCE = 512
 

@@ -52,8 +52,7 @@ class Keypoints:
 
     pixels: NDArray[np.float32]  # (N, 2) (x, y) in pixels; (0.5, 0.5) is the centre of the top-left pixel
     descriptors: NDArray[np.float32]  # (N, 128) RootSIFT (Arandjelovic and Zisserman, CVPR 2012) of unit length
-    # (N,) float32, standard deviation in pixels of the Gaussian at which the keypoint was found.
-    scales_px: NDArray[np.float32]
+    scales_px: NDArray[np.float32]  # (N,) standard deviation of the Gaussian at which the keypoint was found
 
     def __len__(self) -> int:
         return len(self.pixels)
@@ -73,5 +72,4 @@ def unit_descriptors(descriptors: NDArray[Any]) -> NDArray[np.float32]:
     """Stored descriptors (N, D), e.g. uint8, as float32 of unit length (rows of zeros stay zero)."""
     values = descriptors.astype(np.float32)
     length = np.linalg.norm(values, axis=1, keepdims=True)
-    values /= np.where(length > 0, length, 1)
-    return values
+    return values / np.where(length > 0, length, 1)

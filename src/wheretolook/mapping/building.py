@@ -74,30 +74,17 @@ def build_map(
     device: str = "cpu",
     progress: bool = True,
 ) -> MapReport:
-    """Map a scene: walk, render, extract, match, triangulate with known poses, filter.
+    """Map a scene in metres, z up: walk, render, extract, match, triangulate with known poses, filter.
 
     The result is a COLMAP model (binary) that any COLMAP tool opens, with `landmarks.npz`, `cameras.npz` and
     `report.json`, which is also returned, beside it. The model holds the filtered points only, so that every reader
     gets the same map. The folder appears when all is done; an interrupted or failed build leaves nothing behind and
-    does not touch an earlier map.
+    does not touch an earlier map, which a finished one replaces. The same seed gives the same bytes.
 
-    Args:
-        mesh: the scene, metres, z up.
-        renderer: renders `mesh`.
-        free_space: free space of `mesh`.
-        camera: intrinsics of the mapping camera.
-        config: see `MapConfig`.
-        seed: the same seed gives the same model and landmarks byte for byte.
-        out_dir: folder to make; an earlier map there is replaced.
-        raycaster: measures the distance from landmarks to the mesh; made on the CPU if None.
-        workers: processes that extract keypoints and match them. Above 1 the caller's script must be guarded
-            by `if __name__ == "__main__":`, as for any of Python's process pools.
-        device: where keypoints are extracted, "cpu" or a CUDA device.
-        progress: show progress bars.
-
-    Raises:
-        MapError: the images give no landmark, or `out_dir` holds something that is not a map.
-        SceneError: there is no floor to walk on.
+    `raycaster` measures the distance from landmarks to the mesh. Keypoints are extracted on `device`, "cpu" or a CUDA
+    device, and matched, by `workers` processes; above 1 the caller's script must be guarded by
+    `if __name__ == "__main__":`, as for any of Python's process pools. Raises MapError if the images give no landmark
+    or `out_dir` holds something that is not a map, SceneError if there is no floor to walk on.
     """
     config, out_dir, clock = config or MapConfig(), Path(out_dir), Clock()
     refuse_foreign_folder(out_dir)
@@ -168,11 +155,7 @@ def save_landmarks(folder: Path, database: Path, max_reprojection_error_px: floa
 
 
 def remove_inaccurate(model: Any, max_reprojection_error_px: float, out_dir: Path, fix: str) -> int:
-    """Remove the points of a reconstruction with a larger mean reprojection error. Returns how many.
-
-    Raises:
-        MapError: no point is left.
-    """
+    """Remove points of a reconstruction with a larger mean reprojection error; how many. MapError if none is left."""
     errors = {i: point.error for i, point in model.points3D.items()}
     removed = [i for i, error in errors.items() if not error <= max_reprojection_error_px]
     if len(removed) == len(errors):

@@ -21,10 +21,7 @@ CAMERAS_FILE = "cameras.npz"  # lies beside the landmarks
 def colmap_poses(model_dir: str | Path, reconstruction: pycolmap.Reconstruction | None = None) -> Float:
     """Poses cam_from_world (M, 3, 4) float64 of the images of a COLMAP model that have one, in the order of their ids.
 
-    The model is read from its folder unless the reconstruction is given.
-
-    Raises:
-        MapError: the folder or a file is missing or corrupt, or no image has a pose.
+    The model is read from its folder, as by `read_model`, unless it is given. MapError if no image has a pose.
     """
     images = (reconstruction or read_model(model_dir)).images
     posed = [images[number] for number in sorted(images) if images[number].has_pose]
@@ -44,11 +41,7 @@ def save_mapping_poses(cam_from_world: Float, path: str | Path) -> None:
 
 
 def load_mapping_poses(path: str | Path) -> Float:
-    """Read what `save_mapping_poses` wrote, (M, 3, 4) float32.
-
-    Raises:
-        MapError: the file is missing, damaged, or does not hold poses.
-    """
+    """Read what `save_mapping_poses` wrote, (M, 3, 4) float32. MapError if the file is missing, damaged or another."""
     path, fix = Path(path), "Run the map stage again, or remove it to read the COLMAP model beside it instead."
     if not path.is_file():
         raise MapError("there is no file of the mapping images' poses", path=path, fix="Run the map stage again.")

@@ -38,8 +38,7 @@ class ModelArrays:
 def read_model(model_dir: str | Path) -> Any:
     """Read a COLMAP model as a `pycolmap.Reconstruction`, binary or text, with or without rigs and frames (3.12).
 
-    Raises:
-        MapError: the folder or a file is missing, or a file is truncated or corrupt.
+    Raises MapError if the folder or a file is missing, or a file is truncated or corrupt.
     """
     import pycolmap
 
@@ -75,8 +74,7 @@ def read_model(model_dir: str | Path) -> Any:
 def model_arrays(reconstruction: Any) -> ModelArrays:
     """Arrays of a `pycolmap.Reconstruction`. Errors it does not hold yet are computed from the observations.
 
-    Raises:
-        MapError: a track names an image that has no pose.
+    Raises MapError if a track names an image that has no pose.
     """
     points = reconstruction.points3D
     point_ids = np.array(sorted(points), dtype=np.int64)
@@ -108,8 +106,7 @@ def read_descriptors(
 ) -> list[NDArray[np.uint8]]:
     """Descriptors (K, 128) uint8 of the model's images, in the order of `model.image_ids`, joined by image name.
 
-    Raises:
-        MapError: the database is missing, unreadable, or not the one the model was built from.
+    Raises MapError if the database is missing, unreadable, or not the one the model was built from.
     """
     import pycolmap
 
@@ -154,9 +151,8 @@ def _check_count(path: Path, least_bytes: int) -> None:
 
 
 def _check_points(path: Path) -> None:
-    data = path.read_bytes()
     _check_count(path, _POINT_BYTES)
-    end = 8
+    data, end = path.read_bytes(), 8
     for _ in range(struct.unpack_from("<Q", data)[0]):
         if end + _POINT_BYTES > len(data):
             end = len(data) + 1
@@ -166,6 +162,6 @@ def _check_points(path: Path) -> None:
 
 
 def _check_size(path: Path, expected: int) -> None:
-    if path.stat().st_size != expected:
-        problem = "the file is truncated or corrupt"
-        raise MapError(problem, path=path, value=f"{path.stat().st_size} bytes", fix=_REBUILD)
+    size = path.stat().st_size
+    if size != expected:
+        raise MapError("the file is truncated or corrupt", path=path, value=f"{size} bytes", fix=_REBUILD)

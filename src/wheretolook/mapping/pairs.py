@@ -28,16 +28,9 @@ def surface_overlap(
 ) -> NDArray[np.float64]:
     """Share of the surface in one image that another image sees too, similarly enough for the two to be matched.
 
-    A point counts if the other image's depth agrees with it (5 %), if the rays of the two images meet at 1 to 55
-    degrees, and if their depths differ by less than a factor of 2.5.
-
-    Args:
-        camera: intrinsics of all images.
-        cam_from_world: (I, 3, 4) poses.
-        depth_m: (I, h, w) z-depth from `shrink_depth`; 0 where there is none.
-
-    Returns:
-        (I, I) symmetric: the mean of both directions' shares, in [0, 1]; 0 on the diagonal.
+    Takes poses (I, 3, 4) and z-depth (I, h, w) from `shrink_depth`, 0 where there is none. A point counts if the other
+    image's depth agrees with it (5 %), if the rays of the two images meet at 1 to 55 degrees, and if their depths
+    differ by less than a factor of 2.5. Returns (I, I), the mean of both directions' shares; 0 on the diagonal.
     """
     n, h, w = depth_m.shape
     step = max(1, w // _SAMPLES_ACROSS)
@@ -60,8 +53,7 @@ def surface_overlap(
         there = depth_m[j, np.minimum(index[..., 1], h - 1), np.minimum(index[..., 0], w - 1)]
         ray = points - centers[j]
         cosine = (ray * seen_from).sum(-1) / np.maximum(np.linalg.norm(ray, axis=-1), 1e-9)
-        shared = inside & (np.abs(there - z) < _DEPTH_TOLERANCE * z)
-        shared &= (cosine > farthest) & (cosine < closest)
+        shared = inside & (np.abs(there - z) < _DEPTH_TOLERANCE * z) & (cosine > farthest) & (cosine < closest)
         shared &= (z < _DEPTH_RATIO * depth) & (depth < _DEPTH_RATIO * z)
         share[:, j] = shared.mean(1)
     np.fill_diagonal(share, 0)

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from wheretolook.mapping.config import MapConfig
 
 _PAIRS_AT_A_TIME = 64  # that a process matches; also the step of the progress bar
+Stored = tuple[NDArray[np.float32], NDArray[np.uint8]]  # pixels (N, 2) and descriptors (N, 128), as in a database
+MatchJob = tuple[NDArray[np.int64], list[Stored], Path]
 
 
 def image_name(index: int) -> str:
@@ -43,21 +45,11 @@ def triangulate_known_poses(
 ) -> Any:
     """Match pairs of images, verify the matches against the known poses, and triangulate.
 
-    Args:
-        database: COLMAP database to make; gets keypoints, descriptors, matches and verified matches.
-        camera: intrinsics of all images.
-        cam_from_world: (I, 3, 4) poses, kept as they are.
-        keypoints: of the I images.
-        colors: (N_i, 3) uint8 colours of the keypoints.
-        pairs: (P, 2) indices of the images to match, i < j.
-        config: thresholds of verification and triangulation.
-        clock: times a step.
-        seed: of COLMAP's sampling.
-        processes: match; as many threads verify.
-        progress: show a progress bar.
+    Makes a COLMAP database of keypoints, descriptors, matches and verified matches. Takes poses (I, 3, 4), which stay
+    as they are, keypoints and their colours (N_i, 3) uint8 of each image, and pairs (P, 2) of images to match, i < j.
+    The processes match, as many threads verify; `clock` times a step.
 
-    Returns:
-        A `pycolmap.Reconstruction`, not yet filtered by reprojection error.
+    Returns a `pycolmap.Reconstruction`, not yet filtered by reprojection error.
     """
     import pycolmap
 
@@ -104,10 +96,6 @@ def color_points(model: Any, colors: Sequence[NDArray[np.uint8]]) -> None:
         point.color = np.rint(np.mean(observed, axis=0)).astype(np.uint8)
 
 
-Stored = tuple[NDArray[np.float32], NDArray[np.uint8]]
-"""Pixels (N, 2) and descriptors (N, 128) of an image's keypoints, as in a COLMAP database."""
-
-
 def match_pairs(
     stored: Sequence[Stored], pairs: NDArray[np.int64], folder: Path, processes: Processes, progress: bool = True
 ) -> Generator[NDArray[np.uint32], None, None]:
@@ -122,9 +110,6 @@ def match_pairs(
         for matches in processes.map(_run_match_job, jobs):
             yield from matches
             bar.update(len(matches))
-
-
-MatchJob = tuple[NDArray[np.int64], list[Stored], Path]
 
 
 def _match_job(pairs: NDArray[np.int64], stored: Sequence[Stored], folder: Path) -> MatchJob:
@@ -156,11 +141,9 @@ def _posed_model(camera: PinholeCamera, cam_from_world: NDArray[np.floating[Any]
     import pycolmap
 
     model = pycolmap.Reconstruction()
+    size = {"width": camera.width, "height": camera.height}
     parameters = [camera.focal_px, camera.cx, camera.cy]
-    colmap_camera = pycolmap.Camera(
-        camera_id=1, model="SIMPLE_PINHOLE", width=camera.width, height=camera.height, params=parameters
-    )
-    model.add_camera_with_trivial_rig(colmap_camera)
+    model.add_camera_with_trivial_rig(pycolmap.Camera(camera_id=1, model="SIMPLE_PINHOLE", params=parameters, **size))
     for index, pose in enumerate(np.asarray(cam_from_world, dtype=np.float64)):
         image = pycolmap.Image(name=image_name(index), camera_id=1, image_id=index + 1)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:, :3]), pose[:, 3]))

@@ -55,16 +55,8 @@ def plan_walk(
 ) -> Walk:
     """Plan a walk that starts at a random place and goes on to the nearest unvisited floor until enough is visited.
 
-    Args:
-        free_space: what is free and where the floor is.
-        bounds: (2, 3) metres, lowest and highest corner of the scene.
-        n_images: number of poses, spaced evenly along the walk. Cameras look mostly along it.
-        config: see `WalkConfig`.
-        seed: of the start and of the camera's motion.
-
-    Raises:
-        ConfigError: fewer than two images.
-        SceneError: there is no floor to walk on.
+    `bounds` (2, 3) metres are the lowest and highest corner of the scene. The poses are spaced evenly along the walk
+    and look mostly along it. Raises ConfigError for fewer than two, SceneError if there is no floor to walk on.
     """
     config = config or WalkConfig()
     if n_images < 2:

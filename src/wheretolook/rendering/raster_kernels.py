@@ -14,11 +14,10 @@ import warp as wp
 
 from wheretolook.rendering.trace_kernel import Appearance, pixel_of, ray_through, shade
 
+# Triangles are widened by this many pixels, so that rounding opens no gap between neighbours.
 _SLACK = wp.constant(wp.float64(1.0e-9))
-"""Triangles are widened by this many pixels, so that rounding opens no gap between neighbours."""
-
+# Up to this sine of the angle between a triangle's plane and the camera, the camera counts as in the plane.
 _FLAT = wp.constant(wp.float64(1.0e-13))
-"""Up to this sine of the angle between a triangle's plane and the camera, the camera counts as in the plane."""
 
 
 @wp.kernel(enable_backward=False)
@@ -48,10 +47,7 @@ def _within(span: wp.vec2d, slope: wp.float64, value: wp.float64):
 
 @wp.kernel(enable_backward=False)
 def raster_kernel(
-    projected: wp.array2d[wp.vec3d],
-    indices: wp.array[wp.int32],
-    nearness: wp.array3d[wp.float32],
-    triangle: wp.array3d[wp.int32],
+    projected: wp.array2d[wp.vec3d], indices: wp.array[int], nearness: wp.array3d[float], triangle: wp.array3d[int]
 ):
     # One thread per triangle. That is safe only on the CPU, where the threads run one after the other.
     b, face = wp.tid()

@@ -15,12 +15,10 @@ from wheretolook.scenes.procedural.layout import Lamp
 from wheretolook.scenes.procedural.noise import NoiseBank
 from wheretolook.scenes.procedural.patches import Patch, Surface, join
 from wheretolook.scenes.procedural.plan import Plan, draw_plan
-from wheretolook.scenes.procedural.repetition import repeat_patterns
 from wheretolook.scenes.procedural.shell import build_shell
 from wheretolook.scenes.procedural.style import Style
 
-BRIGHTNESS = np.geomspace(0.12, 1.06, atlas.LEVELS)
-"""Factors on the albedo of shared materials."""
+BRIGHTNESS = np.geomspace(0.12, 1.06, atlas.LEVELS)  # factors on the albedo of shared materials
 
 
 def furnish_apartment(config: ApartmentConfig, seed: int) -> tuple[Plan, list[Patch], list[Lamp], np.random.Generator]:
@@ -39,10 +37,7 @@ def generate_apartment(config: ApartmentConfig, seed: int, device: str = "cpu") 
     """A furnished apartment in metres, z up, floor at z = 0, centred on the origin; one texture with baked light.
 
     The same configuration and seed give the same bytes on the same device, "cpu" or a CUDA device for the light rays.
-
-    Raises:
-        ConfigError: there is no such device.
-        SceneError: the texture is too small for the apartment.
+    Raises ConfigError if there is no such device, SceneError if the texture is too small for the apartment.
     """
     config = config.of_seed(seed)
     floor_plan, patches, lamps, rng = furnish_apartment(config, seed)
@@ -51,7 +46,7 @@ def generate_apartment(config: ApartmentConfig, seed: int, device: str = "cpu") 
     noise = NoiseBank(rng)
     painted = atlas.paint_charts(plan, noise)
     if config.repetition:
-        painted = repeat_patterns(plan, painted, config.repetition, np.random.default_rng([seed, 1]), noise)
+        painted = atlas.repeat_patterns(plan, painted, config.repetition, np.random.default_rng([seed, 1]), noise)
     mean_colour = np.array([image[::2, ::2].mean((0, 1)) for image in painted])
     albedo = np.clip(mean_colour[plan.patch_chart], 0, 1) ** 2.2
 

@@ -19,19 +19,11 @@ Colour = tuple[float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """How a surface looks.
+    """How a surface looks."""
 
-    Attributes:
-        paint: fills a canvas: (height, width, 3) float32, sRGB albedo in 0 to 1.
-        emissive: shown as painted, without baked light (window panes, lamp shades).
-        shared: all patches of this material share one small piece of texture in a few brightness levels, instead of
-            each having its own (leaves, covers of books).
-        casts_shadow: whether it blocks light.
-    """
-
-    paint: Callable[[Canvas], Image]
-    emissive: bool = False
-    shared: bool = False
+    paint: Callable[[Canvas], Image]  # fills a canvas: (height, width, 3) float32, sRGB albedo in 0 to 1
+    emissive: bool = False  # shown as painted, without baked light (window panes, lamp shades)
+    shared: bool = False  # all patches share one small piece of texture in a few brightness levels (leaves, covers)
     casts_shadow: bool = True
 
 

@@ -42,20 +42,13 @@ class NoiseBank:
 
 @dataclass(frozen=True)
 class Canvas:
-    """The size, scale and origin of the image that a painter makes, and the noise it can use.
+    """The size, scale and origin of the image that a painter makes, and the noise it can use."""
 
-    Attributes:
-        height, width: of the image in texels.
-        texels_per_m: texels per metre.
-        x_m, y_m: metres from the pattern's origin to the left and to the top edge.
-        noise: the fields to crop from.
-    """
-
-    height: int
+    height: int  # of the image in texels
     width: int
     texels_per_m: float
-    x_m: float
-    y_m: float
+    x_m: float  # from the pattern's origin to the left edge
+    y_m: float  # from the pattern's origin to the top edge
     noise: NoiseBank
 
     @property

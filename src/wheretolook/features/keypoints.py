@@ -72,4 +72,5 @@ def unit_descriptors(descriptors: NDArray[Any]) -> NDArray[np.float32]:
     """Stored descriptors (N, D), e.g. uint8, as float32 of unit length (rows of zeros stay zero)."""
     values = descriptors.astype(np.float32)
     length = np.linalg.norm(values, axis=1, keepdims=True)
-    return values / np.where(length > 0, length, 1)
+    values /= np.where(length > 0, length, 1)
+    return values

@@ -39,7 +39,8 @@ def learning_figure(image: BinnedImage, activations: Sequence[Float], channels: 
         draw_counts(bins, image)
         bins.set_title(f"b  image binning\n{len(image.counts)} × {len(image.counts)}", loc="left")
         bins.set_xlabel(f"{int((image.counts > 0).sum())} of {image.counts.size} filled")
-        inputs = [figure.add_subplot(row) for row in stages[2].subgridspec(len(means), 1)]
+        inner = stages[2].subgridspec(len(means), 1)
+        inputs = [figure.add_subplot(inner[row]) for row in range(len(means))]
         for axes, values, name in zip(inputs, means, channels, strict=True):
             reach = float(np.abs(values).max()) or 1.0
             _grid(axes, values, "PuOr", -reach, reach)

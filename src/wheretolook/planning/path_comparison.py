@@ -170,7 +170,7 @@ def plan_pairs(
 
     def planned(ends: Float, viewpoint_map: ViewpointMap | None) -> PlannedPath | None:
         try:
-            return plan_path(*ends, space, space.bounds, viewpoint_map, config.planner, progress=False)
+            return plan_path(ends[0], ends[1], space, space.bounds, viewpoint_map, config.planner, progress=False)
         except PlanningError:
             return None
 

@@ -54,7 +54,7 @@ def refine_directions(
     otherwise the step is halved, until it falls below the last. All views are searched together, so that the scorer
     gets batches. Scores need not be continuous.
 
-    The search begins at locations (B, 3) m with axes (B, 3) of any length, such as the best of a lattice. The default of
+    The search begins at locations (B, 3) m with axes (B, 3) of any length, such as the best of a lattice. The default
     `max_angle_deg` from there exceeds the distance of neighbours on a lattice of 500 directions; about half that
     distance works well as the first step.
 

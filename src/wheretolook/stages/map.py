@@ -39,8 +39,8 @@ def make_maps(experiment: Experiment, say: Say = print, tick: Tick = lambda work
 
             with naming_scene(files.mesh):
                 shown = (scene.mesh, scene.renderer, scene.mesh_space, scene.camera)
-                how = (seed, files.map, scene.raycaster, experiment.n_workers, scene.device)
-                report = build_map(*shown, experiment.map, *how)
+                workers, device = experiment.n_workers, scene.device
+                report = build_map(*shown, experiment.map, seed, files.map, scene.raycaster, workers, device)
             write_stamp(files, "map", key)
             found = f"{report.n_landmarks:,} landmarks from {report.n_registered} images"
             say(

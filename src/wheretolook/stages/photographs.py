@@ -10,7 +10,6 @@ from pathlib import Path
 from wheretolook.config import Experiment
 from wheretolook.dataset.folders import Dataset, SceneFolder
 from wheretolook.dataset.stamps import is_done, read_stamp, stage_key, write_stamp
-from wheretolook.mapping.config import PhotographsConfig
 from wheretolook.mapping.scale import read_scale
 from wheretolook.stages.inputs import Say, Tick
 from wheretolook.utils.errors import ConfigError

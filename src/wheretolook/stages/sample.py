@@ -56,8 +56,8 @@ def _sample(scene: Scene, config: SampleConfig, say: Say) -> None:
     with naming_scene(scene.source):
         grid, free = scene.free_voxels(config, scene.sampled_space)
         seen = (scene.landmarks, scene.camera, scene.occlusion)
-        how = (config, scene.device, f"sample {scene.name}", files.split)
-        table, occlusion = sample_viewpoints(grid, free, *seen, *how)
+        title = f"sample {scene.name}"
+        table, occlusion = sample_viewpoints(grid, free, *seen, config, scene.device, title, files.split)
     occlusion.save(files.occlusion)
     write_table(table, files.table)
     n_locations = table["location_id"].nunique()

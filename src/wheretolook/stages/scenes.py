@@ -26,7 +26,8 @@ def make_scenes(experiment: Experiment, say: Say = print, tick: Tick = lambda wo
     """
     config, root = experiment.scenes, experiment.root
     refuse_release(root)
-    splits: list[Split] = ["train"] * config.train + ["val"] * config.val + ["test"] * config.test
+    numbers: dict[Split, int] = {"train": config.train, "val": config.val, "test": config.test}
+    splits = [split for split, number in numbers.items() for _ in range(number)]
     sources: dict[SceneFolder, Callable[[], TexturedMesh]] = {}
     keys: dict[SceneFolder, list[Any]] = {}
     for seed, split in enumerate(splits, config.seed):

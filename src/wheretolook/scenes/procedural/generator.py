@@ -12,7 +12,7 @@ from wheretolook.scenes.config import ApartmentConfig
 from wheretolook.scenes.procedural import atlas, lighting
 from wheretolook.scenes.procedural.furnishing import furnish
 from wheretolook.scenes.procedural.layout import Lamp
-from wheretolook.scenes.procedural.noise import NoiseBank
+from wheretolook.scenes.procedural.materials import NoiseBank
 from wheretolook.scenes.procedural.patches import Patch, Surface, join
 from wheretolook.scenes.procedural.plan import Plan, draw_plan
 from wheretolook.scenes.procedural.shell import build_shell

@@ -14,8 +14,7 @@ from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.colmap_camera import Camera, ColmapCamera
 from wheretolook.geometry.poses import Float, camera_centers, check_poses
 from wheretolook.inputs.bins import BinnedViews, bin_views, count_bins
-from wheretolook.mapping.cameras import colmap_poses
-from wheretolook.mapping.colmap_model import read_model
+from wheretolook.mapping.colmap_model import colmap_poses, read_model
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
 from wheretolook.visibility.frustum import LandmarkSets, in_view_on_device, landmarks_in_view, points_on_device
 from wheretolook.visibility.occlusion import NoOcclusion, OcclusionModel

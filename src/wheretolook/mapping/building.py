@@ -23,7 +23,7 @@ from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float, poses_looking_along
 from wheretolook.mapping import triangulation
-from wheretolook.mapping.cameras import CAMERAS_FILE, colmap_poses, save_mapping_poses
+from wheretolook.mapping.colmap_model import CAMERAS_FILE, colmap_poses, save_mapping_poses
 from wheretolook.mapping.config import MapConfig
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
 from wheretolook.mapping.triangulation import image_name, triangulate_known_poses

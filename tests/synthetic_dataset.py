@@ -12,7 +12,7 @@ from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import Float, poses_looking_along
 from wheretolook.inputs.bins import bin_views_plain
-from wheretolook.mapping.cameras import save_mapping_poses
+from wheretolook.mapping.colmap_model import save_mapping_poses
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.viewpoints.config import Split
 from wheretolook.viewpoints.table import LOCALIZED, NO_POSE, TOO_FEW_MATCHES, pose_columns, write_table

@@ -19,7 +19,7 @@ from wheretolook.config import Experiment, ScenesConfig
 from wheretolook.dataset.folders import Dataset, SceneFolder
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.mapping import incremental
-from wheretolook.mapping.cameras import colmap_poses
+from wheretolook.mapping.colmap_model import colmap_poses
 from wheretolook.mapping.config import KnownDistance, MapConfig, PhotographsConfig, ScaleConfig
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.mapping.photograph_map import map_photographs

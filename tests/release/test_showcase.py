@@ -17,7 +17,7 @@ from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
 from wheretolook.inputs.bins import InputStatistics
 from wheretolook.learning.trained_network import TrainedNetwork
-from wheretolook.mapping.cameras import save_mapping_poses
+from wheretolook.mapping.colmap_model import save_mapping_poses
 from wheretolook.methods.base import Scorer
 from wheretolook.methods.binned_network import BinnedNetworkScorer
 from wheretolook.methods.mlp.network import NetworkSpec, ViewpointNetwork

@@ -68,7 +68,7 @@ class WarpSift:
     def _extract_block(self, space: ScaleSpace, grey: Any) -> list[Keypoints]:
         n_images = grey.shape[0]
         space.fill(grey)
-        keys = _sorted_unique(space.find())
+        keys = np.unique(space.find())
         if len(keys) == 0:
             return [Keypoints.none() for _ in range(n_images)]
         table, place, angle, places = self._turn(space, keys)
@@ -139,11 +139,6 @@ class WarpSift:
         buffer = self._buffer(name, len(values), dtype)
         wp.copy(buffer, wp.array(values, dtype=dtype, device="cpu"), count=len(values))
         return buffer
-
-
-def _sorted_unique(keys: NDArray[np.int64]) -> NDArray[np.int64]:
-    keys = np.sort(keys)
-    return keys[np.flatnonzero(np.diff(keys, prepend=-1))]
 
 
 def _by_response(image: NDArray[np.int64], table: NDArray[np.float32], angle: NDArray[np.float32]) -> NDArray[np.intp]:

@@ -103,25 +103,18 @@ def reflected(index: wp.int32, size: wp.int32):
 
 @wp.func
 def smoothed(
-    values: wp.array[float],
-    start: int,
-    step: int,
-    at: int,
-    size: int,
-    weights: wp.array[float],
-    first: int,
-    radius: int,
+    line: wp.array[float], start: int, step: int, at: int, size: int, weights: wp.array[float], first: int, radius: int
 ):
     """A symmetric filter at one place of a line of values; `weights` are from its middle outwards."""
     middle = start + at * step
-    total = weights[first] * values[middle]
+    total = weights[first] * line[middle]
     if at >= radius and at + radius < size:
         for tap in range(1, radius + 1):
-            total += weights[first + tap] * (values[middle - tap * step] + values[middle + tap * step])
+            total += weights[first + tap] * (line[middle - tap * step] + line[middle + tap * step])
     else:
         for tap in range(1, radius + 1):
-            before = values[start + reflected(at - tap, size) * step]
-            after = values[start + reflected(at + tap, size) * step]
+            before = line[start + reflected(at - tap, size) * step]
+            after = line[start + reflected(at + tap, size) * step]
             total += weights[first + tap] * (before + after)
     return total
 

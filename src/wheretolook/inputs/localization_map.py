@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import Float, camera_centers, check_poses
 from wheretolook.inputs.bins import BinnedViews, bin_views, count_bins
-from wheretolook.mapping.cameras import colmap_poses
-from wheretolook.mapping.colmap_model import read_model
+from wheretolook.mapping.colmap_model import colmap_poses, read_model
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
 from wheretolook.visibility.frustum import (
     LandmarkSets,

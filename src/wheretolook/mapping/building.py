@@ -21,11 +21,11 @@ from wheretolook.features.extraction import KeypointExtractor
 from wheretolook.features.keypoints import Keypoints
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
-from wheretolook.geometry.poses import poses_looking_along
-from wheretolook.mapping.cameras import CAMERAS_FILE, colmap_poses, save_mapping_poses
+from wheretolook.geometry.poses import Float, poses_looking_along
+from wheretolook.mapping import triangulation
+from wheretolook.mapping.colmap_model import CAMERAS_FILE, colmap_poses, save_mapping_poses
 from wheretolook.mapping.config import MapConfig
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
-from wheretolook.mapping.pairs import choose_pairs, shrink_depth, surface_overlap
 from wheretolook.mapping.triangulation import image_name, triangulate_known_poses
 from wheretolook.mapping.walk import FreeSpaceQueries, plan_walk
 from wheretolook.utils.errors import MapError
@@ -99,7 +99,8 @@ def build_map(
             extracted = extract_with_colors(extractor, images, len(poses), processes, "map: render, extract", progress)
             keypoints, colors = zip(*extracted, strict=True)
         with clock("pairs"):
-            pairs = choose_pairs(surface_overlap(camera, poses, np.stack(depth)), config.partners)
+            overlap = triangulation.surface_overlap(camera, poses, np.stack(depth))
+            pairs = triangulation.choose_pairs(overlap, config.partners)
         database = partial / DATABASE_FILE
         views = camera, poses, keypoints, colors
         model = triangulate_known_poses(database, *views, pairs, config, clock, seed, processes, progress)
@@ -229,18 +230,14 @@ def extract_with_colors(
 
 
 def _rendered(
-    renderer: Renderer,
-    camera: PinholeCamera,
-    poses: NDArray[np.floating[Any]],
-    depth: list[NDArray[np.float32]],
-    keep_in: Path | None,
+    renderer: Renderer, camera: PinholeCamera, poses: Float, depth: list[NDArray[np.float32]], keep_in: Path | None
 ) -> Iterator[NDArray[np.uint8]]:
     """Images (H, W, 3) of poses (I, 3, 4), written to a folder if one is given. Adds their shrunk depth to `depth`."""
     import cv2
 
     for start in range(0, len(poses), _RENDER_BATCH):
         rendering = renderer.render(camera, poses[start : start + _RENDER_BATCH])
-        depth.extend(shrink_depth(rendering.depth_m))
+        depth.extend(triangulation.shrink_depth(rendering.depth_m))
         for offset, rgb in enumerate(rendering.rgb):
             if keep_in is not None:
                 keep_in.mkdir(exist_ok=True)

@@ -17,15 +17,10 @@ from tqdm.auto import tqdm
 
 from wheretolook.features.extraction import KeypointExtractor
 from wheretolook.features.keypoints import ExtractorConfig
+from wheretolook.mapping import photographs
 from wheretolook.mapping.building import extract_with_colors
 from wheretolook.mapping.colmap_model import read_model
-from wheretolook.mapping.photographs import (
-    PhotographCameras,
-    list_photographs,
-    photograph_pairs,
-    read_photograph,
-    reduce_photograph,
-)
+from wheretolook.mapping.photographs import PhotographCameras, list_photographs, photograph_pairs
 from wheretolook.mapping.triangulation import Stored, fill_database, match_pairs, stored_keypoints
 from wheretolook.utils.colmap import quiet_colmap
 from wheretolook.utils.errors import MapError
@@ -125,16 +120,16 @@ def _extract(
 ) -> dict[str, NDArray[Any]]:
     full_sizes, sizes = [], []
 
-    def photographs() -> Iterator[NDArray[np.uint8]]:
+    def images() -> Iterator[NDArray[np.uint8]]:
         for name in names:
-            rgb = read_photograph(folder / name)
-            reduced = reduce_photograph(rgb, max_side_px)
+            rgb = photographs.read_photograph(folder / name)
+            reduced = photographs.reduce_photograph(rgb, max_side_px)
             full_sizes.append(rgb.shape[1::-1])
             sizes.append(reduced.shape[1::-1])
             yield reduced
 
     n = len(names)
-    extracted = extract_with_colors(extractor, photographs(), n, processes, "map: extract", progress, same_size=False)
+    extracted = extract_with_colors(extractor, images(), n, processes, "map: extract", progress, same_size=False)
     found = [(*stored_keypoints(keypoints), color) for keypoints, color in extracted]
     counts = np.array([len(color) for *_, color in found])
     parts = zip(("pixels", "descriptors", "colors"), zip(*found, strict=True), strict=True)
@@ -195,8 +190,8 @@ def _reconstruct(
     ordered = sorted(found.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
     shutil.rmtree(models)
     if not ordered:
-        photographs = f"at least {_LEAST_IMAGES} sharp photographs that share most of what they show with the next"
-        fix = f"Give {photographs}, from different places; a focal length (map.photographs.camera_params) helps."
+        enough = f"at least {_LEAST_IMAGES} sharp photographs that share most of what they show with the next"
+        fix = f"Give {enough}, from different places; a focal length (map.photographs.camera_params) helps."
         value = f"{n_images} photographs, none placed"
         raise MapError("the photographs do not overlap enough for a map", value=value, fix=fix)
     models.mkdir()

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from wheretolook.dataset.folders import RELEASE_FILE, Dataset, SceneFolder
-from wheretolook.mapping.cameras import CAMERAS_FILE, save_mapping_poses
+from wheretolook.mapping.colmap_model import CAMERAS_FILE, save_mapping_poses
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.methods.method import Method
 from wheretolook.methods.registry import learned, scorers

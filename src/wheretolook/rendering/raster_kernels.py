@@ -22,15 +22,14 @@ _FLAT = wp.constant(wp.float64(1.0e-13))
 
 @wp.kernel(enable_backward=False)
 def project_kernel(
-    vertices: wp.array[wp.vec3],
-    pixel_from_world: wp.array[wp.mat33d],
+    points: wp.array[wp.vec3],
+    rotation: wp.array[wp.mat33d],
     offset: wp.array[wp.vec3d],
     projected: wp.array2d[wp.vec3d],
 ):
     b, i = wp.tid()
-    v = vertices[i]
-    at = wp.vec3d(wp.float64(v[0]), wp.float64(v[1]), wp.float64(v[2]))
-    projected[b, i] = pixel_from_world[b] * at + offset[b]
+    at = wp.vec3d(wp.float64(points[i][0]), wp.float64(points[i][1]), wp.float64(points[i][2]))
+    projected[b, i] = rotation[b] * at + offset[b]
 
 
 @wp.func

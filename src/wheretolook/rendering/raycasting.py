@@ -93,8 +93,8 @@ class MeshRaycaster:
     def _upload_pairs(self, **arrays: ArrayLike) -> list[Any]:
         """Two arrays (N, 3) on the device. Raises ValueError if their lengths differ."""
         uploaded: list[Any] = [vec3_array(values, self.device) for values in arrays.values()]
-        lengths = [f"{array.shape[0]} {name}" for name, array in zip(arrays, uploaded, strict=True)]
         if uploaded[0].shape != uploaded[1].shape:
+            lengths = [f"{array.shape[0]} {name}" for name, array in zip(arrays, uploaded, strict=True)]
             raise ValueError(" for ".join(lengths))
         return uploaded
 

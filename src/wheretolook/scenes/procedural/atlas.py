@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wheretolook.scenes.procedural import artwork
-from wheretolook.scenes.procedural.materials import Material
-from wheretolook.scenes.procedural.noise import Canvas, Image, NoiseBank
+from wheretolook.scenes.procedural.materials import Canvas, Image, Material, NoiseBank
 from wheretolook.scenes.procedural.patches import Patch
 from wheretolook.utils.errors import SceneError
 
@@ -73,12 +72,10 @@ def _pack(charts: Sequence[Chart], size: int) -> tuple[NDArray[np.int64], int] |
     x = y = shelf = 0
     for k in np.lexsort((np.arange(len(charts)), -outer[:, 0], -outer[:, 1])):
         w, h = outer[k]
-        if w > size:
-            return None
         if x + w > size:
             x, y, shelf = 0, y + shelf, 0
         shelf = max(shelf, int(h))
-        if y + shelf > size:
+        if w > size or y + shelf > size:
             return None
         corners[k] = x + charts[k].pad, y + charts[k].pad
         x += int(w)

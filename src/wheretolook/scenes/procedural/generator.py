@@ -12,8 +12,8 @@ from wheretolook.scenes.config import ApartmentConfig
 from wheretolook.scenes.procedural import atlas, lighting
 from wheretolook.scenes.procedural.furnishing import furnish
 from wheretolook.scenes.procedural.layout import Lamp
-from wheretolook.scenes.procedural.noise import NoiseBank
-from wheretolook.scenes.procedural.patches import Patch, Surface, join
+from wheretolook.scenes.procedural.materials import NoiseBank
+from wheretolook.scenes.procedural.patches import Patch, join
 from wheretolook.scenes.procedural.plan import Plan, draw_plan
 from wheretolook.scenes.procedural.shell import build_shell
 from wheretolook.scenes.procedural.style import Style
@@ -55,10 +55,12 @@ def generate_apartment(config: ApartmentConfig, seed: int, device: str = "cpu") 
     windows = [(pane, floor_plan.rooms[pane.room].curtains_closed) for pane in panes]
     light = lighting.bake(patches, surface, samples, albedo, windows, lamps, device=device, rays=config.light_rays)
     chart, factors = _light_charts(plan, patches, samples, light)
+    size = np.array([(c.width, c.height) for c in plan.charts], float)[chart]
+    texels = plan.corners[chart].astype(float)[surface.patch][:, None] + surface.st * size[surface.patch][:, None]
     return TexturedMesh(
         vertices=(config.enlarged * surface.vertices).astype(np.float32),
         triangles=surface.triangles.astype(np.int32),
-        corner_uvs=_uvs(plan, chart, surface),
+        corner_uvs=(texels / np.array(plan.size, float)).astype(np.float32),
         triangle_texture=np.zeros(len(surface.triangles), np.int32),
         textures=(atlas.compose(plan, painted, factors),),
     )
@@ -85,9 +87,3 @@ def _light_charts(
         else:
             factors[chart[k]] = factor
     return chart, factors
-
-
-def _uvs(plan: atlas.AtlasPlan, chart: NDArray[np.int64], surface: Surface) -> NDArray[np.float32]:
-    size = np.array([(c.width, c.height) for c in plan.charts], float)[chart]
-    texel = plan.corners[chart].astype(float)[surface.patch][:, None] + surface.st * size[surface.patch][:, None]
-    return (texel / np.array(plan.size, float)).astype(np.float32)

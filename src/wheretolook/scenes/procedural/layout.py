@@ -17,6 +17,7 @@ DOOR_ZONE_M = 0.95  # depth of the floor before a door that stays free
 WARM = (1.0, 0.80, 0.58)  # colour of a light bulb
 
 Rectangle = tuple[float, float, float, float]
+Size = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ class Spot:
 
     side: int  # of the room
     at: float  # wall coordinate of its middle
-    size: tuple[float, float, float]  # width along the wall, depth into the room and height
+    size: Size  # width along the wall, depth into the room and height
     front: float  # depth of the floor before it that must stay free
     footprint: Rectangle  # in the world
 
@@ -122,7 +123,7 @@ class Layout:
         return not any(a0 < b1 + gap and b0 < a1 + gap and z0 < h1 and h0 < z1 for b0, b1, h0, h1 in self.on_wall[side])
 
     def find_by_wall(
-        self, size: tuple[float, float, float], place: str = "any", front: float = 0.5, sides: list[int] | None = None
+        self, size: Size, place: str = "any", front: float = 0.5, sides: list[int] | None = None
     ) -> Spot | None:
         """Spot along a wall for a piece of furniture (see `Spot`), or None: at its `middle`, a `corner`, or `any`.
 

@@ -169,12 +169,7 @@ def cushion(
 
 
 def lathe(
-    profile: Sequence[tuple[float, float]],
-    material: Material,
-    *,
-    sides: int = 16,
-    centre: ArrayLike = (0, 0, 0),
-    density: float = 1.0,
+    profile: ArrayLike, material: Material, *, sides: int = 16, centre: ArrayLike = (0, 0, 0), density: float = 1.0
 ) -> list[Patch]:
     """Surface of revolution about z; `profile` lists (radius, z) downwards, radius 0 at both ends closes it."""
     rz, angle = np.asarray(profile, float), _full_turn(sides)

@@ -180,10 +180,9 @@ def _fits(room: Room) -> bool:
 def _add_doors(rng: np.random.Generator, rooms: list[Room], doors: list[tuple[int, int]], height: float) -> None:
     for i, j in doors:
         a, b = rooms[i], rooms[j]
-        wall = shared_wall(a, b)
+        wall, kinds = shared_wall(a, b), {a.kind, b.kind}
         assert wall is not None
         side, low, high = wall
-        kinds = {a.kind, b.kind}
         wide = kinds == {"living", "kitchen"} or (kinds == {"living", "hall"} and rng.random() < 0.4)
         wide = wide and high - low - 0.3 > 1.3
         width = float(min(rng.uniform(1.3, 2.0), high - low - 0.3) if wide else rng.uniform(0.86, 0.95))
@@ -212,9 +211,7 @@ def outside_spans(room: Room, rooms: list[Room], side: int) -> list[tuple[float,
 
 
 def _add_windows(rng: np.random.Generator, rooms: list[Room]) -> None:
-    for room in rooms:
-        if room.kind == "hall":
-            continue
+    for room in (room for room in rooms if room.kind != "hall"):
         spans = [(high - low, side, low, high) for side in range(4) for low, high in outside_spans(room, rooms, side)]
         for span, side, low, high in sorted(spans, reverse=True)[: 2 if room.kind == "living" else 1]:
             small = room.kind == "bathroom"

@@ -79,20 +79,14 @@ class ColmapCamera:
     into the image. So a point counts as seen only if the ray of its pixel, by COLMAP's own inverse, leads back to it.
     COLMAP's fisheye models see nothing at 90 degrees from the axis and beyond.
 
-    Args:
-        model: COLMAP's name of the model, such as "OPENCV" or "OPENCV_FISHEYE".
-        width: image width in pixels.
-        height: image height in pixels.
-        params: intrinsics in COLMAP's order for the model.
-
     Raises:
         ConfigError: COLMAP has no such model, or the model takes other parameters.
     """
 
-    model: str
-    width: int
+    model: str  # COLMAP's name, such as "OPENCV" or "OPENCV_FISHEYE"
+    width: int  # of the image, in pixels
     height: int
-    params: tuple[float, ...]
+    params: tuple[float, ...]  # intrinsics in COLMAP's order for the model
 
     def __post_init__(self) -> None:
         import pycolmap
@@ -117,11 +111,7 @@ class ColmapCamera:
 
     @classmethod
     def of_map(cls, model: str | Path) -> ColmapCamera:
-        """The camera with which the COLMAP model in a folder was made.
-
-        Raises:
-            MapError: the model cannot be read or has not exactly one camera.
-        """
+        """The camera that made the COLMAP model in a folder; MapError if that cannot be read or has several or none."""
         import pycolmap
 
         path = Path(model)

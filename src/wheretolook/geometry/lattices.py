@@ -12,9 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from wheretolook.geometry.poses import Float
 from wheretolook.utils.errors import ConfigError
 
-GOLDEN_ANGLE = np.pi * (1 + np.sqrt(5))
-"""Azimuth between neighbours of the spiral, in radians: the paper's i * pi * (1 + sqrt 5)."""
-
+GOLDEN_ANGLE = np.pi * (1 + np.sqrt(5))  # radians between neighbours of the spiral: the paper's i * pi * (1 + sqrt 5)
 Lattice = Literal["fibonacci", "azimuth-elevation", "released", "yaw-pitch"]
 
 
@@ -168,7 +166,6 @@ LATTICES: dict[str, Callable[[int], Float]] = {
     "released": released_lattice,
     "yaw-pitch": lambda n: axes_of_angles(yaw_pitch_angles()),
 }
-"""What makes the directions of each `Lattice`."""
 
 
 def _positive(n: int) -> int:

@@ -24,11 +24,7 @@ if TYPE_CHECKING:
 
 
 def free_locations(grid: VoxelGrid, free_space: FreeSpace | MappedSpace) -> NDArray[np.int64]:
-    """Ids of the grid's locations in free space, ascending.
-
-    Raises:
-        SceneError: there is none.
-    """
+    """Ids of the grid's locations in free space, ascending. Raises SceneError if there is none."""
     ids = np.flatnonzero(free_space.is_free(grid.centers()))
     if len(ids) == 0:
         problem = f"none of the {len(grid)} locations is in free space"

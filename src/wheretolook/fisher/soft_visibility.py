@@ -82,18 +82,12 @@ class GaussianProcessVisibility(SoftVisibility):
 
     v(z, f) = k(z, Z) K^-1 s(Z . f) with the sampled axes Z, the kernel k(z, z') = exp(-|z - z'|^2 / 2 l^2),
     K = k(Z, Z), and s(c) = 1 / (1 + exp(-steepness (c - cos half angle))).
-
-    Args:
-        half_angle_rad: of the cone that stands for the field of view.
-        length: l, the length of a chord of the unit sphere.
-        n_factors: F; the axes are a Fibonacci lattice.
-        steepness: of the soft step.
     """
 
-    half_angle_rad: float
-    length: float
-    n_factors: int = 70
-    steepness: float = 15.0
+    half_angle_rad: float  # of the cone that stands for the field of view
+    length: float  # l, the length of a chord of the unit sphere
+    n_factors: int = 70  # F; the axes are a Fibonacci lattice
+    steepness: float = 15.0  # of the soft step
 
     @classmethod
     def fitted(cls, half_angle_rad: float, n_factors: int = 70, steepness: float = 15.0) -> GaussianProcessVisibility:

@@ -79,28 +79,23 @@ class ColmapCamera:
     into the image. So a point counts as seen only if the ray of its pixel, by COLMAP's own inverse, leads back to it.
     COLMAP's fisheye models see nothing at 90 degrees from the axis and beyond.
 
-    Args:
-        model: COLMAP's name of the model, such as "OPENCV" or "OPENCV_FISHEYE".
-        width: image width in pixels.
-        height: image height in pixels.
-        params: intrinsics in COLMAP's order for the model.
-
     Raises:
         ConfigError: COLMAP has no such model, or the model takes other parameters.
     """
 
-    model: str
-    width: int
+    model: str  # COLMAP's name, such as "OPENCV" or "OPENCV_FISHEYE"
+    width: int  # of the image, in pixels
     height: int
-    params: tuple[float, ...]
+    params: tuple[float, ...]  # intrinsics in COLMAP's order for the model
 
     def __post_init__(self) -> None:
         import pycolmap
 
         names = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
         if self.model not in names:
-            fix = f"Use one of {', '.join(names)}."
-            raise ConfigError("COLMAP has no such camera model", value=self.model, fix=fix)
+            raise ConfigError(
+                "COLMAP has no such camera model", value=self.model, fix=f"Use one of {', '.join(names)}."
+            )
         expected = pycolmap.Camera.create_from_model_name(1, self.model, 1.0, 1, 1).params_info
         if len(self.params) != len(expected.split(",")) or self.width < 1 or self.height < 1:
             problem = f"camera model {self.model} needs a positive size and the parameters {expected}"
@@ -116,11 +111,7 @@ class ColmapCamera:
 
     @classmethod
     def of_map(cls, model: str | Path) -> ColmapCamera:
-        """The camera with which the COLMAP model in a folder was made.
-
-        Raises:
-            MapError: the model cannot be read or has not exactly one camera.
-        """
+        """The camera that made the COLMAP model in a folder; MapError if that cannot be read or has several or none."""
         import pycolmap
 
         path = Path(model)

@@ -38,8 +38,7 @@ if TYPE_CHECKING:
 import torch
 from torch import Tensor
 
-GPU_LANES = 32
-"""Threads that share a view on a GPU where bins are only counted."""
+GPU_LANES = 32  # threads that share a view on a GPU where bins are only counted
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,11 +65,7 @@ class BinnedViews:
         return (self.counts > 0).sum((1, 2), dtype=np.int32)
 
     def select(self, channels: tuple[str, ...]) -> BinnedViews:
-        """The same views with only the named channels, in the order asked for.
-
-        Raises:
-            ConfigError: a channel is not there.
-        """
+        """The same views with only the named channels, in that order. Raises ConfigError if one is not there."""
         unknown = [name for name in channels if name not in self.channels]
         if unknown:
             raise ConfigError("unknown input channel", value=unknown[0], fix=f"There are {', '.join(self.channels)}.")
@@ -80,8 +75,7 @@ class BinnedViews:
 def arrange(means: NDArray[np.float32], filled: NDArray[np.bool_], layout: Layout) -> NDArray[np.float32]:
     """Lay out bins (B, C, bins, bins), which are zero where not `filled` (B, bins, bins), for a network.
 
-    "in_place" keeps every bin where it is; "compact" moves the filled bins to the front in row-major order, as the
-    released code does.
+    "in_place" keeps every bin where it is; "compact" moves the filled ones to the front, row by row.
     """
     if layout == "in_place":
         return means
@@ -132,10 +126,7 @@ def bin_views(
 def count_bins(
     posed: PosedViews, bins: int = 30, device: str = "cpu", block_bytes: int = 1 << 30
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """`BinnedViews.n_visible` and `BinnedViews.n_filled` of views, (B,) each, without the bins' means.
-
-    The arguments are those of `bin_views`, which is the plain twin of this.
-    """
+    """`n_visible` and `n_filled` of what `bin_views`, the plain twin of this, makes, (B,) each, without the means."""
     if isinstance(posed.camera, ColmapCamera):
         binned = bin_views_plain(posed, bins)
         return binned.n_visible, binned.n_filled
@@ -197,19 +188,15 @@ def bin_views_plain(posed: PosedViews, bins: int = 30, landmarks: Landmarks | No
     return BinnedViews(means.reshape(n_views, -1, bins, bins), counts.reshape(n_views, bins, bins), channels)
 
 
-STATISTICS_BLOCK = 256
-"""Views worked through at a time when statistics are taken: few enough for a processor's cache."""
+STATISTICS_BLOCK = 256  # views worked through at a time when statistics are taken: few enough for a processor's cache
 
 
 @dataclass(frozen=True)
 class InputStatistics:
     """Mean and standard deviation of each kind of input over the filled bins of the training views.
 
-    Attributes:
-        channels: names of the channels, as in `wheretolook.inputs.channels.ALL_CHANNELS`.
-        mean: mean of each channel, in its unit (such as pixels or metres), over the values that are known.
-        std: standard deviation of each channel, in its unit; 1 where it would be 0. Infinite where no value is known,
-            so that a network does not look at a channel that it has never seen.
+    They are in each channel's unit (such as pixels or metres), over the values that are known. The deviation is 1 where
+    it would be 0, and infinite where no value is known, so that a network does not look at a channel never seen.
     """
 
     channels: tuple[str, ...]
@@ -218,13 +205,9 @@ class InputStatistics:
 
     @classmethod
     def of(cls, means: Tensor, filled: Tensor, rows: Tensor, channels: tuple[str, ...] = CHANNELS) -> InputStatistics:
-        """Statistics over the filled bins of some views.
+        """Statistics over the bins of views `rows` (n,) int64 among `means` (B, C, bins, bins) that are `filled`.
 
-        Args:
-            means: (B, C, bins, bins) binned views, empty bins zero, NaN where a value is not known.
-            filled: (B, bins, bins) bool.
-            rows: views to use, (n,) int64.
-            channels: names of the C channels.
+        Means are zero in empty bins and NaN where a value is not known; `filled` is (B, bins, bins) bool.
         """
         rows = rows.to(means.device)
         total = torch.zeros(len(channels), dtype=torch.float64, device=means.device)

@@ -38,8 +38,7 @@ class LocalizationMap:
     camera: Camera = PinholeCamera()  # the camera that will look: a pinhole, or any COLMAP model
     occlusion: OcclusionModel = NoOcclusion()  # which landmarks have a free line of sight from a location
     device: str = "cpu"  # where kernels run, "cpu" or a CUDA device
-    # cam_from_world (M, 3, 4) of the images the map was made from, where they are known.
-    mapping_poses: Float | None = None
+    mapping_poses: Float | None = None  # cam_from_world (M, 3, 4) of the images the map was made from, if known
 
     @classmethod
     def from_colmap(
@@ -67,10 +66,8 @@ class LocalizationMap:
             MapError: no usable model in the folder.
             SceneError: the mesh cannot be used.
         """
-        reconstruction = read_model(model)
-        landmarks = load_colmap_landmarks(
-            Path(model), max_reprojection_error_px=max_reprojection_error_px, reconstruction=reconstruction
-        )
+        found, worst_px = read_model(model), max_reprojection_error_px
+        landmarks = load_colmap_landmarks(Path(model), max_reprojection_error_px=worst_px, reconstruction=found)
         occlusion = occlusion or NoOcclusion()
         if mesh is not None:
             from wheretolook.scenes.loading import load_mesh
@@ -79,46 +76,28 @@ class LocalizationMap:
 
             space = FreeSpace(load_mesh(Path(mesh)), device=device)
             occlusion = MeshOcclusion(space.raycaster, two_sided=space.two_sided)
-        return cls(landmarks, camera, occlusion, device, colmap_poses(model, reconstruction).astype(np.float32))
+        return cls(landmarks, camera, occlusion, device, colmap_poses(model, found).astype(np.float32))
 
     def bin_views(self, cam_from_world: Float, bins: int = 30, landmark_channels: bool = False) -> BinnedViews:
         """Bin the landmarks that views (B, 3, 4) see, in bins x bins cells of the image.
 
         Bins have `CHANNELS`, or with `landmark_channels` also the landmarks' attributes, `ALL_CHANNELS`. Here as in
-        the other methods, views at the same location share its occlusion test.
-
-        Raises:
-            ValueError: the poses have another shape, or entries that are not finite.
+        the other methods, views at the same location share its occlusion test, and poses of another shape or with
+        entries that are not finite raise ValueError.
         """
         described = self.landmarks if landmark_channels else None
         return bin_views(self._views(cam_from_world), bins=bins, device=self.device, landmarks=described)
 
     def count_bins(self, cam_from_world: Float, bins: int = 30) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """How many landmarks the views (B, 3, 4) see, and how many bins have one in them, (B,) each.
-
-        Raises:
-            ValueError: the poses have another shape, or entries that are not finite.
-        """
+        """How many landmarks the views (B, 3, 4) see, and how many bins have one in them, (B,) each."""
         return count_bins(self._views(cam_from_world), bins=bins, device=self.device)
 
     def landmarks_in_view(self, cam_from_world: Float) -> LandmarkSets:
-        """The landmarks that each of the views (B, 3, 4) sees.
-
-        Raises:
-            ValueError: the poses have another shape, or entries that are not finite.
-        """
+        """The landmarks that each of the views (B, 3, 4) sees."""
         return landmarks_in_view(self._views(cam_from_world), self.device)
 
     def in_view_on_device(self, cam_from_world: Float) -> tuple[NDArray[np.int64], Tensor]:
-        """What `landmarks_in_view` gives, its indices left on the map's device.
-
-        Returns:
-            starts: (B + 1,) int64; view b sees the landmarks `indices[starts[b]:starts[b + 1]]`.
-            indices: int32, on the map's device.
-
-        Raises:
-            ValueError: the poses have another shape, or entries that are not finite.
-        """
+        """What `landmarks_in_view` gives, starts (B + 1,) int64 and indices int32; the latter on the map's device."""
         import torch  # takes seconds to load
         import warp as wp
 

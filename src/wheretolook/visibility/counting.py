@@ -45,8 +45,7 @@ class FrustumCounter:
         distinct_pixels: count the pixels that some landmark falls on instead of the landmarks, as the released code
             does. With a COLMAP camera this is done in NumPy, thousands of times slower.
         size: cells along a side of the sphere's map, instead of what suits `n_points`.
-        scratch_bytes: memory for the bitmaps of distinct pixels, or for lists of landmarks that a COLMAP camera must be
-            asked about.
+        scratch_bytes: for bitmaps of distinct pixels, or for lists of landmarks to ask a COLMAP camera about.
 
     Raises:
         ConfigError: no such device, a size that is not even, or rotations that are not finite or of another shape.

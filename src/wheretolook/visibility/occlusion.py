@@ -75,16 +75,11 @@ class OcclusionModel(ABC):
     """Tells which landmarks nothing stands in front of.
 
     Callers ask for as many locations at once as their memory allows, so a model need not divide its work.
-
-    Attributes:
-        name: of the model, as in `OcclusionConfig`.
-        uses_all_cores: whether `unoccluded` occupies all cores of a CPU by itself.
-        landmarks_hide: whether landmarks occlude one another, so that added landmarks change the mask of the others.
     """
 
-    name: str = "custom"
-    uses_all_cores: bool = False
-    landmarks_hide: bool = False
+    name: str = "custom"  # as in `OcclusionConfig`
+    uses_all_cores: bool = False  # `unoccluded` occupies all cores of a CPU by itself
+    landmarks_hide: bool = False  # landmarks occlude one another: added ones change the mask of the others
 
     @abstractmethod
     def unoccluded(self, locations: Float, points: Float) -> NDArray[np.bool_]:
@@ -139,14 +134,9 @@ class NoOcclusion(OcclusionModel):
 class MeshOcclusion(OcclusionModel):
     """Exact occlusion by the scene's mesh: one ray for each location and landmark.
 
-    Args:
-        raycaster: the mesh.
-        margin_m: a surface this close in front of a landmark is the landmark's own.
-        two_sided: whether the backs of triangles are surfaces too, which `FreeSpace.two_sided` finds out. If not, a
-            location from which mostly backs are seen lies inside geometry.
-
-    Raises:
-        ConfigError: the margin is negative or not finite.
+    A surface `margin_m` in front of a landmark is the landmark's own; ConfigError if that is negative or not finite.
+    `two_sided` says whether the backs of triangles are surfaces too, which `FreeSpace.two_sided` finds out. If not, a
+    location from which mostly backs are seen lies inside geometry.
     """
 
     name = "mesh"
@@ -186,12 +176,8 @@ class MeshOcclusion(OcclusionModel):
 class StoredOcclusion(OcclusionModel):
     """Occlusion computed once for the locations of a dataset and stored, so that the mesh is no longer needed.
 
-    Args:
-        locations: (L, 3) metres.
-        packed: (L, ceil(N / 8)) uint8, the mask as `numpy.packbits` packs it: a bit is set where the line of sight is
-            free. Columns are in the order of the map's landmarks.
-        n_landmarks: N.
-        model: name of the occlusion model it was computed with.
+    Of L locations and N landmarks in the map's order, `packed` (L, ceil(N / 8)) uint8 is the mask as `numpy.packbits`
+    packs it: a bit is set where the line of sight is free. `model` names the occlusion model it was computed with.
     """
 
     def __init__(self, locations: ArrayLike, packed: NDArray[np.uint8], n_landmarks: int, model: str = "mesh") -> None:
@@ -237,11 +223,7 @@ class StoredOcclusion(OcclusionModel):
 
     @classmethod
     def load(cls, path: Path) -> StoredOcclusion:
-        """Read what `save` wrote.
-
-        Raises:
-            TableError: the file is missing or damaged.
-        """
+        """Read what `save` wrote. Raises TableError if the file is missing or damaged."""
         try:
             data = load_npz(path)
             return cls(data["locations"], data["mask"], int(data["n_landmarks"]), str(data.get("model", "mesh")))

@@ -49,17 +49,11 @@ def survey(
 ) -> Survey:
     """Find the landmarks (N, 3) m that are unoccluded from each of locations (L, 3) m, and count those in view.
 
-    They are counted (paper, Sec. 3.2) for each of rotations (D, 3, 3) cam_from_world. Works through the locations in
-    blocks, so that memory does not grow with their number (except for the result: a bit for each location and landmark,
-    if occlusion is kept).
-
-    Args:
-        keep: K, how many of the best directions to return for each location; 0 for all.
-        distinct_pixels: count pixels that see a landmark instead of landmarks.
-        keep_occlusion: whether to return the masks.
-        threads: threads on a CPU, 0 for all cores.
-        memory_bytes: bound on the memory of all blocks that are worked on at a time, on the device.
-        progress: text of a progress bar; None shows none.
+    They are counted (paper, Sec. 3.2) for each of rotations (D, 3, 3) cam_from_world, or with `distinct_pixels` the
+    pixels that see one; of the directions the best `keep` are returned for each location, 0 for all. Works through the
+    locations in blocks, which take at most `memory_bytes` on the device at a time, so that memory does not grow with
+    their number (except for the result: a bit for each location and landmark, if occlusion is kept). On a CPU with as
+    many threads as said, 0 for all cores. The progress bar has a text; None shows none.
 
     Raises:
         MapError: there are no landmarks.

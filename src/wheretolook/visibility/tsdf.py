@@ -159,11 +159,7 @@ class TsdfVolume:
         return int(self._grid.hashmap().size())
 
     def integrate(self, image: DepthImage) -> None:
-        """Average a depth image into the field; one without readings changes nothing.
-
-        Raises:
-            ConfigError: the volume has outgrown the memory.
-        """
+        """Average a depth image into the field. Raises ConfigError if the volume has outgrown the memory."""
         from open3d import core
         from open3d.t.geometry import Image
 
@@ -182,10 +178,8 @@ class TsdfVolume:
     def surface(self) -> TexturedMesh:
         """The zero crossing as triangles without colours, whose fronts face the cameras that saw them.
 
-        Several threads find the triangles, so their order may differ from run to run; the triangles do not.
-
-        Raises:
-            SceneError: there is none.
+        Several threads find the triangles, so their order may differ from run to run; the triangles do not. Raises
+        SceneError if there is none.
         """
         fix = "Check the poses, that depths are in metres, and that voxel_size_m is below the scene's size."
         nothing = SceneError("the depth images show no surface", value=f"{len(self)} blocks of voxels", fix=fix)
@@ -242,11 +236,7 @@ class TsdfOcclusion(MeshOcclusion):
 
 
 def estimate_blocks(images: Sequence[DepthImage], config: TsdfConfig) -> int:
-    """Blocks of voxels that the surfaces in the images will touch, from some pixels of up to 100 of the images.
-
-    Raises:
-        SceneError: there is no image, or none of those has a reading.
-    """
+    """Blocks of voxels that the images' surfaces will touch, from some pixels of up to 100; SceneError without any."""
     cell_m = max(config.block_m, _SURVEY_CELL_M)
     cells = np.empty(0, dtype=np.int64)
     number = np.array([1, 1 << 21, 1 << 42])  # one number a cell sorts faster than three
@@ -264,7 +254,6 @@ def estimate_blocks(images: Sequence[DepthImage], config: TsdfConfig) -> int:
 
 
 def _check_memory(n_blocks: int, config: TsdfConfig, limit_bytes: int) -> None:
-    """Raise ConfigError if so many blocks do not fit into the memory."""
     fits = min(limit_bytes // BYTES_PER_BLOCK, MAX_BLOCKS)
     if n_blocks <= fits:
         return

@@ -40,7 +40,7 @@ from wheretolook.viewpoints.table import is_good, poses, write_table
 from wheretolook.visibility.occlusion import StoredOcclusion
 
 TRAIN = train_config("mlp-2d", "mlp-2d+z", epochs=3, hidden=(16,), accelerator="cpu")
-CONFIGS = Path(__file__).parents[1] / "configs"
+CONFIGS = Path(__file__).parents[2] / "configs"
 VERSIONS = {"numpy": "2.9.9", "pycolmap": "4.1.0"}
 
 

@@ -22,7 +22,7 @@ from wheretolook.stages.evaluate import evaluate_methods as evaluate
 from wheretolook.utils.errors import MissingRunError
 from wheretolook.utils.tracking import TrackingConfig, client, finished_runs, newest_artifact, newest_run
 
-PAGE = Path(__file__).parents[1] / "mlruns" / "README.md"
+PAGE = Path(__file__).parents[2] / "mlruns" / "README.md"
 
 
 @pytest.fixture(scope="module")

@@ -1,5 +1,6 @@
 # make demo   sets everything up and runs the whole line on the embedded default
-# make test   sets everything up and runs linter, type checker and tests
+# make test   sets everything up and runs linter, type checker and the tests: five minutes on two cores
+# make test-all   the same and the slow tests too, in a quarter of an hour
 # make ui     opens MLflow on the runs, those of the release included; make lab opens Jupyter on the notebooks
 # make html   runs all notebooks and writes them as pages, notebooks/html
 # Options: TORCH=cuda for the CUDA build of PyTorch, PYTHON=python3.12 for a certain interpreter. See environment.md.
@@ -14,18 +15,24 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --progre
 CONSTRAINTS := configs/constraints.txt
 READY := $(VENV)/ready-$(TORCH)
 
-.PHONY: demo test setup ui lab html clean help
+.PHONY: demo test test-all setup ui lab html clean help
 
 help:
-	@sed -n '1,5s/^# //p' Makefile
+	@sed -n '1,6s/^# //p' Makefile
 
 demo: $(READY)
 	@$(BIN)/wheretolook demo
 
-test: $(READY)
+# Slow are Ray, processes that are killed, all notebooks but one, and the like. mypy runs beside the tests, which wait for
+# nothing, and speaks after them if it found something; their status is that of the target.
+test: TESTS := -m 'not slow'
+test test-all: $(READY)
 	$(BIN)/ruff check . && $(BIN)/ruff format --check .
-	$(BIN)/mypy
-	OMP_WAIT_POLICY=PASSIVE OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
+	@echo "mypy runs beside the tests"; $(BIN)/mypy >$(VENV)/mypy.log 2>&1 & types=$$!; \
+	OMP_WAIT_POLICY=PASSIVE OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile \
+	  --no-loadscope-reorder $(TESTS); tests=$$?; \
+	wait $$types || { cat $(VENV)/mypy.log; test $$tests -ne 0 || tests=1; }; \
+	exit $$tests
 
 ui: $(READY)
 	@$(BIN)/wheretolook log-release

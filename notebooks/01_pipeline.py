@@ -72,7 +72,7 @@ display(pipeline_figure(pipeline_of(showcase, scorer, location)))
 # and crosses tell what really came of views that were rendered and localized; the network was not told.
 
 # %%
-display(peaks_figure(*peaks_of(showcase, scorer, location).drawn))
+display(peaks_figure(*peaks_of(showcase, scorer, location)))
 
 # %% [markdown]
 # ## Turn it yourself
@@ -82,6 +82,6 @@ display(peaks_figure(*peaks_of(showcase, scorer, location).drawn))
 # ```python
 # from wheretolook.figures.viewer import show_scene
 #
-# one = showcase.localization_map
-# show_scene(showcase.mesh, one.landmarks.points, one.mapping_poses, cut_m=1.5)
+# localization_map = showcase.localization_map
+# show_scene(showcase.mesh, localization_map.landmarks.points, localization_map.mapping_poses, cut_m=1.5)
 # ```

@@ -69,13 +69,13 @@ display(inputs_figure(worst.image))
 # was when the image was localized.
 
 # %%
-display(learning_figure(*learning.drawn))
+display(learning_figure(*learning))
 
 # %% [markdown]
 # The view at the same place that it likes least:
 
 # %%
-display(learning_figure(*worst.drawn))
+display(learning_figure(*worst))
 
 # %% [markdown]
 # ## Its architecture

@@ -113,7 +113,7 @@ location = showcase.instructive_location()
 
 # %%
 mlp = load_scorer(release.root / "weights" / "mlp-2d+z.safetensors", showcase.localization_map)
-display(peaks_figure(*peaks_of(showcase, mlp, location).drawn))
+display(peaks_figure(*peaks_of(showcase, mlp, location)))
 
 # %% [markdown]
 # ### The set network
@@ -124,7 +124,7 @@ display(peaks_figure(*peaks_of(showcase, mlp, location).drawn))
 
 # %%
 scorer = load_scorer(release.root / "weights", showcase.localization_map)
-display(peaks_figure(*peaks_of(showcase, scorer, location).drawn))
+display(peaks_figure(*peaks_of(showcase, scorer, location)))
 
 # %% [markdown]
 # ### Where they err
@@ -134,10 +134,10 @@ display(peaks_figure(*peaks_of(showcase, scorer, location).drawn))
 
 # %%
 mistaken = mistaken_location(showcase, mlp)
-display(peaks_figure(*peaks_of(showcase, mlp, mistaken).drawn))
+display(peaks_figure(*peaks_of(showcase, mlp, mistaken)))
 
 # %% [markdown]
 # The set network at that place:
 
 # %%
-display(peaks_figure(*peaks_of(showcase, scorer, mistaken).drawn))
+display(peaks_figure(*peaks_of(showcase, scorer, mistaken)))

@@ -53,7 +53,7 @@ config = PlanConfig(grid=(8, 8, 4), directions=200, planner=PathConfig(time_s=6.
 
 # %%
 one, methods = showcase.localization_map, ["forward", "fisher-trace-gp", "set"]
-paths = plan_by_methods(methods, start, goal, showcase.scene, release, showcase.space, one.occlusion, config=config)
+paths = plan_by_methods(showcase, release, methods, start, goal, config)
 
 # %% [markdown]
 # From above, with an arrow for where the camera looks. All three go nearly the same way. Looking ahead, the camera ends

@@ -1,17 +1,34 @@
-"""Shared fixtures: small random maps and views."""
+"""Shared fixtures: small random maps and views, and an MLflow store that is quick to make."""
 
 from __future__ import annotations
 
+import shutil
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
+import torch
 import warp as wp
+from matplotlib.figure import Figure
 
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import Float, poses_looking_along
+from wheretolook.labelling import local_engine
+from wheretolook.labelling.shard import LabelledShard, Shard, ShardWorker
+from wheretolook.utils.tracking import client
+from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.utils.warp import start_warp
-from wheretolook.visibility.frustum import VisibleSets
+from wheretolook.visibility.frustum import LandmarkSets
+
+LONG = [f"test_{name}.py" for name in ("pipeline", "release", "notebooks", "evaluate", "train", "engines", "faults")]
+"""Files that take longest. They are begun first, so that no process is left with one when the others have finished."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    items.sort(key=lambda item: LONG.index(item.path.name) if item.path.name in LONG else len(LONG))
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
@@ -19,6 +36,59 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     if "device" in metafunc.fixturenames:
         start_warp()
         metafunc.parametrize("device", ["cpu", "cuda"] if wp.is_cuda_available() else ["cpu"])
+
+
+@pytest.fixture(scope="session", autouse=True)
+def migrated_stores(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """New MLflow stores start as a copy of an empty one, since MLflow takes seconds to make a store's tables."""
+    empty = TrackingConfig(str(tmp_path_factory.mktemp("mlruns")))
+    made_by_mlflow = TrackingConfig.uri.fget  # type: ignore[attr-defined]
+
+    def uri(tracking: TrackingConfig) -> str:
+        store = tracking.root / "mlflow.db"
+        if tracking != empty and not store.exists():
+            if not (empty.root / store.name).exists():
+                client(empty)
+            store.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(empty.root / store.name, store)
+        return str(made_by_mlflow(tracking))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(TrackingConfig, "uri", property(uri))
+        yield
+
+
+def _without_pictures() -> Iterator[None]:
+    """Figures are built, but their files stay empty: drawing is a third of a small training or evaluation."""
+
+    def savefig(figure: Figure, path: str | Path, **options: object) -> None:
+        Path(path).write_bytes(b"")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Figure, "savefig", savefig)
+        yield
+
+
+no_pictures = pytest.fixture(_without_pictures, scope="module", name="no_pictures")
+no_pictures_here = pytest.fixture(_without_pictures, name="no_pictures_here")
+
+
+@pytest.fixture
+def in_this_process(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Shards are labelled here one after the other: quicker, for what the workers have no part in."""
+    threads = torch.get_num_threads(), cv2.getNumThreads()
+
+    def run(
+        shards: Sequence[Shard], workers: int, tick: Callable[[int], None]
+    ) -> Iterator[tuple[Shard, LabelledShard]]:
+        worker = ShardWorker()
+        for shard in shards:
+            yield shard, worker.label(shard.job, shard.rows, tick)
+
+    monkeypatch.setattr(local_engine, "run_local", run)
+    yield
+    torch.set_num_threads(threads[0])
+    cv2.setNumThreads(threads[1])
 
 
 @dataclass(frozen=True)
@@ -30,7 +100,7 @@ class RandomViews:
     locations: Float
     directions: Float
     mask: np.ndarray
-    visible: VisibleSets
+    visible: LandmarkSets
     location_rows: np.ndarray
     cam_from_world: Float
 
@@ -44,4 +114,4 @@ def random_views(request: pytest.FixtureRequest) -> RandomViews:
     mask = rng.random((len(locations), len(points))) < 0.6
     location_rows = rng.integers(0, len(locations), 40)
     poses = poses_looking_along(locations[location_rows], rng.normal(size=(40, 3)))
-    return RandomViews(camera, points, locations, directions, mask, VisibleSets.from_mask(mask), location_rows, poses)
+    return RandomViews(camera, points, locations, directions, mask, LandmarkSets.from_mask(mask), location_rows, poses)

@@ -9,17 +9,10 @@ import pandas as pd
 
 from synthetic_dataset import make_dataset
 from synthetic_scores import make_scores
-from wheretolook.dataset.folders import Dataset
+from wheretolook.dataset.folders import RELEASE_FILE, Dataset
 from wheretolook.evaluation.paper_tables import write_paper_tables
-from wheretolook.release.copy import ABOUT
 
-METHODS: tuple[str, ...] = (
-    "random",
-    "bins",
-    "fisher-trace-exact",
-    "mlp-2d+z",
-    "mlp-2d+3d",
-)
+METHODS: tuple[str, ...] = ("random", "bins", "fisher-trace-exact", "mlp-2d+z", "mlp-2d+3d")
 
 
 def make_release(root: Path) -> Dataset:
@@ -44,7 +37,7 @@ def make_release(root: Path) -> Dataset:
     record = {"about": about, "weights_sha256": "0", "run_id": "0" * 32, "metrics": metrics}
     (weights / "mlp-2d+3d.json").write_text(json.dumps(record))
     about = {"source": "source", "source_fingerprint": "0", "code_version": "0", "settings": {}}
-    (root / ABOUT).write_text(json.dumps(about))
+    (root / RELEASE_FILE).write_text(json.dumps(about))
     return dataset
 
 

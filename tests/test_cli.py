@@ -39,14 +39,11 @@ def test_only_evaluate_lists_methods(capsys: pytest.CaptureFixture[str]) -> None
             "viewpoint-map",
             ["--scenes.mapped_space.clearance_m", "--map.photographs.assume_metric", "photographs has no"],
         ),
-        (
-            "plan",
-            ["--scene, --start, --goal,", "--film", "wheretolook plan --config", "--tracking.folder", "model tsdf"],
-        ),
+        ("plan", ["--plan.start", "--plan.film", "wheretolook plan --config", "--tracking.folder", "model tsdf"]),
     ],
 )
 def test_help_names_what_a_stage_reads(stage: str, says: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([stage, "--help"]) == 0
+    assert main([stage, "--help-all"]) == 0
     said = capsys.readouterr().out
     assert [text for text in says if text not in said] == [] and "--evaluate" not in said
 

@@ -20,7 +20,8 @@ from PIL import Image
 
 from synthetic_release import make_release
 from wheretolook.methods.styles import MethodStyle, scorer_style
-from wheretolook.utils.tracking import TrackingConfig, newest_run
+from wheretolook.utils.tracking import newest_run
+from wheretolook.utils.tracking_config import TrackingConfig
 
 FOLDER = Path(__file__).parents[1] / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
@@ -86,7 +87,9 @@ def test_notebooks_say_what_they_show(path: Path) -> None:
             assert len(lines) <= 6, cell.source
 
 
-@pytest.mark.parametrize("name", FROM_RUNS)
+@pytest.mark.parametrize(
+    "name", ["05_tables", *(pytest.param(name, marks=pytest.mark.slow) for name in FROM_RUNS if name != "05_tables")]
+)
 def test_notebooks_of_runs_draw_them(name: str, environment: Path) -> None:
     notebook = nbformat.read(FOLDER / f"{name}.ipynb", as_version=4)
     NotebookClient(notebook, timeout=120, resources={"metadata": {"path": str(FOLDER)}}).execute()
@@ -97,6 +100,7 @@ def test_notebooks_of_runs_draw_them(name: str, environment: Path) -> None:
         assert any("Localization score" in text for text in outputs(notebook, "text/markdown"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", OF_THE_RELEASE)
 def test_notebooks_of_the_release_run_from_top_to_bottom(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

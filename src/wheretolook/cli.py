@@ -8,75 +8,193 @@ import sys
 import time
 import traceback
 import warnings
-from collections.abc import Iterator
-from dataclasses import is_dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from wheretolook.utils.errors import ConfigError, WhereToLookError
+from wheretolook.utils.options import Option, all_options, check_names, grouped, names_in, nearest, one_line
 from wheretolook.utils.version import VERSION
 
 if TYPE_CHECKING:
-    from jsonargparse import ArgumentParser
-
     from wheretolook.config import Experiment
 
+
+@dataclass(frozen=True)
+class Stage:
+    """What the command line knows of a stage.
+
+    Args:
+        function: in `wheretolook.stages`.
+        text: what it does.
+        matter: the options that matter, which `--help` shows; a word without a dot may be a short flag.
+        groups: the options it reads, which `--help-all` shows: those in these groups; none for all.
+        example: arguments to try.
+        short: flags that may be given without their group.
+        config: name of the file in configs/ that is read unless --config names one.
+        notes: what else to know.
+    """
+
+    function: str
+    text: str
+    matter: tuple[str, ...]
+    groups: tuple[str, ...] = ()
+    example: str = "--config configs/demo.yaml"
+    short: Mapping[str, str] = field(default_factory=dict)
+    config: str = ""
+    notes: str = ""
+
+
+_SPACE = ("occlusion", "scenes.free_space", "scenes.mapped_space", "map.photographs.assume_metric")
+_OF_MAPS = ("occlusion.model", "scenes.free_space.clearance_m", "map.photographs.assume_metric")
+
 STAGES = {
-    "scenes": ("make_scenes", "Make or load the textured meshes.", ("scenes",)),
-    "map": (
+    "scenes": Stage(
+        "make_scenes",
+        "Make or load the textured meshes.",
+        ("scenes.train", "scenes.val", "scenes.test", "scenes.seed", "scenes.meshes", "scenes.apartment.n_rooms",
+         "scenes.apartment.area_m2", "scenes.apartment.texture_richness", "scenes.apartment.clutter",
+         "scenes.apartment.vary"),
+        ("scenes",),
+        "--config configs/demo.yaml --scenes.train 5",
+    ),
+    "map": Stage(
         "make_maps",
         "Build a COLMAP map of every scene from renders along a walk, or of a folder of photographs: --images FOLDER.",
+        ("map.n_images", "map.keep_images", "map.extractor.method", "images", "map.photographs.name",
+         "map.photographs.max_side_px", "map.photographs.camera_model", "map.photographs.camera_params",
+         "map.photographs.scale.marker_size_m", "map.photographs.scale.positions", "label.workers"),
         ("map", "scenes.free_space", "label.workers"),
+        "--name photos --images FOLDER",
     ),
-    "sample": (
+    "sample": Stage(
         "sample",
         "Choose viewpoints by the landmarks they see.",
-        (
-            "sample",
-            "occlusion",
-            "scenes.free_space",
-            "scenes.mapped_space",
-            "map.photographs.assume_metric",
-        ),
+        ("sample.grid", "sample.directions", "sample.lattice", "sample.keep", "sample.min_visible",
+         "sample.max_locations", "sample.max_directions", "sample.seed", *_OF_MAPS),
+        ("sample", *_SPACE),
+        "--config configs/demo.yaml --sample.max_locations 100",
     ),
-    "label": ("label", "Render and localize every viewpoint, measure the pose error. Resumes.", ("label", "tracking")),
-    "train": ("train", "Learn from the labels, one weights file for each method.", ("train", "tracking")),
-    "evaluate": ("evaluate", "Score all methods on the test scenes.", ("evaluate", "occlusion", "tracking")),
-    "viewpoint-map": (
+    "label": Stage(
+        "label",
+        "Render and localize every viewpoint, measure the pose error. Resumes.",
+        ("engine", "label.ray_address", "label.workers", "label.shard_size", "label.store_matches",
+         "label.localizer.max_ratio", "label.localizer.max_error_px", "label.localizer.min_inliers",
+         "tracking.folder"),
+        ("label", "tracking"),
+        "--config configs/paper.yaml --engine ray",
+    ),
+    "train": Stage(
+        "train",
+        "Learn from the labels, one weights file for each method.",
+        ("train.methods", "train.also", "train.val_fraction", "train.seed", "train.accelerator", "train.devices",
+         "train.mlp.epochs", "train.mlp.batch_size", "train.mlp.balance", "train.set.epochs",
+         "tracking.folder"),
+        ("train", "tracking"),
+        "--config configs/demo.yaml --train.methods '[mlp-2d+z, set]'",
+    ),
+    "evaluate": Stage(
+        "evaluate",
+        "Score all methods on the test scenes.",
+        ("evaluate.methods", "evaluate.weights", "evaluate.split", "evaluate.top_n", "evaluate.thresholds",
+         "evaluate.occlusions", "evaluate.candidates", "evaluate.heading", "evaluate.reference", "evaluate.seed",
+         "tracking.folder"),
+        ("evaluate", "occlusion", "tracking"),
+        "--config configs/demo.yaml --evaluate.methods '[random, visible, set]'",
+        notes="What evaluate.methods may name: wheretolook evaluate --list-methods",
+    ),
+    "viewpoint-map": Stage(
         "viewpoint_map",
         "Score every direction at every free voxel of a scene, for planners to look up. Needs no labels.",
-        ("viewpoint_map", "occlusion", "scenes.free_space", "scenes.mapped_space", "map.photographs.assume_metric"),
+        ("scene", "method", "weights", "out", "viewpoint_map.grid", "viewpoint_map.directions",
+         "viewpoint_map.lattice", *_OF_MAPS),
+        ("viewpoint_map", *_SPACE),
+        """--config configs/demo.yaml --scene apartment-000 \\
+      --weights data/release/weights/mlp-2d+z.safetensors --out apartment.map""",
+        {f"--{name}": f"--viewpoint_map.{name}" for name in ("scene", "method", "weights", "out")},
+        notes="""\
+Reads a scene's map and its mesh, as the scenes and map stages leave them; a scene of photographs has no mesh, and is
+free where scenes.mapped_space says. Without weights or a method, the best weights of the dataset, or else those that
+ship, score the views. The folder holds plain arrays and LAYOUT.txt, which says how to read them; in Python:
+
+  from wheretolook.planning import ViewpointMap
+  viewpoint_map = ViewpointMap.load("apartment.map", mmap=True)
+  choice = viewpoint_map.best((1.0, 2.0, 1.5))    # None where no camera can be, else axis, score, n_visible""",
     ),
-    "plan": (
+    "plan": Stage(
         "plan",
         "Plan a path on which the camera sees what it needs to know where it is; a table, a picture and a film of it.",
-        ("plan", "occlusion", "scenes.free_space", "scenes.mapped_space", "map.photographs.assume_metric", "tracking"),
+        ("scene", "start", "goal", "method", "weights", "out", "film", "plan.against", "plan.rerun",
+         "plan.planner.time_s", "plan.planner.score_weight", *_OF_MAPS),
+        ("plan", *_SPACE, "tracking"),
+        """--config configs/demo.yaml --scene apartment-000 --start '[-4, -3, 1.4]' --goal '[4, 3, 1.4]' \\
+      --plan.against '[forward]' --film mp4 --out way""",
+        {f"--{name}": f"--plan.{name}" for name in ("scene", "start", "goal", "method", "weights", "out", "film")},
+        notes="""\
+Reads a scene's map and its mesh, if it has one, as the scenes and map stages leave them.
+Without a mesh to keep clear of, by what depth images saw: --occlusion.model tsdf""",
     ),
-    "compare-paths": (
+    "compare-paths": Stage(
         "compare_paths",
         "Plan paths between random places by several methods, render what the camera sees, localize it. Resumes.",
+        ("paths.scenes", "paths.pairs", "paths.methods", "paths.weights", "paths.seed", "paths.min_distance_m",
+         "paths.planner.time_s", "paths.planner.score_weight", "occlusion.model", "label.workers",
+         "tracking.folder"),
         ("paths", "occlusion", "scenes.free_space", "label", "tracking"),
+        "--config configs/demo.yaml --paths.methods '[forward, set]' --paths.pairs 5",
     ),
-    "release": (
+    "release": Stage(
         "release",
         "Make a compact copy, data/release; given that copy and weights trained on it, evaluate and write its card.",
+        ("release_name", "evaluate.methods", "evaluate.occlusions", "evaluate.candidates", "tracking.folder"),
         ("evaluate", "occlusion", "tracking"),
+        "--config configs/release.yaml",
     ),
-    "log-release": (
+    "log-release": Stage(
         "log_release",
         "Log what a release ships as MLflow runs, as if it had been made here; once.",
+        ("tracking.folder", "tracking.experiment"),
         ("tracking",),
+        "--tracking.folder elsewhere",
+        config="release",
+        notes="""\
+A release ships its tables, not an MLflow store. This logs them into one, in seconds: an evaluation with its nested
+runs, a train run for each weights record, the comparison of learners, planned paths and measured times. Done again, it
+adds only what is new; `make ui` does it first. Without --config it is configs/release.yaml.""",
     ),
-    "figures": (
+    "figures": Stage(
         "figures",
         "Draw every figure and table of the paper, and others, from logged runs.",
+        ("out", "only", "kinds", "tracking.folder"),
         ("figures", "tracking"),
+        "--only '[top_n, runtimes]' --kinds '[svg]'",
+        {f"--{name}": f"--figures.{name}" for name in ("out", "only", "kinds")},
+        config="release",
+        notes="""\
+`wheretolook figures --list` tells what there is, of the paper and beyond. Each file says which runs it was drawn from,
+and is attached to them as an artifact under figures/. Where a run is missing, the command that makes it is named and
+the others are drawn; if one of the paper's, or one of those named with --only, is missing, the exit code is 2.
+Without --config it is configs/release.yaml, whose runs are logged first. Tables are CSV, Markdown and TeX.""",
     ),
-}
-"""Sub-command: function in `wheretolook.stages`, what it does, groups of settings it reads."""
+    "demo": Stage(
+        "",
+        "Run all stages on the embedded default and draw the score figure.",
+        ("scenes.train", "scenes.test", "scenes.meshes", "map.n_images", "sample.max_locations",
+         "sample.max_directions", "label.workers", "train.methods", "train.mlp.epochs", "evaluate.methods",
+         "evaluate.weights", "tracking.folder"),
+        example="--name small --scenes.train 2",
+        config="demo",
+        notes="Without --config it is configs/demo.yaml.",
+    ),
+}  # fmt: skip
+"""The sub-commands, in the order of the line of stages."""
 
-DEMO = "Run all stages on the embedded default and draw the score figure."
+_SHORT = {"--engine": "--label.engine", "--images": "--map.photographs.images"}
+"""Flags of every stage that may be given without their group."""
+
+_COMMON = ("name", "data", "device")
 
 USAGE = """\
 wheretolook: where to point a camera so that it knows where it is
@@ -86,7 +204,8 @@ usage: wheretolook STAGE [--config FILE.yaml] [--GROUP.SETTING VALUE ...] [--deb
 stages, in order; each reads what the one before it left in <data>/<name>/
 {stages}
 
-  wheretolook STAGE --help         the settings a stage reads, with their defaults
+  wheretolook STAGE --help         the options that matter to a stage, with their defaults
+  wheretolook STAGE --help-all     every option it reads
   wheretolook demo                 is configs/demo.yaml unless --config names another
   wheretolook map --config configs/demo.yaml --map.n_images 120
   wheretolook map --name photos --images FOLDER       a scene known from photographs alone
@@ -132,8 +251,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _usage() -> str:
-    rows = [*((name, entry[1]) for name, entry in STAGES.items()), ("demo", DEMO)]
-    return USAGE.format(stages="\n".join(f"  {name:<15}{text}" for name, text in rows))
+    return USAGE.format(stages="\n".join(f"  {name:<15}{stage.text}" for name, stage in STAGES.items()))
 
 
 def _method_list() -> str:
@@ -146,8 +264,10 @@ def _method_list() -> str:
 
 
 def _run(command: str, arguments: list[str]) -> int:
-    if command not in (*STAGES, "demo"):
-        raise ConfigError("unknown stage", value=command, fix=f"Use one of {', '.join((*STAGES, 'demo'))}.")
+    if command not in STAGES:
+        near = nearest(command, STAGES)
+        fix = f"Did you mean {near}?" if near else f"Use one of {', '.join(STAGES)}."
+        raise ConfigError("unknown stage", value=command, fix=fix)
     if command == "evaluate" and "--list-methods" in arguments:
         print(_method_list())
         return 0
@@ -159,6 +279,8 @@ def _run(command: str, arguments: list[str]) -> int:
     experiment = parse_experiment(command, arguments)
     if experiment is None:
         return 0
+    if experiment.device != "auto":
+        _ = experiment.warp_device  # refused now if it is not there, not after hours of other work
     from wheretolook import stages
 
     if command == "demo":
@@ -167,8 +289,7 @@ def _run(command: str, arguments: list[str]) -> int:
         run_demo(experiment)
     else:
         start = time.monotonic()
-        name = STAGES[command][0]
-        getattr(stages, name)(experiment)
+        getattr(stages, STAGES[command].function)(experiment)
         print(f"done in {time.monotonic() - start:.0f} s: {experiment.root}")
     return 0
 
@@ -179,25 +300,59 @@ def parse_experiment(command: str, arguments: list[str]) -> Experiment | None:
     Raises:
         ConfigError: a file is missing, or a key or value does not fit.
     """
-    from wheretolook.config import Experiment
+    from wheretolook.config import MOVED, Experiment
 
-    short = {**_SHORT, **_SHORT_OF.get(command, {})}
-    arguments = [short.get(name, name) + equals + value for name, equals, value in
-                 (argument.partition("=") for argument in arguments)]  # fmt: skip
-    chosen = any(argument.startswith("--config") for argument in arguments)
-    if command in _DEFAULT_CONFIG and not chosen and not {"-h", "--help"} & {*arguments}:
-        arguments = ["--config", str(_default_config(command)), *arguments]
-    parser = _parser(command)
-    if "-h" in arguments or "--help" in arguments:
-        print(_help(parser, command))
+    options, short = all_options(Experiment), {**_SHORT, **STAGES[command].short}
+    given = [argument.partition("=") for argument in arguments]
+    arguments = [short.get(name, name) + equals + value for name, equals, value in given]
+    if {"-h", "--help", "--help-all"} & {*arguments}:
+        print(_help(command, options, everything="--help-all" in arguments))
         return None
-    from jsonargparse import ArgumentError
-
+    names = [argument.partition("=")[0] for argument in arguments if argument.startswith("--")]
+    names = [name.removeprefix("--").removesuffix("+") for name in names]
+    known = {**options, **{name: Option(name, "") for name in ("config", "print_config", "help-all", "debug")}}
+    known |= {flag.removeprefix("--"): Option(flag, "") for flag in short}
+    check_names(names, known, MOVED, "--")
+    if "config" not in names and STAGES[command].config:
+        arguments = ["--config", str(_default_config(command)), *arguments]
     files = [value for flag, value in pairwise(arguments) if flag == "--config"]
     files += [argument.removeprefix("--config=") for argument in arguments if argument.startswith("--config=")]
-    file = ", ".join(files) or None
     for name in files:
-        _check_groups(Path(name))
+        _check_file(Path(name), options)
+    return _parsed(command, arguments, ", ".join(files) or None)
+
+
+def _check_file(path: Path, options: Mapping[str, Option]) -> None:
+    """Raise ConfigError, with the file's path, unless it can be read and every key in it is an option's."""
+    import yaml
+
+    from wheretolook.config import MOVED
+
+    try:
+        content = yaml.safe_load(path.read_text()) or {}
+    except FileNotFoundError as error:
+        there = sorted(map(str, Path("configs").glob("*.yaml")))
+        near = nearest(str(path), there)
+        fix = f"Did you mean {near}?" if near else f"Here are {', '.join(there)}." if there else _RUN_THERE
+        raise ConfigError("there is no such file", path=path, fix=fix) from error
+    except (UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ConfigError(f"this is no YAML: {' '.join(str(error).split())}", path=path) from error
+    try:
+        if not isinstance(content, dict):
+            raise ConfigError("a file of settings is a mapping", fix="Write such as `name: demo`.")
+        check_names(names_in(content, options), options, MOVED)
+    except ConfigError as error:
+        raise ConfigError(error.problem, path=path, value=error.value, fix=error.fix) from error
+
+
+def _parsed(command: str, arguments: list[str], file: str | None) -> Experiment:
+    from jsonargparse import ArgumentError, ArgumentParser
+
+    from wheretolook.config import Experiment
+
+    parser = ArgumentParser(prog=f"wheretolook {command}", exit_on_error=False, add_help=False, allow_abbrev=False)
+    parser.add_argument("--config", action="config")
+    parser.add_class_arguments(Experiment)
     try:
         settings = vars(parser.instantiate(parser.parse_args(arguments)))
         settings.pop("config")
@@ -206,124 +361,40 @@ def parse_experiment(command: str, arguments: list[str]) -> Experiment | None:
         for cause in _causes(error):
             if isinstance(cause, WhereToLookError):
                 fix = (
-                    cause.fix or f"Correct it there or on the command line; `wheretolook {command} --help` explains it."
+                    cause.fix
+                    or f"Correct it there or on the command line; `wheretolook {command} --help-all` explains it."
                 )
                 path = cause.path or file
                 raise type(cause)(cause.problem, path=path, value=cause.value, fix=fix) from error
         problem = " ".join(str(error).split())
         path = None if problem.startswith("unrecognized arguments") else file
-        raise ConfigError(problem, path=path, fix=f"`wheretolook {command} --help` lists the settings.") from error
+        raise ConfigError(problem, path=path, fix=f"`wheretolook {command} --help-all` lists the options.") from error
 
 
-def _check_groups(path: Path) -> None:
-    """A group of settings that is no mapping would be passed over in silence, and the defaults used."""
-    import yaml
-
-    from wheretolook.config import Experiment
-
-    try:
-        content = yaml.safe_load(path.read_text())
-    except (OSError, UnicodeDecodeError, yaml.YAMLError):
-        return  # the parser says what is wrong
-    for name, default in vars(Experiment()).items():
-        if is_dataclass(default) and isinstance(content, dict) and not isinstance(content.get(name, {}), dict):
-            fix = f"Write its settings as `{name}: {{setting: value}}`."
-            raise ConfigError(f"{name} is a group of settings", path=path, value=content[name], fix=fix)
-
-
-def _parser(command: str) -> ArgumentParser:
-    from jsonargparse import ArgumentParser
-
-    from wheretolook.config import Experiment
-
-    text = DEMO if command == "demo" else STAGES[command][1]
-    parser = ArgumentParser(
-        prog=f"wheretolook {command}",
-        usage=f"wheretolook {command} [--config FILE.yaml] [--GROUP.SETTING VALUE ...]",
-        description=text,
-        exit_on_error=False,
-    )
-    parser.add_argument("--config", action="config", help="YAML file of an experiment, such as configs/demo.yaml")
-    parser.add_class_arguments(Experiment)
-    return parser
-
-
-def _help(parser: ArgumentParser, command: str) -> str:
-    """The settings this stage reads; the file may hold those of every other stage too."""
-    groups = STAGES[command][2] if command in STAGES else ()
-
-    def belongs(dest: str) -> bool:
-        if not groups or ("." not in dest and dest not in _GROUPS):
-            return True
-        return any(dest == group or dest.startswith(f"{group}.") for group in (*groups, "camera"))
-
-    for group in parser._action_groups:
-        group._group_actions = [action for action in group._group_actions if belongs(action.dest)]
-    return str(parser.format_help()) + _MORE_HELP.get(command, "")
-
-
-_SHORT = {"--engine": "--label.engine", "--images": "--map.photographs.images"}
-"""Flags that may be given without their group."""
-
-_SHORT_OF = {
-    "viewpoint-map": {f"--{name}": f"--viewpoint_map.{name}" for name in ("scene", "method", "weights", "out")},
-    "figures": {f"--{name}": f"--figures.{name}" for name in ("out", "only", "kinds")},
-    "plan": {f"--{name}": f"--plan.{name}" for name in ("scene", "start", "goal", "method", "weights", "out", "film")},
-}
-"""The same, of one sub-command alone, since others have flags of such names in their own groups."""
-
-_DEFAULT_CONFIG = {"demo": "demo", "log-release": "release", "figures": "release"}
-"""Sub-commands that need no --config: names of files in configs/."""
-
-_MORE_HELP = {
-    "evaluate": "\nWhat evaluate.methods may name: wheretolook evaluate --list-methods\n",
-    "log-release": """
-A release ships its tables, not an MLflow store. This logs them into one, in seconds: an evaluation with a nested run
-for each method x N x occlusion x candidates, a train run for each weights record, the comparison of learners,
-planned paths and measured times. Done again, it adds only what is new; `make ui` does it first. Without --config it is
-configs/release.yaml.
-
-  wheretolook log-release                               into mlruns/
-  wheretolook log-release --tracking.folder elsewhere
-""",
-    "figures": """
-Each file says which runs it was drawn from, and is attached to them as an artifact under figures/. Where a run is
-missing, the command that makes it is named and the others are drawn; if one of the paper's, or one of those named with
---only, is missing, the exit code is 2. --out, --only and --kinds stand for the settings of figures. Without --config it
-is configs/release.yaml, whose runs are logged first.
-
-  wheretolook figures --list                            what there is, of the paper and beyond
-  wheretolook figures --out figures                     everything, as PNG and PDF, tables as CSV, Markdown and TeX
-  wheretolook figures --only '[top_n, runtimes]' --kinds '[svg]'
-  wheretolook figures --config configs/demo.yaml        from the runs of the demo
-""",
-    "viewpoint-map": """
-Reads a scene's map and its mesh, as the scenes and map stages leave them; a scene of photographs has no mesh, and is
-free where scenes.mapped_space says. --scene, --method, --weights and --out stand for the settings of viewpoint_map.
-Without weights or a method, the best weights of the dataset, or else those that ship, score the views. For example,
-with the paper's network:
-
-  wheretolook viewpoint-map --config configs/demo.yaml --scene apartment-000 \\
-      --weights data/release/weights/mlp-2d+z.safetensors --out apartment.map
-
-The folder holds plain arrays and LAYOUT.txt, which says how C++ or any language reads them. In Python:
-
-  from wheretolook.planning import ViewpointMap
-  viewpoint_map = ViewpointMap.load("apartment.map", mmap=True)
-  choice = viewpoint_map.best((1.0, 2.0, 1.5))    # None where no camera can be, else axis, score, n_visible
-""",
-    "plan": """
-Reads a scene's map and its mesh, if it has one, as the scenes and map stages leave them. --scene, --start, --goal,
---method, --weights, --out and --film stand for the settings of plan. For example, beside the shortest path:
-
-  wheretolook plan --config configs/demo.yaml --scene apartment-000 --start '[-4, -3, 1.4]' --goal '[4, 3, 1.4]' \\
-      --plan.against '[forward]' --film mp4 --out way
-
-Without a mesh to keep clear of, by what depth images saw: --occlusion.model tsdf
-""",
-}
-
-_GROUPS = {group.partition(".")[0] for _, _, groups in STAGES.values() for group in groups}
+def _help(command: str, options: Mapping[str, Option], everything: bool) -> str:
+    """The options that matter to a stage, or all that it reads; a file may hold those of every other stage too."""
+    stage = STAGES[command]
+    parts = [f"usage: wheretolook {command} [--config FILE.yaml] [--GROUP.OPTION VALUE ...]", stage.text]
+    if everything:
+        roots = {group.partition(".")[0] for other in STAGES.values() for group in other.groups}
+        read = [
+            option
+            for name, option in options.items()
+            if not stage.groups
+            or name.partition(".")[0] not in roots
+            or any(f"{name}.".startswith(f"{group}.") for group in stage.groups)
+        ]
+        parts.append(grouped(read))
+    else:
+        lines = [one_line(Option("config", "YAML file of an experiment, such as configs/demo.yaml"))]
+        for name in (*_COMMON, *stage.matter):
+            long = {**_SHORT, **stage.short}.get(f"--{name}", name).removeprefix("--")
+            lines.append(one_line(options[long], f"--{name}"))
+        more = sum(not (option.is_group or option.is_fixed) for option in options.values())
+        parts.append("\n".join(lines))
+        parts.append(f"wheretolook {command} --help-all explains every option it reads, of {more} in all.")
+    parts.append(f"Example:\n  wheretolook {command} {stage.example}")
+    return "\n\n".join([*parts, *([stage.notes] if stage.notes else [])])
 
 
 def _causes(error: BaseException) -> Iterator[BaseException]:
@@ -333,12 +404,13 @@ def _causes(error: BaseException) -> Iterator[BaseException]:
         cause = cause.__cause__ or cause.__context__
 
 
+_RUN_THERE = "Run in the project's folder, or give the path of a YAML file with --config."
+
+
 def _default_config(command: str) -> Path:
-    path = Path(f"configs/{_DEFAULT_CONFIG[command]}.yaml")
+    path = Path(f"configs/{STAGES[command].config}.yaml")
     if not path.is_file():
-        raise ConfigError(
-            "the default configuration is not here", path=path, fix="Run in the project's folder, or give --config."
-        )
+        raise ConfigError("the default configuration is not here", path=path, fix=_RUN_THERE)
     return path
 
 

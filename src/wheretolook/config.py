@@ -13,15 +13,24 @@ from wheretolook.figures.config import FiguresConfig
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.labelling.config import LabelConfig
 from wheretolook.mapping.config import MapConfig
+from wheretolook.methods.train_config import MOVED as MOVED_TRAIN_OPTIONS
 from wheretolook.methods.train_config import TrainConfig
 from wheretolook.planning.config import PathsConfig, PlanConfig, ViewpointMapConfig
-from wheretolook.scenes.procedural.generator import ApartmentConfig
-from wheretolook.space.free_space import FreeSpaceConfig
-from wheretolook.space.mapped_space import MappedSpaceConfig
+from wheretolook.scenes.config import ApartmentConfig
+from wheretolook.space.config import FreeSpaceConfig, MappedSpaceConfig
+from wheretolook.utils.devices import check_device_name, usable_device
 from wheretolook.utils.errors import ConfigError
-from wheretolook.utils.tracking import TrackingConfig
-from wheretolook.viewpoints.sampling import SampleConfig
+from wheretolook.utils.tracking_config import TrackingConfig
+from wheretolook.viewpoints.config import SampleConfig
 from wheretolook.visibility.config import OcclusionConfig
+
+
+def _check_folder_name(whose: str, name: str, taken: tuple[str, ...] = ()) -> None:
+    if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9._-]*", name) or name in taken:
+        fix = "Give it a name of letters, digits, '.', '_' and '-'" + (
+            f", but not {', '.join(taken)}." if taken else "."
+        )
+        raise ConfigError(f"{whose} becomes a folder's", value=name, fix=fix)
 
 
 @dataclass(frozen=True)
@@ -41,13 +50,7 @@ class MeshSource:
     up: str = "z"
 
     def __post_init__(self) -> None:
-        name = self.scene_name
-        if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9._-]*", name) or name in ("weights", "results", "all"):
-            raise ConfigError(
-                "a scene's name becomes a folder's",
-                value=name,
-                fix="Give it a name of letters, digits, '.', '_' and '-'.",
-            )
+        _check_folder_name("a scene's name", self.scene_name, taken=("weights", "results", "all"))
 
     @property
     def scene_name(self) -> str:
@@ -63,9 +66,9 @@ class ScenesConfig:
         train: procedural apartments to learn from.
         val: procedural apartments for validation; with none, some locations of the training scenes are held out.
         test: procedural apartments to evaluate on.
-        seed: of the first apartment; each further one counts up.
+        seed: seed of the first apartment; each further one counts up.
         apartment: what an apartment is like.
-        meshes: scenes from meshes of one's own, beside the apartments.
+        meshes: scenes from meshes of one's own, beside the apartments, such as [{path: scans/office.glb}].
         free_space: where a camera may be.
         mapped_space: where it may be in a scene of photographs, which has no mesh.
     """
@@ -93,10 +96,10 @@ class Experiment:
     """Settings of all stages. Each stage reads what it needs; results lie in `<data>/<name>/`.
 
     Args:
-        name: of the dataset's folder.
+        name: name of the dataset, and of its folder.
         data: folder of all datasets.
         release_name: folder of the dataset's release.
-        device: "cpu", "cuda", "cuda:<index>", or "auto" for the first GPU there is.
+        device: where to compute: auto, cpu, cuda, or cuda:<index>.
         camera: the camera that will look, and with which the map's images are rendered.
         scenes: stage 1, meshes.
         map: stage 2, COLMAP maps, of meshes or of photographs.
@@ -132,11 +135,8 @@ class Experiment:
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
 
     def __post_init__(self) -> None:
-        if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9._-]*", self.release_name):
-            raise ConfigError(
-                "a release's name becomes a folder's", value=self.release_name,
-                fix="Give it a name of letters, digits, '.', '_' and '-'.",
-            )  # fmt: skip
+        check_device_name(self.device)
+        _check_folder_name("a release's name", self.release_name)
 
     @property
     def root(self) -> Path:
@@ -150,9 +150,15 @@ class Experiment:
 
     @property
     def warp_device(self) -> str:
-        """The device kernels run on, with "auto" resolved."""
-        if self.device != "auto":
-            return self.device
-        import torch
+        """The device kernels run on, with "auto" resolved.
 
-        return "cuda" if torch.cuda.is_available() else "cpu"
+        Raises:
+            ConfigError: there is no such device here. Of a Ray cluster only its machines know which they have.
+        """
+        if self.label.engine == "ray" and self.device != "auto":
+            return self.device
+        return usable_device(self.device)
+
+
+MOVED: dict[str, str] = {**MOVED_TRAIN_OPTIONS}
+"""Options there were, and where they have gone: the name of another option, or a sentence."""

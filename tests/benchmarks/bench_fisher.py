@@ -29,7 +29,7 @@ from wheretolook.fisher.soft_visibility import (
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import VoxelGrid, fibonacci_sphere
 from wheretolook.geometry.poses import Float, poses_looking_along
-from wheretolook.visibility.frustum import VisibleSets
+from wheretolook.visibility.frustum import LandmarkSets
 
 ROOM_M = ((-5.0, -4.0, 0.0), (5.0, 4.0, 2.6))
 
@@ -74,7 +74,7 @@ def errors_over_samples(samples: tuple[int, ...] = (10, 15, 20, 30, 50, 70, 100,
     locations = np.random.default_rng(1).uniform((-4, -3, 0.6), (4, 3, 2.0), (20, 3))
     views = poses_looking_along(np.repeat(locations, len(axes), axis=0), np.tile(axes, (len(locations), 1)))
     rows = np.repeat(np.arange(len(locations)), len(axes))
-    everything = VisibleSets.from_mask(np.ones((len(locations), len(points)), bool))
+    everything = LandmarkSets.from_mask(np.ones((len(locations), len(points)), bool))
     exact = exact_information(camera, views, points, everything, rows)
     truth = information_matrices(exact)
     best = {metric: metric_of(exact, metric).reshape(len(locations), -1) for metric in METRICS}
@@ -141,11 +141,11 @@ def main() -> None:
         ("none hidden", np.ones((len(locations), len(points)), bool)),
         ("half hidden", rng.random((len(locations), len(points))) < 0.5),
     ):
-        sets = VisibleSets.from_mask(mask)
+        sets = LandmarkSets.from_mask(mask)
         few = max(1, repeats // 2)
         timed(f"  sums, {label}", lambda s=sets: exact_information(camera, views, points, s, rows, device), few)
 
-        def all_rows(s: VisibleSets = sets) -> None:
+        def all_rows(s: LandmarkSets = sets) -> None:
             numbers = exact_information(camera, views, points, s, rows, device)
             for metric in METRICS:
                 metric_of(numbers, metric, None, device)

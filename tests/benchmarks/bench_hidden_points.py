@@ -18,19 +18,20 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from wheretolook.figures.hidden_points import hidden_points_figure
-from wheretolook.figures.style import save_figure
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.rendering.raycasting import MeshRaycaster
+from wheretolook.scenes.config import ApartmentConfig
 from wheretolook.scenes.loading import load_mesh
-from wheretolook.scenes.procedural.generator import ApartmentConfig, generate_apartment
+from wheretolook.scenes.procedural.generator import generate_apartment
 from wheretolook.space.free_space import FreeSpace
-from wheretolook.utils.tracking import TrackingConfig, log, start_run
+from wheretolook.utils.tracking import log, start_run
+from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.sampling import free_locations
 from wheretolook.visibility.agreement import MaskAgreement
-from wheretolook.visibility.hidden_points import DEFAULT_RADIUS, HiddenPointRemoval
+from wheretolook.visibility.config import DEFAULT_RADIUS
+from wheretolook.visibility.hidden_points import HiddenPointRemoval
 from wheretolook.visibility.occlusion import MeshOcclusion
 
 RADII = (1, 2, 5, 10, 15, 20, 30, 40, 50, 70, 100, 150, 200, 300, 500, 1000)
@@ -81,7 +82,7 @@ def report_choice(curves: pd.DataFrame) -> None:
               f"its own best {f1[scene].idxmax():6g}: {f1[scene].max():.3f}")  # fmt: skip
 
 
-def log_curves(curves: pd.DataFrame, margin_m: float, figure: Path | None) -> None:
+def log_curves(curves: pd.DataFrame, margin_m: float) -> None:
     """One run: the curve of each scene as metrics, the radius in thousandths as their step."""
     params = {"margin_m": margin_m, "scenes": ", ".join(curves["scene"].unique()), "default_radius": DEFAULT_RADIUS}
     with start_run(TrackingConfig(), "hidden points", "benchmark", params) as (client, run_id):
@@ -89,8 +90,6 @@ def log_curves(curves: pd.DataFrame, margin_m: float, figure: Path | None) -> No
             metrics = {f"{name}/{row.scene}": getattr(row, name) for name in ("precision", "recall", "f1")}
             log(client, run_id, metrics=metrics, step=round(1000 * row.radius))
         client.log_table(run_id, curves, "hidden_points.json")
-        if figure is not None:
-            client.log_artifact(run_id, str(figure))
 
 
 def main() -> None:
@@ -102,7 +101,6 @@ def main() -> None:
     parser.add_argument("--locations", type=int, default=30, help="free locations of each scene, at random")
     parser.add_argument("--landmarks", type=int, default=15_000, help="landmarks of a generated scene")
     parser.add_argument("--device", default="cpu", help="Warp's device")
-    parser.add_argument("--figure", type=Path, help="PNG to write")
     parser.add_argument("--log", action="store_true", help="log the curves to MLflow, in mlruns/")
     args = parser.parse_args()
 
@@ -134,10 +132,8 @@ def main() -> None:
                   f"one thread, {every:.0f} ms with {threads}")  # fmt: skip
     curves = pd.DataFrame(rows)
     report_choice(curves)
-    if args.figure is not None:
-        save_figure(hidden_points_figure(curves, DEFAULT_RADIUS), args.figure)
     if args.log:
-        log_curves(curves, args.margin, args.figure)
+        log_curves(curves, args.margin)
 
 
 if __name__ == "__main__":

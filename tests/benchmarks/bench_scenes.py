@@ -34,9 +34,7 @@ class Scene:
 def argument_parser(doc: str, views: int) -> argparse.ArgumentParser:
     """A parser with the options that every benchmark of labelling has, explained by the benchmark's docstring."""
     parser = argparse.ArgumentParser(
-        description=doc.splitlines()[0],
-        epilog=doc.partition("\n\n")[2],
-        formatter_class=argparse.RawTextHelpFormatter,
+        description=doc.splitlines()[0], epilog=doc.partition("\n\n")[2], formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument(
         "--scene", type=Path, help="folder with a mesh.glb, or a mesh file (z up); default: generate an apartment"
@@ -54,7 +52,8 @@ def argument_parser(doc: str, views: int) -> argparse.ArgumentParser:
 def open_scene(source: Path | None, folder: Path, seed: int, device: str) -> Scene:
     """Read the scene, or generate an apartment into `folder`."""
     if source is None:
-        from wheretolook.scenes.procedural.generator import ApartmentConfig, generate_apartment
+        from wheretolook.scenes.config import ApartmentConfig
+        from wheretolook.scenes.procedural.generator import generate_apartment
 
         source = folder / "mesh.glb"
         save_glb(generate_apartment(ApartmentConfig(), seed, device=device), source)

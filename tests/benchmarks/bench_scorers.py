@@ -64,7 +64,7 @@ def main() -> None:
     localization_map = room_map(args.landmarks, locations, args.device)
     axes = fibonacci_sphere(args.directions)
     views = poses_looking_along(np.repeat(locations, len(axes), axis=0), np.tile(axes, (len(locations), 1)))
-    seen = np.diff(localization_map.visible_landmarks(views[:: max(1, len(views) // 1000)]).starts)
+    seen = np.diff(localization_map.landmarks_in_view(views[:: max(1, len(views) // 1000)]).starts)
     cores = torch.get_num_threads()
     print(f"{len(views):,} views of {args.landmarks:,} landmarks, {np.median(seen):.0f} in view (up to {seen.max()})")
     print(f"on {args.device}, {cores} threads")

@@ -35,7 +35,8 @@ from wheretolook.learning.fit import EpochRecord, RunLog, fit, home_device
 from wheretolook.methods.mlp.config import MlpConfig
 from wheretolook.methods.mlp.network import NetworkSpec, ViewpointNetwork
 from wheretolook.methods.train_config import TrainConfig
-from wheretolook.utils.tracking import TrackingConfig, start_run
+from wheretolook.utils.tracking import start_run
+from wheretolook.utils.tracking_config import TrackingConfig
 
 CAMERA = PinholeCamera()
 BLOCK = 4096

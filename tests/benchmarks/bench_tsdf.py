@@ -23,8 +23,9 @@ from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.rendering.types import camera_rays
+from wheretolook.scenes.config import ApartmentConfig
 from wheretolook.scenes.loading import load_mesh
-from wheretolook.scenes.procedural.generator import ApartmentConfig, generate_apartment
+from wheretolook.scenes.procedural.generator import generate_apartment
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.visibility.agreement import MaskAgreement
 from wheretolook.visibility.occlusion import MeshOcclusion

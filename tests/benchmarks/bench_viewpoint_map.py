@@ -31,7 +31,8 @@ from wheretolook.planning.refine import refine_directions
 from wheretolook.planning.sequences import TurnLimit, best_sequence, greedy_sequence
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.rendering.raycasting import MeshRaycaster
-from wheretolook.scenes.procedural.generator import ApartmentConfig, generate_apartment
+from wheretolook.scenes.config import ApartmentConfig
+from wheretolook.scenes.procedural.generator import generate_apartment
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.visibility.occlusion import MeshOcclusion
 

@@ -165,7 +165,8 @@ def machine(device: str) -> dict[str, Any]:
 
 
 def paper_size(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
-    from wheretolook.scenes.procedural.generator import ApartmentConfig, generate_apartment
+    from wheretolook.scenes.config import ApartmentConfig
+    from wheretolook.scenes.procedural.generator import generate_apartment
 
     rng = np.random.default_rng(0)
     base = load_mesh(args.scene) if args.scene else generate_apartment(ApartmentConfig(), 0, device=device)
@@ -262,7 +263,8 @@ BASE = {"landmarks": 24_919, "locations": 64, "directions": 500}
 
 
 def scaling(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
-    from wheretolook.scenes.procedural.generator import ApartmentConfig, generate_apartment
+    from wheretolook.scenes.config import ApartmentConfig
+    from wheretolook.scenes.procedural.generator import generate_apartment
 
     rng = np.random.default_rng(0)
     base = load_mesh(args.scene) if args.scene else generate_apartment(ApartmentConfig(), 0, device=device)
@@ -294,7 +296,8 @@ def scaling(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
 
 def bounded(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
     """2 million landmarks x 5,000 locations within the memory allowed."""
-    from wheretolook.scenes.procedural.generator import ApartmentConfig, generate_apartment
+    from wheretolook.scenes.config import ApartmentConfig
+    from wheretolook.scenes.procedural.generator import generate_apartment
 
     rng = np.random.default_rng(0)
     mesh = untextured(*with_triangles(generate_apartment(ApartmentConfig(), 0, device=device), args.triangles))
@@ -324,7 +327,7 @@ def draw(args: argparse.Namespace) -> None:
     from wheretolook.figures.runtimes import runtime_figure, scaling_figure
     from wheretolook.figures.style import save_figure
     from wheretolook.release.benchmark_runs import RUNTIMES_CSV, SCALING_CSV, log_runtimes
-    from wheretolook.utils.tracking import TrackingConfig
+    from wheretolook.utils.tracking_config import TrackingConfig
 
     sizes, growth = (
         pd.DataFrame([row for file in args.draw for row in rows_of(Path(file), part)])
@@ -357,12 +360,7 @@ def main() -> None:
     parser.add_argument("--bounded", action="store_true", help="2 million landmarks x 5,000 locations, too")
     parser.add_argument("--memory-gb", type=float, default=2.0, help="bound on the blocks in work")
     parser.add_argument("--out", help="write the results to this JSON file")
-    parser.add_argument(
-        "--draw",
-        nargs="+",
-        metavar="JSON",
-        help="draw earlier results, or a table of such",
-    )
+    parser.add_argument("--draw", nargs="+", metavar="JSON", help="draw earlier results, or a table of such")
     parser.add_argument("--figures", default=".", help="folder for figures and tables")
     parser.add_argument("--log", action="store_true", help="log tables and figures to MLflow")
     args = parser.parse_args()

@@ -42,7 +42,8 @@ from wheretolook.methods.set.config import SetConfig
 from wheretolook.methods.set.learn import SetData, learn_set
 from wheretolook.methods.train_config import TrainConfig
 from wheretolook.stages.train import train_methods as train
-from wheretolook.utils.tracking import TrackingConfig, start_run
+from wheretolook.utils.tracking import start_run
+from wheretolook.utils.tracking_config import TrackingConfig
 
 METHODS = ("mlp-2d+z", "mlp-2d+3d+landmark", "conv", "trees", "set", "sphere")
 

@@ -252,11 +252,7 @@ def test_with_shuffled_labels_every_method_is_as_good_as_chance() -> None:
     views = random_views(rng, 3000)
     informed = views.good[:, 0] + rng.normal(size=len(views.location))
     shuffled = TestViews(views.location, views.viewpoint_id, rng.permutation(views.good), views.location_scene)
-    scores = {
-        "random": rng.random(len(informed)),
-        "bins": informed,
-        "mlp-2d": rng.random(len(informed)),
-    }
+    scores = {"random": rng.random(len(informed)), "bins": informed, "mlp-2d": rng.random(len(informed))}
     config = EvaluateConfig(thresholds=((0.05, 0.4), (5.0, 10.0)), resamples=1000, reference="random")
     table = pooled_rows(score_table(shuffled, scores, ["a", "b", "c"], config))
     for n in config.top_n:

@@ -73,10 +73,7 @@ def test_colmap_method_gives_the_keypoints_of_colmaps_own_feature_extraction(tmp
     options = pycolmap.FeatureExtractionOptions()
     options.sift.first_octave = 0
     pycolmap.extract_features(
-        str(tmp_path / "database.db"),
-        str(tmp_path / "images"),
-        extraction_options=options,
-        device=pycolmap.Device.cpu,
+        str(tmp_path / "database.db"), str(tmp_path / "images"), extraction_options=options, device=pycolmap.Device.cpu
     )
     with pycolmap.Database.open(str(tmp_path / "database.db")) as database:
         pixels = np.asarray(database.read_keypoints(1))[:, :2]
@@ -111,7 +108,7 @@ def test_first_octave_minus_one_adds_small_keypoints():
         assert fine.scales_px.min() < 0.75 * coarse.scales_px.min()
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", ["opencv", pytest.param("colmap", marks=pytest.mark.slow)])
 def test_same_image_same_keypoints_in_any_process(method):
     images = [textured_image(seed) for seed in range(5)]
     extractor = KeypointExtractor(ExtractorConfig(method=method))

@@ -22,7 +22,7 @@ def random_descriptors(n: int, seed: int = 0) -> Descriptors:
 
 
 def extreme_descriptors(n: int, seed: int = 0) -> Descriptors:
-    """Nothing but 0 and 255, so that sums are as large as they get; the first row is all 255, the second all 0."""
+    """Only values 0 and 255, so that sums are as large as possible; the first row is all 255, the second all 0."""
     values = 255 * np.random.default_rng(seed).integers(0, 2, (n, 128), dtype=np.uint8)
     values[:1], values[1:2] = 255, 0
     return values
@@ -35,7 +35,7 @@ def sift_like_descriptors(n: int, seed: int = 0) -> Descriptors:
 
 
 def views_of(landmarks: Descriptors, n: int, noise: float, seed: int = 1) -> Descriptors:
-    """Descriptors of keypoints that see landmarks chosen at random, some of them chosen twice."""
+    """Noisy descriptors of random landmarks, some of them chosen twice."""
     rng = np.random.default_rng(seed)
     seen = unit_descriptors(landmarks[rng.integers(0, len(landmarks), n)])
     return quantize_descriptors(unit_descriptors(np.abs(seen + rng.normal(size=seen.shape) * noise)))
@@ -72,7 +72,7 @@ def test_no_keypoint_and_one(device: str, make) -> None:  # type: ignore[no-unty
 
 @pytest.mark.parametrize("n", [1, 63, 64, 65, 127, 128, 129, 500])
 def test_blocks_leave_no_seam(device: str, n: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Blocks of 64, or of one where a product of more does not fit."""
+    """Blocks of 64 descriptors, or of one where the product of more does not fit."""
     for block in (64, 1):
         monkeypatch.setattr(matching, "_PRODUCT_BYTES", dict.fromkeys(("cpu", "cuda"), 4 * 320 * block))
         assert_nearest_two(device, sift_like_descriptors(n, seed=1), sift_like_descriptors(300))
@@ -146,11 +146,12 @@ def run_python(code: str, **environment: str) -> str:
     return run.stdout.decode().strip()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("instructions", ["AVX2", "AVX512_CORE"])
 def test_a_cpu_whose_byte_products_saturate_finds_the_same(instructions: str) -> None:
     """oneDNN is told to leave out this CPU's newer instructions."""
     code = (
-        "from labelling import test_matching as tests\n"
+        "from features import test_matching as tests\n"
         "for make in (tests.random_descriptors, tests.extreme_descriptors, tests.sift_like_descriptors):\n"
         "    for n, k in ((3, 1), (64, 17), (70, 5), (1000, 300)):\n"
         "        tests.assert_nearest_two('cpu', make(k, seed=1), make(n))\n"
@@ -160,10 +161,10 @@ def test_a_cpu_whose_byte_products_saturate_finds_the_same(instructions: str) ->
 
 
 def test_a_thread_keeps_to_the_cores_it_was_told() -> None:
-    """Of four cores, to which OpenMP would start three threads from each thread that multiplies."""
+    """With four cores, OpenMP would start three more threads for each thread that multiplies."""
     code = (
         "import os, threading, torch\n"
-        "from labelling.test_matching import DescriptorMatcher, random_descriptors\n"
+        "from features.test_matching import DescriptorMatcher, random_descriptors\n"
         "torch.set_num_threads(1)\n"
         "matcher = DescriptorMatcher(random_descriptors(5000))\n"
         "before = len(os.listdir('/proc/self/task'))\n"

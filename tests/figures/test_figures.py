@@ -10,7 +10,6 @@ import pytest
 from matplotlib.colors import to_rgb
 
 from wheretolook.figures.lattices import covering_radius_deg, fibonacci_figure, nearest_angles_deg
-from wheretolook.figures.sphere import viewpoint_sphere_figure
 from wheretolook.figures.style import save_figure
 from wheretolook.figures.training import training_figure
 from wheretolook.geometry.lattices import fibonacci_sphere, released_lattice
@@ -61,16 +60,6 @@ def test_training_figure_names_learners_as_other_figures_do() -> None:
         "train_bce", "val_bce", "train_average_precision", "val_average_precision")}).assign(epoch=[0, 1])  # fmt: skip
     labels = training_figure({"set": history}).axes[1].get_legend_handles_labels()[1]
     assert labels == ["set of landmarks: training", "set of landmarks: validation"]
-
-
-def test_sphere_figure_stars_the_best_direction(tmp_path: Path) -> None:
-    directions, best = fibonacci_sphere(100), 37
-    scores = {"bins": -np.abs(np.arange(100) - best).astype(float), "mlp-2d": np.arange(100.0)}
-    figure = viewpoint_sphere_figure(directions, scores, np.arange(100) < 20)
-    x, y = (float(values[0]) for values in figure.axes[0].lines[0].get_data())
-    np.testing.assert_allclose([np.cos(y) * np.cos(x), np.cos(y) * np.sin(x), np.sin(y)], directions[best], atol=1e-12)
-    assert len(figure.axes) == 2
-    _assert_draws(figure, tmp_path)
 
 
 def test_methods_look_different() -> None:

@@ -1,4 +1,4 @@
-"""Pictures from above show what is left of a scene, and points of the world land where the scene shows them."""
+"""Pictures from above show the cut scene, and world points project to where the picture shows them."""
 
 from __future__ import annotations
 

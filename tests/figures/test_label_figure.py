@@ -15,7 +15,7 @@ from synthetic_dataset import make_dataset
 from wheretolook.figures.labels import SHADES, label_figure
 from wheretolook.figures.style import save_figure
 from wheretolook.labelling.report import POSITIVE, LabelSummary, label_summary, threshold_sentence
-from wheretolook.viewpoints.table import Split
+from wheretolook.viewpoints.config import Split
 from wheretolook.viewpoints.thresholds import ALL, THRESHOLDS
 
 SPLITS: dict[int, tuple[Split, ...]] = {

@@ -11,7 +11,7 @@ from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.colmap_camera import ColmapCamera
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import poses_looking_along, rotation_looking_along, transform
-from wheretolook.visibility.frustum import VisibleSets
+from wheretolook.visibility.frustum import LandmarkSets
 
 
 def test_information_is_that_of_the_plain_twin(random_views: RandomViews, device: str) -> None:
@@ -29,7 +29,7 @@ def test_more_views_than_a_core_takes_at_a_time(device: str) -> None:
     points, rows = rng.uniform(-4, 4, (200, 3)), rng.integers(0, 7, 1000)
     locations, mask = rng.uniform(-2, 2, (7, 3)), rng.random((7, 200)) < 0.7
     poses = poses_looking_along(locations[rows], rng.normal(size=(1000, 3)))
-    arguments = PinholeCamera(), poses, points, VisibleSets.from_mask(mask), rows
+    arguments = PinholeCamera(), poses, points, LandmarkSets.from_mask(mask), rows
     np.testing.assert_allclose(exact_information(*arguments, device), exact_information_plain(*arguments), atol=1e-9)
 
 
@@ -45,7 +45,7 @@ def test_landmarks_on_the_very_border_are_decided_alike(device: str) -> None:
     rays = np.concatenate([(pixels - (320, 240)) / 320, np.ones((20_000, 1))], 1) * depth
     points = np.einsum("nji,nj->ni", rotations[rng.integers(0, 40, 20_000)], rays)
     poses = poses_looking_along(np.zeros((40, 3)), fibonacci_sphere(40))
-    sets = VisibleSets.from_mask(np.ones((1, len(points)), bool))
+    sets = LandmarkSets.from_mask(np.ones((1, len(points)), bool))
     arguments = camera, poses, points, sets, np.zeros(40, dtype=int)
     # the turn's share of the trace is twice the number of landmarks in view
     found, plain = exact_information(*arguments, device), exact_information_plain(*arguments)
@@ -58,7 +58,7 @@ def test_information_by_hand(device: str) -> None:
     camera = PinholeCamera(100, 100, 50.0)  # sees 45 degrees to every side
     points = np.array([[2, 0, 0], [2, 1.9, 0], [2, 2.1, 0], [-2, 0, 0], [np.nan, 0, 0], [0, 0, 0]])
     poses = poses_looking_along(np.zeros((3, 3)), [[1.0, 0, 0], [-1, 0, 0], [0, 0, 1]])
-    sets = VisibleSets.from_mask(np.array([[True] * 6, [True, False, True, True, True, True]]))
+    sets = LandmarkSets.from_mask(np.array([[True] * 6, [True, False, True, True, True, True]]))
     found = exact_information(camera, poses[[0, 0, 1, 2]], points, sets, np.array([0, 1, 0, 0]), device)
     near, wide = bearing_numbers(points[:2])
     np.testing.assert_allclose(found, [near + wide, near, bearing_numbers(points[3]), np.zeros(15)], atol=1e-12)
@@ -90,7 +90,7 @@ def test_a_pinhole_of_colmap_is_as_ours(random_views: RandomViews, device: str) 
 
 
 def test_no_views_and_no_landmarks(device: str) -> None:
-    camera, none = PinholeCamera(), VisibleSets.from_mask(np.ones((1, 0), bool))
+    camera, none = PinholeCamera(), LandmarkSets.from_mask(np.ones((1, 0), bool))
     assert exact_information(camera, np.empty((0, 3, 4)), np.ones((1, 3)), none, np.empty(0, int), device).shape == (
         0,
         15,

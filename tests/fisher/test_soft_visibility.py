@@ -34,8 +34,7 @@ def values(visibility: SoftVisibility, axes: Float, bearings: Float) -> Float:
 
 
 @pytest.mark.parametrize(
-    ("boundary", "coefficients"),
-    [(0.5, (0.70710678, 0.5, -0.20710678)), (0.8, (0.10710678, 0.5, 0.39289322))],
+    ("boundary", "coefficients"), [(0.5, (0.70710678, 0.5, -0.20710678)), (0.8, (0.10710678, 0.5, 0.39289322))]
 )
 def test_published_coefficients(boundary: float, coefficients: tuple[float, ...]) -> None:
     found = QuadraticVisibility(QUARTER, boundary, boundary).coefficients

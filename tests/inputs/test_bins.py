@@ -12,24 +12,19 @@ from synthetic_dataset import make_landmarks
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.colmap_camera import ColmapCamera
 from wheretolook.geometry.poses import transform
-from wheretolook.inputs.bins import (
-    arrange,
-    bin_views,
-    bin_views_plain,
-    count_bins,
-)
+from wheretolook.inputs.bins import arrange, bin_views, bin_views_plain, count_bins
 from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS, LANDMARK_CHANNELS, PAPER_VARIANTS
 from wheretolook.inputs.landmarks_in_view import ATTRIBUTES, LandmarkDescriber
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.utils.errors import ConfigError
-from wheretolook.visibility.frustum import VisibleSets, visible_landmarks
+from wheretolook.visibility.frustum import LandmarkSets, landmarks_in_view
 
 LOOKING_ALONG_Z = np.eye(3, 4)[None]
 
 
-def hand_counted(points: list[list[float]]) -> VisibleSets:
-    return VisibleSets.from_mask(np.ones((1, len(points)), dtype=bool))
+def hand_counted(points: list[list[float]]) -> LandmarkSets:
+    return LandmarkSets.from_mask(np.ones((1, len(points)), dtype=bool))
 
 
 @pytest.mark.parametrize("bin_function", [bin_views, bin_views_plain])
@@ -111,7 +106,7 @@ def test_channels_of_landmarks_are_means_of_their_attributes(random_views: Rando
     camera = ColmapCamera("RADIAL", 320, 240, (150.0, 165.0, 118.0, -0.15, 0.02)) if distorted else v.camera
     arguments = v.cam_from_world, v.points, v.visible, v.location_rows
     binned = bin_views(camera, *arguments, bins=1, landmarks=landmarks)
-    seen = visible_landmarks(camera, *arguments)
+    seen = landmarks_in_view(camera, *arguments)
     described = LandmarkDescriber(LocalizationMap(landmarks, camera)).describe(v.cam_from_world, seen)
     of_bins = [ATTRIBUTES.index(name) for name in LANDMARK_CHANNELS]
     for view in range(len(v.cam_from_world)):

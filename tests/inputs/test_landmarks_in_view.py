@@ -39,7 +39,7 @@ def localization_map(request: pytest.FixtureRequest, device: str) -> Localizatio
 def test_each_landmark_by_hand(localization_map: LocalizationMap) -> None:
     m, views = localization_map.landmarks, some_views()
     described = LandmarkDescriber(localization_map).describe(views)
-    visible = localization_map.visible_landmarks(views)
+    visible = localization_map.landmarks_in_view(views)
     assert len(described) == 50 and described.counts.tolist() == np.diff(visible.starts).tolist()
     assert described.counts.min() == 0 and described.counts.max() > 50
     np.testing.assert_array_equal(described.rows.cpu(), visible.indices)

@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-
-import cv2
 import numpy as np
 import pandas as pd
 import pytest
-import torch
 
 from labelling.rooms import CAMERA, PLAIN, POSTER, MappedRoom, facing, file_bytes, map_room
-from wheretolook.labelling import local_engine
 from wheretolook.labelling.localizer import Localizer
-from wheretolook.labelling.shard import LabelledShard, Shard, ShardWorker, label_rows
+from wheretolook.labelling.shard import label_rows
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import load_mesh
@@ -34,7 +29,7 @@ def views() -> pd.DataFrame:
 
 @pytest.fixture(scope="session")
 def expected(room: MappedRoom, views: pd.DataFrame, tmp_path_factory: pytest.TempPathFactory) -> bytes:
-    """The file of their labels that any engine must end with."""
+    """The file of their labels that every engine must produce."""
     localizer = Localizer(Landmarks.load(room.landmarks), CAMERA)
     labelled = label_rows(views, WarpRenderer(load_mesh(room.mesh)), localizer, CAMERA)
     assert labelled["status"].nunique() > 1
@@ -50,23 +45,5 @@ def matched(room: MappedRoom, views: pd.DataFrame) -> pd.DataFrame:
 
 @pytest.fixture(scope="session")
 def expected_matches(matched: pd.DataFrame, tmp_path_factory: pytest.TempPathFactory) -> bytes:
-    """The file that any engine must end with when it stores matches."""
+    """The file that every engine must produce when it stores matches."""
     return file_bytes(matched, tmp_path_factory.mktemp("matched"))
-
-
-@pytest.fixture
-def in_this_process(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Shards are labelled here one after the other: quicker, for what the workers have no part in."""
-    threads = torch.get_num_threads(), cv2.getNumThreads()
-
-    def run(
-        shards: Sequence[Shard], workers: int, tick: Callable[[int], None]
-    ) -> Iterator[tuple[Shard, LabelledShard]]:
-        worker = ShardWorker()
-        for shard in shards:
-            yield shard, worker.label(shard.job, shard.rows, tick)
-
-    monkeypatch.setattr(local_engine, "run_local", run)
-    yield
-    torch.set_num_threads(threads[0])
-    cv2.setNumThreads(threads[1])

@@ -1,4 +1,4 @@
-"""A room whose answers are known: a plain wall never localizes, a poster wall in the map always does. And what fails.
+"""A room with known labels (its plain wall never localizes, its poster wall always does), and faulty workers.
 
 Worker processes import this module to unpickle what the tests hand them.
 """
@@ -54,10 +54,8 @@ def map_room(folder: Path, texture_scale: float) -> MappedRoom:
     mesh = replace(mesh, textures=tuple(textures), corner_uvs=mesh.corner_uvs * np.float32(texture_scale))
     save_glb(mesh, folder / "mesh.glb")
     mesh = load_mesh(folder / "mesh.glb")
-    build_map(
-        mesh, WarpRenderer(mesh), BoxFreeSpace(), CAMERA, MapConfig(n_images=24), seed=0, out_dir=folder / "map",
-        raycaster=MeshRaycaster(mesh), workers=1, progress=False,
-    )  # fmt: skip
+    inputs = (mesh, WarpRenderer(mesh), BoxFreeSpace(), CAMERA, MapConfig(n_images=24))
+    build_map(*inputs, seed=0, out_dir=folder / "map", raycaster=MeshRaycaster(mesh), workers=1, progress=False)
     return MappedRoom(folder / "mesh.glb", folder / "map" / "landmarks.npz")
 
 
@@ -69,7 +67,7 @@ def viewpoints(locations: np.ndarray, directions: np.ndarray) -> pd.DataFrame:
 
 
 def facing(wall: int, n: int, distance_m: float, seed: int = 0) -> pd.DataFrame:
-    """Views square to a wall x = const, near enough to see nothing but it."""
+    """Views perpendicular to a wall x = const, so near that they see only this wall."""
     rng = np.random.default_rng(seed)
     locations = np.column_stack([np.zeros(n), rng.uniform(1.6, 2.4, n), rng.uniform(1.2, 1.4, n)])
     locations[:, 0] = ROOM_SIZE[0] - distance_m if wall == PLAIN else distance_m
@@ -78,9 +76,8 @@ def facing(wall: int, n: int, distance_m: float, seed: int = 0) -> pd.DataFrame:
 
 def label(table: pd.DataFrame, room: MappedRoom, shards: Path, **config: Any) -> bytes:
     """Bytes of the labelled table's file."""
-    labelled = label_viewpoints(
-        table, room.mesh, room.landmarks, CAMERA, shards, LabelConfig(**config), progress=False
-    )  # fmt: skip
+    options = LabelConfig(**config)
+    labelled = label_viewpoints(table, room.mesh, room.landmarks, CAMERA, shards, options, progress=False)
     return file_bytes(labelled, shards)
 
 
@@ -121,21 +118,21 @@ def wait_until(condition: Callable[[], bool], seconds: float = 120) -> None:
 
 
 class Deadly:
-    """Kills the worker that gets it."""
+    """Kills the worker that receives it."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         return signal.raise_signal, (signal.SIGKILL,)
 
 
 def half_a_message(pipe: Connection, number: int) -> None:
-    """In place of a worker: dies while it sends its labels."""
+    """Stands in for a worker: dies while it sends its labels."""
     pipe.recv()
     pipe._send((1000).to_bytes(4, "big") + b"the beginning")  # type: ignore[attr-defined]
     sys.exit(1)
 
 
 class BreaksRenderer(SceneJob):
-    """Wherever it arrives, the renderer fails."""
+    """Makes the renderer fail in the process that receives it."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _arrive, (self.mesh, self.landmarks, self.camera)

@@ -20,8 +20,12 @@ from wheretolook.labelling.labeller import MANIFEST, LabelTask, label_scenes
 from wheretolook.labelling.shard import Shard
 from wheretolook.utils.errors import ConfigError, SceneError
 
+SLOW = pytest.mark.slow
 
-@pytest.mark.parametrize(("workers", "shard_size"), [(1, 24), (2, 5), (4, 3)])
+
+@pytest.mark.parametrize(
+    ("workers", "shard_size"), [(2, 5), pytest.param(1, 24, marks=SLOW), pytest.param(4, 3, marks=SLOW)]
+)
 def test_workers_and_shards_do_not_change_the_table(
     room: MappedRoom, views: pd.DataFrame, expected: bytes, tmp_path: Path, workers: int, shard_size: int
 ) -> None:
@@ -30,18 +34,17 @@ def test_workers_and_shards_do_not_change_the_table(
 
 
 def test_a_run_that_was_left_goes_on_where_it_stopped(
-    room: MappedRoom, views: pd.DataFrame, expected: bytes, tmp_path: Path
+    room: MappedRoom, views: pd.DataFrame, expected: bytes, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
-    first, second = (
-        LabelTask(name, room.job, rows, tmp_path / name)
-        for name, rows in (("first", views[:4]), ("second", views))
-    )  # fmt: skip
+    first = LabelTask("first", room.job, views[:4], tmp_path / "first")
+    second = LabelTask("second", room.job, views, tmp_path / "second")
     run = label_scenes([first, second], LabelConfig(workers=2, shard_size=4), progress=False)
     assert next(run).task is first
     run.close()
     assert not multiprocessing.active_children()
     finished = times(first.shards) | times(second.shards)
 
+    request.getfixturevalue("in_this_process")
     again = label_scenes([first, second], LabelConfig(workers=1, shard_size=4), progress=False)
     scenes = {scene.task.name: scene for scene in again}
     assert list(scenes) == ["first", "second"]
@@ -61,15 +64,16 @@ def test_without_ray_the_extra_to_install_is_named(room: MappedRoom, monkeypatch
 
 @pytest.mark.parametrize("resources", [{"CPU": 8.0}, {"GPU": 1.0}])
 def test_what_no_machine_of_the_cluster_has_is_named(resources: dict[str, float]) -> None:
-    """Ray would wait for it for ever."""
+    """Without the check, Ray would wait forever."""
     missing = "GPU" if "CPU" in resources else "CPU"
     with pytest.raises(ConfigError, match=f"has no {missing}"):
         ray_engine._check_resources(resources, needs_gpu=True)
     ray_engine._check_resources({"CPU": 1.0}, needs_gpu=False)
 
 
+@pytest.mark.slow
 def test_an_address_without_a_cluster_is_refused_at_once(room: MappedRoom) -> None:
-    """Ray itself would try for many minutes."""
+    """Without the check, Ray would try for many minutes."""
     pytest.importorskip("ray")
     shard = Shard(room.job, Path("shard.parquet"), facing(POSTER, 1, 1.5))
     with socket.socket() as taken:  # but not listening
@@ -98,10 +102,11 @@ def cluster() -> Iterator[Any]:
             cluster.shutdown()
 
 
+@pytest.mark.slow
 def test_a_cluster_gives_the_same_table(
     cluster: Any, room: MappedRoom, views: pd.DataFrame, expected: bytes, tmp_path: Path
 ) -> None:
-    """It connects to the cluster's address by itself, and leaves it again, also when an error ends it."""
+    """The engine connects to the cluster and disconnects again, also after an error."""
     import ray
 
     config = {"engine": "ray", "ray_address": cluster.address, "shard_size": 3}
@@ -115,6 +120,7 @@ def test_a_cluster_gives_the_same_table(
     assert not ray.is_initialized()
 
 
+@pytest.mark.slow
 def test_a_machine_that_is_removed_loses_nothing(
     cluster: Any, room: MappedRoom, views: pd.DataFrame, expected: bytes, tmp_path: Path
 ) -> None:

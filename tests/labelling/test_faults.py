@@ -1,4 +1,4 @@
-"""A fault at each step of labelling ends in the same table, after a resumed run where need be, or in a typed error."""
+"""Faults at each step of labelling lead to the same table, possibly after resuming, or to a typed error."""
 
 from __future__ import annotations
 
@@ -38,6 +38,7 @@ from wheretolook.utils.errors import StorageError, TableError, WorkerError
 from wheretolook.viewpoints.table import read_table, write_table
 
 
+@pytest.mark.slow
 def test_killed_workers_are_replaced_and_repeat_their_shard_only(
     room: MappedRoom, views: pd.DataFrame, expected: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -74,6 +75,7 @@ def test_killed_workers_are_replaced_and_repeat_their_shard_only(
     assert not multiprocessing.active_children()
 
 
+@pytest.mark.slow
 def test_a_shard_that_kills_its_worker_every_time_is_given_up(
     room: MappedRoom, views: pd.DataFrame, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -110,7 +112,7 @@ def test_a_failing_renderer_is_named_with_the_mesh(room: MappedRoom, views: pd.D
 def test_a_full_disk_keeps_what_is_finished(
     room: MappedRoom, views: pd.DataFrame, expected: bytes, tmp_path: Path
 ) -> None:
-    """/dev/full takes the place of the file that is being written: first the manifest, then the third shard."""
+    """/dev/full replaces the file that is being written: first the manifest, then the third shard."""
     shards = tmp_path / "shards"
     shards.mkdir()
     (shards / f"{labeller.MANIFEST}.partial").symlink_to("/dev/full")
@@ -168,7 +170,7 @@ def test_a_shard_that_is_damaged_while_others_are_made_is_an_error(
     assert [path.name[:8] for path in times(tmp_path)] == ["00000002"]  # the next run makes the other anew
 
 
-@pytest.mark.parametrize("matches", [False, True])
+@pytest.mark.parametrize("matches", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_no_flipped_bit_of_a_table_goes_unnoticed(
     matches: bool, expected: bytes, expected_matches: bytes, tmp_path: Path
 ) -> None:
@@ -214,11 +216,18 @@ def test_shards_of_another_mesh_or_of_other_viewpoints_are_not_used(
     assert (read_table(tmp_path / "shards-labelled.parquet")["status"] == "too_few_matches").all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("n_finished", "matches"), [(0, False), (3, False), (3, True)])
 def test_killed_at_any_moment_it_resumes_to_the_same_table(
-    room: MappedRoom, views: pd.DataFrame, expected: bytes, expected_matches: bytes, tmp_path: Path, n_finished: int,
-    matches: bool, request: pytest.FixtureRequest,
-) -> None:  # fmt: skip
+    room: MappedRoom,
+    views: pd.DataFrame,
+    expected: bytes,
+    expected_matches: bytes,
+    tmp_path: Path,
+    n_finished: int,
+    matches: bool,
+    request: pytest.FixtureRequest,
+) -> None:
     write_table(views, tmp_path / "table.parquet")
     script = tmp_path / "run.py"
     script.write_text(
@@ -257,5 +266,5 @@ def with_flipped_bit(content: bytes, place: int, bit: int = 0) -> bytes:
 
 
 def inside_a_page(path: Path) -> int:
-    """Among the translations, which do not compress: but for the checksum, another number would be read."""
+    """The bit is in the translations, which are not compressed: only the checksum reveals the change."""
     return int(pq.ParquetFile(path).metadata.row_group(0).column(7).data_page_offset) - 4  # its dictionary's last value

@@ -21,6 +21,7 @@ from wheretolook.utils.errors import MapError, SceneError
 from wheretolook.viewpoints.table import is_good
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_a_plain_wall_never_localizes_and_a_poster_wall_always_does(room: MappedRoom, tmp_path: Path) -> None:
     for wall, expected in ((PLAIN, 0.0), (POSTER, 1.0)):
         table = facing(wall, 12, distance_m=1.1)
@@ -34,8 +35,9 @@ def test_a_plain_wall_never_localizes_and_a_poster_wall_always_does(room: Mapped
             assert (labelled["n_inliers"] >= 10).all() and labelled["error_m"].max() < 0.05
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_a_repeated_texture_localizes_at_the_wrong_copy_and_is_labelled_so(tmp_path: Path) -> None:
-    """On the 4 m long wall the texture comes again after 2.5 m: some poses are off by just that, with many inliers."""
+    """On the 4 m long wall the texture repeats after 2.5 m: some poses are wrong by 2.5 m, with many inliers."""
     room = map_room(tmp_path, texture_scale=1.0)
     arguments = room.mesh, room.landmarks, CAMERA, tmp_path / "shards", LabelConfig(workers=1)
     labelled = label_viewpoints(facing(POSTER, 12, distance_m=1.1), *arguments, progress=False)

@@ -65,7 +65,7 @@ def test_the_source_is_read_no_further_than_the_queues_are_long() -> None:
 
 
 class OwnError(BaseException):
-    """Not even an Exception."""
+    """A BaseException that is not an Exception."""
 
 
 @pytest.mark.parametrize("place", ["source", "first", "last"])

@@ -1,4 +1,4 @@
-"""Numbers of a dataset's labels, by hand on small tables, and what is logged of them."""
+"""Statistics of labels, compared with numbers computed by hand on small tables, and their logging."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.labelling.report import POSITIVE, label_markdown, label_summary, threshold_sentence
 from wheretolook.stages.label import log_labels
 from wheretolook.utils.errors import TableError
-from wheretolook.utils.tracking import TrackingConfig, artifact, newest_run
+from wheretolook.utils.tracking import artifact, newest_run
+from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import (
     LOCALIZED,
     NO_POSE,
@@ -31,7 +32,7 @@ NAN = float("nan")
 
 
 def table(rows: list[tuple[int, float, int, str, float, float]]) -> pd.DataFrame:
-    """Viewpoints of rows (location, its height, visible landmarks, status, errors in metres and degrees)."""
+    """Viewpoints of rows (location, its height, landmarks in view, status, errors in metres and degrees)."""
     names = ["location_id", "z", "n_visible", "status", "error_m", "error_deg"]
     frame = pd.DataFrame(rows, columns=names)
     centers = np.column_stack([np.full((len(rows), 2), 7.0), frame.pop("z")])
@@ -72,8 +73,8 @@ def test_shares_by_hand(summary) -> None:  # type: ignore[no-untyped-def]
     hall = shares.loc["hall", "train"]
     assert (hall["n_views"], hall["n_locations"]) == (8, 4)
     np.testing.assert_allclose(hall[list(POSITIVE)].astype(float), np.array([1, 2, 3, 4]) / 8)
-    np.testing.assert_allclose(hall[[LOCALIZED, TOO_FEW_MATCHES, NO_POSE, "without_pose"]].astype(float),
-                               np.array([5, 1, 2, 2]) / 8)  # fmt: skip
+    statuses = hall[[LOCALIZED, TOO_FEW_MATCHES, NO_POSE, "without_pose"]].astype(float)
+    np.testing.assert_allclose(statuses, np.array([5, 1, 2, 2]) / 8)
     assert hall["locations_positive"] == 1 / 4
     assert hall["finest_of_coarsest"] == 1 / 4
     assert hall["same_label_share"] == 5 / 8
@@ -134,9 +135,12 @@ def one_kind(good: int, finer: int, bad: int) -> pd.DataFrame:
 
 @pytest.mark.parametrize(
     ("good", "coarse", "verdict"),
-    [(19, 1, "The thresholds all but coincide:"), (16, 4, "The thresholds differ little:"),
-     (15, 5, "The thresholds differ:")],
-)  # fmt: skip
+    [
+        (19, 1, "The thresholds all but coincide:"),
+        (16, 4, "The thresholds differ little:"),
+        (15, 5, "The thresholds differ:"),
+    ],
+)
 def test_words_follow_from_the_numbers(good: int, coarse: int, verdict: str) -> None:
     summary = label_summary({"a": one_kind(good, coarse, bad=20)}, {"a": "train"})
     sentence = threshold_sentence(summary)
@@ -160,14 +164,13 @@ def test_labels_of_one_class_are_told_without_numbers_that_are_none() -> None:
 
 def test_markdown_has_a_row_for_every_scene_split_and_band(summary) -> None:  # type: ignore[no-untyped-def]
     lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in label_markdown(summary, "Hut").split("\n")]
-    assert ["hall", "train", "8", "4", "12.5", "25.0", "37.5", "50.0", "25.0", "62.5", "12.5", "25.0", "25.0", "62.5",
-            "0.38"] in lines  # fmt: skip
+    shares = ["12.5", "25.0", "37.5", "50.0", "25.0", "62.5", "12.5", "25.0", "25.0", "62.5", "0.38"]
+    assert ["hall", "train", "8", "4", *shares] in lines
     assert [line[:2] for line in lines if line[:1] == [ALL]] == [[ALL, "train"], [ALL, "test"], [ALL, ALL]]
     assert ["0–0.5", "5", "40.0", "60.0", "80.0", "80.0"] in lines
     assert ["1–1.5", "0", "–", "–", "–", "–"] in lines
-    assert [line[0] for line in lines if line and line[0] in ("0", "1–9", "1,000–2,999", "≥ 3,000")] == [
-        "0", "1–9", "1,000–2,999", "≥ 3,000",
-    ]  # fmt: skip
+    bands = ["0", "1–9", "1,000–2,999", "≥ 3,000"]
+    assert [line[0] for line in lines if line and line[0] in bands] == bands
     assert ["0.001–0.01", "30.0", "10.0"] in lines
 
 
@@ -181,9 +184,8 @@ def test_logged_numbers_are_those_of_the_tables(dataset: Dataset, tmp_path: Path
     summary = log_labels(dataset, tracking, {"render": 1.5, "label": 20.0})
     run = newest_run(tracking, "label", {"dataset": "hut"})
     assert run is not None
-    assert run.data.params == {
-        "dataset": "hut", "dataset_fingerprint": dataset.fingerprint(), "scenes": "scene-0 scene-1 scene-2",
-    }  # fmt: skip
+    params = {"dataset": "hut", "dataset_fingerprint": dataset.fingerprint()}
+    assert run.data.params == params | {"scenes": "scene-0 scene-1 scene-2"}
     metrics, shares = run.data.metrics, summary.shares
     assert (metrics["n_views"], metrics["train_n_views"], metrics["test_n_views"]) == (120, 80, 40)
     assert (metrics["seconds_render"], metrics["seconds_label"]) == (1.5, 20.0)

@@ -52,7 +52,7 @@ def test_rows_belong_to_the_labels_beside_them(room: MappedRoom, matched: pd.Dat
 def test_inliers_lie_where_the_true_pose_puts_them(
     room: MappedRoom, views: pd.DataFrame, matched: pd.DataFrame
 ) -> None:
-    """Within RANSAC's limit of the keypoint they were matched with; the other matches lie beyond it."""
+    """Inliers project within RANSAC's limit of their keypoint; the other matches project beyond it."""
     landmarks = Landmarks.load(room.landmarks)
     localizer = Localizer(landmarks, CAMERA)
     good = np.flatnonzero(is_good(matched))
@@ -82,17 +82,17 @@ def test_labels_are_the_same_with_and_without(
     assert file_bytes(matched.drop(columns=MATCH_FIELDS.names), tmp_path / "bare") == expected
 
 
-def test_matches_of_every_status_are_told(room: MappedRoom) -> None:
+def test_matches_of_every_status_are_told(room: MappedRoom, monkeypatch: pytest.MonkeyPatch) -> None:
     table = facing(POSTER, 1, 1.5)
     image = WarpRenderer(load_mesh(room.mesh)).render(CAMERA, poses(table)).rgb[0]
     landmarks = Landmarks.load(room.landmarks)
     many = 10_000
-    for config, status in (
-        (LocalizerConfig(), LOCALIZED),
-        (LocalizerConfig(min_inliers=many), NO_POSE),
-        (LocalizerConfig(min_matches=many), TOO_FEW_MATCHES),
-    ):
-        found = Localizer(landmarks, CAMERA, config).localize(image)
+    for name, status in (("", LOCALIZED), ("min_inliers", NO_POSE), ("min_matches", TOO_FEW_MATCHES)):
+        with monkeypatch.context() as changed:
+            config = LocalizerConfig(min_inliers=many if name == "min_inliers" else 10)
+            if name == "min_matches":
+                changed.setattr(LocalizerConfig, name, many)
+            found = Localizer(landmarks, CAMERA, config).localize(image)
         assert found.status == status and found.matched_rows.dtype == np.int64
         assert found.matched_rows.shape == (found.n_matches,) and found.n_matches > 50
         assert (len(found.inlier_rows) > 0) == (status != TOO_FEW_MATCHES)
@@ -107,6 +107,7 @@ def test_rows_of_earlier_labels_do_not_survive(room: MappedRoom, matched: pd.Dat
     assert file_bytes(again, tmp_path / "again") == file_bytes(matched[:2], tmp_path / "first")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("workers", "shard_size"), [(1, 24), (2, 5)])
 def test_workers_and_shards_do_not_change_the_rows(
     room: MappedRoom, views: pd.DataFrame, expected_matches: bytes, tmp_path: Path, workers: int, shard_size: int
@@ -117,7 +118,7 @@ def test_workers_and_shards_do_not_change_the_rows(
 
 @pytest.mark.usefixtures("in_this_process")
 def test_shards_with_and_without_matches_are_told_apart(room: MappedRoom, tmp_path: Path) -> None:
-    """Those without have the names and the manifest they had before matches could be stored."""
+    """Shards without matches have the names and the manifest of versions that could not store matches."""
     table, shards = pd.concat([facing(POSTER, 3, 1.5), facing(PLAIN, 1, 1.1)], ignore_index=True), tmp_path / "shards"
     settings = {
         "versions": versions(),
@@ -139,9 +140,8 @@ def test_shards_with_and_without_matches_are_told_apart(room: MappedRoom, tmp_pa
 
     label(table, room, shards, shard_size=4, store_matches=True)
     (stored,) = set(times(shards)) - {without}
-    assert json.loads((shards / MANIFEST).read_text()) == {
-        **settings, "store_matches": True, "n_viewpoints": 4, "shards": {stored.name: 4}
-    }  # fmt: skip
+    expected = {**settings, "store_matches": True, "n_viewpoints": 4, "shards": {stored.name: 4}}
+    assert json.loads((shards / MANIFEST).read_text()) == expected
     both = times(shards)
     assert before.items() <= both.items()
     label(table, room, shards, shard_size=4)

@@ -35,11 +35,7 @@ class WallMarker:
         return np.array(self.center) + across[:, :1] * self.right + across[:, 1:] * [[0.0, 0.0, -1.0]]
 
 
-MARKERS = (
-    WallMarker(3, (1.6, 3.99, 1.5)),
-    WallMarker(7, (2.6, 3.99, 1.0)),
-    WallMarker(11, (3.4, 3.99, 1.7)),
-)
+MARKERS = (WallMarker(3, (1.6, 3.99, 1.5)), WallMarker(7, (2.6, 3.99, 1.0)), WallMarker(11, (3.4, 3.99, 1.7)))
 """On the wall y = 4 m, seen from inside the room."""
 
 

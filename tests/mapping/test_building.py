@@ -16,9 +16,9 @@ from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.mapping import triangulation
 from wheretolook.mapping.building import build_map
 from wheretolook.mapping.cameras import load_mapping_poses
-from wheretolook.mapping.config import MapConfig
+from wheretolook.mapping.config import MapConfig, WalkConfig
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
-from wheretolook.mapping.walk import WalkConfig, plan_walk
+from wheretolook.mapping.walk import plan_walk
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.utils.errors import ConfigError, MapError
 from wheretolook.utils.processes import Processes
@@ -199,7 +199,7 @@ class FailingRenderer:
 
 
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
-@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_failed_build_leaves_nothing_and_keeps_the_earlier_map(
     room, room_free_space, renderer, tmp_path, error, workers
 ):
@@ -240,6 +240,6 @@ def test_scene_without_texture_gives_no_map(room, room_free_space, tmp_path):
 
 
 def test_bad_settings():
-    for settings in ({"n_images": 1}, {"partners": 0}, {"max_reprojection_error_px": 0.0}):
+    for settings in ({"n_images": 1}, {"max_reprojection_error_px": 0.0}):
         with pytest.raises(ConfigError):
             MapConfig(**settings)

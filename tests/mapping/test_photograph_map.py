@@ -27,9 +27,9 @@ from wheretolook.mapping.photograph_map import map_photographs
 from wheretolook.mapping.similarity import fit_similarity
 from wheretolook.methods.visible import VisibleScorer
 from wheretolook.planning.config import ViewpointMapConfig
-from wheretolook.space.mapped_space import MappedSpaceConfig
+from wheretolook.space.config import MappedSpaceConfig
 from wheretolook.utils.errors import ConfigError, MapError, SceneError
-from wheretolook.viewpoints.sampling import SampleConfig
+from wheretolook.viewpoints.config import SampleConfig
 from wheretolook.viewpoints.table import UNLABELLED, poses
 
 TRUTH = hand_held_poses()

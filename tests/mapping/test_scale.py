@@ -165,7 +165,6 @@ def test_one_source_of_scale() -> None:
         {"marker_size_m": 0.2, "distance": distance},
         {"positions": Path("positions.csv"), "distance": distance},
         {"marker_size_m": -1.0},
-        {"tolerance_percent": 0.0},
     ):
         with pytest.raises(ConfigError):
             ScaleConfig(**settings)  # type: ignore[arg-type]

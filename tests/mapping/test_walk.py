@@ -7,7 +7,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from wheretolook.mapping.walk import WalkConfig, plan_walk
+from wheretolook.mapping.config import WalkConfig
+from wheretolook.mapping.walk import plan_walk
 from wheretolook.utils.errors import ConfigError, SceneError
 
 SIZE = (8.0, 6.0, 2.6)
@@ -83,8 +84,9 @@ def test_walk_is_free_and_covers_what_was_asked(seed, coverage):
     assert walk.coverage - 0.03 <= near <= walk.coverage + 0.15
 
 
-def test_poses_are_spaced_evenly_along_the_walk_and_look_ahead():
-    walk = plan_walk(Room(door_m=1.2), BOUNDS, 120, WalkConfig(swing_deg=30, pitch_deg=-4, pitch_variation_deg=8), 3)
+def test_poses_are_spaced_evenly_along_the_walk_and_look_ahead(monkeypatch):
+    monkeypatch.setattr(WalkConfig, "pitch_variation_deg", 8.0)
+    walk = plan_walk(Room(door_m=1.2), BOUNDS, 120, WalkConfig(swing_deg=30, pitch_deg=-4), 3)
     assert walk.positions.shape == walk.directions.shape == (120, 3)
     np.testing.assert_allclose(np.linalg.norm(walk.directions, axis=1), 1, atol=1e-9)
     steps = np.linalg.norm(np.diff(walk.positions[:, :2], axis=0), axis=1)
@@ -113,10 +115,11 @@ def test_only_the_largest_reachable_part_is_walked():
     assert (walk.positions[:, 0] < 4).all() or (walk.positions[:, 0] > 4).all()
 
 
-def test_walk_climbs_to_another_storey():
+def test_walk_climbs_to_another_storey(monkeypatch):
+    monkeypatch.setattr(WalkConfig, "eye_height_variation_m", 0.1)
     scene = TwoStoreys()
     bounds = np.array([(0, 0, 0), (8, 6, 5.2)])
-    walk = plan_walk(scene, bounds, 300, WalkConfig(coverage=0.95, eye_height_variation_m=0.1), 1)
+    walk = plan_walk(scene, bounds, 300, WalkConfig(coverage=0.95), 1)
     assert scene.segments_are_free(walk.path[:-1], walk.path[1:]).all()
     floor = scene.floor_below(walk.positions)
     height = walk.positions[:, 2] - floor
@@ -133,16 +136,17 @@ def test_seed_decides():
     assert not np.allclose(a.positions, c.positions)
 
 
-def test_scenes_without_a_floor_and_bad_settings():
+def test_scenes_without_a_floor_and_bad_settings(monkeypatch):
     with pytest.raises(SceneError, match="no free floor"):
         plan_walk(Room(door_m=1.2, clearance_m=3.1), BOUNDS, 10)
     with pytest.raises(SceneError, match="no free floor"):
         plan_walk(Room(door_m=1.2), BOUNDS, 10, WalkConfig(eye_height_m=5.0))
-    with pytest.raises(SceneError, match="free step"):
-        plan_walk(Room(door_m=1.2), BOUNDS, 10, WalkConfig(cell_m=5.5))
     with pytest.raises(ConfigError):
         plan_walk(Room(door_m=1.2), BOUNDS, 1)
-    bad = ({"coverage": 0.0}, {"coverage": 1.1}, {"cell_m": 0.0}, {"pitch_deg": 85.0}, {"eye_height_variation_m": 2.0})
+    monkeypatch.setattr(WalkConfig, "cell_m", 5.5)
+    with pytest.raises(SceneError, match="free step"):
+        plan_walk(Room(door_m=1.2), BOUNDS, 10)
+    bad = ({"coverage": 0.0}, {"coverage": 1.1}, {"pitch_deg": 85.0}, {"eye_height_m": 0.1})
     for settings in bad:
         with pytest.raises(ConfigError):
             WalkConfig(**settings)

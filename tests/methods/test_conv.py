@@ -33,8 +33,11 @@ from wheretolook.methods.registry import load_scorer, make_scorer
 from wheretolook.stages.evaluate import evaluate_methods as evaluate
 from wheretolook.stages.train import train_methods as train
 from wheretolook.utils.errors import ConfigError, WeightsError
-from wheretolook.utils.tracking import TrackingConfig, client
+from wheretolook.utils.tracking import client
+from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import LOCALIZED, NO_POSE, UNLABELLED, poses, write_table
+
+pytestmark = pytest.mark.usefixtures("no_pictures")
 
 FEW = ConvConfig(epochs=2, batch_size=64, widths=(4, 8, 8), bins=12)
 

@@ -32,18 +32,15 @@ from wheretolook.methods.matchability.network import MatchabilityNetwork, bearin
 from wheretolook.methods.registry import load_scorer, make_scorer
 from wheretolook.methods.set.config import SetConfig
 from wheretolook.methods.set.learn import of_size
-from wheretolook.methods.set.network import (
-    EXPECTED,
-    SetNetwork,
-    expected_statistics,
-    information_matrices,
-)
+from wheretolook.methods.set.network import EXPECTED, SetNetwork, expected_statistics, information_matrices
 from wheretolook.methods.set.score import SetScorer
 from wheretolook.stages.evaluate import evaluate_methods as evaluate
 from wheretolook.stages.train import train_methods as train
 from wheretolook.utils.errors import ConfigError, TableError, WeightsError
-from wheretolook.utils.tracking import TrackingConfig
+from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import LOCALIZED, poses, read_table, write_table
+
+pytestmark = pytest.mark.usefixtures("no_pictures")
 
 DISTANCE = ATTRIBUTES.index("distance")
 NO_STATISTICS = AttributeStatistics((0.0,) * len(ATTRIBUTES), (1.0,) * len(ATTRIBUTES))
@@ -152,7 +149,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     for scene in made.scenes:
         table = read_table(scene.table)
         localization_map = scene.localization_map(CAMERA)
-        visible = localization_map.visible_landmarks(poses(table))
+        visible = localization_map.landmarks_in_view(poses(table))
         clear = localization_map.landmarks.ambiguity < 0.5
         found = [rows[clear[rows]].astype(np.int32) for rows in (visible[view] for view in range(len(table)))]
         strangers = np.array([len(clear) - 1], dtype=np.int32)  # matched, but perhaps not in view
@@ -256,7 +253,7 @@ def test_enlarged_views_are_those_of_an_enlarged_scene(dataset: Dataset) -> None
     landmarks = localization_map.landmarks
     twice = replace(landmarks, points=2 * landmarks.points, mapping_distance_m=2 * landmarks.mapping_distance_m)
     cam_from_world = poses(labelled_rows(scene))[:20]
-    visible = localization_map.visible_landmarks(cam_from_world)
+    visible = localization_map.landmarks_in_view(cam_from_world)
     here = LandmarkDescriber(localization_map).describe(cam_from_world, visible).values
     cam_from_world[:, :, 3] *= 2
     there = LandmarkDescriber(LocalizationMap(twice, dataset.camera)).describe(cam_from_world, visible).values

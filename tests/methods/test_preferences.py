@@ -68,7 +68,7 @@ def test_a_wall_that_repeats_its_texture_is_not_the_one_to_look_at(n: int, seed:
     landmarks = two_walls(n, seed)
     views = poses_looking_along([[0, 0, 1.3]] * 2, [[-1.0, 0, 0], [1.0, 0, 0]])
     localization_map = LocalizationMap(landmarks, CAMERA)
-    visible = localization_map.visible_landmarks(views)
+    visible = localization_map.landmarks_in_view(views)
     assert len(visible[0]) == len(visible[1]) == n
     assert np.median(landmarks.ambiguity[visible[1]]) > np.median(landmarks.ambiguity[visible[0]]) + 0.1
     odds = np.log(1 / scores_of(localization_map, views) - 1)
@@ -111,6 +111,6 @@ def test_of_a_wall_mapped_from_one_side_it_is_that_side_to_look_from(tmp_path: P
     assert (landmarks.mapping_direction[:, 1] > 0.5).all()
     where = np.array([[0, -2.0, 1.35], [0, 2.0, 1.35]])
     views = poses_looking_along(where, -where * (0, 1, 0))
-    assert np.diff(localization_map.visible_landmarks(views).starts).tolist() == [n, n]
+    assert np.diff(localization_map.landmarks_in_view(views).starts).tolist() == [n, n]
     scores = scores_of(localization_map, views)
     assert scores[0] > scores[1] + 0.2

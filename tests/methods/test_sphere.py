@@ -32,9 +32,12 @@ from wheretolook.methods.sphere.views import FEATURES, OFFSET_M, LocationDescrib
 from wheretolook.stages.evaluate import evaluate_methods as evaluate
 from wheretolook.stages.train import train_methods as train
 from wheretolook.utils.errors import ConfigError, MapError, WeightsError
-from wheretolook.utils.tracking import TrackingConfig, client
+from wheretolook.utils.tracking import client
+from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import is_good, poses, write_table
 from wheretolook.visibility.occlusion import StoredOcclusion
+
+pytestmark = pytest.mark.usefixtures("no_pictures")
 
 FEW = SphereConfig(points=48, cameras=8, width=32, heads=2, layers=1, dropout=0.0, epochs=10, batch_size=40)
 SMALL = train_config("sphere", accelerator="cpu", sphere=FEW)

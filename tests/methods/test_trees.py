@@ -1,4 +1,4 @@
-"""Boosted trees: the same numbers as scikit-learn's, on disk and back, trained and evaluated as any other method."""
+"""Boosted trees: the same numbers as LightGBM's, on disk and back, trained and evaluated as any other method."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import lightgbm
 import numpy as np
 import pytest
 import torch
 from safetensors.numpy import load_file, save_file
-from sklearn.ensemble import HistGradientBoostingClassifier
 
 from learning_options import changed, train_config
 from synthetic_dataset import CAMERA, make_dataset
@@ -27,8 +27,10 @@ from wheretolook.methods.trees.score import TreesScorer
 from wheretolook.stages.evaluate import evaluate_methods as evaluate
 from wheretolook.stages.train import train_methods as train
 from wheretolook.utils.errors import ConfigError, WeightsError
-from wheretolook.utils.tracking import TrackingConfig
+from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import is_good, poses
+
+pytestmark = pytest.mark.usefixtures("no_pictures")
 
 FEW = TreesConfig(max_trees=20, max_leaves=7, min_leaf=5)
 
@@ -47,15 +49,47 @@ def trees() -> BoostedTrees:
     return fit_trees(some_views(3000, 0), some_views(1000, 1), CAMERA, FEW)[0]
 
 
-def test_trees_are_scikit_learns() -> None:
+def test_trees_are_lightgbms() -> None:
+    """To the last digits, also where a value is unknown that was, or was not, in training, zero, or a threshold."""
     views, others = some_views(2000, 0), some_views(500, 1)
-    model = HistGradientBoostingClassifier(max_iter=30, random_state=0, early_stopping=False)
-    model.fit(views.values, views.labels)
+    data = lightgbm.Dataset(views.values.astype(np.float64), views.labels.astype(np.float64))
+    model = lightgbm.train({"objective": "binary", "verbosity": -1, "num_threads": 1}, data, 30)
+    rng = np.random.default_rng(2)
+    others.values[rng.random(others.values.shape) < 0.1] = np.nan
+    others.values[rng.random(others.values.shape) < 0.1] = 0
     for n_trees in (1, 17, 30):
-        found = BoostedTrees.of_sklearn(model, CAMERA, n_trees)
+        found = BoostedTrees.of_lightgbm(model, CAMERA, n_trees)
         assert len(found.roots) == n_trees and found.depth > 3
-        logits = list(model.staged_decision_function(others.values))[n_trees - 1]
-        np.testing.assert_allclose(found.raw_logits(torch.from_numpy(others.values)), np.ravel(logits), rtol=1e-12)
+        splits = found.left != torch.arange(len(found.left))
+        for column in found.feature[splits].unique():
+            thresholds = found.threshold[splits & (found.feature == column)]
+            others.values[: len(thresholds), column] = thresholds[: len(others.values)]
+        raw = model.predict(others.values.astype(np.float64), num_iteration=n_trees, raw_score=True)
+        np.testing.assert_allclose(found.raw_logits(torch.from_numpy(others.values)), raw, rtol=0, atol=1e-12)
+
+
+def test_trees_of_one_leaf() -> None:
+    """Where nothing can be told apart, LightGBM stops early."""
+    views = some_views(40, 0)
+    trees, metrics = fit_trees(views, some_views(40, 1), CAMERA, TreesConfig(max_trees=50, min_leaf=30))
+    assert metrics["n_trees"] == len(trees.roots) == 1 and trees.depth == 0
+    logits = trees.raw_logits(torch.from_numpy(views.values))
+    share = float(views.labels.mean())
+    np.testing.assert_allclose(logits, np.log(share / (1 - share)), atol=1e-6)
+
+
+def test_the_same_seed_gives_the_same_bytes(tmp_path: Path) -> None:
+    for name in ("first", "second"):
+        fit_trees(some_views(3000, 0), some_views(500, 1), CAMERA, FEW, seed=3)[0].save(tmp_path / name)
+    assert (tmp_path / "first").read_bytes() == (tmp_path / "second").read_bytes()
+
+
+def test_weights_of_earlier_trees_score_as_they_did(trees: BoostedTrees, tmp_path: Path) -> None:
+    """Those of scikit-learn have log-odds of their own beside the trees."""
+    replace(trees, baseline=-0.75).save(tmp_path / "trees.safetensors")
+    views = torch.from_numpy(some_views(50, 2).values)
+    found = BoostedTrees.load(tmp_path / "trees.safetensors")
+    torch.testing.assert_close(found.raw_logits(views), trees.raw_logits(views) - 0.75)
 
 
 def test_as_many_trees_are_kept_as_order_the_other_views_best() -> None:

@@ -7,10 +7,10 @@ from itertools import product
 import numpy as np
 import pytest
 
-from planning.rooms import GRID, build, room_landmarks
+from planning.rooms import build, room_landmarks
 from wheretolook.geometry.lattices import axes_of_angles, direction_lattice, yaw_pitch_angles
 from wheretolook.geometry.poses import Float, rotation_angle_deg, rotation_looking_along
-from wheretolook.planning.sequences import TurnLimit, best_sequence, greedy_sequence, path_scores, resample_path
+from wheretolook.planning.sequences import TurnLimit, best_sequence, greedy_sequence, resample_path
 from wheretolook.utils.errors import PlanningError
 
 LATTICES = {"yaw-pitch": direction_lattice(0, "yaw-pitch"), "fibonacci": direction_lattice(300)}
@@ -166,12 +166,6 @@ def test_a_path_through_a_viewpoint_map() -> None:
     viewpoint_map = build(room_landmarks(300), directions=LATTICES["fibonacci"])
     a, b = viewpoint_map.locations[0], viewpoint_map.locations[1]
     waypoints = resample_path([a, b])
-    scores = path_scores(viewpoint_map, waypoints)
-    np.testing.assert_allclose(scores[0], viewpoint_map.scores[0], atol=1e-6)
-    np.testing.assert_allclose(scores[-1], viewpoint_map.scores[1], atol=1e-6)
-    nearest = path_scores(viewpoint_map, waypoints, interpolated=False)
-    np.testing.assert_array_equal(nearest, viewpoint_map.scores[viewpoint_map.rows(waypoints)])
+    scores = viewpoint_map.scores[viewpoint_map.rows(waypoints)]
     limit = TurnLimit.of(viewpoint_map.directions)
     assert best_sequence(scores, limit).total >= greedy_sequence(scores, limit).total
-    with pytest.raises(PlanningError, match="waypoint 1 is not in a free voxel"):
-        path_scores(viewpoint_map, [a, np.array(GRID.upper) + 1])

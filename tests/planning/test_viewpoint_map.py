@@ -52,7 +52,7 @@ def test_every_direction_of_every_free_voxel_has_its_score_and_count(viewpoint_m
     views = poses_looking_along(np.repeat(centers, len(DIRECTIONS), axis=0), np.tile(DIRECTIONS, (len(centers), 1)))
     scores = make_scorer("bins", one).score(views)
     np.testing.assert_array_equal(viewpoint_map.scores.ravel(), scores.astype(np.float32))
-    np.testing.assert_array_equal(viewpoint_map.n_visible.ravel(), np.diff(one.visible_landmarks(views).starts))
+    np.testing.assert_array_equal(viewpoint_map.n_visible.ravel(), np.diff(one.landmarks_in_view(views).starts))
     order = np.lexsort([np.tile(np.arange(60), (len(centers), 1)), -scores.reshape(-1, 60)], axis=1)
     np.testing.assert_array_equal(viewpoint_map.ranked, order)
     origin = viewpoint_map.origin

@@ -25,7 +25,8 @@ from wheretolook.release.showcase import open_showcase
 from wheretolook.release.showcase_figures import planned_views
 from wheretolook.release.table_view import latest_paper_table, paper_cells, paper_styler
 from wheretolook.utils.errors import ConfigError
-from wheretolook.utils.tracking import TrackingConfig, newest_artifact, newest_run
+from wheretolook.utils.tracking import newest_artifact, newest_run
+from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.thresholds import ALL
 
 RELEASE = Path(__file__).parents[2] / "data" / "release"
@@ -75,6 +76,7 @@ def test_all_that_has_a_run_is_written_and_attached(store: tuple[Dataset, Tracki
     assert "fully connected 4500 × 300" in (tmp_path / "architecture.md").read_text()
 
 
+@pytest.mark.slow
 def test_scenes_of_the_release_are_drawn_with_the_runs_of_their_weights(tmp_path: Path) -> None:
     release, tracking = Dataset.load(RELEASE), TrackingConfig(str(tmp_path / "mlruns"))
     runs = log_release(release, tracking).train

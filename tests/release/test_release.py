@@ -18,7 +18,7 @@ from synthetic_dataset import CAMERA, make_dataset
 from wheretolook import stages
 from wheretolook.cli import main, parse_experiment
 from wheretolook.config import Experiment, MeshSource, ScenesConfig
-from wheretolook.dataset.folders import RELEASE, Dataset
+from wheretolook.dataset.folders import RELEASE, RELEASE_FILE, Dataset
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.report import score_markdown
 from wheretolook.learning.data import load_views
@@ -32,14 +32,18 @@ from wheretolook.methods.trees.config import TreesConfig
 from wheretolook.release import copy as releases
 from wheretolook.release.card import release_card
 from wheretolook.stages.evaluate import evaluate_methods as evaluate
+from wheretolook.stages.release import release_settings
 from wheretolook.stages.train import train_methods as train
 from wheretolook.utils.errors import ConfigError, StorageError, TableError, WeightsError
 from wheretolook.utils.files import write_json
-from wheretolook.utils.tracking import TrackingConfig
+from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import is_good, poses, write_table
 from wheretolook.visibility.occlusion import StoredOcclusion
 
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
 TRAIN = train_config("mlp-2d", "mlp-2d+z", epochs=3, hidden=(16,), accelerator="cpu")
+EVALUATE = EvaluateConfig(("random", "visible", "bins", "fisher-trace-exact", "mlp"), resamples=100, top_n=(1, 5))
 CONFIGS = Path(__file__).parents[2] / "configs"
 VERSIONS = {"numpy": "2.9.9", "pycolmap": "4.1.0"}
 
@@ -61,9 +65,13 @@ def label_stamped(root: Path, **options: int) -> Dataset:
 def experiment_of(folder: Path, name: str = "tiny") -> Experiment:
     return Experiment(
         name=name, data=folder / "data", device="cpu", camera=CAMERA, train=TRAIN,
-        scenes=ScenesConfig(train=2, test=2, seed=70), evaluate=EvaluateConfig(resamples=100, top_n=(1, 5)),
+        scenes=ScenesConfig(train=2, test=2, seed=70), evaluate=EVALUATE,
         tracking=TrackingConfig(str(folder / "mlruns")),
     )  # fmt: skip
+
+
+def card_of(release: Dataset) -> str:
+    return release_card(release, release_settings(Experiment()))
 
 
 @pytest.fixture(scope="module")
@@ -124,8 +132,9 @@ def test_a_release_leaves_matches_out(tmp_path: Path) -> None:
             rows = [np.arange(n, dtype=np.int32) for n in table["n_inliers"]]
             write_table(table.assign(matched_rows=rows, inlier_rows=rows), scene.table)
             write_json(scene.label_manifest, {**json.loads(scene.label_manifest.read_text()), "store_matches": True})
-        copy = releases.copy_dataset(dataset, experiment_of(tmp_path / name))
-        releases_of.append({name: content for name, content in contents(copy.root).items() if name != releases.ABOUT})
+        root, settings = tmp_path / name / "data" / "release", release_settings(experiment_of(tmp_path / name))
+        copy = releases.copy_dataset(dataset, root, settings)
+        releases_of.append({name: content for name, content in contents(copy.root).items() if name != RELEASE_FILE})
     assert releases_of[0] == releases_of[1]
 
 
@@ -135,7 +144,7 @@ def load(path: Path) -> ViewpointNetwork:
 
 def test_a_release_scores_as_the_original(finished: Path, tmp_path: Path) -> None:
     """The same weights, in half precision too, on both."""
-    config, tracking = EvaluateConfig(resamples=50), TrackingConfig(str(tmp_path / "mlruns"))
+    config, tracking = replace(EVALUATE, resamples=50), TrackingConfig(str(tmp_path / "mlruns"))
     root = finished / "data" / "release"
     original, release = Dataset.load(finished / "data" / "tiny"), Dataset.load(root)
     shutil.copytree(root, tmp_path / "release")
@@ -184,14 +193,17 @@ def test_the_best_on_validation_ships(finished: Path) -> None:
 def test_what_is_best_of_all_ships_beside_the_network(folder: Path, tmp_path: Path) -> None:
     root = folder / "data" / "release"
     release, tracking = Dataset.load(root), TrackingConfig(str(folder / "mlruns"))
-    few = replace(TRAIN, set=SetConfig(epochs=4, batch_size=32), trees=TreesConfig(max_trees=3, min_leaf=5))
+    few = replace(TRAIN, set=SetConfig(epochs=4, batch_size=16), trees=TreesConfig(max_trees=3, min_leaf=5))
     train(release, changed(few, methods=("set", "trees")), tracking, progress=False)
     records = {name: root / "weights" / f"{name}.json" for name in ("set", "trees")}
     for name, precision in (("set", 0.9999), ("trees", 0.5)):  # whatever they have learnt from so little
         record = json.loads(records[name].read_text())
         record["metrics"]["val_average_precision"] = precision
         records[name].write_text(json.dumps(record))
-    stages.release(experiment_of(folder, "release"), say=quiet)
+    experiment = replace(
+        experiment_of(folder, "release"), evaluate=replace(EVALUATE, methods=(*EVALUATE.methods, "set"))
+    )
+    stages.release(experiment, say=quiet)
     (network,) = (path for path in (root / "weights").glob("mlp-*.safetensors"))
     assert sorted(path.name for path in (root / "weights").glob("*.safetensors")) == [network.name, "set.safetensors"]
     assert (root / "weights" / releases.SHELF / "trees.safetensors").is_file()
@@ -199,13 +211,13 @@ def test_what_is_best_of_all_ships_beside_the_network(folder: Path, tmp_path: Pa
     assert {network.stem, "set"} <= {*scores["method"]} and "trees" not in {*scores["method"]}
     assert {network.stem, "set", "trees"} <= {*variants["method"]}
     card = (root / "README.md").read_text()
-    assert card == release_card(release)
+    assert card == card_of(release)
     for said in (f"{network.name} and set.safetensors", "set of landmarks; and of the paper's best network", "0.9999"):
         assert said in card, said
     scorer = load_scorer(root / "weights", release.scenes[0].localization_map(release.camera))
     assert scorer.name == "set"
     before = contents(root)
-    stages.release(experiment_of(folder, "release"), say=quiet)
+    stages.release(experiment, say=quiet)
     assert contents(root) == before
 
 
@@ -253,20 +265,20 @@ def test_the_card_tells_what_lies_there(folder: Path, monkeypatch: pytest.Monkey
     table = root / "results" / "generalization.csv"
     elsewhere.assign(weights_sha256=releases.sha256(weights)).to_csv(table, index=False)
     (root / "results" / "generalization.md").write_text("Scans are from here, halls from there.\n")
-    longer = release_card(release)
+    longer = card_of(release)
     assert "Localization score on scans" in longer and "Localization score on halls" in longer
     assert "Scans are from here" in longer
     assert "on other datasets" not in card
     elsewhere.assign(weights_sha256="0" * 64).to_csv(table, index=False)  # of weights that shipped before
-    assert release_card(release) == card
+    assert card_of(release) == card
 
 
 def test_scenes_made_by_others_keep_their_licence(folder: Path) -> None:
     experiment = experiment_of(folder)
     scenes = ScenesConfig(train=1, test=0, meshes=(MeshSource(Path("/secret/place/scan.glb")),))
     stages.release(replace(experiment, scenes=scenes), say=quiet)
-    assert "secret" not in (folder / "data" / "release" / releases.ABOUT).read_text()
-    card = release_card(Dataset.load(folder / "data" / "release"))
+    assert "secret" not in (folder / "data" / "release" / RELEASE_FILE).read_text()
+    card = card_of(Dataset.load(folder / "data" / "release"))
     assert "made by others (scan)" in card and "secret" not in card
 
 
@@ -288,7 +300,7 @@ def test_other_data_is_not_overwritten(folder: Path) -> None:
     with pytest.raises(ConfigError, match=r"of another dataset than another \(got 'tiny'\)"):
         stages.release(experiment_of(folder, "another"), say=quiet)
     assert contents(folder / "data" / "release") == before
-    (folder / "data" / "release" / releases.ABOUT).unlink()
+    (folder / "data" / "release" / RELEASE_FILE).unlink()
     with pytest.raises(ConfigError, match="no release and would be overwritten"):
         stages.release(experiment_of(folder), say=quiet)
 
@@ -301,7 +313,7 @@ def test_what_is_missing_is_named(folder: Path, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.undo()
     (root / "results" / "scores.csv").unlink()
     with pytest.raises(TableError, match=r"no scores.*evaluate|scores\.csv"):
-        release_card(Dataset.load(root))
+        card_of(Dataset.load(root))
     shutil.copyfile(next((root / "weights").glob("*.safetensors")), root / "weights" / "mlp-2d+3d.safetensors")
     with pytest.raises(WeightsError, match=r"mlp-2d\+3d\.json"):
         stages.release(experiment, say=quiet)
@@ -344,7 +356,7 @@ def shipped() -> Dataset:
 
 
 def test_the_shipped_card_is_of_what_ships(shipped: Dataset) -> None:
-    assert (shipped.root / releases.CARD).read_text() == release_card(shipped)
+    assert (shipped.root / releases.CARD).read_text() == card_of(shipped)
     assert sum(releases.sizes(shipped.root).values()) < releases.MAX_BYTES
     tables = [scene.read_table() for scene in shipped.split("train")]
     assert sum(map(len, tables)) > 200_000
@@ -374,6 +386,7 @@ def test_the_shipped_best_scorer_scores_as_the_card_says(shipped: Dataset) -> No
     assert abs(views.mean() - good.mean()) < 0.03
 
 
+@pytest.mark.slow
 def test_the_shipped_weights_score_as_the_card_says(shipped: Dataset, tmp_path: Path) -> None:
     shutil.copytree(shipped.root, tmp_path / "data" / "release")
     experiment = parse_experiment(

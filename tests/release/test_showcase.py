@@ -22,7 +22,7 @@ from wheretolook.methods.base import Scorer
 from wheretolook.methods.binned_network import BinnedNetworkScorer
 from wheretolook.methods.mlp.network import NetworkSpec, ViewpointNetwork
 from wheretolook.methods.visible import VisibleScorer
-from wheretolook.release.showcase import Showcase, open_showcase, shares_good
+from wheretolook.release.showcase import Showcase, open_showcase
 from wheretolook.release.showcase_figures import (
     binned_image_of,
     learning_of,
@@ -32,10 +32,14 @@ from wheretolook.release.showcase_figures import (
     sampling_of,
 )
 from wheretolook.rendering.raycasting import MeshRaycaster
-from wheretolook.scenes.procedural.generator import ApartmentConfig, generate_apartment
-from wheretolook.space.free_space import FreeSpace, FreeSpaceConfig
+from wheretolook.scenes.config import ApartmentConfig
+from wheretolook.scenes.procedural.generator import generate_apartment
+from wheretolook.space.config import FreeSpaceConfig
+from wheretolook.space.free_space import FreeSpace
 from wheretolook.utils.errors import ConfigError, SceneError
-from wheretolook.viewpoints.sampling import SampleConfig, free_locations, sample_viewpoints
+from wheretolook.viewpoints.config import SampleConfig
+from wheretolook.viewpoints.locations import shares_good
+from wheretolook.viewpoints.sampling import free_locations, sample_viewpoints
 from wheretolook.viewpoints.table import (
     LOCALIZED,
     NO_POSE,
@@ -106,7 +110,7 @@ class UpScorer(Scorer):
 
 
 def test_the_scene_is_the_one_that_was_sampled(showcase: Showcase) -> None:
-    assert showcase.scene.name == "apartment-003" and showcase.keep == 100
+    assert showcase.name == "apartment-003" and showcase.keep == 100
     assert len(showcase.directions) == SAMPLING.directions
     assert set(showcase.table["location_id"]) <= set(showcase.free)
     centers = camera_centers(poses(showcase.table))
@@ -174,7 +178,7 @@ def test_sampling_counts_what_the_table_counts(showcase: Showcase) -> None:
     assert location in sampling.layer and set(sampling.layer[sampling.free]) <= set(showcase.free)
     # what is in view in all directions together is what is not hidden
     one = showcase.localization_map
-    seen = np.unique(np.concatenate([one.visible_landmarks(pose[None])[0] for pose in poses(rows)]))
+    seen = np.unique(np.concatenate([one.landmarks_in_view(pose[None])[0] for pose in poses(rows)]))
     assert sampling.unoccluded[seen].all() and not sampling.unoccluded.all()
 
 

@@ -77,7 +77,7 @@ def test_occlusion_margin():
     np.testing.assert_array_equal(
         raycaster.occluded(origins, points, margin_m=0.02), [[False, False, True, True], [False, False, True, True]]
     )
-    assert not raycaster.occluded([(3, 3, 1)], [(3, 3, 1)]).any(), "a point at the origin is visible"
+    assert not raycaster.occluded([(3, 3, 1)], [(3, 3, 1)]).any(), "a point at the origin is unoccluded"
     assert raycaster.occluded(np.zeros((2, 3)), np.zeros((0, 3))).shape == (2, 0)
 
 

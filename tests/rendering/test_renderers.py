@@ -242,8 +242,8 @@ def test_rasterizing_leaves_no_gap_on_edges_through_pixel_centres(turn):
 def test_rasterizing_a_triangle_through_the_camera_plane():
     # A floor from far behind the camera to far before it: depth is the height over the ray's slope, up to its far end.
     camera = PinholeCamera(40, 31, 20.0)
-    floor = quads_mesh([[(-1e3, -1e3, -1.5), (1e3, -1e3, -1.5), (1e3, 1e3, -1.5), (-1e3, 1e3, -1.5)]],
-                       [np.full((1, 1, 3), 90, np.uint8)])  # fmt: skip
+    corners = [(-1e3, -1e3, -1.5), (1e3, -1e3, -1.5), (1e3, 1e3, -1.5), (-1e3, 1e3, -1.5)]
+    floor = quads_mesh([corners], [np.full((1, 1, 3), 90, np.uint8)])
     depth_m = WarpRenderer(floor).render(camera, LOOK_ALONG_Y).depth_m[0]
     below = (np.arange(31) + 0.5 - 15.5) / 20.0
     np.testing.assert_array_equal(depth_m[below <= 0], 0)
@@ -256,6 +256,7 @@ def _render_in_worker(seed):
     return WarpRenderer(random_triangles(seed)).render(camera, LOOK_ALONG_Y).rgb
 
 
+@pytest.mark.slow
 def test_renders_in_spawned_processes():
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
         images = list(pool.map(_render_in_worker, [0, 1]))

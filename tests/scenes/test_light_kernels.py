@@ -51,21 +51,18 @@ def direct(
     light, soft = (wp.empty(len(points), dtype=wp.vec3, device=device) for _ in range(2))
     corner, right, down = np.array([[2.0, 0.5, 0.5]]), np.array([[0, -1.0, 0]]), np.array([[0, 0, -1.0]])
     rooms = np.zeros(len(points))
-    wp.launch(
-        direct_kernel, dim=len(points),
-        inputs=[mesh.id, vec3_array(points, device), vec3_array(normals, device), integers(rooms, device),
-                vec3_array(corner, device), vec3_array(right, device), vec3_array(down, device),
-                integers([0], device), integers([0], device), rays, wp.vec3(1.0, 1.0, 1.0),
-                vec3_array(lamps, device), vec3_array(np.ones_like(lamps), device),
-                integers(np.zeros(len(lamps)), device), 64],
-        outputs=[light, soft], device=device,
-    )  # fmt: skip
+    inputs = [mesh.id, *(vec3_array(values, device) for values in (points, normals)), integers(rooms, device)]
+    inputs += [vec3_array(values, device) for values in (corner, right, down)]
+    inputs += [integers([0], device), integers([0], device), rays, wp.vec3(1.0, 1.0, 1.0)]
+    inputs += [vec3_array(lamps, device), vec3_array(np.ones_like(lamps), device)]
+    inputs += [integers(np.zeros(len(lamps)), device), 64]
+    wp.launch(direct_kernel, len(points), inputs, [light, soft], device=device)
     return light.numpy()
 
 
 SCREEN = np.array([[[1.0, -0.4, -9], [1, 9, -9], [1, 9, 9], [1, -0.4, 9]]])
 WALL = np.array([[[1.0, -9, -9], [1, 9, -9], [1, 9, 9], [1, -9, 9]]])
-"""`SCREEN` hides all that a line crosses the plane x = 1 to the left of y = -0.4, `WALL` the whole window."""
+"""`SCREEN` blocks rays that cross the plane x = 1 at y > -0.4, `WALL` all rays to the window."""
 
 
 def test_window_light_is_that_of_its_plain_twin(device: str) -> None:
@@ -102,21 +99,19 @@ def test_lamp_light_falls_with_the_square_of_the_distance(height_m: float, devic
 def gather(
     faces: np.ndarray, points: np.ndarray, normals: np.ndarray, brightness: np.ndarray, rays: int, device: str
 ) -> Any:
-    """What the faces of a box, each of one brightness, throw back, and the shares of open and back rays."""
+    """Light reflected by the faces of a box, each of one brightness, and the shares of open and back rays."""
     device = start_warp(device)
     mesh = quads(faces, device)
     bounced = wp.empty(len(points), dtype=wp.vec3, device=device)
     shares = [wp.empty(len(points), dtype=wp.float32, device=device) for _ in range(2)]
     n = len(faces)
     st = wp.array(np.full((2 * n, 3, 2), 0.5, np.float32), dtype=wp.vec2, device=device)
-    wp.launch(
-        gather_kernel, dim=len(points),
-        inputs=[mesh.id, vec3_array(points, device), vec3_array(normals, device), rays,
-                integers(np.repeat(np.arange(n), 2), device), st, integers(np.arange(n), device),
-                wp.array(np.ones((n, 2), np.int32), dtype=wp.vec2i, device=device),
-                vec3_array(np.full((n, 3), 0.5), device), vec3_array(np.repeat(brightness[:, None], 3, 1), device)],
-        outputs=[bounced, *shares], device=device,
-    )  # fmt: skip
+    shape = wp.array(np.ones((n, 2), np.int32), dtype=wp.vec2i, device=device)
+    albedo, light = np.full((n, 3), 0.5), np.repeat(brightness[:, None], 3, 1)
+    inputs = [mesh.id, vec3_array(points, device), vec3_array(normals, device), rays]
+    inputs += [integers(np.repeat(np.arange(n), 2), device), st, integers(np.arange(n), device), shape]
+    inputs += [vec3_array(albedo, device), vec3_array(light, device)]
+    wp.launch(gather_kernel, len(points), inputs, [bounced, *shares], device=device)
     return bounced.numpy(), shares[0].numpy(), shares[1].numpy()
 
 

@@ -7,7 +7,8 @@ import pytest
 
 from box_scenes import CABINET, ROOM, TABLE_TOP, box_quads, furnished_room, quads_mesh
 from wheretolook.geometry.mesh import TexturedMesh
-from wheretolook.space.free_space import FreeSpace, FreeSpaceConfig
+from wheretolook.space.config import FreeSpaceConfig
+from wheretolook.space.free_space import FreeSpace
 from wheretolook.utils.errors import ConfigError
 
 
@@ -130,5 +131,3 @@ def test_a_steep_surface_is_no_floor():
 def test_bad_config():
     with pytest.raises(ConfigError, match="positive"):
         FreeSpaceConfig(clearance_m=0.0)
-    with pytest.raises(ConfigError, match="share"):
-        FreeSpaceConfig(min_enclosure=1.5)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from wheretolook.space.mapped_space import MappedSpace, MappedSpaceConfig
+from wheretolook.space.config import MappedSpaceConfig
+from wheretolook.space.mapped_space import MappedSpace
 from wheretolook.utils.errors import ConfigError, MapError
 
 WALL = np.stack(np.meshgrid([3.0], np.linspace(-2, 2, 41), np.linspace(0, 2, 21), indexing="ij"), -1).reshape(-1, 3)
@@ -36,8 +37,8 @@ def test_bad_input_is_refused() -> None:
 def test_ways_are_free_where_every_point_of_them_is() -> None:
     rng = np.random.default_rng(0)
     cameras = rng.uniform((0, -1, 0.8), (3, 1, 1.2), (25, 3))
-    space = MappedSpace(np.concatenate([WALL, rng.uniform((0, -1, 0.5), (3, 1, 1.5), (12, 3))]), cameras,
-                        MappedSpaceConfig(max_camera_distance_m=0.6, clearance_m=0.2))  # fmt: skip
+    landmarks = np.concatenate([WALL, rng.uniform((0, -1, 0.5), (3, 1, 1.5), (12, 3))])
+    space = MappedSpace(landmarks, cameras, MappedSpaceConfig(max_camera_distance_m=0.6, clearance_m=0.2))
     a, b = rng.uniform((0, -1, 0.7), (2.7, 1, 1.3), (2, 300, 3))
     shares = np.linspace(0, 1, 2001)[:, None]
     expected = [bool(space.is_free(start + shares * (end - start)).all()) for start, end in zip(a, b, strict=True)]

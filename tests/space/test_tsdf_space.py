@@ -1,4 +1,4 @@
-"""Free space by depth images against free space by the mesh they are of."""
+"""Free space from depth images, compared with that from the mesh they were rendered from."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.planning.config import PathConfig
 from wheretolook.planning.path_planning import plan_path
 from wheretolook.rendering.raycasting import MeshRaycaster
-from wheretolook.space.free_space import FreeSpace, FreeSpaceConfig
+from wheretolook.space.config import FreeSpaceConfig
+from wheretolook.space.free_space import FreeSpace
 from wheretolook.space.tsdf_space import TsdfSpace, seen_through
 from wheretolook.visibility.tsdf import DepthImage, TsdfConfig, TsdfVolume
 
@@ -24,7 +25,7 @@ def space_of(images: list[DepthImage], clearance_m: float = CLEARANCE_M) -> Tsdf
 
 @pytest.fixture(scope="module")
 def images() -> list[DepthImage]:
-    return depth_images(room(), seed=1, n=150)  # which see all there is to see
+    return depth_images(room(), seed=1, n=150)  # enough to see all surfaces
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +64,7 @@ def test_ways_never_come_near_a_surface(space: TsdfSpace) -> None:
 
 
 def test_few_images_leave_holes_but_no_way_through_them(images: list[DepthImage]) -> None:
-    """Of a ceiling that was not seen nothing is known but that nobody saw through it."""
+    """A part of the ceiling that no image saw is not free either."""
     space, points = space_of(images[::4]), random_points(6000, beyond_m=0.0)
     free = space.is_free(points)
     distance = MeshRaycaster(room()).distance_to_surface(points, 1.0)
@@ -72,7 +73,7 @@ def test_few_images_leave_holes_but_no_way_through_them(images: list[DepthImage]
 
 
 def test_what_no_image_saw_is_not_free(images: list[DepthImage]) -> None:
-    """Cameras on one side of the wall, which see nothing of a part of the other."""
+    """The cameras are on one side of the wall, from where a part of the other side is hidden."""
     west = [image for image in images if -image.cam_from_world[:, :3].T[0] @ image.cam_from_world[:, 3] < 1.8]
     points = random_points(6000, beyond_m=0.0)
     seen, by_mesh = seen_through(points, west, 10.0, progress=False), FreeSpace(room()).is_free(points)

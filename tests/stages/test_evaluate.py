@@ -22,8 +22,19 @@ from wheretolook.methods.visible import VisibleScorer
 from wheretolook.stages.evaluate import evaluate_methods as evaluate
 from wheretolook.stages.train import train_methods as train
 from wheretolook.utils.errors import ConfigError, SceneError, TableError, WeightsError
-from wheretolook.utils.tracking import TrackingConfig, client, newest_run, ui_command
+from wheretolook.utils.tracking import (
+    artifact,
+    client,
+    experiment_ids,
+    finished_runs,
+    newest_run,
+    start_run,
+    ui_command,
+)
+from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import UNLABELLED, is_good, poses, write_table
+
+pytestmark = pytest.mark.usefixtures("no_pictures")
 
 CONFIG = EvaluateConfig(("random", "visible", "bins", "mlp"), resamples=100, top_n=(1, 5))
 TWO = train_config("mlp-2d", "mlp-2d+z", epochs=2, hidden=(16,), accelerator="cpu")
@@ -80,40 +91,39 @@ def test_evaluation_writes_prints_and_logs(
     assert parent is not None
     parent_id = parent.info.run_id
     runs = client(tracking).search_runs([parent.info.experiment_id], f"tags.mlflow.parentRunId = '{parent_id}'")
-    assert len(runs) == 6 * 2
-    names = {(run.data.params["method"], run.data.params["top_n"]) for run in runs}
-    assert names == {(method, n) for method in methods for n in ("1", "5")}
-    for run in runs:
-        params = run.data.params
-        row = pooled.loc[(params["method"], int(params["top_n"]))]
+    assert {run.data.params["method"] for run in runs} == {*methods}
+    assert len(runs) == 6
+    for run, n in ((run, n) for run in runs for n in (1, 5)):
+        params, metrics = run.data.params, run.data.metrics
+        row = pooled.loc[(params["method"], n)]
         assert run.info.status == "FINISHED"
-        assert run.data.metrics["raw_0.25m_2deg"] == pytest.approx(row["raw_0.25m_2deg"])
-        assert run.data.metrics["average_precision"] == pytest.approx(row["average_precision"])
-        chosen = pd.read_parquet(Path(run.info.artifact_uri) / "locations.parquet")
+        assert metrics[f"top-{n}/raw_0.25m_2deg"] == pytest.approx(row["raw_0.25m_2deg"])
+        assert metrics["average_precision"] == pytest.approx(row["average_precision"])
+        chosen = pd.read_parquet(Path(run.info.artifact_uri) / "locations.parquet").query(f"top_n == {n}")
         assert len(chosen) == row["n_locations"] == 2 * 14 and not chosen.duplicated(["scene", "location_id"]).any()
         assert chosen["chosen"].sum() == row["n_views"]
         for key in ("0.05m_0.4deg", "5m_10deg"):
             assert chosen[f"good_{key}"].sum() == pytest.approx(row[f"good_{key}"])
             assert chosen[f"any_{key}"].mean() == pytest.approx(row[f"any_{key}"])
         assert chosen["best_score"].isna().all() == (params["method"] in ("random", "oracle"))
-        assert run.data.metrics["regret_0.25m_2deg"] == pytest.approx(row["regret_0.25m_2deg"])
+        for name in ("regret_0.25m_2deg", "regret_low_0.25m_2deg", "any_5m_10deg", "normalized_0.5m_5deg"):
+            assert metrics[f"top-{n}/{name}"] == pytest.approx(row[name])
         assert params["candidates"] == "all"
         assert {"split", "seed", "thresholds", "weights", "reference", "dataset_fingerprint"} <= set(params)
         for scene in ("scene-2", "scene-3"):
             (part,) = table[
-                (table["method"] == params["method"])
-                & (table["top_n"] == int(params["top_n"])) & (table["scene"] == scene)
+                (table["method"] == params["method"]) & (table["top_n"] == n) & (table["scene"] == scene)
             ].to_dict("records")  # fmt: skip
-            assert run.data.metrics[f"good_0.05m_0.4deg/{scene}"] == pytest.approx(part["good_0.05m_0.4deg"])
+            assert metrics[f"top-{n}/{scene}/regret_0.05m_0.4deg"] == pytest.approx(part["regret_0.05m_0.4deg"])
     # the README's search finds the best of them, which is no oracle
     readme = (Path(__file__).parents[2] / "README.md").read_text()
     (query,) = re.findall(r"`(tags\.stage = \"evaluate\"[^`]*)`", readme)
     query = query.replace('params.dataset = "release"', 'params.dataset = "tiny"')
     (best,) = client(tracking).search_runs(
-        [parent.info.experiment_id], query, order_by=["metrics.`regret_0.05m_0.4deg`"], max_results=1
+        [parent.info.experiment_id], query, order_by=["metrics.`top-1/regret_0.05m_0.4deg`"], max_results=1
     )
-    assert best.data.params["method"] != "oracle" and best.data.params["top_n"] == "1"
-    assert best.data.metrics["regret_0.05m_0.4deg"] == pooled.loc[("bins", 1)]["regret_0.05m_0.4deg"] == 0
+    assert best.data.params["method"] != "oracle"
+    assert best.data.metrics["top-1/regret_0.05m_0.4deg"] == pooled.loc[("bins", 1)]["regret_0.05m_0.4deg"] == 0
     artifacts = Path(parent.info.artifact_uri)
     assert {path.name for path in artifacts.iterdir()} == {path.name for path in results.iterdir()}
     assert not list(cwd.iterdir())
@@ -125,6 +135,11 @@ def test_evaluation_writes_prints_and_logs(
     assert latest_scores(moved, "another") is None
     store = tmp_path / "elsewhere" / "mlflow.db"
     assert ui_command(moved).endswith(f"mlflow ui --backend-store-uri sqlite:///{store}")
+    with start_run(moved, "later", "evaluate", {"dataset": "tiny"}) as (mlflow, later):
+        mlflow.log_text(later, "here", "note.txt")
+    assert artifact(moved, later, "note.txt").read_text() == "here" and not (tmp_path / "mlruns").exists()
+    assert [run.info.run_id for run in finished_runs(moved, "evaluate")] == [later, parent_id]
+    assert len(experiment_ids(client(moved), moved)) == 2  # MLflow keeps the old place in the old one
 
 
 def test_learned_methods_are_calibrated_on_the_val_scenes(dataset: Dataset, tmp_path: Path) -> None:
@@ -268,9 +283,9 @@ def test_candidates_are_chosen_by_visibility(tmp_path: Path) -> None:
 
     parent = newest_run(tracking, "evaluate", {"dataset": "ranked"})
     both = client(tracking).search_runs([parent.info.experiment_id], "params.candidates = 'best 4'")  # type: ignore[union-attr]
-    assert {run.info.run_name for run in both} >= {"visible best 1 (mesh, best 4)", "oracle best 5 (mesh, best 4)"}
+    assert {run.info.run_name for run in both} >= {"visible (mesh, best 4)", "oracle (mesh, best 4)"}
     chosen = pd.read_parquet(Path(both[0].info.artifact_uri) / "locations.parquet")
-    assert len(chosen) == 2 * 13 and 3 not in set(chosen["location_id"])
+    assert len(chosen) == 2 * 2 * 13 and 3 not in set(chosen["location_id"])
 
     with pytest.raises(TableError, match=r"of one class only among the best 1 candidates.*of 26 viewpoints"):
         for scene, table in zip(dataset.scenes, tables, strict=True):

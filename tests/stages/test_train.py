@@ -27,8 +27,11 @@ from wheretolook.methods.registry import load_scorer
 from wheretolook.methods.train_config import TrainConfig
 from wheretolook.stages.train import train_methods as train
 from wheretolook.utils.errors import ConfigError, TableError
-from wheretolook.utils.tracking import TrackingConfig, client
+from wheretolook.utils.tracking import client
+from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import LOCALIZED, NO_POSE, UNLABELLED, is_good, write_table
+
+pytestmark = pytest.mark.usefixtures("no_pictures")
 
 SMALL = train_config("mlp-2d", epochs=3, hidden=(32,), accelerator="cpu")
 
@@ -303,6 +306,7 @@ def test_the_same_seed_gives_the_same_weights(dataset: Dataset, store: str) -> N
     assert train(dataset, changed(config, seed=1), tracking, progress=False)[0].path.read_bytes() != first
 
 
+@pytest.mark.slow
 def test_two_processes_train_as_one_does(dataset: Dataset, store: str, capfd: pytest.CaptureFixture[str]) -> None:
     # 920 training views: the last batch has one view, so that one of two processes has none
     tracking, one = TrackingConfig(store, "devices"), changed(SMALL, dropout=0.0, batch_size=919)

@@ -11,7 +11,8 @@ from wheretolook.geometry.lattices import VoxelGrid, fibonacci_sphere
 from wheretolook.geometry.poses import camera_centers, transform
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.utils.errors import ConfigError, SceneError
-from wheretolook.viewpoints.sampling import SampleConfig, free_locations, sample_viewpoints
+from wheretolook.viewpoints.config import SampleConfig
+from wheretolook.viewpoints.sampling import free_locations, sample_viewpoints
 from wheretolook.viewpoints.table import SCHEMA, poses
 from wheretolook.visibility.occlusion import NoOcclusion, StoredOcclusion
 

@@ -12,11 +12,11 @@ from wheretolook.geometry.poses import rotation_looking_along, transform
 from wheretolook.utils.errors import ConfigError
 from wheretolook.visibility.frustum import (
     MIN_DEPTH_M,
-    VisibleSets,
+    LandmarkSets,
     _starts,
     in_view,
-    visible_landmarks,
-    visible_landmarks_plain,
+    landmarks_in_view,
+    landmarks_in_view_plain,
 )
 
 IDENTITY = np.eye(3)[None]
@@ -25,7 +25,7 @@ CAMERA = PinholeCamera(640, 480, 320.0)  # in single precision its sides pass ex
 
 def test_sparse_rows_of_a_mask() -> None:
     mask = np.array([[1, 0, 1], [0, 0, 0], [0, 1, 1]], dtype=bool)
-    sets = VisibleSets.from_mask(mask)
+    sets = LandmarkSets.from_mask(mask)
     assert sets.starts.tolist() == [0, 2, 2, 4]
     assert [sets[row].tolist() for row in range(len(sets))] == [[0, 2], [], [1, 2]]
 
@@ -62,8 +62,8 @@ def test_behind_on_the_border_at_zero_depth_not_a_number(
     points = np.array([point], dtype=np.float64)
     with np.errstate(over="ignore"):
         assert in_view(CAMERA, IDENTITY, points.astype(np.float32)).tolist() == [[seen]]
-    everything = VisibleSets.from_mask(np.ones((1, 1), bool))
-    found = visible_landmarks(CAMERA, np.eye(3, 4)[None], points, everything, np.zeros(1, int), device)
+    everything = LandmarkSets.from_mask(np.ones((1, 1), bool))
+    found = landmarks_in_view(CAMERA, np.eye(3, 4)[None], points, everything, np.zeros(1, int), device)
     assert found.indices.tolist() == ([0] if seen else [])
     assert count_everything(CAMERA, IDENTITY, np.zeros((1, 3)), points, device).tolist() == [[int(seen)]]
 
@@ -98,7 +98,7 @@ def test_the_test_is_the_projection(random_views: RandomViews) -> None:
 def test_collected_landmarks_are_those_of_the_plain_twin(random_views: RandomViews, device: str) -> None:
     v = random_views
     arguments = v.camera, v.cam_from_world, v.points, v.visible, v.location_rows
-    kernel, plain = visible_landmarks(*arguments, device=device), visible_landmarks_plain(*arguments)
+    kernel, plain = landmarks_in_view(*arguments, device=device), landmarks_in_view_plain(*arguments)
     np.testing.assert_array_equal(kernel.starts, plain.starts)
     np.testing.assert_array_equal(kernel.indices, plain.indices)
     assert len(plain.indices) > 500 and len(plain) == len(v.cam_from_world)
@@ -109,7 +109,7 @@ def test_collected_landmarks_are_those_of_the_plain_twin(random_views: RandomVie
 def test_a_distorted_camera_collects_what_it_projects_into_its_image(random_views: RandomViews) -> None:
     v = random_views
     camera = ColmapCamera("OPENCV", 640, 480, (300.0, 300.0, 330.0, 235.0, -0.2, 0.05, 1e-3, -1e-3))
-    found = visible_landmarks(camera, v.cam_from_world, v.points, v.visible, v.location_rows)
+    found = landmarks_in_view(camera, v.cam_from_world, v.points, v.visible, v.location_rows)
     for view, pose in enumerate(v.cam_from_world):
         candidates = v.visible[v.location_rows[view]]
         inside = camera.sees(transform(pose, v.points[candidates]))

@@ -6,22 +6,28 @@ import hashlib
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import Float
-from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.cameras import CAMERAS_FILE, colmap_poses, holds_model, load_mapping_poses
-from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.mapping.scale import read_scale
 from wheretolook.utils.errors import ConfigError, TableError
 from wheretolook.utils.files import fingerprint, write_json
-from wheretolook.viewpoints.table import Split, read_table
-from wheretolook.visibility.occlusion import StoredOcclusion
+from wheretolook.viewpoints.config import Split
+from wheretolook.viewpoints.table import read_table
+
+if TYPE_CHECKING:
+    from wheretolook.inputs.localization_map import LocalizationMap
 
 RELEASE = "release"
 """Name of the dataset, beside all others, that ships with its weights."""
+
+RELEASE_FILE = "release.json"
+"""What a release was made from; the file that makes a dataset one."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +82,15 @@ class SceneFolder:
         """Which landmark each sampled location has a free line of sight to."""
         return self.folder / "occlusion.npz"
 
+    @property
+    def is_photographed(self) -> bool:
+        """Whether the scene is known from photographs alone.
+
+        Raises:
+            MapError: it has no mesh, and its map's report is damaged.
+        """
+        return not self.mesh.is_file() and read_scale(self.map) is not None
+
     def read_table(self, matches: bool = False) -> pd.DataFrame:
         """The scene's viewpoints, on request with their matches; see `wheretolook.viewpoints.table.read_table`."""
         return read_table(self.table, matches)
@@ -94,6 +109,10 @@ class SceneFolder:
 
     def localization_map(self, camera: PinholeCamera, device: str = "cpu") -> LocalizationMap:
         """The scene's map with the occlusion stored for its sampled locations; the mesh is not needed."""
+        from wheretolook.inputs.localization_map import LocalizationMap
+        from wheretolook.mapping.landmarks import Landmarks
+        from wheretolook.visibility.occlusion import StoredOcclusion
+
         landmarks, occlusion = Landmarks.load(self.landmarks), StoredOcclusion.load(self.occlusion)
         return LocalizationMap(landmarks, camera, occlusion, device, self.mapping_poses())
 

@@ -1,95 +1,241 @@
-"""Where a camera can be in a scene, and what its landmarks are hidden by: from mesh, depth images or photographs."""
+"""A scene opened once, mesh or photographs: where a camera can be, what hides landmarks, what cameras see."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
-from wheretolook.config import Experiment
 from wheretolook.dataset.folders import SceneFolder
-from wheretolook.dataset.scene_occlusion import scene_occlusion, scene_tsdf
 from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.geometry.poses import camera_centers
-from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.geometry.lattices import ViewLattice, VoxelGrid
+from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.mapping.scale import read_scale
-from wheretolook.scenes.loading import load_mesh
-from wheretolook.space.free_space import FreeSpace
-from wheretolook.space.mapped_space import MappedSpace, MappedSpaceConfig
-from wheretolook.space.tsdf_space import TsdfSpace
-from wheretolook.utils.errors import MapError
+from wheretolook.space.config import FreeSpaceConfig, MappedSpaceConfig
+from wheretolook.utils.devices import usable_device
+from wheretolook.utils.errors import MapError, SceneError
 from wheretolook.visibility.config import OcclusionConfig
-from wheretolook.visibility.occlusion import OcclusionModel
-from wheretolook.visibility.tsdf import TsdfOcclusion
+
+if TYPE_CHECKING:
+    from wheretolook.dataset.rendered_depth import RenderedDepth
+    from wheretolook.geometry.mesh import TexturedMesh
+    from wheretolook.inputs.localization_map import LocalizationMap
+    from wheretolook.mapping.landmarks import Landmarks
+    from wheretolook.rendering.raycasting import MeshRaycaster
+    from wheretolook.rendering.warp_renderer import WarpRenderer
+    from wheretolook.space.free_space import FreeSpace
+    from wheretolook.space.mapped_space import MappedSpace
+    from wheretolook.visibility.occlusion import OcclusionModel
+    from wheretolook.visibility.tsdf import TsdfVolume
 
 
-def space_and_occlusion(
-    scene: SceneFolder, camera: PinholeCamera, experiment: Experiment, occlusion: OcclusionConfig,
-    free_by_tsdf: bool = True,
-) -> tuple[FreeSpace | MappedSpace, OcclusionModel]:  # fmt: skip
-    """Free space of a scene, by its mesh or else its mapping cameras, and which landmarks its locations see.
-
-    With the occlusion model "tsdf", free space is by the same fused depth images (`TsdfSpace`, a `FreeSpace`), as of a
-    robot that has no mesh.
+@dataclass(frozen=True)
+class SceneConfig:
+    """How a scene is looked at.
 
     Args:
-        scene: its files.
-        camera: takes the depth images of a TSDF.
-        experiment: settings of free space, and the device.
-        occlusion: model asked for; without a mesh, one that needs none
-            (`wheretolook.dataset.scene.occlusion_without_mesh`).
-        free_by_tsdf: False keeps free space by the mesh whatever hides landmarks, so that all occlusion models are
-            sampled at the same locations.
-
-    Raises:
-        SceneError: the mesh is missing or cannot be used. MapError: there is no map, or one without a scale.
+        occlusion: what hides landmarks.
+        free_space: where a camera can be in a scene with a mesh.
+        mapped_space: where it can be in a scene of photographs.
+        assume_metric: whether the unit of a map without a scale is taken for a metre.
     """
-    device = experiment.warp_device
-    if is_photographed(scene):
-        space = mapped_space(scene, experiment.scenes.mapped_space, experiment.map.photographs.assume_metric)
-        return space, scene_occlusion(scene, camera, occlusion, device)
-    mesh = load_mesh(scene.mesh)
-    if occlusion.model == "tsdf" and free_by_tsdf:
-        volume, images = scene_tsdf(scene, camera, occlusion, mesh, device)
-        tsdf_space = TsdfSpace(volume, images, experiment.scenes.free_space, device)
-        return tsdf_space, TsdfOcclusion(volume, occlusion.margin_m, device)
-    free_space = FreeSpace(mesh, experiment.scenes.free_space, device)
-    return free_space, scene_occlusion(scene, camera, occlusion, device, mesh, free_space.two_sided)
+
+    occlusion: OcclusionConfig = field(default_factory=OcclusionConfig)
+    free_space: FreeSpaceConfig = field(default_factory=FreeSpaceConfig)
+    mapped_space: MappedSpaceConfig = field(default_factory=MappedSpaceConfig)
+    assume_metric: bool = False
 
 
-def is_photographed(scene: SceneFolder) -> bool:
-    """Whether a scene is known from photographs alone.
+class Scene:
+    """A scene of a dataset with its camera. Each part is made when it is first asked for, and kept.
 
-    Raises:
-        MapError: it has no mesh, and its map's report is damaged.
+    Args:
+        files: its files.
+        camera: intrinsics of the camera that will look.
+        config: how it is looked at.
+        device: where kernels run: "cpu", a CUDA device, or "auto" for the first GPU there is.
+        mesh: its mesh, if there is no file of it; metres, z up.
+        progress: show progress bars where depth images are fused.
+
+    Raises (each part, when it is made):
+        SceneError: the mesh is missing or cannot be used.
+        MapError: the map is missing, damaged, or not in metres.
+        ConfigError: there is no such device, or the voxels of a TSDF do not fit into memory.
     """
-    return not scene.mesh.is_file() and read_scale(scene.map) is not None
 
+    def __init__(
+        self,
+        files: SceneFolder,
+        camera: PinholeCamera,
+        config: SceneConfig = SceneConfig(),
+        device: str = "cpu",
+        mesh: TexturedMesh | None = None,
+        progress: bool = True,
+    ) -> None:
+        self.files, self.camera, self.config, self.progress = files, camera, config, progress
+        self._device = device
+        if mesh is not None:
+            self.mesh = mesh
 
-def mapped_space(scene: SceneFolder, config: MappedSpaceConfig, assume_metric: bool) -> MappedSpace:
-    """Free space of a scene of photographs.
+    @property
+    def name(self) -> str:
+        """Name of the scene."""
+        return self.files.name
 
-    Raises:
-        MapError: the map has no scale, and is not to be taken for one in metres.
-    """
-    require_metres(scene, assume_metric)
-    poses = scene.mapping_poses()
-    if poses is None:
-        raise MapError("the poses of the map's photographs are missing", path=scene.map, fix="Run the map stage again.")
-    return MappedSpace(Landmarks.load(scene.landmarks).points, camera_centers(poses.astype(np.float64)), config)
+    @cached_property
+    def device(self) -> str:
+        """Where kernels run."""
+        return usable_device(self._device)
 
+    @cached_property
+    def is_photographed(self) -> bool:
+        """Whether the scene is known from photographs alone."""
+        return self.files.is_photographed
 
-def require_metres(scene: SceneFolder, assume_metric: bool) -> None:
-    """Raise MapError if a scene's map is not in metres, unless it is to be taken for one that is."""
-    scale = read_scale(scene.map)
-    if scale is not None and not scale.is_metric and not assume_metric:
-        raise MapError(
-            "the map has no scale, and this needs metres", path=scene.map, value=scale.source,
-            fix="Map it with marker sizes, a distance or positions (map.photographs.scale), or pass "
-            "--map.photographs.assume_metric true to take its unit for a metre.",
-        )  # fmt: skip
+    @property
+    def source(self) -> Path:
+        """The file that everything follows from: the mesh, or else the poses of the photographs."""
+        return self.files.mapping_cameras if self.is_photographed else self.files.mesh
 
+    @cached_property
+    def mesh(self) -> TexturedMesh:
+        """The textured mesh."""
+        from wheretolook.scenes.loading import load_mesh
 
-def occlusion_without_mesh(config: OcclusionConfig) -> OcclusionConfig:
-    """The occlusion model asked for, or hidden-point removal if that one needs a mesh."""
-    return replace(config, model="hidden-points") if config.model in ("mesh", "tsdf") else config
+        return load_mesh(self.files.mesh)
+
+    @cached_property
+    def renderer(self) -> WarpRenderer:
+        """Renders the mesh."""
+        from wheretolook.rendering.warp_renderer import WarpRenderer
+
+        return WarpRenderer(self.mesh, self.device)
+
+    @property
+    def raycaster(self) -> MeshRaycaster:
+        """Casts rays against the mesh."""
+        return self.mesh_space.raycaster
+
+    @cached_property
+    def mesh_space(self) -> FreeSpace:
+        """Where a camera can be by the mesh."""
+        from wheretolook.space.free_space import FreeSpace
+
+        return FreeSpace(self.mesh, self.config.free_space, self.device)
+
+    @cached_property
+    def mapped_space(self) -> MappedSpace:
+        """Where a camera can be by the photographs."""
+        from wheretolook.space.mapped_space import MappedSpace
+
+        self.require_metres()
+        if self.mapping_poses is None:
+            fix = "Run the map stage again."
+            raise MapError("the poses of the map's photographs are missing", path=self.files.map, fix=fix)
+        centers = camera_centers(self.mapping_poses.astype(np.float64))
+        return MappedSpace(self.landmarks.points, centers, self.config.mapped_space)
+
+    @property
+    def sampled_space(self) -> FreeSpace | MappedSpace:
+        """Where viewpoints are sampled: the same for all occlusion models."""
+        return self.mapped_space if self.is_photographed else self.mesh_space
+
+    @cached_property
+    def space(self) -> FreeSpace | MappedSpace:
+        """Where a camera can be by what it knows: with occlusion by "tsdf", the depth images and not the mesh."""
+        if self.is_photographed or self.config.occlusion.model != "tsdf":
+            return self.sampled_space
+        from wheretolook.space.tsdf_space import TsdfSpace
+
+        volume, images = self._fused
+        return TsdfSpace(volume, images, self.config.free_space, self.device, self.progress)
+
+    def require_metres(self) -> None:
+        """Raise MapError if the map is not in metres, unless it is to be taken for one that is."""
+        scale = read_scale(self.files.map)
+        if scale is not None and not scale.is_metric and not self.config.assume_metric:
+            raise MapError(
+                "the map has no scale, and this needs metres",
+                path=self.files.map,
+                value=scale.source,
+                fix="Map it with marker sizes, a distance or positions (map.photographs.scale), or pass "
+                "--map.photographs.assume_metric true to take its unit for a metre.",
+            )
+
+    def free_voxels(self, views: ViewLattice, space: FreeSpace | MappedSpace) -> tuple[VoxelGrid, NDArray[np.int64]]:
+        """The voxels of a lattice, and the ids of those where a camera can be, ascending.
+
+        Args:
+            views: the lattice.
+            space: `space` or `sampled_space`.
+
+        Raises:
+            SceneError: none is free.
+        """
+        from wheretolook.viewpoints.sampling import free_locations
+
+        grid = views.voxels(space.bounds)
+        free = free_locations(grid, space)
+        # depth images that have not seen all of the scene may put free space behind surfaces
+        return grid, free[~self.occlusion.inside_geometry(grid.centers()[free])]
+
+    @cached_property
+    def landmarks(self) -> Landmarks:
+        """The map's landmarks."""
+        from wheretolook.mapping.landmarks import Landmarks
+
+        return Landmarks.load(self.files.landmarks)
+
+    @cached_property
+    def mapping_poses(self) -> Float | None:
+        """Poses cam_from_world (M, 3, 4) float32 of the mapping images, if they are known."""
+        return self.files.mapping_poses()
+
+    @property
+    def occlusion_config(self) -> OcclusionConfig:
+        """What hides landmarks: as asked for, or hidden-point removal where that needs a mesh and there is none."""
+        config = self.config.occlusion
+        needs_mesh = config.model in ("mesh", "tsdf")
+        return replace(config, model="hidden-points") if needs_mesh and self.is_photographed else config
+
+    @cached_property
+    def occlusion(self) -> OcclusionModel:
+        """Which landmarks nothing stands in front of, seen from any location."""
+        from wheretolook.visibility.hidden_points import HiddenPointRemoval
+        from wheretolook.visibility.occlusion import MeshOcclusion, NoOcclusion
+        from wheretolook.visibility.tsdf import TsdfOcclusion
+
+        config = self.occlusion_config
+        if config.model == "none":
+            return NoOcclusion()
+        if config.model == "hidden-points":
+            return HiddenPointRemoval(config.radius, config.margin_m)
+        if "mesh" not in vars(self) and not self.files.mesh.is_file():
+            fix = "Run the scenes stage, or use hidden-points or none."
+            raise SceneError(f"occlusion by {config.model} needs the scene's mesh", path=self.files.mesh, fix=fix)
+        if config.model == "tsdf":
+            return TsdfOcclusion(self._fused[0], config.margin_m, self.device)
+        return MeshOcclusion(self.raycaster, config.margin_m, self.mesh_space.two_sided)
+
+    @cached_property
+    def localization_map(self) -> LocalizationMap:
+        """What a scorer is built from; answers for any location."""
+        from wheretolook.inputs.localization_map import LocalizationMap
+
+        return LocalizationMap(self.landmarks, self.camera, self.occlusion, self.device, self.mapping_poses)
+
+    @cached_property
+    def _fused(self) -> tuple[TsdfVolume, RenderedDepth]:
+        """The volume that depth images fuse to, and these, rendered where the map's images were taken."""
+        from wheretolook.dataset.rendered_depth import RenderedDepth
+        from wheretolook.mapping.cameras import colmap_poses
+        from wheretolook.visibility.tsdf import TsdfConfig, TsdfVolume
+
+        config = self.config.occlusion
+        images = RenderedDepth(self.renderer, self.camera, colmap_poses(self.files.map))
+        tsdf = TsdfConfig(voxel_size_m=config.voxel_m, max_depth_m=config.max_depth_m)
+        return TsdfVolume.from_images(images, tsdf, self.progress), images

@@ -24,27 +24,27 @@ class EvaluateConfig:
     """Options of evaluation.
 
     Args:
-        methods: methods to compare, by name or by family, such as "set" and "mlp", see `wheretolook evaluate
-            --list-methods`; if none is named, all but those that are compared only if named. Of those that have learnt,
-            every weights file is a method of its own.
-        weights: weights to evaluate; empty for all in the dataset's `weights` folder.
+        methods: methods to compare, by name or family, such as set and mlp. See `wheretolook evaluate --list-methods`;
+            if none is named, all but those that are compared only if named.
+        weights: files of weights to evaluate; empty for all in the dataset's `weights` folder.
         split: whose scenes to evaluate on: "test", "val" or "train".
         top_n: how many of a location's best-scored viewpoints count; every value gives a row of the table.
-        thresholds: pairs of limits, in metres and degrees, that both errors of a good viewpoint stay strictly under.
-            The first pair is the label.
+        thresholds: limits in metres and degrees that both errors of a good viewpoint stay under. Pairs; strictly under;
+            the first pair is the label.
         seed: seed of the random method, of the bootstrap and of the paired test.
         resamples: bootstrap resamples of the locations, for 95 % intervals, and sign flips of the paired test.
-        occlusions: occlusion models to see the landmarks by, each scored apart: "mesh", "tsdf", "hidden-points",
-            "none". Empty for the one that the viewpoints were sampled with, which is stored.
+        occlusions: occlusion models to see the landmarks by, each scored apart. "mesh", "tsdf", "hidden-points",
+            "none"; empty for the one that the viewpoints were sampled with, which is stored.
         candidates: sets of views to choose from, each tabulated apart. 0 is for all labelled directions of a location,
             as a planner meets them, K > 0 for those among the K that see most landmarks (of all directions, labelled or
             not), as in the paper.
         block_m: intervals and tests resample locations in squares of so many metres on the floor together, as
             neighbours see the same landmarks; 0 takes each location for independent.
-        heading: of the method "forward", in the world: one direction, or the waypoints of a path, whose direction of
-            travel nearest to a location is the heading there. Empty for a horizontal heading drawn for each location.
-        reference: method that every other is compared with, by its name in the table, such as "bins" or "mlp-2d+z".
-            Empty for "set", or else "mlp-2d+3d", or else the first learned one.
+        heading: heading of the method "forward": one direction, or the waypoints of a path. In the world; the direction
+            of travel nearest to a location is the heading there. Empty for a horizontal heading drawn for each
+            location.
+        reference: method that every other is compared with, by its name, such as "bins" or "mlp-2d+z". Empty for
+            "set", or else "mlp-2d+3d", or else the first learned one.
     """
 
     methods: tuple[str, ...] = field(default_factory=_all_methods)

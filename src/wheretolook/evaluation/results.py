@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -19,7 +20,8 @@ from wheretolook.evaluation.views import CandidateSet
 from wheretolook.geometry.poses import Float
 from wheretolook.methods.registry import methods_named, scorers
 from wheretolook.utils.files import fingerprint
-from wheretolook.utils.tracking import NestedRun, TrackingConfig, artifact, log, newest_run, start_run
+from wheretolook.utils.tracking import NestedRun, artifact, log, log_nested, newest_run, start_run
+from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.thresholds import ALL, threshold_key
 from wheretolook.visibility.config import OcclusionConfig
 
@@ -31,7 +33,7 @@ VARIANTS_CSV = "variants.csv"
 """In a release's `results/`: scores of the networks for all inputs, as `scores.csv`, before one was chosen to ship."""
 
 LOCATIONS_PARQUET = "locations.parquet"
-"""Artifact of each nested run: what was chosen at each location."""
+"""Artifact of each nested run: what was chosen at each location, for each N."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,34 +98,60 @@ def evaluation_params(dataset: Dataset, scenes: Sequence[SceneFolder], weights: 
     }
 
 
-_NAMED = ("method", "occlusion", "candidates", "top_n")
-"""What names a row of a score table, beside the scene."""
+_NAMED = ("method", "occlusion", "candidates")
+"""What names a nested run."""
 
-_BY_SCENE = ("good_", "n_views", "normalized_", "regret_")
-"""Beginnings of the columns whose values in each scene are logged as well."""
+_OF_ALL_VIEWS = ("n_locations", "average_precision", "roc_auc", "ece", "ece_scaled", "temperature")
+"""Columns of a score table that do not depend on N."""
+
+_OF_CHOSEN = re.compile("(raw|any|normalized|p)_(?!low_|high_)|(regret|difference)_")
+"""Beginning of the columns that are logged for each N. `scores.csv`, an artifact, has the other intervals and counts;
+each metric costs MLflow 0.3 ms."""
+
+_OF_SCENE = re.compile("regret_(?!low_|high_)")
+"""Beginning of the columns that are logged for each N and scene."""
 
 
-def runs_of_rows(table: pd.DataFrame, params: Mapping[str, Any]) -> Iterator[tuple[dict[str, Any], NestedRun]]:
-    """Each row over all scenes of score tables, with the run nested in the evaluation's that it is logged as.
+def runs_of_rows(table: pd.DataFrame, params: Mapping[str, Any]) -> Iterator[NestedRun]:
+    """The runs that score tables are logged as: for each method, occlusion model and candidate set one.
+
+    Its metrics are named by N, the scene unless it is all of them, and the column, such as
+    `top-1/regret_0.05m_0.4deg` and `top-5/apartment-210/regret_5m_10deg`, or by the column if N does not matter.
 
     Args:
         table: score tables, one below the other, with columns `occlusion` and `candidates`.
         params: of the evaluation; the row's own are added.
     """
-    by_row: dict[tuple[Any, ...], list[dict[Any, Any]]] = {}
-    for record in table[table["scene"] != ALL].to_dict("records"):
-        by_row.setdefault(tuple(record[name] for name in _NAMED), []).append(record)
-    for record in table[table["scene"] == ALL].to_dict("records"):
-        row = {str(key): value for key, value in record.items()}
-        seen = (row["occlusion"], *([row["candidates"]] if row["candidates"] != ALL else []))
-        shown = (row["method"], f"best {row['top_n']}", f"({', '.join(seen)})")
-        texts = (*_NAMED, "scene", "reference")
-        numbers = {key: float(value) for key, value in row.items() if key not in texts}
-        for scene in by_row.get(tuple(row[name] for name in _NAMED), []):
-            for key, value in scene.items():
-                if str(key).startswith(_BY_SCENE):
-                    numbers[f"{key}/{scene['scene']}"] = float(value)
-        yield row, NestedRun(" ".join(shown), {**params, **{key: row[key] for key in _NAMED}}, numbers)
+    for key, rows in table.groupby(list(_NAMED), sort=False):
+        own = dict(zip(_NAMED, map(str, key), strict=True))
+        numbers: dict[str, float] = {}
+        for row in rows.to_dict("records"):
+            pooled, place = row["scene"] == ALL, f"top-{row['top_n']}"
+            if pooled:
+                numbers |= {name: float(row[name]) for name in _OF_ALL_VIEWS if name in row}
+            for name, value in ((str(name), value) for name, value in row.items()):
+                if pooled and _OF_CHOSEN.match(name):
+                    numbers[f"{place}/{name}"] = float(value)
+                elif not pooled and _OF_SCENE.match(name):
+                    numbers[f"{place}/{row['scene']}/{name}"] = float(value)
+        candidates = [own["candidates"]] if own["candidates"] != ALL else []
+        name = f"{own['method']} ({', '.join([own['occlusion'], *candidates])})"
+        yield NestedRun(name, {**params, **own}, numbers)
+
+
+def _runs_with_locations(
+    scored: Sequence[ScoredSet],
+    params: Mapping[str, Any],
+    scenes: Sequence[SceneFolder],
+    config: EvaluateConfig,
+    file: Path,
+) -> Iterator[NestedRun]:
+    """The runs of `runs_of_rows`, each with a `file` that holds what was chosen until the next is asked for."""
+    for one in scored:
+        for nested in runs_of_rows(one.table, params):
+            chosen = [location_table(one, nested.params["method"], n, scenes, config) for n in config.top_n]
+            pd.concat(chosen).to_parquet(file, index=False)
+            yield replace(nested, files=(file,))
 
 
 def location_table(
@@ -131,7 +159,7 @@ def location_table(
 ) -> pd.DataFrame:
     """What a method chooses at each location, one row each.
 
-    Columns: scene, location_id, chosen (views), for each threshold good_* (how many of them are good) and any_*
+    Columns: scene, location_id, top_n, chosen (views), for each threshold good_* (how many of them are good) and any_*
     (whether one is; for random choice both are expectations), and best_score, that of the view chosen first; NaN for
     random choice and the oracle, which choose by no score.
     """
@@ -139,6 +167,7 @@ def location_table(
     columns: dict[str, Any] = {
         "scene": [scenes[number].name for number in views.location_scene],
         "location_id": scored.candidates.location_id,
+        "top_n": n,
         "chosen": top.chosen.astype(np.int64),
     }
     for index, key in enumerate(map(threshold_key, config.thresholds)):
@@ -157,7 +186,7 @@ def log_evaluation(
     occlusion: OcclusionConfig,
     results: Path,
 ) -> None:
-    """Log an evaluation: a run with the files of `results`, and in it one for each row over all scenes.
+    """Log an evaluation: a run with the files of `results`, and nested in it those of `runs_of_rows`.
 
     Args:
         dataset: evaluated.
@@ -191,13 +220,8 @@ def log_evaluation(
         for file in results.iterdir():
             if file.is_file():
                 client.log_artifact(run, str(file))
-        for one in evaluation.scored:
-            for row, nested in runs_of_rows(one.table, params):
-                chosen = location_table(one, row["method"], row["top_n"], scenes, config)
-                chosen.to_parquet(Path(folder) / LOCATIONS_PARQUET, index=False)
-                with start_run(tracking, nested.name, "evaluate", nested.params, parent=run) as (_, child):
-                    log(client, child, metrics=nested.metrics)
-                    client.log_artifact(child, str(Path(folder) / LOCATIONS_PARQUET))
+        file = Path(folder) / LOCATIONS_PARQUET
+        log_nested(tracking, run, "evaluate", _runs_with_locations(evaluation.scored, params, scenes, config, file))
 
 
 def latest_scores(tracking: TrackingConfig, dataset: str | None = None) -> pd.DataFrame | None:

@@ -11,7 +11,7 @@ import pandas as pd
 from tqdm.auto import tqdm
 
 from wheretolook.dataset.folders import Dataset, SceneFolder
-from wheretolook.dataset.scene_occlusion import scene_occlusion
+from wheretolook.dataset.scene import Scene, SceneConfig
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.scores import reference_method
 from wheretolook.geometry.poses import Float
@@ -127,8 +127,8 @@ def score_scenes(
             localization_map = scene.localization_map(dataset.camera, device)
             # a release has no mesh, but what each location sees by it
             if occlusion is not None and (scene.mesh.is_file() or occlusion.model != localization_map.occlusion.name):
-                model = scene_occlusion(scene, dataset.camera, occlusion, device, progress=progress)
-                localization_map = replace(localization_map, occlusion=model)
+                opened = Scene(scene, dataset.camera, SceneConfig(occlusion), device, progress=progress)
+                localization_map = replace(localization_map, occlusion=opened.occlusion)
             used.add(localization_map.occlusion.name)
             scorers = _scorers(localization_map, config, weights)
             reference_method(scorers, config.reference)  # an unknown one is told before the work

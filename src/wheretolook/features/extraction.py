@@ -1,4 +1,4 @@
-"""SIFT keypoints and descriptors. The same extractor serves the images of the map and the queries."""
+"""Extraction of SIFT keypoints and descriptors, for the images of the map and for queries alike."""
 
 from __future__ import annotations
 
@@ -17,12 +17,7 @@ from wheretolook.utils.processes import Processes
 
 
 class KeypointExtractor:
-    """Extracts SIFT keypoints, on one CPU core or a GPU.
-
-    Args:
-        config: see `ExtractorConfig`.
-        device: "cpu" or a CUDA device. COLMAP's SIFT runs on the CPU in any case: on a GPU it is not repeatable.
-    """
+    """Extracts SIFT keypoints, on a CPU core or a GPU (COLMAP's on the CPU only: on a GPU it is not repeatable)."""
 
     def __init__(self, config: ExtractorConfig | None = None, device: str = "cpu") -> None:
         self.config = config or ExtractorConfig()
@@ -35,41 +30,30 @@ class KeypointExtractor:
             self._extractor = _colmap_sift(self.config) if self.config.method == "colmap" else _opencv_sift(self.config)
 
     def extract(self, rgb: NDArray[np.uint8]) -> Keypoints:
-        """Extract keypoints of one image.
-
-        Args:
-            rgb: (H, W, 3) uint8.
-
-        Returns:
-            At most `max_keypoints` keypoints, in an order that depends on the image alone.
+        """At most `max_keypoints` keypoints of one image (H, W, 3) uint8, in an order that depends on the image alone.
 
         Raises:
-            ValueError: when the image is not (H, W, 3) uint8.
+            ValueError: the image has another shape or type.
         """
         return self.extract_batch([rgb])[0]
 
     def extract_batch(self, images: Sequence[NDArray[np.uint8]]) -> list[Keypoints]:
-        """Extract keypoints of images (H, W, 3) uint8 of one size, at once if this is on a GPU. See `extract`."""
+        """Extract keypoints of images (H, W, 3) uint8 of one size, on a GPU all at once. See `extract`."""
         grey = [_grey(rgb) for rgb in images]
         if self.on_gpu:
-            found: list[Keypoints] = self._extractor.extract_many(np.stack([one.to_array() for one in grey]))
+            found: list[Keypoints] = self._extractor.extract_many(np.stack([bitmap.to_array() for bitmap in grey]))
             return found
         if self.config.method == "colmap":
-            return [self._extract_colmap(one) for one in grey]
-        return [self._extract_opencv(one.to_array()) for one in grey]
+            return [self._extract_colmap(bitmap) for bitmap in grey]
+        return [self._extract_opencv(bitmap.to_array()) for bitmap in grey]
 
     def extract_many(
         self, images: Iterable[NDArray[np.uint8]], workers: int | Processes = 1
     ) -> Generator[Keypoints, None, None]:
-        """Extract keypoints of many images, in processes of their own (pycolmap's extractor holds Python's lock), or
-        in batches on a GPU.
+        """Keypoints of many images (H, W, 3) uint8, in their order, extracted in worker processes or in GPU batches.
 
-        Args:
-            images: each (H, W, 3) uint8; read only a few images ahead of what is returned.
-            workers: processes, or how many to spawn; 1 stays in this one.
-
-        Yields:
-            Keypoints in the order of the images, the same whatever the number of workers.
+        Only a few images are read ahead. `workers` are processes, or how many to spawn (threads would wait for one
+        another, since pycolmap's extractor holds Python's lock); 1 stays in this process. The result is the same.
         """
         if self.on_gpu:
             source = iter(images)
@@ -87,7 +71,7 @@ class KeypointExtractor:
         if len(keypoints) == 0:
             return Keypoints.none()
         table = np.array([(k.x, k.y, k.compute_scale()) for k in keypoints], dtype=np.float32)
-        # COLMAP's own cap keeps whole scale levels from the largest down, so it can overshoot; cut what is beyond.
+        # COLMAP keeps whole scale levels, from the largest down, so there can be more than the limit.
         keep = np.argsort(-table[:, 2], kind="stable")[: self.config.max_keypoints]
         return Keypoints(table[keep, :2], unit_descriptors(descriptors.data[keep]), table[keep, 2])
 
@@ -110,7 +94,7 @@ _GPU_BATCH = 8
 
 
 def _grey(rgb: NDArray[np.uint8]) -> Any:
-    """COLMAP's own conversion to grey (Rec. 709 weights): with other weights other keypoints pass the thresholds."""
+    """Convert to grey as COLMAP does (Rec. 709 weights); with other weights other keypoints pass the thresholds."""
     import pycolmap
 
     if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3:

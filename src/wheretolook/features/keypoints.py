@@ -1,8 +1,8 @@
-"""Keypoints with their descriptors, and how they are extracted: settings and results."""
+"""Settings of the keypoint extractor, and its result: keypoints with their descriptors."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -16,20 +16,24 @@ class ExtractorConfig:
     """Settings of the keypoint extractor.
 
     Args:
-        method: whose SIFT to run. `opencv` finds nearly the same keypoints as `colmap`, COLMAP's own extraction on the
-            CPU, in 40 % of the time; on a GPU, Warp kernels find OpenCV's up to rounding.
+        method: whose SIFT finds keypoints, opencv or colmap. `opencv` finds nearly the same keypoints as `colmap`,
+            COLMAP's own extraction on the CPU, in 40 % of the time; on a GPU, Warp kernels find OpenCV's up to
+            rounding.
         first_octave: -1 doubles the image first, which gives about three times as many (and smaller) keypoints, for
             `colmap` at four times the cost; 0 starts at the image's own size. COLMAP's default is -1.
-        max_keypoints: the most keypoints kept an image. `colmap` prefers large scales, `opencv` strong contrast.
+        max_keypoints: largest number of keypoints for each image. `colmap` prefers large scales, `opencv` strong
+            contrast.
         peak_threshold: least contrast (difference of Gaussians, grey values in [0, 1]). COLMAP's default is 0.02 / 3.
-        edge_threshold: largest ratio of principal curvatures (Lowe 2004, section 4.1).
+
+    Attributes:
+        edge_threshold: largest ratio of principal curvatures: the value of Lowe 2004 (section 4.1), COLMAP and OpenCV.
     """
 
     method: Literal["opencv", "colmap"] = "opencv"
     first_octave: int = -1
     max_keypoints: int = 2048
     peak_threshold: float = 0.02 / 3
-    edge_threshold: float = 10.0
+    edge_threshold: float = field(default=10.0, init=False)
 
     def __post_init__(self) -> None:
         if self.method not in ("colmap", "opencv"):
@@ -38,24 +42,17 @@ class ExtractorConfig:
             raise ConfigError("first_octave must be -1 or 0", value=self.first_octave)
         if self.max_keypoints < 1:
             raise ConfigError("max_keypoints must be positive", value=self.max_keypoints)
-        if not (self.peak_threshold > 0 and self.edge_threshold > 0):
-            raise ConfigError(
-                "peak_threshold and edge_threshold must be positive", value=(self.peak_threshold, self.edge_threshold)
-            )
+        if not self.peak_threshold > 0:
+            raise ConfigError("peak_threshold must be positive", value=self.peak_threshold)
 
 
 @dataclass(frozen=True, eq=False)
 class Keypoints:
-    """Keypoints of one image.
+    """Keypoints of one image."""
 
-    Attributes:
-        pixels: (N, 2) float32, (x, y) in pixels; (0.5, 0.5) is the centre of the top-left pixel.
-        descriptors: (N, 128) float32 RootSIFT (Arandjelovic and Zisserman, CVPR 2012) of unit length.
-        scales_px: (N,) float32, standard deviation in pixels of the Gaussian at which the keypoint was found.
-    """
-
-    pixels: NDArray[np.float32]
-    descriptors: NDArray[np.float32]
+    pixels: NDArray[np.float32]  # (N, 2) (x, y) in pixels; (0.5, 0.5) is the centre of the top-left pixel
+    descriptors: NDArray[np.float32]  # (N, 128) RootSIFT (Arandjelovic and Zisserman, CVPR 2012) of unit length
+    # (N,) float32, standard deviation in pixels of the Gaussian at which the keypoint was found.
     scales_px: NDArray[np.float32]
 
     def __len__(self) -> int:

@@ -1,4 +1,4 @@
-"""The two landmarks nearest to each keypoint's descriptor, exactly, by one matrix product."""
+"""Matching of keypoints with landmarks: exact nearest neighbours among descriptors, by matrix products."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ Matches = tuple[NDArray[np.int64], NDArray[np.int64]]
 """Rows of keypoints and rows of their landmarks, (M,) each, in ascending order of the keypoints."""
 
 GROUP = 32
-"""Landmarks whose best is found first; the two best of all are then looked for in the two best groups."""
+"""Landmarks per group. The two best groups are found first, and in them the two best landmarks."""
 
 _PRODUCT_BYTES = {"cpu": 2**22, "cuda": 2**30}
-"""Size of a block of products: on a CPU it should stay in the cache."""
+"""Size of a block of products; on a CPU it should fit into the cache."""
 
 
 class DescriptorMatcher:
@@ -26,7 +26,7 @@ class DescriptorMatcher:
     Descriptors are compared as COLMAP stores them, in whole numbers, by their scalar products. These are then exact, in
     eight-bit integers on a CPU as in half precision with single-precision sums on a GPU: both give the same neighbours,
     and those of one descriptor do not depend on what it is matched together with. `nearest_two_plain` is the twin. A
-    CPU whose byte products saturate works in single precision, where 128 * 255^2 < 2^24 is exact, too.
+    CPU whose byte products saturate or are slow works in single precision, where 128 * 255^2 < 2^24 is exact, too.
 
     Args:
         descriptors: (N, 128) uint8, of the landmarks.
@@ -37,18 +37,18 @@ class DescriptorMatcher:
         self.device = torch.device(device)
         n, length = descriptors.shape
         self.n_landmarks = n
-        self._in_bytes = self.device.type == "cpu" and _byte_products_are_exact()
+        self._in_bytes = self.device.type == "cpu" and _byte_products_pay()
         padded = -(-max(n, 2 * GROUP) // GROUP) * GROUP
         whole = torch.zeros((padded, length), dtype=torch.int32)
         whole[:n] = torch.from_numpy(descriptors.astype(np.int32))
-        if self._in_bytes:  # in signed bytes: q.d = (q - 128).(d - 128) + 128 (sum of d) + terms of q alone
+        if self._in_bytes:  # in signed bytes: q.d = (q - 128).(d - 128) + 128 (sum of d) + terms that depend on q only
             self._descriptors = (whole - 128).to(torch.int8).T
             self._bias = 128 * whole.sum(1, dtype=torch.int32)
         else:
             number = torch.float32 if self.device.type == "cpu" else torch.float16
             self._descriptors = whole.to(self.device, number).T
             self._bias = torch.zeros(padded, device=self.device)
-        self._bias[n:] = -(2**28)  # rows that only pad are never near
+        self._bias[n:] = -(2**28)  # rows of padding are never near
 
     def nearest_two(
         self, descriptors: NDArray[np.uint8]
@@ -56,10 +56,10 @@ class DescriptorMatcher:
         """Nearest landmark of each descriptor (K, 128) uint8, and its products with the nearest and second nearest.
 
         Returns:
-            rows (K,), nearest (K,) and second (K,); of several landmarks equally near, `rows` names any. Where there
-            are fewer than two landmarks, what is missing has a product of -2^28.
+            rows (K,), nearest (K,) and second (K,); of several landmarks equally near, `rows` has any. Where there are
+            fewer than two landmarks, the missing product is -2^28.
         """
-        # OpenMP counts by thread: without this, the first product in a new thread would start one thread for each core
+        # OpenMP's limit is per thread: without this, the first product in a new thread would start a thread per core.
         torch.set_num_threads(torch.get_num_threads())
         queries = torch.from_numpy(descriptors.astype(np.int32))
         block = max(1, _PRODUCT_BYTES[self.device.type] // (4 * len(self._bias)))
@@ -69,29 +69,32 @@ class DescriptorMatcher:
 
     def _best_two(self, queries: Tensor) -> tuple[Tensor, Tensor]:
         """Row of the nearest landmark, (k,), and the two largest products, (k, 2)."""
-        of_query = torch.zeros((), device=self.device)
+        query_bias = torch.zeros((), device=self.device)
         if self._in_bytes:
             product = torch._int_mm((queries - 128).to(torch.int8), self._descriptors)
-            of_query = 128 * (queries.sum(1, keepdim=True) - 128 * queries.shape[1])
+            query_bias = 128 * (queries.sum(1, keepdim=True) - 128 * queries.shape[1])
         elif self.device.type == "cpu":
             product = queries.float() @ self._descriptors
         else:
             product = torch.mm(queries.to(self.device, torch.float16), self._descriptors, out_dtype=torch.float32)
         groups = product.add_(self._bias).view(len(product), len(self._bias) // GROUP, GROUP)
-        of_best = groups.amax(2).topk(2, dim=1).indices
-        candidates = groups.gather(1, of_best[:, :, None].expand(-1, -1, GROUP)).flatten(1)
-        best, at = candidates.topk(2, dim=1)
-        first = at[:, 0]
-        rows = of_best.gather(1, first[:, None] // GROUP)[:, 0] * GROUP + first % GROUP
-        return rows, best + of_query
+        best_groups = groups.amax(2).topk(2, dim=1).indices
+        candidates = groups.gather(1, best_groups[:, :, None].expand(-1, -1, GROUP)).flatten(1)
+        best, best_candidates = candidates.topk(2, dim=1)
+        first = best_candidates[:, 0]
+        rows = best_groups.gather(1, first[:, None] // GROUP)[:, 0] * GROUP + first % GROUP
+        return rows, best + query_bias
 
 
 @cache
-def _byte_products_are_exact() -> bool:
-    """Whether this CPU adds up products of signed bytes without saturation, as it does with VNNI instructions.
+def _byte_products_pay() -> bool:
+    """Whether this CPU adds up products of signed bytes fast and without saturation, as it does with VNNI instructions.
 
-    Without them (AVX2, the first AVX-512) pairs of products are added in 16 bits, and large ones come out wrong.
+    Without them AVX-512 adds pairs of products in 16 bits, and large ones come out wrong. With AVX2 they are right, but
+    take PyTorch's plain loop, eighteen times as long as products in single precision.
     """
+    if torch.backends.cpu.get_cpu_capability() == "AVX2":
+        return False
     left, right = torch.full((64, 128), 127), torch.full((128, 64), 127)
     left[::2], right[:, ::2] = -128, -128
     try:
@@ -104,7 +107,7 @@ def _byte_products_are_exact() -> bool:
 def nearest_two_plain(
     queries: NDArray[np.uint8], descriptors: NDArray[np.uint8]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Twin of `DescriptorMatcher.nearest_two`: all products, sorted."""
+    """Plain twin of `DescriptorMatcher.nearest_two`: all products, sorted."""
     product = queries.astype(np.int64) @ descriptors.astype(np.int64).T
     order = np.argsort(-product, axis=1, kind="stable")
     best = np.take_along_axis(product, order[:, :2], axis=1)
@@ -114,23 +117,19 @@ def nearest_two_plain(
 def match(matcher: DescriptorMatcher, descriptors: Sequence[NDArray[np.uint8]], max_ratio: float) -> list[Matches]:
     """2D-3D matches of several images at once.
 
-    A match passes Lowe's ratio test (IJCV 2004, Sec. 7.1), and a landmark keeps only its nearest keypoint.
-
-    With a single landmark there is no second nearest, so nothing matches.
+    A match passes Lowe's ratio test (IJCV 2004, Sec. 7.1), and a landmark keeps only its nearest keypoint. With a
+    single landmark there is no second nearest, so nothing matches.
 
     Args:
         matcher: of the landmarks.
         descriptors: of each image, (K_i, 128) uint8.
         max_ratio: the nearest landmark's distance over the second nearest's must be below it.
-
-    Returns:
-        The matches of each image.
     """
-    lengths = [len(one) for one in descriptors]
+    lengths = [len(of_image) for of_image in descriptors]
     if sum(lengths) == 0 or matcher.n_landmarks < 2:
         return [(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)) for _ in descriptors]
     rows, nearest, second = matcher.nearest_two(np.concatenate(descriptors))
-    # squared distances of descriptors of length 512, of which rounding leaves some a little longer
+    # squared distances between descriptors of length 512; rounding makes some a little longer, hence the maximum
     distance, next_distance = (np.maximum(2 * (512**2 - best), 0) for best in (nearest, second))
     passed = distance < max_ratio**2 * next_distance
     ends = np.cumsum(lengths)

@@ -1,6 +1,6 @@
-"""Warp kernels of `WarpSift` that turn and describe its keypoints (Lowe, IJCV 2004, sections 5 and 6).
+"""Warp kernels of `WarpSift` that find the orientations of keypoints and describe them (Lowe, IJCV 2004, 5 and 6).
 
-Sums have one order, whatever runs beside them: each thread adds to its own histogram.
+Each thread adds to its own histogram, so that sums have a fixed order.
 """
 
 # mypy: ignore-errors
@@ -14,15 +14,12 @@ from wheretolook.features.warp_sift_kernels import LAYERS, SIGMA, Limits, Pyrami
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-TURN_BINS = wp.constant(36)
-MAX_TURNS = wp.constant(18)
-"""Peaks that a histogram of 36 bins can have."""
-TURN_LANES = wp.constant(8)
-"""Threads that share the rows around a keypoint."""
-CELLS = wp.constant(4)
-CELL_BINS = wp.constant(8)
-SIDE_OF_CELL = wp.constant(3.0)
-"""Width of a descriptor's cell in standard deviations of the keypoint's Gaussian."""
+TURN_BINS = wp.constant(36)  # of the histogram of directions around a keypoint
+MAX_TURNS = wp.constant(18)  # peaks that a histogram of 36 bins can have
+TURN_LANES = wp.constant(8)  # threads that share the rows around a keypoint
+CELLS = wp.constant(4)  # along each side of a descriptor
+CELL_BINS = wp.constant(8)  # directions in each
+SIDE_OF_CELL = wp.constant(3.0)  # width of a descriptor's cell in standard deviations of the keypoint's Gaussian
 
 TurnHistogram = wp.types.vector(length=36, dtype=wp.float32)
 CellHistogram = wp.types.vector(length=8, dtype=wp.float32)
@@ -35,8 +32,8 @@ class Places:
     level: wp.array[wp.int32]  # first value of its Gaussian level in the pyramids
     octave: wp.array[wp.int32]
     at: wp.array[wp.vec2i]  # column, row
-    centre: wp.array[wp.vec2]  # the same, refined
-    sigma: wp.array[wp.float32]  # of its Gaussian
+    centre: wp.array[wp.vec2]  # column, row, refined
+    sigma: wp.array[wp.float32]  # standard deviation of its Gaussian, in pixels of the octave
 
 
 PLACE_TYPES = {"level": wp.int32, "octave": wp.int32, "at": wp.vec2i, "centre": wp.vec2, "sigma": wp.float32}
@@ -46,7 +43,7 @@ PLACE_TYPES = {"level": wp.int32, "octave": wp.int32, "at": wp.vec2i, "centre": 
 def place_kernel(
     pyramid: Pyramid, keys: wp.array[wp.int64], limits: Limits, places: Places, table: wp.array2d[wp.float32]
 ):
-    """The keypoints at sorted keys, and x, y, scale (pixels of the image, 0 at the first one's centre) and response."""
+    """The keypoints at sorted keys; x, y, scale in pixels of the image (0 at the first one's centre), response."""
     row = wp.tid()
     key = keys[row]
     level = level_of(key)
@@ -62,7 +59,7 @@ def place_kernel(
     places.at[row] = wp.vec2i(peak.column, peak.row)
     places.centre[row] = wp.vec2(x, y)
     places.sigma[row] = sigma
-    pixels = 0.5 * wp.float32(1 << octave)  # of the image to one of the octave
+    pixels = 0.5 * wp.float32(1 << octave)  # pixels of the image in a pixel of the octave
     table[row, 0] = x * pixels
     table[row, 1] = y * pixels
     table[row, 2] = sigma * pixels
@@ -77,14 +74,14 @@ def gradient_at(values: wp.array[wp.float32], at: wp.int32, columns: wp.int32):
 
 @wp.func
 def in_turns(gradient: wp.vec2):
-    """Direction of a gradient, from 0 to 1."""
+    """Direction of a gradient as a share of a full turn, from 0 to 1."""
     turns = wp.atan2(gradient[1], gradient[0]) * (0.5 / wp.pi)
     return wp.where(turns < 0.0, turns + 1.0, turns)
 
 
 @wp.kernel
 def turn_histogram_kernel(pyramid: Pyramid, places: Places, histograms: wp.array3d[wp.float32]):
-    """Directions of the gradients around a keypoint, those of every `TURN_LANES`-th row."""
+    """Histogram of the directions of the gradients around a keypoint, in every `TURN_LANES`-th row."""
     row, lane = wp.tid()
     octave = places.octave[row]
     rows = pyramid.rows[octave]
@@ -113,7 +110,7 @@ def turn_histogram_kernel(pyramid: Pyramid, places: Places, histograms: wp.array
 
 @wp.kernel
 def turn_kernel(histograms: wp.array3d[wp.float32], n_turns: wp.array[wp.int32], angles: wp.array2d[wp.float32]):
-    """Peaks of the smoothed histogram, in degrees as OpenCV's (clockwise in the image, from x to the right)."""
+    """Peaks of the smoothed histogram, in degrees clockwise from the image's x axis, as OpenCV's."""
     row = wp.tid()
     histogram = TurnHistogram()
     for turn in range(TURN_BINS):
@@ -153,7 +150,7 @@ def describe_kernel(
     angles: wp.array[wp.float32],
     histograms: wp.array2d[wp.float32],
 ):
-    """One cell of a descriptor: the directions of the gradients less than a cell's width from its centre."""
+    """One cell of a descriptor: histogram of the gradients less than a cell's width from its centre."""
     row, cell = wp.tid()
     place = chosen[row]
     octave = places.octave[place]
@@ -205,7 +202,7 @@ def describe_kernel(
 
 @wp.kernel
 def finish_kernel(histograms: wp.array2d[wp.float32], descriptors: wp.array2d[wp.float32]):
-    """Descriptors in bytes, as OpenCV's, and of those RootSIFT (Arandjelovic and Zisserman, CVPR 2012)."""
+    """Round descriptors to bytes as OpenCV does, then take RootSIFT of them (Arandjelovic, Zisserman, CVPR 2012)."""
     row = wp.tid()
     size = histograms.shape[1]
     square = wp.float32(0.0)
@@ -222,7 +219,7 @@ def finish_kernel(histograms: wp.array2d[wp.float32], descriptors: wp.array2d[wp
         value = wp.min(wp.rint(wp.min(histograms[row, k], limit) * scale), 255.0)
         descriptors[row, k] = value
         total += value
-    # the roots of what sums to 1 have unit length already, up to rounding
+    # roots of numbers that sum to 1 have unit length, up to rounding
     total = wp.max(total, 1.0e-12)
     for k in range(size):
         descriptors[row, k] = wp.sqrt(descriptors[row, k] / total)

@@ -12,17 +12,13 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-LAYERS = wp.constant(3)
-"""Layers an octave in which extrema are sought; it holds three more levels of the Gaussian."""
-LEVELS = wp.constant(6)
-BORDER = wp.constant(5)
-"""No extremum is sought closer than this to an octave's border, in its pixels."""
-STEPS = wp.constant(5)
-"""Steps of refinement after which a candidate that still moves is dropped."""
-SIGMA = wp.constant(1.6)
+LAYERS = wp.constant(3)  # of each octave, in which extrema are looked for
+LEVELS = wp.constant(6)  # of the Gaussian in each octave
+BORDER = wp.constant(5)  # distance in pixels from an octave's border within which no extremum is looked for
+STEPS = wp.constant(5)  # of refinement, after which a candidate that still moves is dropped
+SIGMA = wp.constant(1.6)  # of an octave's first level, in its pixels
 
-MAX_SIDE = wp.constant(1 << 14)
-"""Rows or columns that a doubled image may have; with the two below, what a key is made of."""
+MAX_SIDE = wp.constant(1 << 14)  # rows or columns of a doubled image; this and the two below make up a key
 MAX_OCTAVES = wp.constant(16)
 MAX_LAYERS = wp.constant(4)
 KEYS_OF_IMAGE = (1 << 14) ** 2 * 16 * 4
@@ -33,15 +29,26 @@ class Pyramid:
     """Gaussian levels: image by image, octave by octave, level by level, row by row."""
 
     values: wp.array[wp.float32]
-    image_size: wp.int32  # values an image
+    image_size: wp.int32  # number of values of an image
     starts: wp.array[wp.int32]  # first value of each octave of an image
     rows: wp.array[wp.int32]
     columns: wp.array[wp.int32]
 
 
 @wp.struct
+class Level:
+    """A level of an octave, of all images."""
+
+    values: wp.array[wp.float32]
+    image_size: wp.int32  # values an image
+    start: wp.int32  # first value of the level in an image
+    rows: wp.int32
+    columns: wp.int32
+
+
+@wp.struct
 class Limits:
-    """What a keypoint must pass."""
+    """Thresholds that a keypoint must pass."""
 
     pre_contrast: wp.float32  # of the extremum's own value, in 0..255
     contrast: wp.float32  # of the interpolated one, in 0..1
@@ -60,11 +67,15 @@ class Peak:
     response: wp.float32
 
 
+@wp.func
+def place_in(level: Level, image: wp.int32, row: wp.int32, column: wp.int32):
+    """Where the value of a pixel stands."""
+    return image * level.image_size + level.start + row * level.columns + column
+
+
 @wp.kernel
-def double_kernel(
-    grey: wp.array3d[wp.uint8], values: wp.array[wp.float32], image_size: wp.int32, start: wp.int32, columns: wp.int32
-):
-    """Twice the size: pixel (2x, 2y) is (x, y), those between are interpolated linearly."""
+def double_kernel(grey: wp.array3d[wp.uint8], target: Level):
+    """Double the size: pixel (2x, 2y) is pixel (x, y), those between are interpolated linearly."""
     image, row, column = wp.tid()
     top = row >> 1
     left = column >> 1
@@ -76,27 +87,19 @@ def double_kernel(
         + wp.int32(grey[image, bottom, left])
         + wp.int32(grey[image, bottom, right])
     )
-    values[image * image_size + start + row * columns + column] = 0.25 * wp.float32(total)
+    target.values[place_in(target, image, row, column)] = 0.25 * wp.float32(total)
 
 
 @wp.kernel
-def halve_kernel(
-    values: wp.array[wp.float32],
-    image_size: wp.int32,
-    source: wp.int32,
-    source_columns: wp.int32,
-    target: wp.int32,
-    columns: wp.int32,
-):
-    """Every other pixel of every other row."""
+def halve_kernel(source: Level, target: Level):
+    """Take every other pixel of every other row."""
     image, row, column = wp.tid()
-    base = image * image_size
-    values[base + target + row * columns + column] = values[base + source + 2 * (row * source_columns + column)]
+    target.values[place_in(target, image, row, column)] = source.values[place_in(source, image, 2 * row, 2 * column)]
 
 
 @wp.func
 def reflected(index: wp.int32, size: wp.int32):
-    """An index beyond the border mirrored at the border's pixels, as often as it takes."""
+    """An index beyond the border mirrored at the border's pixels, as often as needed."""
     period = 2 * size - 2
     wrapped = wp.abs(index) % period
     return wp.min(wrapped, period - wrapped)
@@ -113,7 +116,7 @@ def smoothed(
     first_weight: wp.int32,
     radius: wp.int32,
 ):
-    """The symmetric filter at one place of a line of values; `weights` from its middle outwards."""
+    """A symmetric filter at one place of a line of values; `weights` are from its middle outwards."""
     middle = start + at * stride
     total = weights[first_weight] * values[middle]
     if at >= radius and at + radius < size:
@@ -128,55 +131,35 @@ def smoothed(
 
 
 @wp.kernel
-def smooth_rows_kernel(
-    values: wp.array[wp.float32],
-    image_size: wp.int32,
-    source: wp.int32,
-    columns: wp.int32,
+def smooth_kernel(
+    source: Level,
+    target: Level,
+    along_rows: wp.bool,
     weights: wp.array[wp.float32],
     first_weight: wp.int32,
     radius: wp.int32,
-    half_smooth: wp.array[wp.float32],
-    half_size: wp.int32,
 ):
-    """Along each row of a level."""
+    """Smooth each row, or else each column, of a level."""
     image, row, column = wp.tid()
-    start = image * image_size + source + row * columns
-    half_smooth[image * half_size + row * columns + column] = smoothed(
-        values, start, 1, column, columns, weights, first_weight, radius
-    )
-
-
-@wp.kernel
-def smooth_columns_kernel(
-    half_smooth: wp.array[wp.float32],
-    half_size: wp.int32,
-    rows: wp.int32,
-    columns: wp.int32,
-    weights: wp.array[wp.float32],
-    first_weight: wp.int32,
-    radius: wp.int32,
-    values: wp.array[wp.float32],
-    image_size: wp.int32,
-    target: wp.int32,
-):
-    """Along each column of what `smooth_rows_kernel` left."""
-    image, row, column = wp.tid()
-    start = image * half_size + column
-    values[image * image_size + target + row * columns + column] = smoothed(
-        half_smooth, start, columns, row, rows, weights, first_weight, radius
-    )
+    value = wp.float32(0.0)
+    if along_rows:
+        start = place_in(source, image, row, 0)
+        value = smoothed(source.values, start, 1, column, source.columns, weights, first_weight, radius)
+    else:
+        start = place_in(source, image, 0, column)
+        value = smoothed(source.values, start, source.columns, row, source.rows, weights, first_weight, radius)
+    target.values[place_in(target, image, row, column)] = value
 
 
 @wp.func
 def is_extremum(values: wp.array[wp.float32], at: wp.int32, size: wp.int32, columns: wp.int32, limit: wp.float32):
-    """Whether the difference of Gaussians at `at` is the largest, or the smallest, of its 27 (equal ones allowed)."""
+    """Whether the difference of Gaussians at `at` is the largest or smallest in its 3 x 3 x 3 neighbourhood."""
     value = values[at + size] - values[at]
     sign = wp.where(value > 0.0, 1.0, -1.0)
     highest = sign * value
     if highest <= limit:
         return False
-    # its own neighbours along the row first, then layer by layer, until one is higher
+    # the neighbours along the row first, then layer by layer, until one is higher
     if sign * (values[at + size + 1] - values[at + 1]) > highest:
         return False
     if sign * (values[at + size - 1] - values[at - 1]) > highest:
@@ -193,8 +176,15 @@ def is_extremum(values: wp.array[wp.float32], at: wp.int32, size: wp.int32, colu
 
 @wp.func
 def difference(values: wp.array[wp.float32], at: wp.int32, size: wp.int32):
-    """Difference of Gaussians in 0..1 (its level's and the next's)."""
+    """Difference of Gaussians in 0..1, of the next level and this one."""
     return (values[at + size] - values[at]) * (1.0 / 255.0)
+
+
+@wp.func
+def mixed(values: wp.array[wp.float32], at: wp.int32, a: wp.int32, b: wp.int32, size: wp.int32):
+    """Mixed second derivative of the difference of Gaussians along the strides a and b."""
+    same = difference(values, at + a + b, size) - difference(values, at + a - b, size)
+    return 0.25 * (same - difference(values, at - a + b, size) + difference(values, at - a - b, size))
 
 
 @wp.func
@@ -207,7 +197,7 @@ def refined(
     column: wp.int32,
     limits: Limits,
 ):
-    """Where the parabola through an extremum and its neighbours has its own (Lowe 2004, section 4)."""
+    """The extremum of the parabola through a discrete extremum and its neighbours (Lowe 2004, section 4)."""
     peak = Peak()
     peak.found = False
     rows = pyramid.rows[octave]
@@ -226,37 +216,20 @@ def refined(
     middle = wp.float32(0.0)
     while inside and not settled and step < STEPS:
         at = start + layer * size + row * columns + column
-        above = at + size
-        below = at - size
         middle = difference(values, at, size)
         east = difference(values, at + 1, size)
         west = difference(values, at - 1, size)
         south = difference(values, at + columns, size)
         north = difference(values, at - columns, size)
-        up = difference(values, above, size)
-        down = difference(values, below, size)
+        up = difference(values, at + size, size)
+        down = difference(values, at - size, size)
         gradient = 0.5 * wp.vec3(east - west, south - north, up - down)
         xx = east + west - 2.0 * middle
         yy = south + north - 2.0 * middle
         ss = up + down - 2.0 * middle
-        xy = 0.25 * (
-            difference(values, at + columns + 1, size)
-            - difference(values, at + columns - 1, size)
-            - difference(values, at - columns + 1, size)
-            + difference(values, at - columns - 1, size)
-        )
-        xs = 0.25 * (
-            difference(values, above + 1, size)
-            - difference(values, above - 1, size)
-            - difference(values, below + 1, size)
-            + difference(values, below - 1, size)
-        )
-        ys = 0.25 * (
-            difference(values, above + columns, size)
-            - difference(values, above - columns, size)
-            - difference(values, below + columns, size)
-            + difference(values, below - columns, size)
-        )
+        xy = mixed(values, at, columns, 1, size)
+        xs = mixed(values, at, size, 1, size)
+        ys = mixed(values, at, size, columns, size)
         by_x = wp.vec3(xx, xy, xs)
         by_y = wp.vec3(xy, yy, ys)
         by_s = wp.vec3(xs, ys, ss)
@@ -265,9 +238,7 @@ def refined(
         offset = wp.vec3(0.0)
         if determinant != 0.0:
             offset = (-1.0 / determinant) * wp.vec3(
-                wp.dot(gradient, normal),
-                wp.dot(gradient, wp.cross(by_s, by_x)),
-                wp.dot(gradient, wp.cross(by_x, by_y)),
+                wp.dot(gradient, normal), wp.dot(gradient, wp.cross(by_s, by_x)), wp.dot(gradient, wp.cross(by_x, by_y))
             )
         largest = wp.max(wp.abs(offset[0]), wp.max(wp.abs(offset[1]), wp.abs(offset[2])))
         if largest < 0.5:
@@ -276,15 +247,9 @@ def refined(
             column += wp.int32(wp.rint(offset[0]))
             row += wp.int32(wp.rint(offset[1]))
             layer += wp.int32(wp.rint(offset[2]))
-            inside = (
-                layer >= 1
-                and layer <= LAYERS
-                and row >= BORDER
-                and row < rows - BORDER
-                and column >= BORDER
-                and column < columns - BORDER
-            )
-        else:  # also where it is not a number
+            inside = layer >= 1 and layer <= LAYERS and row >= BORDER and row < rows - BORDER
+            inside = inside and column >= BORDER and column < columns - BORDER
+        else:  # also if it is NaN
             inside = False
         step += 1
     if settled:
@@ -303,7 +268,7 @@ def refined(
 
 @wp.func
 def key_of(image: wp.int32, octave: wp.int32, layer: wp.int32, row: wp.int32, column: wp.int32):
-    """A place in the pyramids as one number, by which places are sorted."""
+    """Image, octave, layer and pixel as one number, by which keypoints are sorted."""
     level = (image * MAX_OCTAVES + octave) * MAX_LAYERS + layer
     return (wp.int64(level) * wp.int64(MAX_SIDE) + wp.int64(row)) * wp.int64(MAX_SIDE) + wp.int64(column)
 
@@ -325,15 +290,11 @@ def pixel_of(key: wp.int64):
 
 @wp.kernel
 def extrema_kernel(
-    pyramid: Pyramid,
-    octave: wp.int32,
-    limits: Limits,
-    number: wp.array[wp.int32],
-    keys: wp.array[wp.int64],
+    pyramid: Pyramid, octave: wp.int32, limits: Limits, number: wp.array[wp.int32], keys: wp.array[wp.int64]
 ):
-    """List the keypoints of an octave, or only count them where the list is full, in any order and with repetitions.
+    """List the keypoints of an octave in any order, or only count them once the list is full.
 
-    Several extrema can move to the same place in their refinement.
+    A keypoint can be listed several times, since the refinement can move several extrema to the same place.
     """
     image, layer, row, column = wp.tid()
     layer += 1

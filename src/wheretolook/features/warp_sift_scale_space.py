@@ -1,4 +1,4 @@
-"""The Gaussian scale space of many images at once, on a device, and the extrema in it (Lowe, IJCV 2004)."""
+"""The Gaussian scale spaces of many images on a device, and their extrema (Lowe, IJCV 2004)."""
 
 from __future__ import annotations
 
@@ -15,28 +15,27 @@ from wheretolook.features.warp_sift_kernels import (
     LAYERS,
     LEVELS,
     SIGMA,
+    Level,
     Pyramid,
     double_kernel,
     extrema_kernel,
     halve_kernel,
-    smooth_columns_kernel,
-    smooth_rows_kernel,
+    smooth_kernel,
 )
 
-_ASSUMED_SIGMA = 0.5
-"""Blur of an image as it comes, in its pixels."""
+_ASSUMED_SIGMA = 0.5  # blur of an input image, in its pixels
 
 
 class ScaleSpace:
-    """The Gaussian scale spaces of images of one size, and the list of their extrema.
+    """The Gaussian scale spaces of up to `n_images` images of one size, and the list of their extrema.
 
     Args:
-        rows: of an image. With as many columns, `octave_sizes` must not be empty.
+        rows: of an image; its smaller side must exceed `BORDER`, so that there is an octave.
         columns: of an image.
-        n_images: for how many there is room.
-        first_octave: -1 seeks keypoints in the doubled image too, 0 from the image's own size on.
+        n_images: for how many to make room.
+        first_octave: -1 looks for keypoints in the doubled image too, 0 only from the image's own size on.
         limits: `Limits`.
-        device: as Warp calls it.
+        device: Warp's name of a device.
     """
 
     def __init__(self, rows: int, columns: int, n_images: int, first_octave: int, limits: Any, device: str) -> None:
@@ -46,7 +45,13 @@ class ScaleSpace:
         starts = np.cumsum([0, *(LEVELS * r * c for r, c in self.sizes)])
         self.image_size = int(starts[-1])
         self.starts = [int(start) for start in starts[:-1]]
-        self.pyramid = self._pyramid()
+        rows_of, columns_of = ([size[side] for size in self.sizes] for side in (0, 1))
+        pyramid: Any = Pyramid()
+        pyramid.values = wp.empty(n_images * self.image_size, dtype=wp.float32, device=device)
+        pyramid.image_size = self.image_size
+        for name, values in (("starts", self.starts), ("rows", rows_of), ("columns", columns_of)):
+            setattr(pyramid, name, wp.array(values, dtype=wp.int32, device=device))
+        self.pyramid = pyramid
         self.grey = wp.empty((n_images, rows, columns), dtype=wp.uint8, device=device)
         self.half_smooth = wp.empty(n_images * 4 * rows * columns, dtype=wp.float32, device=device)
         self.number = wp.zeros(1, dtype=wp.int32, device=device)
@@ -58,20 +63,8 @@ class ScaleSpace:
         self.weights: Any = wp.array(np.concatenate(filters).astype(np.float32), dtype=wp.float32, device=device)
         self._commands = self._record()
 
-    def _pyramid(self) -> Any:
-        pyramid: Any = Pyramid()
-        pyramid.values = wp.empty(self.n_images * self.image_size, dtype=wp.float32, device=self.device)
-        pyramid.image_size = self.image_size
-        for name, numbers in (
-            ("starts", self.starts),
-            ("rows", [rows for rows, _ in self.sizes]),
-            ("columns", [columns for _, columns in self.sizes]),
-        ):
-            setattr(pyramid, name, wp.array(numbers, dtype=wp.int32, device=self.device))
-        return pyramid
-
     def fill(self, grey: Any) -> None:
-        """The scale spaces of (B, H, W) uint8 images, in NumPy or Warp, B at most `n_images`."""
+        """Compute the scale spaces of images (B, H, W) uint8, in NumPy or Warp, B at most `n_images`."""
         if isinstance(grey, np.ndarray):
             grey = wp.array(np.ascontiguousarray(grey), dtype=wp.uint8, device="cpu", copy=False)
         wp.copy(self.grey, grey.contiguous(), count=grey.size)
@@ -88,22 +81,17 @@ class ScaleSpace:
             self.number.zero_()
             for octave in range(1 + self.first_octave, len(self.sizes)):
                 rows, columns = self.sizes[octave]
-                wp.launch(
-                    extrema_kernel,
-                    dim=(self.filled, LAYERS, rows - 2 * BORDER, columns - 2 * BORDER),
-                    inputs=[self.pyramid, octave, self.limits],
-                    outputs=[self.number, self.keys],
-                    device=self.device,
-                )
+                shape = self.filled, LAYERS, rows - 2 * BORDER, columns - 2 * BORDER
+                inputs, outputs = [self.pyramid, octave, self.limits], [self.number, self.keys]
+                wp.launch(extrema_kernel, shape, inputs, outputs, device=self.device)
             number = int(self.number.numpy()[0])
             if number <= len(self.keys):
                 return self.keys[:number].numpy()
             self.keys = wp.empty(roomy(number), dtype=wp.int64, device=self.device)
 
     def _record(self) -> list[tuple[Any, tuple[int, int]]]:
-        """The launches that fill the scale spaces, and how many threads of each an image has."""
+        """The launches that fill the scale spaces, and how many threads of each work on an image."""
         commands: list[tuple[Any, tuple[int, int]]] = []
-        values, image_size = self.pyramid.values, self.image_size
 
         def add(kernel: Any, octave: int, *inputs: Any) -> None:
             size = self.sizes[octave]
@@ -111,36 +99,37 @@ class ScaleSpace:
             command = wp.launch(kernel, dim=dim, inputs=list(inputs), device=self.device, record_cmd=True)
             commands.append((command, size))
 
+        def level_of(octave: int, level: int, half_smooth: bool = False) -> Any:
+            """A level of the pyramid, or the memory for one smoothed along its rows only."""
+            found: Any = Level()
+            found.rows, found.columns = self.sizes[octave]
+            if half_smooth:
+                found.values, found.image_size, found.start = self.half_smooth, 4 * self.rows * self.columns, 0
+            else:
+                found.values, found.image_size = self.pyramid.values, self.image_size
+                found.start = self.starts[octave] + level * found.rows * found.columns
+            return found
+
         def smooth(octave: int, source: int, target: int) -> None:
             """From level to level of an octave, with the filter of the latter."""
-            rows, columns = self.sizes[octave]
-            start, size, half_size = self.starts[octave], rows * columns, 4 * self.rows * self.columns
-            half = [self.weights, self.first_weights[target], self.radii[target]]
-            add(
-                smooth_rows_kernel, octave, values, image_size, start + source * size, columns, *half,
-                self.half_smooth, half_size,
-            )  # fmt: skip
-            add(
-                smooth_columns_kernel, octave, self.half_smooth, half_size, rows, columns, *half,
-                values, image_size, start + target * size,
-            )  # fmt: skip
+            filter_of_target = [self.weights, self.first_weights[target], self.radii[target]]
+            half = level_of(octave, 0, half_smooth=True)
+            add(smooth_kernel, octave, level_of(octave, source), half, True, *filter_of_target)
+            add(smooth_kernel, octave, half, level_of(octave, target), False, *filter_of_target)
 
-        add(double_kernel, 0, self.grey, values, image_size, 0, self.sizes[0][1])
+        add(double_kernel, 0, self.grey, level_of(0, 0))
         smooth(0, 0, 0)
         for octave in range(len(self.sizes)):
             if octave > 0:
-                rows, columns = self.sizes[octave - 1]
-                source = self.starts[octave - 1] + LAYERS * rows * columns
-                target, target_columns = self.starts[octave], self.sizes[octave][1]
-                add(halve_kernel, octave, values, image_size, source, columns, target, target_columns)
-            sought = octave > self.first_octave
-            for level in range(1, LEVELS if sought else LAYERS + 1):
+                add(halve_kernel, octave, level_of(octave - 1, LAYERS), level_of(octave, 0))
+            searched = octave > self.first_octave
+            for level in range(1, LEVELS if searched else LAYERS + 1):
                 smooth(octave, level - 1, level)
         return commands
 
 
 def octave_sizes(rows: int, columns: int) -> list[tuple[int, int]]:
-    """Rows and columns of the octaves in which a keypoint can be, the first of twice the image's size."""
+    """Rows and columns of the octaves that can hold a keypoint; the first has twice the image's size."""
     sizes = [(2 * rows, 2 * columns)]
     while min(sizes[-1]) > 2 * BORDER:
         sizes.append((sizes[-1][0] // 2, sizes[-1][1] // 2))
@@ -148,12 +137,12 @@ def octave_sizes(rows: int, columns: int) -> list[tuple[int, int]]:
 
 
 def values_of_image(rows: int, columns: int) -> int:
-    """How many numbers the scale space of an image has."""
+    """How many values the scale space of an image has."""
     return LEVELS * sum(r * c for r, c in octave_sizes(rows, columns))
 
 
 def _sigmas() -> list[float]:
-    """Standard deviation that each level adds to the one before; the first, to the doubled image."""
+    """Standard deviation of the filter that makes each level from the one before, the first from the doubled image."""
     sigma = SIGMA
     total = [sigma * 2 ** (level / LAYERS) for level in range(LEVELS)]
     first = math.sqrt(sigma**2 - (2 * _ASSUMED_SIGMA) ** 2)
@@ -161,12 +150,12 @@ def _sigmas() -> list[float]:
 
 
 def _half_gaussian(sigma: float) -> NDArray[np.float64]:
-    """Weights of a Gaussian filter from its middle outwards, cut where `cv2.GaussianBlur` cuts them."""
+    """Weights of a Gaussian filter from its middle outwards, truncated where `cv2.GaussianBlur` does."""
     radius = (round(8 * sigma + 1) | 1) // 2
     weights = np.exp(-(np.arange(-radius, radius + 1) ** 2) / (2 * sigma**2))
     return (weights / weights.sum())[radius:]
 
 
 def roomy(n: int) -> int:
-    """At least n, one of few sizes."""
+    """A power of two of at least n, so that buffers have few different sizes."""
     return 1 << max(10, (n - 1).bit_length())

@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.style import context
 
 from wheretolook.evaluation.score_table import main_rows, methods_of
+from wheretolook.figures.config import Look
 from wheretolook.figures.style import INK, RC, new_figure
 from wheretolook.methods.method import MethodStyle
 from wheretolook.methods.styles import method_style
@@ -16,17 +17,14 @@ _BEFORE, _AFTER = "before", "after"
 
 
 def calibration_figure(table: pd.DataFrame) -> Figure:
-    """Reliability of each learned method before and after temperature scaling.
+    """Reliability diagram of each learned method before (open marks) and after temperature scaling (filled).
+
+    One column for each method: above, the share of good views over the mean prediction of each bin; below, the number
+    of views in each bin.
 
     Args:
-        table: one row for each method, `when` ("before", "after") and bin, with `bin_low`, `bin_high`,
-            `mean_predicted` and `share_good` (NaN in empty bins), `n` (views), `ece` and `temperature`: what the
-            evaluate stage writes as `calibration.csv`. A method without "after" has no temperature. Of several
-            occlusion models or sets of candidates the first is drawn.
-
-    Returns:
-        One column for each method: above, the share of good views against the mean prediction in each bin, open marks
-        before and filled ones after, the diagonal where both are equal; below, how many views fall in each bin.
+        table: `calibration.csv` of the evaluate stage: a row for each method, `when` ("before", "after") and
+            bin. Of several occlusion models or sets of candidates the first is drawn.
     """
     table = main_rows(table)
     methods = methods_of(table)
@@ -52,11 +50,11 @@ def calibration_figure(table: pd.DataFrame) -> Figure:
 
 def _draw(curve: Axes, counts: Axes, part: pd.DataFrame, style: MethodStyle, when: str) -> None:
     scaled = when == _AFTER
+    line: Look = {"color": style.color, "linewidth": 1.2, "linestyle": "-" if scaled else ":"}
+    mark: Look = {"marker": style.marker, "markersize": 5, "markerfacecolor": style.color if scaled else "white"}
     label = f"T = {part['temperature'].iloc[0]:.2f}" if scaled else "as predicted"
     label += f": ECE {part['ece'].iloc[0]:.3f}"
     known = part[part["n"] > 0]
-    curve.plot(known["mean_predicted"], known["share_good"], "-" if scaled else ":", color=style.color,
-               marker=style.marker, markersize=5, markerfacecolor=style.color if scaled else "white", linewidth=1.2,
-               label=label, clip_on=False, zorder=3 if scaled else 2.5)  # fmt: skip
-    edges = [*part["bin_low"], part["bin_high"].iloc[-1]]
-    counts.stairs(part["n"], edges, color=style.color, linewidth=1.2, linestyle="-" if scaled else ":")
+    where: Look = {"clip_on": False, "zorder": 3 if scaled else 2.5}
+    curve.plot(known["mean_predicted"], known["share_good"], label=label, **line, **mark, **where)
+    counts.stairs(part["n"], [*part["bin_low"], part["bin_high"].iloc[-1]], **line)

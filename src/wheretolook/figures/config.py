@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from wheretolook.utils.errors import ConfigError
+
+Look = dict[str, Any]
+"""Keyword arguments of Matplotlib's functions, such as colours and sizes."""
 
 KINDS = ("png", "pdf", "svg")
 """Kinds of files that figures are written as."""
@@ -13,11 +17,11 @@ KINDS = ("png", "pdf", "svg")
 
 @dataclass(frozen=True)
 class FiguresConfig:
-    """Options of drawing.
+    """Options of the figures stage.
 
     Args:
         out: folder of the files; `<dataset>/results/figures` if not given.
-        only: names of the items to make, as `wheretolook figures --list` tells; empty for all.
+        only: names of what to draw, as `wheretolook figures --list` tells; empty for all.
         kinds: kinds of files of a figure: png, pdf, svg.
     """
 

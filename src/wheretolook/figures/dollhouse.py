@@ -14,17 +14,11 @@ from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import Float, invert_poses
 
 BLUE, SKY, GREEN, ORANGE, VERMILION, PURPLE = "#0072B2", "#56B4E9", "#009E73", "#E69F00", "#D55E00", "#CC79A7"
-"""Okabe and Ito (2008)."""
+"""The colours of Okabe and Ito (2008), which colour-blind people can tell apart."""
 
 
 def draw_house(axes: Axes, house: Dollhouse, fade: float = 0.5) -> None:
-    """The picture, with axes in its pixels.
-
-    Args:
-        axes: to draw on.
-        house: the picture.
-        fade: 0 draws it as it is, 1 leaves nothing of it, so that what is drawn upon it stands out.
-    """
+    """Draw the picture, with axes in its pixels; `fade` makes it paler, from 0 (as it is) to 1 (white)."""
     height, width = house.rgb.shape[:2]
     rgb = 255 * (house.rgb / 255.0) ** 0.7  # rooms without a lamp are dark
     axes.imshow((rgb + fade * (255 - rgb)).astype(np.uint8), extent=(0, width, height, 0))
@@ -33,13 +27,13 @@ def draw_house(axes: Axes, house: Dollhouse, fade: float = 0.5) -> None:
 
 
 def draw_points(axes: Axes, house: Dollhouse, points: ArrayLike, **style: Any) -> None:
-    """World points (N, 3) m as dots."""
+    """Draw world points (N, 3) m as dots."""
     pixels = house.pixels(points).reshape(-1, 2)
     axes.scatter(pixels[:, 0], pixels[:, 1], **{"linewidths": 0, **style})
 
 
 def draw_segments(axes: Axes, house: Dollhouse, segments: ArrayLike, **style: Any) -> LineCollection:
-    """Lines between world points (..., 2, 3) m."""
+    """Draw lines between pairs of world points (..., 2, 3) m."""
     pixels = house.pixels(np.asarray(segments)).reshape(-1, 2, 2)
     lines = LineCollection(list(pixels), **{"capstyle": "round", **style})
     axes.add_collection(lines, autolim=False)

@@ -1,4 +1,4 @@
-"""From an image to the network's input: visible landmarks, bins, channels."""
+"""How an image becomes the network's input: landmarks in view, bins, channels."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _EMPTY = "#e8e8e8"
 
 @dataclass(frozen=True, eq=False)
 class BinnedImage:
-    """One view and what a network is told of it.
+    """One view and the input that a network gets for it.
 
     Attributes:
         rgb: (H, W, 3) uint8, what the camera sees.
@@ -41,15 +41,10 @@ class BinnedImage:
 
 
 def inputs_figure(image: BinnedImage, variants: Mapping[str, tuple[str, ...]] = PAPER_VARIANTS) -> Figure:
-    """The image with its landmarks, their bins, and the channels of each input variant.
+    """The image with its landmarks, their number in each bin, and the channels of each input variant.
 
-    Args:
-        image: with every channel that a variant asks for.
-        variants: channels by name; the paper's by default.
-
-    Returns:
-        As wide as two columns. Left: the image, then the number of landmarks in each bin. Right: a row for each
-        variant, a map of the bins for each of its channels; empty bins are grey, and zero to the network.
+    Two columns wide. Right, a row for each of `variants` (names of channels, all of which `image` must have); bins
+    without landmarks are grey.
     """
     channels = [*dict.fromkeys(name for names in variants.values() for name in names)]
     with context(PRINT):
@@ -84,7 +79,7 @@ def draw_landmarks(axes: Axes, image: BinnedImage) -> None:
     axes.imshow(image.rgb, extent=(0, width, height, 0))
     axes.scatter(image.pixels[:, 0], image.pixels[:, 1], s=1.5, color=ORANGE, linewidths=0, rasterized=True)
     axes.set(xlim=(0, width), ylim=(height, 0))
-    _bare(axes)
+    frame(axes)
 
 
 def n_landmarks(image: BinnedImage) -> str:
@@ -93,7 +88,7 @@ def n_landmarks(image: BinnedImage) -> str:
 
 
 def draw_counts(axes: Axes, image: BinnedImage) -> None:
-    """Landmarks in each bin, on a logarithmic scale of colours, over the pale image."""
+    """Number of landmarks in each bin, in logarithmic colours, over the pale image."""
     height, width = image.rgb.shape[:2]
     axes.imshow(255 - (255 - image.rgb) // 3, extent=(0, width, height, 0))
     counts = np.ma.masked_equal(image.counts, 0)
@@ -102,11 +97,11 @@ def draw_counts(axes: Axes, image: BinnedImage) -> None:
     axes.vlines(np.linspace(0, width, bins + 1), 0, height, color="white", linewidth=0.25)
     axes.hlines(np.linspace(0, height, bins + 1), 0, width, color="white", linewidth=0.25)
     axes.set(xlim=(0, width), ylim=(height, 0), aspect="equal")
-    _bare(axes)
+    frame(axes)
 
 
 def draw_channel(axes: Axes, image: BinnedImage, name: str) -> None:
-    """One channel of the bins, from its least (dark) to its greatest value (light); the range stands below."""
+    """One channel, dark at its least and light at its greatest value; the range stands below."""
     values = np.ma.masked_invalid(np.asarray(image.means[name], dtype=np.float64))
     axes.set_facecolor(_EMPTY)
     low, high = (float(values.min()), float(values.max())) if values.count() else (0.0, 0.0)
@@ -117,10 +112,11 @@ def draw_channel(axes: Axes, image: BinnedImage, name: str) -> None:
     digits = 0 if UNITS.get(name) == "px" else 1
     ends = " to ".join(dict.fromkeys(f"{end:.{digits}f}" for end in (low, high))).replace("-", "−")
     axes.set_xlabel(ends if values.count() else "no landmark", fontsize=6.5, labelpad=1)
-    _bare(axes)
+    frame(axes)
 
 
-def _bare(axes: Axes) -> None:
+def frame(axes: Axes, color: str = INK, linewidth: float = 0.5) -> None:
+    """Axes of an image: a frame without ticks and grid."""
     axes.set(xticks=[], yticks=[])
     axes.grid(False)
-    axes.spines[:].set(visible=True, linewidth=0.5, color=INK)
+    axes.spines[:].set(visible=True, linewidth=linewidth, color=color)

@@ -14,13 +14,10 @@ from wheretolook.geometry.poses import Float
 
 
 def covering_radius_deg(directions: Float) -> float:
-    """Largest angle from any direction of the sphere to the nearest of the given ones, in degrees.
+    """Largest angle from any direction of the sphere to the nearest of (n, 3) unit vectors, in degrees.
 
-    The farthest direction is a vertex of the spherical Voronoi diagram, that is, the outward normal of a face of the
-    convex hull; its distance is that of the face's plane. Exact.
-
-    Args:
-        directions: (n, 3) unit vectors, not all in one half-space.
+    Exact: the farthest direction is the normal of a face of the convex hull. The vectors must not all lie in one
+    half-space.
     """
     return float(np.degrees(np.arccos(np.clip(-ConvexHull(directions).equations[:, 3].max(), -1, 1))))
 
@@ -32,13 +29,10 @@ def nearest_angles_deg(directions: Float) -> Float:
 
 
 def fibonacci_figure(n: int = 500) -> Figure:
-    """The spherical Fibonacci lattice, the azimuth-elevation lattice and the one of the paper's released code.
+    """The spherical Fibonacci lattice, the azimuth-elevation lattice and that of the paper's released code.
 
-    Args:
-        n: number of directions of each (the azimuth-elevation lattice has the nearest product of rows and columns).
-
-    Returns:
-        One sphere each, seen from 25 degrees above the equator; the directions on the far side are pale.
+    Each has about `n` directions and is drawn as a sphere seen from 25 degrees above the equator, directions on the far
+    side pale.
     """
     lattices = (
         ("spherical Fibonacci", fibonacci_sphere(n), "#D55E00"),
@@ -61,7 +55,7 @@ def fibonacci_figure(n: int = 500) -> Figure:
 def _draw_sphere(axes: Axes, directions: Float, color: str) -> None:
     """Orthographic view of directions on a sphere."""
     tilt = np.radians(25)
-    # rows: right, up and towards the eye, for an eye 25 degrees above the equator in the direction of -y
+    # rows: right, up and towards a viewer 25 degrees above the equator in the direction of -y
     view = np.array([[1, 0, 0], [0, np.sin(tilt), np.cos(tilt)], [0, -np.cos(tilt), np.sin(tilt)]])
     x, y, depth = view @ directions.T
     turn = np.linspace(0, 2 * np.pi, 200)

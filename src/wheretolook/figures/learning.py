@@ -1,4 +1,4 @@
-"""The paper's figure of the network, from real data: a view, its bins, what the network makes of them, its score."""
+"""The paper's figure of the network, with real values: a view, its bins, the hidden layers, the score."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import ConnectionPatch
 from matplotlib.style import context
 
+from wheretolook.figures.config import Look
 from wheretolook.figures.dollhouse import BLUE, VERMILION
-from wheretolook.figures.inputs import BinnedImage, draw_counts, draw_landmarks, n_landmarks
+from wheretolook.figures.inputs import BinnedImage, draw_counts, draw_landmarks, frame, n_landmarks
 from wheretolook.figures.style import INK, PRINT, TWO_COLUMNS_IN, new_figure
 from wheretolook.geometry.poses import Float
 
@@ -22,17 +23,13 @@ _WIDE = 10  # letters below the score
 
 
 def learning_figure(image: BinnedImage, activations: Sequence[Float], channels: Sequence[str], outcome: str) -> Figure:
-    """From a pose and what it sees to a score.
+    """The image with its landmarks, landmarks by bin, standardized channels, hidden layers (dark: 0), and the score.
 
     Args:
         image: the view, binned.
         activations: of the network, see `wheretolook.methods.mlp.architecture.activations`.
         channels: names of the input's channels.
-        outcome: what came of localizing the view, in words.
-
-    Returns:
-        As wide as two columns: the image with its landmarks, landmarks by bin, the standardized channels, the values of
-        each hidden layer (dark: not active), and the score between 0 and 1.
+        outcome: how localizing the view ended, in words.
     """
     means, *hidden, score = activations
     ratios = [2.1, 2.1, 1.0, *(1.0 for _ in hidden), 0.75]
@@ -70,22 +67,20 @@ def learning_figure(image: BinnedImage, activations: Sequence[Float], channels: 
 
 
 def _connect(figure: Figure, before: list[Axes], inputs: list[Axes], after: list[Axes]) -> None:
-    """Arrows from each panel to the next; the column of channels counts as one."""
+    """Arrows from each panel to the next; the channels, one below the other, count as one panel."""
     middle = inputs[len(inputs) // 2]
-    at = 0.5 if len(inputs) % 2 else 1.0  # an even number has its middle between two
-    for one, other in pairwise([*before, middle, *after]):
-        start = (1.0, at if one is middle else 0.5)
-        end = (-0.45, at) if other is middle else (0.0, 0.5)  # clear of the channel's name
-        arrow = ConnectionPatch(start, end, "axes fraction", "axes fraction", axesA=one, axesB=other, arrowstyle="-|>",
-                                mutation_scale=7, color=INK, shrinkA=2, shrinkB=2, linewidth=0.8)  # fmt: skip
-        figure.add_artist(arrow)
+    at = 0.5 if len(inputs) % 2 else 1.0  # with an even number, the middle is between two panels
+    arrow: Look = {"arrowstyle": "-|>", "mutation_scale": 7, "color": INK, "shrinkA": 2, "shrinkB": 2, "linewidth": 0.8}
+    ends: Look = {"coordsA": "axes fraction", "coordsB": "axes fraction"}
+    for left, right in pairwise([*before, middle, *after]):
+        start = (1.0, at if left is middle else 0.5)
+        end = (-0.45, at) if right is middle else (0.0, 0.5)  # clear of the channel's name
+        figure.add_artist(ConnectionPatch(start, end, axesA=left, axesB=right, **ends, **arrow))
 
 
 def _grid(axes: Axes, values: Float, colors: str, low: float, high: float) -> None:
     axes.imshow(values, cmap=colors, vmin=low, vmax=high, interpolation="nearest")
-    axes.set(xticks=[], yticks=[])
-    axes.grid(False)
-    axes.spines[:].set(visible=True, linewidth=0.5, color=INK)
+    frame(axes)
 
 
 def _draw_score(axes: Axes, score: float, outcome: str) -> None:
@@ -93,6 +88,7 @@ def _draw_score(axes: Axes, score: float, outcome: str) -> None:
     axes.set(xlim=(-0.5, 0.5), ylim=(0, 1), xticks=[], yticks=[0, 0.5, 1])
     axes.yaxis.tick_right()
     axes.spines[:].set_visible(True)
-    axes.text(0, score - 0.03 if score >= 0.2 else score + 0.03, f"{score:.2f}", ha="center",
-              va="top" if score >= 0.2 else "bottom", color="white" if score >= 0.2 else INK, fontsize=7)  # fmt: skip
+    inside = score >= 0.2  # the bar is long enough for its number
+    place: Look = {"va": "top", "color": "white"} if inside else {"va": "bottom", "color": INK}
+    axes.text(0, score - 0.03 if inside else score + 0.03, f"{score:.2f}", ha="center", fontsize=7, **place)
     axes.set_xlabel("\n".join(textwrap.wrap(outcome, _WIDE)))

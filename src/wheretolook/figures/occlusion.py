@@ -1,6 +1,8 @@
-"""How much the occlusion model matters."""
+"""How well each method does with each occlusion model."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -22,14 +24,12 @@ _MARKERS = ("o", "s", "^", "D")
 def occlusion_figure(scores: pd.DataFrame) -> Figure:
     """Average precision and share of good best views of each method, by occlusion model.
 
+    The share is that at the finest threshold, in % of the oracle's, with bootstrap intervals. A row for each method, a
+    mark for each occlusion model; the random choice and the oracle are lines.
+
     Args:
         scores: tables of `wheretolook.evaluation.scores.score_table`, one below the other, with a column `occlusion`;
-            the rows over all scenes of the first N, and of the first set of candidates, are drawn.
-
-    Returns:
-        Two panels with a row for each method, groups set apart, and a mark for each occlusion model, the first one
-        filled: average precision, and the share at the first threshold, in % of the oracle's, with bootstrap
-        intervals. Choosing at random looks at no landmark and is a line, the oracle a line at 100 %.
+            the rows over all scenes, of the first N and the first set of candidates, are drawn.
     """
     scores = main_rows(scores, ("candidates",))
     key, n = threshold_keys(scores)[0], scores["top_n"].iloc[0]
@@ -42,8 +42,8 @@ def occlusion_figure(scores: pd.DataFrame) -> Figure:
         figure = new_figure(8.0, 1.5 + 0.3 * (max(y.values(), default=0) + 1))
         left, right = figure.subplots(1, 2, sharey=True)
         _draw(left, pooled, models, y, "average_precision", 1.0)
-        ends = (f"normalized_low_{key}", f"normalized_high_{key}")
-        _draw(right, pooled, models, y, f"normalized_{key}", 100.0, ends)
+        columns = (f"normalized_{end}{key}" for end in ("", "low_", "high_"))
+        _draw(right, pooled, models, y, next(columns), 100.0, *columns)
         left.set(xlabel=f"average precision\n{threshold_label(key)}", xlim=(0, 1.02))
         right.set(xlabel=f"{chosen} within {threshold_label(key)}\n% of the oracle's share", xlim=(0, 104))
         figure.supxlabel("whiskers: 95 % bootstrap interval over locations", fontsize=8)
@@ -52,25 +52,24 @@ def occlusion_figure(scores: pd.DataFrame) -> Figure:
         left.set_ylim(max(y.values(), default=0) + 0.7, -0.7)
         for axes in (left, right):
             axes.tick_params(axis="y", length=0)
-        handles: list[Line2D] = [
-            Line2D([], [], linestyle="none", marker=_MARKERS[place % len(_MARKERS)], color=INK, markersize=6,
-                   markerfacecolor=INK if place == 0 else "white", label=_LABELS.get(model, model))
-            for place, model in enumerate(models)
-        ]  # fmt: skip
+        handles: list[Line2D] = []
+        for number, model in enumerate(models):
+            look = _mark(number, INK)
+            handles.append(Line2D([], [], linestyle="none", label=_LABELS.get(model, model), **look))
         labels = [method_style(name).label for name in (ORACLE, *filter(by_chance, methods_of(pooled)))]
         handles += [line for line in right.lines if line.get_label() in labels]
         figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), columnspacing=1.4)
         return figure
 
 
+def _mark(number: int, color: str) -> dict[str, Any]:
+    """Look of the mark of an occlusion model, by its number; the first is filled."""
+    fill = color if number == 0 else "white"
+    return {"marker": _MARKERS[number % len(_MARKERS)], "color": color, "markersize": 6, "markerfacecolor": fill}
+
+
 def _draw(
-    axes: Axes,
-    pooled: pd.DataFrame,
-    models: list[str],
-    y: dict[str, float],
-    column: str,
-    scale: float,
-    ends: tuple[str, ...] = (),
+    axes: Axes, pooled: pd.DataFrame, models: list[str], y: dict[str, float], column: str, scale: float, *ends: str
 ) -> None:
     """A line from model to model for each method, and their marks; `ends` names the columns of whiskers."""
     for method, place in y.items():
@@ -83,8 +82,7 @@ def _draw(
             if ends:
                 low, high = (by_model[end].iloc[number] for end in ends)
                 axes.hlines(place + shift[number], low, high, color=style.color, linewidth=0.9)
-            axes.plot(value, place + shift[number], _MARKERS[number % len(_MARKERS)], color=style.color, markersize=6,
-                      markerfacecolor=style.color if number == 0 else "white")  # fmt: skip
+            axes.plot(value, place + shift[number], **_mark(number, style.color), linestyle="none")
     for method in filter(by_chance, methods_of(pooled)):
         style, value = method_style(method), scale * pooled.loc[pooled["method"] == method, column].iloc[0]
         axes.axvline(value, color=style.color, linestyle=style.dashes, label=style.label, zorder=1)

@@ -1,4 +1,4 @@
-"""The whole idea in one picture: a map, the score of every direction at a place, its best and its worst view."""
+"""The idea in one picture: a map, the score of every direction at one place, its best and its worst view."""
 
 from __future__ import annotations
 
@@ -11,22 +11,18 @@ from matplotlib.figure import Figure
 from matplotlib.style import context
 from numpy.typing import NDArray
 
+from wheretolook.figures.config import Look
 from wheretolook.figures.style import INK, RC, new_figure
 from wheretolook.geometry.poses import Float
+from wheretolook.planning.turns import pan_tilt_angles
 
 STAR = "#D55E00"
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A viewpoint as the camera sees it.
-
-    Attributes:
-        rgb: (H, W, 3) uint8.
-        direction: (3,) unit vector it looks along, world frame.
-        score: predicted probability that it localizes.
-        outcome: what came of localizing it, in words.
-    """
+    """The image (H, W, 3) uint8 of a viewpoint, its unit axis (3,) in the world, its score (the predicted probability
+    that it localizes), and how localizing it ended, in words."""
 
     rgb: NDArray[np.uint8]
     direction: Float
@@ -77,17 +73,8 @@ def _draw_map(figure: Figure, axes: Axes, landmarks: Float, locations: Float, sh
     low, high = np.percentile(landmarks[:, :2], (0.5, 99.5), axis=0)
     axes.scatter(landmarks[:, 0], landmarks[:, 1], s=0.6, color="#9a9a9a", linewidths=0, rasterized=True)
     order = np.argsort(share_good, kind="stable")
-    points = axes.scatter(
-        locations[order, 0],
-        locations[order, 1],
-        s=34,
-        c=share_good[order],
-        cmap="cividis",
-        vmin=0,
-        vmax=1,
-        edgecolors="white",
-        linewidths=0.6,
-    )
+    look: Look = {"s": 34, "cmap": "cividis", "vmin": 0, "vmax": 1, "edgecolors": "white", "linewidths": 0.6}
+    points = axes.scatter(locations[order, 0], locations[order, 1], c=share_good[order], **look)
     axes.plot(*place[:2], "o", markersize=11, markerfacecolor="none", markeredgecolor=STAR, markeredgewidth=2)
     axes.set_aspect("equal")
     axes.set(xlim=(low[0] - 0.3, high[0] + 0.3), ylim=(low[1] - 0.3, high[1] + 0.3), xlabel="x (m)", ylabel="y (m)")
@@ -97,16 +84,11 @@ def _draw_map(figure: Figure, axes: Axes, landmarks: Float, locations: Float, sh
 
 
 def _draw_sphere(figure: Figure, axes: Axes, directions: Float, scores: Float, best: View, worst: View) -> None:
-    azimuth, elevation = _angles(directions)
+    azimuth, elevation = pan_tilt_angles(directions)
     points = axes.scatter(azimuth, elevation, s=30, c=scores, cmap="cividis", norm=Normalize(0, 1), linewidths=0)
     for view, mark in ((best, "*"), (worst, "X")):
-        axes.plot(*_angles(view.direction), mark, markersize=15, color=STAR, markeredgecolor="white")
+        axes.plot(*pan_tilt_angles(view.direction), mark, markersize=15, color=STAR, markeredgecolor="white")
     axes.set(xticklabels=[], yticklabels=[], anchor="N")
     axes.set_title("every direction from the ringed place")
     bar = figure.colorbar(points, ax=axes, shrink=0.6, pad=0.06, orientation="horizontal")
     bar.set_label("predicted probability to localize", color=INK)
-
-
-def _angles(directions: Float) -> tuple[Float, Float]:
-    """Azimuth and elevation in radians of unit vectors (..., 3)."""
-    return np.arctan2(directions[..., 1], directions[..., 0]), np.arcsin(np.clip(directions[..., 2], -1, 1))

@@ -1,4 +1,4 @@
-"""A planned path as a film: what the camera sees, where it is, and what its view is worth."""
+"""A planned path as a film: what the camera sees, where it is, and the score of its view."""
 
 from __future__ import annotations
 
@@ -13,10 +13,12 @@ from matplotlib.figure import Figure
 from matplotlib.style import context
 from numpy.typing import NDArray
 
+from wheretolook.figures.config import Look
 from wheretolook.figures.style import INK, RC, new_figure
 from wheretolook.geometry.poses import Float
 from wheretolook.methods.styles import method_style
 from wheretolook.planning.path_view import PathView, Pixels
+from wheretolook.planning.polylines import lengths_along
 from wheretolook.utils.errors import ConfigError
 
 PATH, SEEN = "#CC3311", "#EE9900"
@@ -25,11 +27,10 @@ STILLS = 5
 
 
 def film_frames(views: Sequence[PathView], landmarks: Float) -> Iterator[Pixels]:
-    """Frames (H, W, 3) uint8, one a view: the image with its landmarks, the map from above, the score along the path.
+    """Frames (H, W, 3) uint8, one for each view: its image with the landmarks in view, the map from above, the score
+    along the path.
 
-    Args:
-        views: along the path, one at least.
-        landmarks: (N, 3) of the map, metres.
+    There must be a view; `landmarks` are those of the map, (N, 3) metres.
     """
     with context(RC):
         for number in range(len(views)):
@@ -44,10 +45,7 @@ def film_frames(views: Sequence[PathView], landmarks: Float) -> Iterator[Pixels]
 def still_figure(views: Sequence[PathView], landmarks: Float, title: str = "") -> Figure:
     """The path in one picture: map from above, score along it, and some views evenly spread over it.
 
-    Args:
-        views: along the path, one at least.
-        landmarks: (N, 3) of the map, metres.
-        title: over the map.
+    There must be a view; `landmarks` are those of the map, (N, 3) metres; the title stands over the map.
     """
     shown = np.unique(np.linspace(0, len(views) - 1, STILLS).round().astype(int))
     with context(RC):
@@ -67,9 +65,7 @@ def still_figure(views: Sequence[PathView], landmarks: Float, title: str = "") -
 def methods_figure(paths: Mapping[str, Sequence[PathView]], landmarks: Float) -> Figure:
     """The paths of several methods side by side, from above, with where the camera looks (paper, Sec. 4.3).
 
-    Args:
-        paths: views along the path of each method, by its name on the command line.
-        landmarks: (N, 3) of the map, metres.
+    `paths` holds the views along the path of each method, by its name on the command line; `landmarks` (N, 3) metres.
     """
     with context(RC):
         figure = new_figure(3.9 * len(paths), 4.2)
@@ -98,7 +94,7 @@ def save_film(frames: Iterator[Pixels], path: Path, frames_per_second: float = F
 
         writer = None
         for frame in frames:
-            even = frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2]  # the codec's blocks
+            even = frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2]  # the codec needs even sides
             if writer is None:
                 codec = cv2.VideoWriter.fourcc(*"mp4v")
                 writer = cv2.VideoWriter(str(partial), codec, frames_per_second, even.shape[1::-1])
@@ -110,10 +106,6 @@ def save_film(frames: Iterator[Pixels], path: Path, frames_per_second: float = F
     else:
         raise ConfigError("a film is a .gif or an .mp4", path=path, value=path.suffix, fix="Name it so.")
     os.replace(partial, path)
-
-
-def _xy(point: Float) -> tuple[float, float]:
-    return float(point[0]), float(point[1])
 
 
 def _pixels(figure: Figure) -> Pixels:
@@ -142,16 +134,15 @@ def _draw_map(
     low, high = np.minimum(low, positions[:, :2].min(0)), np.maximum(high, positions[:, :2].max(0))
     axes.scatter(landmarks[:, 0], landmarks[:, 1], s=0.5, color="#9a9a9a", linewidths=0, rasterized=True)
     axes.plot(*positions[:, :2].T, color=PATH, linewidth=1.6)
+    xy = [(float(x), float(y)) for x, y in positions[:, :2]]
     reach = 0.07 * float(np.max(high - low))
+    arrow: Look = {"arrowstyle": "-|>", "color": INK, "linewidth": 1.0, "shrinkA": 0, "shrinkB": 0}
     for at in [number] if number is not None else range(0, len(views), max(1, len(views) // 25)):
-        tip = views[at].axis[:2] * (2 if number is not None else 1) * reach
-        axes.annotate(
-            "", _xy(positions[at, :2] + tip), _xy(positions[at]),
-            arrowprops={"arrowstyle": "-|>", "color": INK, "linewidth": 1.0, "shrinkA": 0, "shrinkB": 0},
-        )  # fmt: skip
+        x, y = positions[at, :2] + views[at].axis[:2] * (2 if number is not None else 1) * reach
+        axes.annotate("", (float(x), float(y)), xy[at], arrowprops=arrow)
+    disc: Look = {"boxstyle": "circle,pad=0.15", "facecolor": PATH, "edgecolor": "white"}
     for column, at in enumerate(() if shown is None else shown, 1):
-        axes.annotate(str(column), _xy(positions[at]), fontsize=9, color="white", ha="center", va="center",
-                      bbox={"boxstyle": "circle,pad=0.15", "facecolor": PATH, "edgecolor": "white"})  # fmt: skip
+        axes.annotate(str(column), xy[at], fontsize=9, color="white", ha="center", va="center", bbox=disc)
     axes.set(xlim=(low[0] - 0.3, high[0] + 0.3), ylim=(low[1] - 0.3, high[1] + 0.3), aspect="equal")
     axes.set(xlabel="x (m)", ylabel="y (m)")
 
@@ -160,12 +151,12 @@ def _draw_scores(
     axes: Axes, views: Sequence[PathView], number: int | None, shown: NDArray[np.int64] | None = None
 ) -> None:
     positions = np.array([view.position for view in views])
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))])
+    along = lengths_along(positions)
     scores = np.array([view.score for view in views])
     axes.plot(along, scores, color=PATH, linewidth=1.4)
     if number is not None:
         axes.plot(along[number], scores[number], "o", color=INK, markersize=6)
     for column, at in enumerate(() if shown is None else shown, 1):
         side = "left" if at == 0 else "right" if at == len(views) - 1 else "center"
-        axes.annotate(str(column), (along[at], scores[at]), textcoords="offset points", xytext=(0, 6), ha=side)
+        axes.annotate(str(column), (along[at], scores[at]), (0, 6), textcoords="offset points", ha=side)
     axes.set(xlim=(0, max(along[-1], 1e-6)), ylim=(0, 1.12), xlabel="along the path (m)", ylabel="score")

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.style import context
 
+from wheretolook.figures.config import Look
 from wheretolook.figures.style import INK, RC, new_figure
 from wheretolook.methods.styles import method_style
 
@@ -14,14 +17,10 @@ TITLES = {"planned": "places and views planned", "given": "views along a given p
 
 
 def paths_figure(summary: pd.DataFrame) -> Figure:
-    """Share of the views along paths that localize.
+    """Share of the views along paths that localize, from `wheretolook.planning.path_report.summarize_paths`.
 
-    Args:
-        summary: of `wheretolook.planning.path_report.summarize_paths`.
-
-    Returns:
-        A panel for each task; in it, a group of bars for each scene, and for all of them, a bar for each method, with
-        95 % intervals. Views chosen by ActLoc's rule are hatched.
+    A panel for each task, in it a bar for each scene (and all of them) and method, with 95 % intervals; hatched where
+    views were chosen by ActLoc's rule.
     """
     with context(RC):
         tasks = list(dict.fromkeys(summary["task"]))
@@ -38,21 +37,17 @@ def paths_figure(summary: pd.DataFrame) -> Figure:
                 name, _, rule = method.partition(" ")
                 style = method_style(name)
                 value, low, high = (100 * of_method[f"localized{end}"].to_numpy() for end in ("", "_low", "_high"))
-                axes.bar(
-                    at, value, 0.92 * width, color=style.color, hatch="////" if rule else "", edgecolor="white",
-                    linewidth=0.4, label=f"{style.label}{', greedy' if rule else ''}",
-                )  # fmt: skip
-                # a share may lie outside its interval of few resamples
-                axes.errorbar(
-                    at, value, np.maximum(0, [value - low, high - value]), fmt="none", ecolor=INK, elinewidth=0.9
-                )
-            axes.set_title(TITLES.get(task, task))
-            axes.set_ylabel("views that localize (%)")
-            axes.set_ylim(0, 100)
+                label, hatch = (f"{style.label}, greedy", "////") if rule else (style.label, "")
+                look: Look = {"color": style.color, "hatch": hatch, "edgecolor": "white", "linewidth": 0.4}
+                axes.bar(at, value, 0.92 * width, label=label, **look)
+                whiskers = np.maximum(0, [value - low, high - value])  # few resamples may not enclose the share
+                axes.errorbar(at, value, whiskers, fmt="none", ecolor=INK, elinewidth=0.9)
+            axes.set(title=TITLES.get(task, task), ylabel="views that localize (%)", ylim=(0, 100))
             axes.set_xticks(np.arange(len(scenes)), [name.replace("_", "\n", 1) for name in scenes])
             axes.grid(axis="x", visible=False)
-        named = {
-            label: handle for axes in panels for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
-        }
+        named: dict[str, Any] = {}
+        for axes in panels:
+            handles, labels = axes.get_legend_handles_labels()
+            named |= dict(zip(labels, handles, strict=True))
         figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=3, frameon=False)
         return figure

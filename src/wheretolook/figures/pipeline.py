@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from matplotlib.style import context
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from wheretolook.figures.dollhouse import (
     BLUE,
@@ -23,34 +24,34 @@ from wheretolook.figures.dollhouse import (
     frustum_segments,
 )
 from wheretolook.figures.house_image import Dollhouse
+from wheretolook.figures.inputs import frame
 from wheretolook.figures.style import INK, ONE_COLUMN_IN, PRINT, TWO_COLUMNS_IN, new_figure
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import Float
 
 _GLYPH = 32  # directions drawn of a location
-_MARGIN_M = 0.1  # landmarks lie a little behind surfaces, too
 
 
 @dataclass(frozen=True, eq=False)
 class Pipeline:
-    """What the figure draws.
+    """What `pipeline_figure` draws.
 
     Attributes:
         house: the scene from above.
         landmarks: (N, 3) of the map, metres.
         mapping_poses: cam_from_world (M, 3, 4) of the images that the map was made from.
-        camera: of all images.
-        locations: (L, 3) metres, where viewpoints are sampled.
-        n_locations: how many there are in the scene; those of `locations` may be some of them.
-        n_directions: of each location.
+        camera: intrinsics of all images.
+        locations: (L, 3) metres, the sampled locations that are shown.
+        n_locations: number of sampled locations in the whole scene.
+        n_directions: number of directions at each location.
         best_axes: (L, 3) unit optical axis of the best view of each location.
         best_scores: (L,) its score, a probability.
         chosen: cam_from_world (3, 4) of the camera that is chosen.
         chosen_score: its score.
-        seen: (N,) landmarks that it sees.
-        rgb: (H, W, 3) uint8, the image that it takes.
-        outcome: what came of localizing it, in words; empty where it is not known.
+        seen: (N,) whether it sees each landmark.
+        rgb: (H, W, 3) uint8, its image.
+        outcome: how localizing it ended, in words; empty if not known.
     """
 
     house: Dollhouse
@@ -72,8 +73,7 @@ class Pipeline:
 def pipeline_figure(pipeline: Pipeline) -> Figure:
     """Map, sampled viewpoints, ranked viewpoints and the chosen camera, all drawn on the same picture of the scene.
 
-    Returns:
-        Four panels, two by two, as wide as two columns. Landmarks that something stands in front of are left out.
+    The map's panel leaves out landmarks that are occluded in the picture.
     """
     with context(PRINT):
         top, bottom = _rows_drawn(pipeline.house)
@@ -92,7 +92,7 @@ def pipeline_figure(pipeline: Pipeline) -> Figure:
 
 
 def _draw_map(axes: Axes, pipeline: Pipeline) -> None:
-    shown = pipeline.landmarks[pipeline.house.shows(pipeline.landmarks, _MARGIN_M)]
+    shown = pipeline.landmarks[pipeline.house.shows(pipeline.landmarks)]
     draw_points(axes, pipeline.house, shown, s=0.9, color=ORANGE, rasterized=True)
     frusta = frustum_segments(pipeline.camera, pipeline.mapping_poses, 0.16)
     draw_segments(axes, pipeline.house, frusta, color=BLUE, linewidth=0.5)
@@ -110,14 +110,7 @@ def _draw_samples(axes: Axes, pipeline: Pipeline) -> None:
 
 
 def ranked_figure(house: Dollhouse, locations: Float, best_axes: Float, best_scores: Float) -> Figure:
-    """The best view of each location alone, one column and a half wide.
-
-    Args:
-        house: the scene from above.
-        locations: (L, 3) metres.
-        best_axes: (L, 3) unit optical axes.
-        best_scores: (L,) probabilities.
-    """
+    """The ranked viewpoints alone, one column and a half wide; arguments as in `Pipeline`."""
     with context(PRINT):
         top, bottom = _rows_drawn(house)
         figure = new_figure(1.5 * ONE_COLUMN_IN, 1.5 * ONE_COLUMN_IN * (bottom - top) / house.rgb.shape[1])
@@ -155,16 +148,15 @@ def _draw_choice(axes: Axes, pipeline: Pipeline) -> None:
     draw_points(axes, pipeline.house, corners[:1], s=14, color=VERMILION, zorder=4)
     image = axes.inset_axes((0.6, 0.06, 0.4, 0.36))
     image.imshow(pipeline.rgb)
-    image.set(xticks=[], yticks=[], anchor="SE")
-    image.grid(False)
-    image.spines[:].set(visible=True, color=VERMILION, linewidth=1.2)
+    image.set_anchor("SE")
+    frame(image, VERMILION, 1.2)
     title = f"d  Chosen: {int(pipeline.seen.sum()):,} landmarks in view, score {pipeline.chosen_score:.2f}"
     axes.set_title(title, loc="left")
     axes.text(1.0, 0.04, pipeline.outcome, transform=axes.transAxes, fontsize=7, ha="right", va="top")
 
 
 def _rows_drawn(house: Dollhouse) -> tuple[float, float]:
-    """First and last row of the picture that something is seen in, with room for what is drawn above walls."""
+    """First and last row of the picture with any surface, with some room above for what is drawn over walls."""
     rows = np.flatnonzero((house.depth_m > 0).any(1))
     height = len(house.depth_m)
     return max(0.0, float(rows[0]) - 0.07 * height), min(float(height), float(rows[-1]) + 0.02 * height)
@@ -172,8 +164,6 @@ def _rows_drawn(house: Dollhouse) -> tuple[float, float]:
 
 def _spacing(locations: Float) -> float:
     """Median distance from a location to its nearest neighbour, metres."""
-    from scipy.spatial import cKDTree
-
     if len(locations) < 2:
         return 0.5
     return float(np.median(cKDTree(locations).query(locations, k=2)[0][:, 1]))

@@ -1,9 +1,10 @@
-"""How long visibility takes: against the paper's times, and how time and memory grow."""
+"""Times of the visibility check: compared with the paper's, and how time and memory grow with the size of the task."""
 
 from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from itertools import cycle
 from textwrap import shorten
 from typing import Any
 
@@ -15,11 +16,12 @@ from matplotlib.patches import Patch
 from matplotlib.style import context
 from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter, NullLocator
 
+from wheretolook.figures.config import Look
 from wheretolook.figures.style import INK, RC, new_figure
 
 COUNTS, EVERYTHING = "counts alone", "occlusion, counts, best 100"
 TWIN = "NumPy twin, counts alone, scaled"
-"""Kinds of work that the runtime figure draws; it ignores all others."""
+"""Kinds of work that the runtime figure draws; it ignores all others. The twin is the plain NumPy implementation."""
 
 PAPER_LOCATIONS, PAPER_LANDMARKS = 648, 24_919
 
@@ -29,7 +31,7 @@ _LOOK: dict[str, dict[str, Any]] = {
     _RELEASED: {"facecolor": "#dedede", "edgecolor": "#7a7a7a", "hatch": "...", "linewidth": 0.8},
     _OURS: {"facecolor": "#56B4E9", "edgecolor": "#56B4E9", "linewidth": 0.8},
 }
-"""Whose number a bar is, for the legend. Hatches tell them apart in greyscale; whiskers show on each."""
+"""Looks of bars by the source of their number; hatches tell them apart in greyscale."""
 
 _PANELS = {
     COUNTS: "counts alone: the work that the paper times",
@@ -39,7 +41,7 @@ _PANELS = {
 
 @dataclass(frozen=True)
 class _Bar:
-    """One bar: its label, median seconds, whose number it is, the text at its end, least and most seconds."""
+    """One bar: its label, median seconds, source of the number, text at its end, least and most seconds."""
 
     label: str
     seconds: float
@@ -53,21 +55,20 @@ _ELSEWHERE = (
     _Bar("paper, GPU", 23.0, _PAPER, "23 s"),
     _Bar("released kernel, H200", 12.2, _RELEASED, "12.2 s"),
 )
-"""What `runtime_figure` does not get from its input: the paper's runtime figure ("initial sampling"), and what the
-authors' released CUDA kernel took on an H200."""
+"""Bars that do not come from `runtime_figure`'s input: the paper's runtime figure ("initial sampling"), and the time of
+the authors' released CUDA kernel on an H200."""
 
 
 def runtime_figure(sizes: pd.DataFrame) -> Figure:
     """The paper's runtime figure with this project's times beside it, at the paper's 648 locations x 24,919 landmarks.
 
+    Bars on a logarithmic axis in seconds, whiskers from the shortest to the longest run. Above the counts alone, which
+    the paper times; below, if there are such rows, with the work that its time leaves out.
+
     Args:
         sizes: one row for each machine, kind of work and number of threads, with `what`, `threads`, `median_s`,
             `min_s`, `max_s`, `repeats`, `device` ("cpu" or Warp's CUDA device), `name` and `cores` of the machine. Rows
-            of other work are ignored; so is the NumPy twin next to a GPU if that next to a CPU is there.
-
-    Returns:
-        Bars on a logarithmic axis in seconds, whiskers from the least to the most of repeated runs. Above the counts
-        alone, which is what the paper times; below what its time leaves out as well, if there are such rows.
+            of other work are ignored, and the NumPy twin of a machine with a GPU if there is one of a CPU.
     """
     measured = _measured_bars(sizes)
     bars = {COUNTS: [*_ELSEWHERE, *measured[COUNTS]], EVERYTHING: measured[EVERYTHING]}
@@ -77,8 +78,8 @@ def runtime_figure(sizes: pd.DataFrame) -> Figure:
     start = 10.0 ** min(-3, np.floor(np.log10(min(bar.seconds for bar in every) / 1.5)))
     with context(RC):
         figure = new_figure(6.0, 1.1 + 0.32 * len(every) + 0.4 * len(shown))
-        panels = figure.subplots(len(shown), 1, sharex=True, squeeze=False,
-                                 height_ratios=[len(bars[what]) for what in shown])[:, 0]  # fmt: skip
+        heights = [len(bars[what]) for what in shown]
+        panels = figure.subplots(len(shown), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
         for axes, what in zip(panels, shown, strict=True):
             _draw_bars(axes, bars[what], start)
             axes.set_title(_PANELS[what], fontsize=10, loc="left")
@@ -97,30 +98,25 @@ def runtime_figure(sizes: pd.DataFrame) -> Figure:
 
 
 def runtime_table(sizes: pd.DataFrame) -> pd.DataFrame:
-    """What `runtime_figure` draws of this project's times, in numbers: a row for each machine, work and threads."""
+    """The numbers of this project's times that `runtime_figure` draws: a row for each machine, work and threads."""
     rows = sizes[sizes["what"].isin((TWIN, COUNTS, EVERYTHING))]
-    return pd.DataFrame({
-        "machine": rows["name"].map(machine_label),
-        "work": rows["what"],
-        "threads": rows["threads"],
-        "median (s)": rows["median_s"],
-        "least (s)": rows["min_s"],
-        "most (s)": rows["max_s"],
-        "projections (10⁹/s)": rows["projections_per_s"] / 1e9,
-    }).sort_values(["work", "median (s)"], ignore_index=True)  # fmt: skip
+    columns = {"machine": rows["name"].map(machine_label), "work": rows["what"], "threads": rows["threads"]}
+    columns |= {"median (s)": rows["median_s"], "least (s)": rows["min_s"], "most (s)": rows["max_s"]}
+    columns |= {"projections (10⁹/s)": rows["projections_per_s"] / 1e9}
+    return pd.DataFrame(columns).sort_values(["work", "median (s)"], ignore_index=True)
 
 
 def _draw_bars(axes: Axes, bars: list[_Bar], start: float) -> None:
+    plate: Look = {"facecolor": "white", "edgecolor": "none", "pad": 0.5}
     for y, bar in enumerate(bars):
         axes.barh(y, bar.seconds - start, 0.68, left=start, **_LOOK[bar.source])
         end = bar.seconds
         if bar.spread is not None:
             low, high = bar.spread
-            axes.errorbar(bar.seconds, y, xerr=[[max(bar.seconds - low, 0)], [max(high - bar.seconds, 0)]], fmt="none",
-                          ecolor=INK, elinewidth=1, capsize=2.5)  # fmt: skip
+            ends = [[max(bar.seconds - low, 0)], [max(high - bar.seconds, 0)]]
+            axes.errorbar(bar.seconds, y, xerr=ends, fmt="none", ecolor=INK, elinewidth=1, capsize=2.5)
             end = max(end, high)
-        axes.annotate(bar.text, (end, y), xytext=(5, 0), textcoords="offset points", va="center", fontsize=9.5,
-                      bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.5})  # fmt: skip
+        axes.annotate(bar.text, (end, y), (5, 0), textcoords="offset points", va="center", fontsize=9.5, bbox=plate)
     axes.set_xscale("log")
     axes.set_yticks(range(len(bars)), [_wrapped(bar.label) for bar in bars], fontsize=9.5)
     axes.set_ylim(len(bars) - 0.4, -0.6)
@@ -163,14 +159,14 @@ def _threads(row: dict[Any, Any]) -> str:
 
 
 def machine_label(name: str) -> str:
-    """A processor's name without trade marks, clock and filler, shortened. An architecture alone becomes "CPU"."""
+    """A short name of a processor, without trade marks and clock; "CPU" if only the architecture is known."""
     short = re.sub(r"\((R|TM|C)\)|\b\d+-Cores?\b|\b(Processor|CPU)\b|@.*$", " ", str(name), flags=re.IGNORECASE)
     short = shorten(short, 28, placeholder="…")
     return short if short not in ("", "x86_64", "AMD64", "aarch64", "arm64", "i386", "arm") else "CPU"
 
 
 def duration(seconds: float) -> str:
-    """A time for people, three digits: "3.58 ms", "149 s"."""
+    """A time with three digits: "3.58 ms", "149 s"."""
     value, unit = (seconds, "s") if float(f"{seconds:.3g}") >= 1 else (1e3 * seconds, "ms")
     digits = max(0, 2 - int(np.floor(np.log10(float(f"{value:.3g}")))))
     return f"{float(f'{value:.3g}'):,.{digits}f} {unit}"
@@ -182,42 +178,40 @@ def _ticked(seconds: float) -> str:
 
 _GROWING = ("landmarks", "locations", "directions")
 _MACHINES = (("#0072B2", "o"), ("#D55E00", "s"), ("#009E73", "D"), ("#CC79A7", "^"))
-_WORK = {"with occlusion": ("-", 1.0), COUNTS: ((0, (4, 1.5)), 0.0)}
-"""Dashes, and whether markers are filled."""
+_WORK: dict[str, tuple[Any, bool]] = {"with occlusion": ("-", True), COUNTS: ((0, (4, 1.5)), False)}
+"""Dashes of a kind of work, and whether its markers are filled."""
 
 
 def scaling_figure(growth: pd.DataFrame) -> Figure:
-    """How time and memory grow with the number of landmarks, of locations and of directions, the other two fixed.
+    """How time (above) and memory (below) grow with the number of landmarks, locations or directions, each alone.
+
+    All axes are logarithmic; a dotted line shows proportional growth.
 
     Args:
         growth: one row for each run, with `axis` (which of the three grows), `landmarks`, `locations`, `directions`,
-            `what` ("with occlusion", "counts alone"), `median_s`, `min_s`, `max_s`, `peak_bytes` (0 where it was too
-            little to measure, not drawn), `device` and `name` of the machine.
-
-    Returns:
-        Time above, memory below, all axes logarithmic; bars from the least to the most seconds; a thin line for
-        proportional growth.
+            `what` ("with occlusion", "counts alone"), `median_s`, `min_s`, `max_s`, `peak_bytes` (0, not drawn, where
+            it was too little to measure), `device` and `name` of the machine.
     """
     machines = list(dict.fromkeys(zip(growth["device"], growth["name"], strict=True)))
     shown = [axis for axis in _GROWING if (growth["axis"] == axis).any()]
     with context(RC):
         figure = new_figure(2.2 * len(shown) + 0.7, 5.2)
-        panels = figure.subplots(2, len(shown), sharex="col", sharey="row", squeeze=False,
-                                 subplot_kw={"xscale": "log", "yscale": "log"})  # fmt: skip
+        scales: Look = {"xscale": "log", "yscale": "log"}
+        panels = figure.subplots(2, len(shown), sharex="col", sharey="row", squeeze=False, subplot_kw=scales)
         for column, axis in enumerate(shown):
             part = growth[growth["axis"] == axis]
-            for machine, (color, marker) in zip(machines, _looks(len(machines)), strict=True):
-                on_machine = part[(part["device"] == machine[0]) & (part["name"] == machine[1])]
+            for (device, name), (color, marker) in zip(machines, cycle(_MACHINES), strict=False):
+                on_machine = part[(part["device"] == device) & (part["name"] == name)]
+                whiskers: Look = {"fmt": "none", "ecolor": color, "elinewidth": 1, "capsize": 2, "zorder": 1.9}
                 for what, (dashes, filled) in _WORK.items():
                     rows = on_machine[on_machine["what"] == what].sort_values(axis)
-                    look = {"color": color, "linestyle": dashes, "marker": marker, "markersize": 4.5,
-                            "markerfacecolor": color if filled else "white"}  # fmt: skip
-                    label = f"{machine_label(machine[1])}, {what}"
+                    look: Look = {"color": color, "linestyle": dashes, "marker": marker, "markersize": 4.5}
+                    look["markerfacecolor"] = color if filled else "white"
+                    label = f"{machine_label(name)}, {what}"
                     seconds = rows["median_s"].to_numpy(dtype=float)
                     spread = [seconds - rows["min_s"], rows["max_s"] - seconds]
                     panels[0, column].plot(rows[axis], seconds, label=label, **look)
-                    panels[0, column].errorbar(rows[axis], seconds, np.clip(spread, 0, None), fmt="none", ecolor=color,
-                                               elinewidth=1, capsize=2, zorder=1.9)  # fmt: skip
+                    panels[0, column].errorbar(rows[axis], seconds, np.clip(spread, 0, None), **whiskers)
                     measurable = rows[rows["peak_bytes"] > 0]
                     panels[1, column].plot(measurable[axis], measurable["peak_bytes"] / 1e6, **look)
             fixed = (f"{_numbers(part[other])} {other}" for other in _GROWING if other != axis)
@@ -230,17 +224,13 @@ def scaling_figure(growth: pd.DataFrame) -> Figure:
             axes.yaxis.set_major_formatter(lambda value, _: f"{value:,.10g}")
             axes.xaxis.set_minor_formatter(NullFormatter())
             axes.yaxis.set_minor_formatter(NullFormatter())
-            if np.ptp(np.log10(axes.get_ylim())) < 2:  # or there would be a single number
+            if np.ptp(np.log10(axes.get_ylim())) < 2:  # else the axis would have a single number
                 axes.yaxis.set_major_locator(LogLocator(10, subs=(1, 2, 5)))
         for axes in panels.flat:  # once all limits are known
             _draw_proportional(axes)
         handles, labels = panels[0, 0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper center", ncols=3, columnspacing=1.4, handlelength=2.6)
         return figure
-
-
-def _looks(number: int) -> list[tuple[str, str]]:
-    return [_MACHINES[index % len(_MACHINES)] for index in range(number)]
 
 
 def _numbers(values: pd.Series) -> str:
@@ -251,6 +241,6 @@ def _draw_proportional(axes: Axes) -> None:
     """A line of slope 1 through the middle of the panel, which does not change its limits."""
     (left, right), limits = axes.get_xlim(), axes.get_ylim()
     slope = np.sqrt(limits[0] * limits[1] / (left * right))
-    axes.plot([left, right], [slope * left, slope * right], color="#9a9a9a", linewidth=0.8, linestyle=":", zorder=0.9,
-              scalex=False, scaley=False, label="proportional")  # fmt: skip
+    look: Look = {"color": "#9a9a9a", "linewidth": 0.8, "linestyle": ":", "zorder": 0.9, "label": "proportional"}
+    axes.plot([left, right], [slope * left, slope * right], scalex=False, scaley=False, **look)
     axes.set(xlim=(left, right), ylim=limits)

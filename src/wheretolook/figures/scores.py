@@ -1,4 +1,4 @@
-"""The score figures: how well every method chooses, how much is lost, and what differs from the learned one."""
+"""The score figures: how well every method chooses, what it loses against the oracle, and against a reference."""
 
 from __future__ import annotations
 
@@ -15,20 +15,23 @@ from matplotlib.ticker import MaxNLocator
 
 from wheretolook.evaluation.score_table import main_rows, methods_of, reference_of, threshold_keys
 from wheretolook.evaluation.scores import by_chance
+from wheretolook.figures.config import Look
 from wheretolook.figures.style import INK, RC, new_figure
 from wheretolook.methods.styles import ORACLE, method_group, method_style, rows_by_group
 from wheretolook.viewpoints.thresholds import ALL, threshold_label
 
 _OTHER_MARKERS = ("o", "D", "s", "^")
-"""Of the second and further N."""
+"""Markers of the second and further N."""
 
 _WRAP = 36
-"""Letters of a method's name on one line."""
+"""Longer names of methods are broken into two lines."""
+
+_WHISKERS = "whiskers: 95 % bootstrap interval over locations"
 
 
 @dataclass(frozen=True)
 class _Layout:
-    """What the panels of a figure share: rows of the table by method and N, and where they are drawn."""
+    """What the panels of a figure share: rows of the table by method and N, and the places y of methods."""
 
     rows: dict[tuple[str, int], dict[str, float]]
     y: dict[str, float]
@@ -76,8 +79,8 @@ def score_figure(scores: pd.DataFrame) -> Figure:
     Returns:
         One panel for each threshold, one row for each method, groups set apart: a filled mark for the first N, small
         open ones below it for the others, with bootstrap intervals; the oracle a line at 100 %. The axis above a panel
-        tells the share before division by the oracle's, for the first N. The axes hold the methods that come at least
-        halfway from chance to the oracle; of others that lie beyond, an arrow and numbers tell how far.
+        gives the share before division by the oracle's, for the first N. The axes reach down to the methods that come
+        at least halfway from chance to the oracle; arrows and numbers stand for values beyond.
     """
     scores = main_rows(scores)
     pooled, keys = scores[scores["scene"] == ALL], threshold_keys(scores)
@@ -98,9 +101,9 @@ def score_figure(scores: pd.DataFrame) -> Figure:
                 _add_raw_axis(axes, best.iloc[0])
         _name_rows(panels[0], layout)
         figure.supxlabel(
-            f"% of the oracle's share; above each panel: % of the chosen views, {_best(layout.top_n[0])}\n"
-            "whiskers: 95 % bootstrap interval over locations", fontsize=9,
-        )  # fmt: skip
+            f"% of the oracle's share; above each panel: % of the chosen views, {_best(layout.top_n[0])}\n{_WHISKERS}",
+            fontsize=9,
+        )
         _add_legend(figure, layout, [Line2D([], [], color=INK, linewidth=1, linestyle="--", label="oracle")])
         return figure
 
@@ -108,15 +111,11 @@ def score_figure(scores: pd.DataFrame) -> Figure:
 def regret_figure(scores: pd.DataFrame) -> Figure:
     """What each method loses against the oracle and against the reference, at the finest threshold, for each N.
 
-    Args:
-        scores: as for `score_figure`.
-
-    Returns:
-        Rows as in `score_figure`. Left the regret, right the paired difference to the reference if the table has one,
-        with bootstrap intervals, in percentage points of the chosen views.
+    Rows and `scores` are as in `score_figure`. Left the regret, right the paired difference to the reference if the
+    table has one, with bootstrap intervals, in percentage points of the chosen views.
 
     Raises:
-        ValueError: the table is of an older version and knows no regret.
+        ValueError: the table is of an older version, without regret.
     """
     scores = main_rows(scores)
     pooled, key = scores[scores["scene"] == ALL], threshold_keys(scores)[0]
@@ -140,10 +139,7 @@ def regret_figure(scores: pd.DataFrame) -> Figure:
         panels[0].set_xlabel("percentage points, lower is better", fontsize=9)
         if reference:
             panels[1].set_xlabel("percentage points, higher is better", fontsize=9)
-        figure.supxlabel(
-            f"shares of chosen views within {threshold_label(key)}\n"
-            "whiskers: 95 % bootstrap interval over locations", fontsize=9,
-        )  # fmt: skip
+        figure.supxlabel(f"shares of chosen views within {threshold_label(key)}\n{_WHISKERS}", fontsize=9)
         _name_rows(panels[0], layout)
         _add_legend(figure, layout, [])
         return figure
@@ -174,36 +170,34 @@ def _height(layout: _Layout) -> float:
 
 
 def _draw(axes: Axes, layout: _Layout, column: str) -> None:
-    """Marks of all methods for one column of the table; those beyond the axis' ends as arrows and numbers."""
+    """Marks of all methods for one column of the table; arrows and numbers for those beyond the axis' ends."""
     low, high = axes.get_xlim()
+    plate = {"facecolor": "white", "edgecolor": "none", "pad": 0.5}
     for method, y in layout.y.items():
         style = method_style(method)
         values = [layout.value(method, n, column) for n in layout.top_n]
         if low <= values[0] <= high:
             axes.hlines(y, *layout.ends(method, layout.top_n[0], column), color=INK, linewidth=1.2)
             filled = style.marker in Line2D.filled_markers
-            axes.plot(values[0], y, style.marker, color=style.color, markersize=7, label=style.label,
-                      markeredgecolor=INK if filled else style.color,
-                      markeredgewidth=0.5 if filled else 1.6)  # fmt: skip
+            edge: Look = {"markeredgecolor": INK if filled else style.color, "markeredgewidth": 0.5 if filled else 1.6}
+            axes.plot(values[0], y, style.marker, color=style.color, markersize=7, label=style.label, **edge)
         for value, (n, marker, below) in zip(values[1:], layout.others(), strict=True):
             if low <= value <= high:
                 axes.hlines(y + below, *layout.ends(method, n, column), color=style.color, linewidth=0.8)
-                axes.plot(value, y + below, marker, color=style.color, markersize=3.4, markerfacecolor="white",
-                          markeredgewidth=1)  # fmt: skip
-        for beyond, edge, text, side in (
-            ([value for value in values if value < low], low, "◂ {}", "left"),
-            ([value for value in values if value > high], high, "{} ▸", "right"),
+                small: Look = {"markersize": 3.4, "markerfacecolor": "white", "markeredgewidth": 1}
+                axes.plot(value, y + below, marker, color=style.color, **small)
+        for beyond, end, text, side, shift in (
+            ([value for value in values if value < low], low, "◂ {}", "left", 2),
+            ([value for value in values if value > high], high, "{} ▸", "right", -2),
         ):
-            if beyond and not low <= values[0] <= high:  # the best view's own mark stands where the text would
+            if beyond and not low <= values[0] <= high:  # else the first mark stands where the text would
                 numbers = " · ".join(f"{value:.0f}" for value in beyond).replace("-", "−")
-                shift = 2 if side == "left" else -2
-                axes.annotate(text.format(numbers), (edge, y), (shift, 0), textcoords="offset points", fontsize=7.5,
-                              va="center", ha=side, zorder=1.9,
-                              bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.5})  # fmt: skip
+                look: Look = {"fontsize": 7.5, "va": "center", "ha": side, "zorder": 1.9, "bbox": plate}
+                axes.annotate(text.format(numbers), (end, y), (shift, 0), textcoords="offset points", **look)
 
 
 def _add_raw_axis(axes: Axes, best: float) -> None:
-    """An axis above that tells undivided shares, by the oracle's."""
+    """A second axis, above, of the shares before they are divided by the oracle's, `best`."""
     above = axes.secondary_xaxis(
         "top", functions=(lambda share: np.multiply(share, best), lambda share: np.divide(share, best))
     )
@@ -228,16 +222,10 @@ def _best(n: int) -> str:
 
 def _add_legend(figure: Figure, layout: _Layout, more: Sequence[Line2D]) -> None:
     handles = [Line2D([], [], color=INK, linewidth=1.2, marker="o", markersize=7, label=_best(layout.top_n[0]))]
-    handles += [
-        Line2D([], [], color=INK, linewidth=0.8, marker=marker, markersize=3.4, markerfacecolor="white", label=_best(n))
-        for n, marker, _ in layout.others()
-    ]  # fmt: skip
+    small: Look = {"color": INK, "linewidth": 0.8, "markersize": 3.4, "markerfacecolor": "white"}
+    handles += [Line2D([], [], marker=marker, label=_best(n), **small) for n, marker, _ in layout.others()]
     handles += more
     if any(axes.texts for axes in figure.axes):
-        numbers = ", ".join(map(str, layout.top_n))
-        handles += [
-            Line2D(
-                [], [], color=INK, linestyle="none", marker="$◂$", markersize=5, label=f"beyond the axis, N = {numbers}"
-            )
-        ]
+        beyond = f"beyond the axis, N = {', '.join(map(str, layout.top_n))}"
+        handles.append(Line2D([], [], color=INK, linestyle="none", marker="$◂$", markersize=5, label=beyond))
     figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), columnspacing=1.4, handlelength=1.6)

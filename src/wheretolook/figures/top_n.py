@@ -1,4 +1,4 @@
-"""What several viewpoints of a location are worth: the paper's figure "Multiple viewpoints results"."""
+"""Scores of the best N viewpoints of a location: the paper's figure "Multiple viewpoints results"."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ROWS = {
     "normalized": "good ones among the best N\n(% of the oracle's share)",
     "any": "locations with a good one\namong N (%)",
 }
-"""The two meanings of a score of several viewpoints: columns of the score table, and what they tell."""
+"""The two scores of several viewpoints: columns of the score table, and their labels."""
 
 _PRINTED = {row.name: row.printed for row in PAPER["vs_others"]}
 _PAPER_MARKS = {"proposed": ("D", "paper, proposed"), "random": ("s", "paper, random")}
@@ -35,16 +35,14 @@ _GREY = "#7a7a7a"
 def top_n_figure(scores: pd.DataFrame, methods: Sequence[str] = ()) -> Figure:
     """Scores over the number N of best viewpoints, at each threshold.
 
+    Above, the share of good viewpoints among the best N of all locations, in % of the oracle's; below, the share of
+    locations with a good one among N, the oracle's as lines. Whiskers are 95 % bootstrap intervals. Open grey marks are
+    the paper's numbers, which it prints for N = 1 only, on other scenes and divided by its released code's constant.
+
     Args:
         scores: a table of `wheretolook.evaluation.scores.score_table`; its rows over all scenes are drawn, those of the
             first occlusion model and the first set of candidates if there are several.
         methods: those to draw; `SHOWN` if empty.
-
-    Returns:
-        A column for each threshold. Above the share of good viewpoints among the best N of all locations, in % of the
-        oracle's; below the share of locations with a good one among N, the oracle's as lines. Whiskers are 95 %
-        bootstrap intervals. Open grey marks: what the paper prints for N = 1, on other scenes and divided by the
-        constant of its released code; of other N it prints no numbers.
     """
     scores = main_rows(scores)
     pooled, keys = scores[scores["scene"] == ALL], threshold_keys(scores)

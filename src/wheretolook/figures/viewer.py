@@ -1,4 +1,4 @@
-"""The interactive view: a scene, its map, cameras and a path in Open3D's viewer."""
+"""A scene, its map, cameras and a path in Open3D's interactive viewer."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def scene_geometries(
     camera: PinholeCamera = PinholeCamera(),
     cut_m: float | None = None,
 ) -> list[dict[str, Any]]:
-    """What Open3D's viewer draws, each geometry with a name that the viewer lists, to be shown and hidden.
+    """What Open3D's viewer draws; it lists the geometries by name, to be shown and hidden.
 
     Args:
         mesh: metres, z up; one geometry for each of its textures.
@@ -36,7 +36,7 @@ def scene_geometries(
         cameras: cam_from_world (B, 3, 4).
         path: (P, 3) metres.
         camera: intrinsics of the cameras.
-        cut_m: what of the mesh lies above this height is left out, so that one can look in.
+        cut_m: leave out what of the mesh lies above this height, to look into rooms from above.
 
     Returns:
         Arguments of `open3d.visualization.draw`: `name`, `geometry` and `material` of each.
@@ -55,19 +55,11 @@ def scene_geometries(
     return found
 
 
-def show_scene(
-    mesh: TexturedMesh | None = None,
-    landmarks: ArrayLike | None = None,
-    cameras: ArrayLike | None = None,
-    path: ArrayLike | None = None,
-    camera: PinholeCamera = PinholeCamera(),
-    cut_m: float | None = None,
-    title: str = "wheretolook",
-) -> None:
-    """Open a window with the scene and return when it is closed; a display is needed. Else as `scene_geometries`."""
+def show_scene(*parts: Any, title: str = "wheretolook", **named_parts: Any) -> None:
+    """Show a scene in a window until that is closed. Needs a display. Arguments are those of `scene_geometries`."""
     import open3d as o3d
 
-    geometries = scene_geometries(mesh, landmarks, cameras, path, camera, cut_m)
+    geometries = scene_geometries(*parts, **named_parts)
     o3d.visualization.draw(geometries, title=title, show_skybox=False, bg_color=(1.0, 1.0, 1.0, 1.0))
 
 
@@ -79,7 +71,7 @@ def _mesh_geometries(mesh: TexturedMesh) -> list[dict[str, Any]]:
         rows = np.flatnonzero(mesh.triangle_texture == number)
         if len(rows) == 0:
             continue
-        # a corner of its own for each triangle, so that texture coordinates belong to vertices
+        # triangles share no vertices here, so that each vertex has texture coordinates
         corners = mesh.triangles[rows].reshape(-1)
         part = o3d.geometry.TriangleMesh(
             o3d.utility.Vector3dVector(mesh.vertices[corners].astype(np.float64)),
@@ -89,9 +81,9 @@ def _mesh_geometries(mesh: TexturedMesh) -> list[dict[str, Any]]:
         part.triangle_uvs = o3d.utility.Vector2dVector(np.column_stack([uvs[:, 0], 1 - uvs[:, 1]]))  # v up
         if mesh.vertex_colors is not None:
             part.vertex_colors = o3d.utility.Vector3dVector(mesh.vertex_colors[corners] / 255.0)
-        material = _material("defaultUnlit")
-        material.albedo_img = o3d.geometry.Image(np.ascontiguousarray(texture))  # type: ignore[call-overload]
-        found.append(_named("mesh" if len(mesh.textures) == 1 else f"mesh {number + 1}", part, material))
+        image = o3d.geometry.Image(np.ascontiguousarray(texture))  # type: ignore[call-overload]
+        name = "mesh" if len(mesh.textures) == 1 else f"mesh {number + 1}"
+        found.append(_named(name, part, "defaultUnlit", albedo_img=image))
     return found
 
 
@@ -100,9 +92,7 @@ def _points(name: str, points: Float, color: str) -> dict[str, Any]:
 
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
     cloud.paint_uniform_color(np.array(to_rgb(color)))
-    material = _material("defaultUnlit")
-    material.point_size = _POINT_PX
-    return _named(name, cloud, material)
+    return _named(name, cloud, "defaultUnlit", point_size=_POINT_PX)
 
 
 def _lines(name: str, segments: NDArray[np.floating[Any]], color: str, width_px: float) -> dict[str, Any]:
@@ -113,18 +103,13 @@ def _lines(name: str, segments: NDArray[np.floating[Any]], color: str, width_px:
         o3d.utility.Vector2iVector(np.arange(2 * len(segments), dtype=np.int32).reshape(-1, 2)),
     )
     lines.paint_uniform_color(np.array(to_rgb(color)))
-    material = _material("unlitLine")
-    material.line_width = width_px
-    return _named(name, lines, material)
+    return _named(name, lines, "unlitLine", line_width=width_px)
 
 
-def _material(shader: str) -> Any:
+def _named(name: str, geometry: Any, shader: str, **properties: Any) -> dict[str, Any]:
     import open3d as o3d
 
     material = o3d.visualization.rendering.MaterialRecord()
-    material.shader = shader
-    return material
-
-
-def _named(name: str, geometry: Any, material: Any) -> dict[str, Any]:
+    for key, value in {"shader": shader, **properties}.items():
+        setattr(material, key, value)
     return {"name": name, "geometry": geometry, "material": material}

@@ -1,10 +1,9 @@
-"""The Fisher Information Field: for every location, what gives the information in any direction by one product."""
+"""The Fisher Information Field: factors for every location from which one product gives the information of any view."""
 
 from __future__ import annotations
 
 import json
-import os
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,23 +16,18 @@ from wheretolook.fisher.metrics import metric_of
 from wheretolook.fisher.soft_visibility import GaussianProcessVisibility, QuadraticVisibility, SoftVisibility
 from wheretolook.geometry.poses import Float
 from wheretolook.utils.errors import MapError
+from wheretolook.utils.npz_files import load_npz, save_npz
 
 FORMAT_VERSION = 1
 
 
 @dataclass(frozen=True, eq=False)
 class FisherField:
-    """Information at L locations, as factors of a soft visibility (Zhang and Scaramuzza 2020, Sec. V).
+    """Information at L locations, as factors of a soft visibility (Zhang and Scaramuzza 2020, Sec. V)."""
 
-    Attributes:
-        locations: (L, 3) metres.
-        visibility: the approximation of what is in view.
-        factors: (L, F, 15), see `wheretolook.fisher.information` for the 15 numbers.
-    """
-
-    locations: Float
-    visibility: SoftVisibility
-    factors: Float
+    locations: Float  # (L, 3) metres
+    visibility: SoftVisibility  # the approximation of what is in view
+    factors: Float  # (L, F, 15), see `wheretolook.fisher.information` for the 15 numbers
 
     @classmethod
     def build(
@@ -44,13 +38,13 @@ class FisherField:
         unoccluded: NDArray[np.bool_] | None = None,
         device: str = "cpu",
     ) -> FisherField:
-        """Sum up what all landmarks tell each location.
+        """Sum the information of all landmarks at each location.
 
         Args:
             locations: (L, 3) metres.
             points: (N, 3) landmarks, metres.
             visibility: the approximation of what is in view.
-            unoccluded: (L, N), True where the line of sight is free; None where every one is.
+            unoccluded: (L, N), True where the line of sight is free; None if all are.
             device: "cpu" (all cores) or a CUDA device.
 
         Raises:
@@ -68,15 +62,7 @@ class FisherField:
         return np.asarray(self.visibility.of_axes(np.asarray(axes, dtype=np.float64)) @ self.factors[row])
 
     def information_of_views(self, rows: NDArray[np.int64], axes: Float) -> Float:
-        """Information of many views at once.
-
-        Args:
-            rows: (B,) of their locations.
-            axes: (B, 3) their optical axes, of unit length.
-
-        Returns:
-            (B, 15).
-        """
+        """Information (B, 15) of views at locations `rows` (B,) along optical axes (B, 3) of unit length."""
         order = np.argsort(rows, kind="stable")
         starts = np.searchsorted(rows[order], np.arange(len(self.locations) + 1))
         numbers = np.empty((len(rows), N_NUMBERS))
@@ -92,7 +78,7 @@ class FisherField:
             row: of the location.
             axes: (D, 3) of unit length.
             metric: "mineig", "logdet" or "trace".
-            about_origin: take turns about the world's origin, as the released code of the Fisher Information Field.
+            about_origin: rotate about the world's origin, as the released code of the Fisher Information Field does.
 
         Raises:
             ConfigError: no such metric.
@@ -102,16 +88,15 @@ class FisherField:
         return metric_of(numbers, metric, pivots)
 
     def best_axis(self, row: int, axes: ArrayLike, metric: str) -> int:
-        """The one of the optical axes (D, 3) that a metric likes best at location `row`."""
+        """Row of the optical axis of (D, 3) with the greatest metric at location `row`."""
         return int(np.argmax(self.metric(row, axes, metric)))
 
     def save(self, path: Path) -> None:
         """Write an uncompressed NPZ, atomically: locations, factors, and the approximation as JSON text."""
-        about = {"format_version": FORMAT_VERSION, "kind": type(self.visibility).__name__, **vars_of(self.visibility)}
-        partial = path.with_name(path.name + ".partial")
-        with open(partial, "wb") as file:
-            np.savez(file, locations=self.locations, factors=self.factors, about=json.dumps(about))
-        os.replace(partial, path)
+        visibility: Any = self.visibility
+        about = {"format_version": FORMAT_VERSION, "kind": type(visibility).__name__, **asdict(visibility)}
+        arrays = {"locations": self.locations, "factors": self.factors, "about": np.array(json.dumps(about))}
+        save_npz(path, arrays)
 
     @classmethod
     def load(cls, path: Path) -> FisherField:
@@ -121,34 +106,28 @@ class FisherField:
             MapError: the file is missing, damaged or of another version.
         """
         try:
-            with np.load(path) as data:
-                about = json.loads(str(data["about"]))
-                if about.pop("format_version") != FORMAT_VERSION:
-                    raise ValueError("another version of the format")
-                kind = {kind.__name__: kind for kind in (QuadraticVisibility, GaussianProcessVisibility)}
-                return cls(data["locations"], kind[about.pop("kind")](**about), data["factors"])
-        except Exception as error:  # a damaged zip raises many kinds of errors
+            data = load_npz(path)
+            about = json.loads(str(data["about"]))
+            if about.pop("format_version") != FORMAT_VERSION:
+                raise ValueError("another version of the format")
+            kind = {kind.__name__: kind for kind in (QuadraticVisibility, GaussianProcessVisibility)}
+            return cls(data["locations"], kind[about.pop("kind")](**about), data["factors"])
+        except (ValueError, KeyError, TypeError) as error:
             raise MapError(f"not a Fisher Information Field: {error}", path=path, fix="Build it again.") from error
 
 
-def vars_of(visibility: SoftVisibility) -> dict[str, Any]:
-    """The arguments of a soft visibility, as JSON values."""
-    return {name: getattr(visibility, name) for name in getattr(visibility, "__dataclass_fields__", {})}
-
-
 def worst_axis_of_trace(field: FisherField, row: int, axes: ArrayLike) -> Float:
-    """The one of the axes (D, 3) with the least trace: a probe of the field, the opposite of a choice; (3,)."""
-    axes = np.asarray(axes, dtype=np.float64)
-    return np.asarray(axes[np.argmin(field.metric(row, axes, "trace"))])
+    """The axis (3,) of (D, 3) with the least trace. It tests the field; nobody would choose this view."""
+    return np.asarray(axes, dtype=np.float64)[np.argmin(field.metric(row, axes, "trace"))]
 
 
 def stationary_axis_of_trace(field: FisherField, row: int) -> Float:
-    """Where the gradient of the quadratic field's trace by the axis is zero, (3,) of unit length.
+    """The axis at which the gradient of a quadratic field's trace is zero, (3,), scaled to unit length afterwards.
 
-    The axis is not held to unit length before. The trace is z^T Q z + q . z + constant, so that is z = -Q^-1 q / 2.
-    With the landmarks' squares behind Q and their mean behind q, both positive, it points away from them: the released
-    code calls it the direction of the minimum and turns it round where it wants the best one. (With the default
-    visibility, cones wider than 53 degrees to a side make Q negative, and then it is the best one already.)
+    The trace is z^T Q z + q . z + constant, so its gradient is zero at z = -Q^-1 q / 2. If Q is positive, this axis
+    points away from the landmarks: the released code calls it the direction of the minimum and negates it to get the
+    best one. (With the default visibility, Q is negative for cones wider than 53 degrees to a side; the axis is then
+    the best one itself.)
     """
     assert isinstance(field.visibility, QuadraticVisibility)
     k1, k2, _ = field.visibility.coefficients

@@ -1,7 +1,7 @@
-"""Warp kernels that add up a Fisher Information Field.
+"""Warp kernels that sum a Fisher Information Field.
 
-On a CPU a thread does sixteen numbers by one instruction: vectors are as long as its registers (AVX-512), and multiply
-and add are fused.
+On a CPU one instruction works on sixteen numbers: vectors are as long as AVX-512 registers, and multiply and add are
+fused.
 """
 
 # mypy: ignore-errors
@@ -14,13 +14,12 @@ import warp as wp
 from wheretolook.visibility.frustum_kernel import offset_from
 
 wp.set_module_options(
-    {
-        "enable_backward": False,
-        "cpu_compiler_flags": "-march=native -mprefer-vector-width=512 -ffp-contract=fast",
-    }
+    {"enable_backward": False, "cpu_compiler_flags": "-march=native -mprefer-vector-width=512 -ffp-contract=fast"}
 )
 
 vec16 = wp.types.vector(length=16, dtype=wp.float32)
+mat10x16 = wp.types.matrix(shape=(10, 16), dtype=wp.float32)
+mat15x16 = wp.types.matrix(shape=(15, 16), dtype=wp.float32)
 
 
 @wp.kernel
@@ -33,7 +32,7 @@ def numbers_kernel(
     bearings: wp.array2d[wp.vec3],
     numbers: wp.array2d[vec16],
 ):
-    """The 15 numbers of every landmark at every location; zero if it is hidden or too near."""
+    """The 15 numbers of every landmark at every location; zero if it is occluded or too near."""
     location, landmark = wp.tid()
     free = wp.bool(True)
     if masked:
@@ -69,48 +68,31 @@ def numbers_kernel(
 def quadratic_kernel(
     bearings: wp.array2d[wp.vec3], numbers: wp.array2d[vec16], at_once: wp.int32, sums: wp.array3d[vec16]
 ):
-    """Sums over a part of the landmarks of numbers times xx, xy, xz, yy, yz, zz, x, y, z, one."""
+    """Sums, over a part of the landmarks, of the numbers times xx, xy, xz, yy, yz, zz, x, y, z and 1 of the bearing."""
     location, part = wp.tid()
-    xx = vec16()
-    xy = vec16()
-    xz = vec16()
-    yy = vec16()
-    yz = vec16()
-    zz = vec16()
-    x = vec16()
-    y = vec16()
-    z = vec16()
-    one = vec16()
+    total = mat10x16()
     for landmark in range(part * at_once, wp.min((part + 1) * at_once, bearings.shape[1])):
         f = bearings[location, landmark]
         n = numbers[location, landmark]
-        xx += n * (f[0] * f[0])
-        xy += n * (f[0] * f[1])
-        xz += n * (f[0] * f[2])
-        yy += n * (f[1] * f[1])
-        yz += n * (f[1] * f[2])
-        zz += n * (f[2] * f[2])
-        x += n * f[0]
-        y += n * f[1]
-        z += n * f[2]
-        one += n
-    sums[location, part, 0] = xx
-    sums[location, part, 1] = xy
-    sums[location, part, 2] = xz
-    sums[location, part, 3] = yy
-    sums[location, part, 4] = yz
-    sums[location, part, 5] = zz
-    sums[location, part, 6] = x
-    sums[location, part, 7] = y
-    sums[location, part, 8] = z
-    sums[location, part, 9] = one
+        total[0] += n * (f[0] * f[0])
+        total[1] += n * (f[0] * f[1])
+        total[2] += n * (f[0] * f[2])
+        total[3] += n * (f[1] * f[1])
+        total[4] += n * (f[1] * f[2])
+        total[5] += n * (f[2] * f[2])
+        for axis in range(3):
+            total[6 + axis] += n * f[axis]
+        total[9] += n
+    for factor in range(10):
+        sums[location, part, factor] = total[factor]
 
 
 @wp.func
 def soft_step(x: vec16) -> vec16:
-    """1 / (1 + exp(-2 x)) = (1 + tanh x) / 2 to some 1e-7, by the tangent's best rational approximation of this degree.
+    """1 / (1 + exp(-2 x)) = (1 + tanh x) / 2, to about 1e-7.
 
-    Found by Lawson's iteration on [0, 8.3], where it errs by 8e-9; beyond, the tangent is 1 but for 1.3e-7.
+    By the best rational approximation of tanh of this degree on [0, 8.3], found by Lawson's iteration, which errs by
+    8e-9; beyond 8.3, tanh differs from 1 by less than 1.3e-7.
     """
     limit = vec16(8.3)
     y = wp.max(wp.min(x, limit), -limit)
@@ -134,61 +116,21 @@ def process_kernel(
     at_once: wp.int32,
     sums: wp.array4d[vec16],
 ):
-    """Sums over a part of the landmarks of numbers times the soft steps of sixteen axes.
+    """Sums, over a part of the landmarks, of the numbers times the soft steps of sixteen axes.
 
-    The rows of `planes` are x, y, z of sixteen axes and minus the cosine of the edge, times half the steepness.
+    The rows of `planes` are x, y and z of sixteen axes and minus the cosine of the edge, all times half the steepness.
     """
     location, part, axes = wp.tid()
     zx = planes[axes, 0]
     zy = planes[axes, 1]
     zz = planes[axes, 2]
     edge = planes[axes, 3]
-    s0 = vec16()
-    s1 = vec16()
-    s2 = vec16()
-    s3 = vec16()
-    s4 = vec16()
-    s5 = vec16()
-    s6 = vec16()
-    s7 = vec16()
-    s8 = vec16()
-    s9 = vec16()
-    s10 = vec16()
-    s11 = vec16()
-    s12 = vec16()
-    s13 = vec16()
-    s14 = vec16()
+    total = mat15x16()
     for landmark in range(part * at_once, wp.min((part + 1) * at_once, bearings.shape[1])):
         f = bearings[location, landmark]
         n = numbers[location, landmark]
         seen = soft_step(zx * f[0] + zy * f[1] + zz * f[2] + edge)
-        s0 += seen * n[0]
-        s1 += seen * n[1]
-        s2 += seen * n[2]
-        s3 += seen * n[3]
-        s4 += seen * n[4]
-        s5 += seen * n[5]
-        s6 += seen * n[6]
-        s7 += seen * n[7]
-        s8 += seen * n[8]
-        s9 += seen * n[9]
-        s10 += seen * n[10]
-        s11 += seen * n[11]
-        s12 += seen * n[12]
-        s13 += seen * n[13]
-        s14 += seen * n[14]
-    sums[location, part, axes, 0] = s0
-    sums[location, part, axes, 1] = s1
-    sums[location, part, axes, 2] = s2
-    sums[location, part, axes, 3] = s3
-    sums[location, part, axes, 4] = s4
-    sums[location, part, axes, 5] = s5
-    sums[location, part, axes, 6] = s6
-    sums[location, part, axes, 7] = s7
-    sums[location, part, axes, 8] = s8
-    sums[location, part, axes, 9] = s9
-    sums[location, part, axes, 10] = s10
-    sums[location, part, axes, 11] = s11
-    sums[location, part, axes, 12] = s12
-    sums[location, part, axes, 13] = s13
-    sums[location, part, axes, 14] = s14
+        for i in range(15):
+            total[i] += seen * n[i]
+    for i in range(15):
+        sums[location, part, axes, i] = total[i]

@@ -1,4 +1,4 @@
-"""Sums over all landmarks that a Fisher Information Field is made of."""
+"""The sums over all landmarks that make up a Fisher Information Field."""
 
 from __future__ import annotations
 
@@ -17,14 +17,9 @@ from wheretolook.geometry.poses import Float
 from wheretolook.utils.warp import start_warp
 from wheretolook.visibility.frustum import offsets_from
 
-NEAREST_M = 1e-3
-"""Landmarks nearer to a location than this are left out: their information has no bound."""
-
-AT_ONCE = 512
-"""Landmarks that are summed up in single precision."""
-
-GPU_LOCATIONS = 32
-"""Locations that a GPU takes at a time: about 60 MB for 25,000 landmarks."""
+NEAREST_M = 1e-3  # landmarks nearer to a location than this are left out: their information has no bound
+AT_ONCE = 512  # landmarks that are summed in single precision before their sums are summed in double
+GPU_LOCATIONS = 32  # locations that a GPU takes at a time: about 60 MB for 25,000 landmarks
 
 
 def field_sums(
@@ -34,17 +29,9 @@ def field_sums(
     unoccluded: NDArray[np.bool_] | None = None,
     device: str = "cpu",
 ) -> Float:
-    """Sums over landmarks of information times what `visibility.of_bearings` gives, in single precision.
+    """Sums over landmarks of information times what `visibility.of_bearings` gives, (L, F, 15), in single precision.
 
-    Args:
-        locations: (L, 3) metres.
-        points: (N, 3) landmarks, metres.
-        visibility: quadratic, or a Gaussian process.
-        unoccluded: (L, N), True where the line of sight is free; None where every one is.
-        device: "cpu" (all cores) or a CUDA device.
-
-    Returns:
-        (L, F, 15), see `wheretolook.fisher.information`.
+    Takes locations (L, 3) m, points (N, 3) m and a mask (L, N) as `FisherField.build` does.
     """
     device = start_warp(device)
     wp.load_module(field_kernel, device=device)  # only one thread may do that
@@ -96,7 +83,7 @@ def field_sums_plain(
 
 
 def _planes(visibility: GaussianProcessVisibility) -> NDArray[np.float32]:
-    """Axes and edge as `process_kernel` wants them, (A, 4, 16): sixteen axes at a time, the last ones zero."""
+    """The `planes` of `process_kernel`, (A, 4, 16): sixteen axes at a time, filled up with zeros."""
     planes = np.zeros((-(-visibility.n_factors // 16) * 16, 4), dtype=np.float32)
     planes[: visibility.n_factors, :3] = visibility.axes
     planes[: visibility.n_factors, 3] = -np.cos(visibility.half_angle_rad)

@@ -1,15 +1,16 @@
-"""The Fisher information of a camera's pose in the bearings of landmarks.
+"""The Fisher information on a camera's pose that lies in the bearings of landmarks.
 
 A landmark at the offset r = n f from the camera (unit bearing f, distance n) is measured as the bearing f with
-isotropic noise of one radian. With the pose perturbed by (rho, theta), a shift and a turn about the camera's centre,
-both along the world's axes, the landmark's information on the pose is (Zhang and Scaramuzza, Fisher Information Field,
-2020, eq. 6; here in closed form, with P = I - f f^T)
+isotropic noise of one radian. Let the pose be perturbed by (rho, theta), a translation and a rotation about the camera
+centre, both along the world's axes. Then the landmark's information on the pose is (Zhang and Scaramuzza, Fisher
+Information Field, 2020, eq. 6; here in closed form, with P = I - f f^T)
 
     [   P / n^2    -[f]x / n ]
     [   [f]x / n       P     ]
 
-The camera's rotation cancels: it decides which landmarks are seen, not what each of them tells. Sums over landmarks are
-kept as the 15 numbers that differ: P / n^2 (xx, xy, xz, yy, yz, zz), f / n (x, y, z), P (xx, xy, xz, yy, yz, zz).
+The camera's rotation cancels: it decides which landmarks are in view, not how much information each of them gives. Sums
+over landmarks are kept as the 15 numbers that differ: P / n^2 (xx, xy, xz, yy, yz, zz), f / n (x, y, z), and
+P (xx, xy, xz, yy, yz, zz).
 """
 
 from __future__ import annotations
@@ -19,24 +20,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.geometry.poses import Float
 
-N_NUMBERS = 15
-"""Numbers that a sum of informations is kept as."""
-
-TRACE = np.zeros(N_NUMBERS)
-"""Weights (15,) whose product with the numbers is the trace."""
+N_NUMBERS = 15  # numbers that a sum of information matrices is kept as
+TRACE = np.zeros(N_NUMBERS)  # weights (15,) whose product with the numbers is the trace
 TRACE[[0, 3, 5, 9, 12, 14]] = 1
 
 _UPPER = np.triu_indices(3)
 
 
 def bearing_numbers(offsets: ArrayLike) -> Float:
-    """Each landmark's information as 15 numbers.
+    """Each landmark's information as 15 numbers (..., 15), in the precision of the offsets.
 
-    Args:
-        offsets: (..., 3) from the camera's centre to landmarks, in the world, metres, none of them zero.
-
-    Returns:
-        (..., 15) in the precision of the offsets.
+    Offsets (..., 3) lead from the camera centre to the landmarks, in the world, in metres; none may be zero.
     """
     offsets = np.asarray(offsets)
     distance = np.linalg.norm(offsets, axis=-1, keepdims=True)
@@ -47,13 +41,13 @@ def bearing_numbers(offsets: ArrayLike) -> Float:
 
 
 def information_matrices(numbers: ArrayLike, pivots: ArrayLike | None = None) -> Float:
-    """Matrices (..., 6, 6) of sums kept as numbers (..., 15); shift first, turn second.
+    """Information matrices (..., 6, 6) of sums kept as numbers (..., 15); translation first, rotation second.
 
     Args:
         numbers: as `bearing_numbers` gives them, summed over landmarks.
-        pivots: (..., 3) offsets from the camera's centre to the points that the pose is turned about, metres: minus
-            the camera's centre turns it about the world's origin, as the released code of the Fisher Information Field
-            does. None for the camera's centre. The determinant does not depend on it.
+        pivots: (..., 3) offsets from the camera centre to the points that the pose is rotated about, metres: minus the
+            camera centre rotates it about the world's origin, as the released code of the Fisher Information Field
+            does. None for the camera centre. The determinant does not depend on it.
     """
     numbers = np.asarray(numbers, dtype=np.float64)
     matrices = np.empty((*numbers.shape[:-1], 6, 6))

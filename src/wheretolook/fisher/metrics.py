@@ -1,4 +1,4 @@
-"""Single numbers made of the information on a pose."""
+"""Metrics that turn the information on a pose into a single number."""
 
 from __future__ import annotations
 
@@ -19,12 +19,11 @@ from wheretolook.utils.warp import start_warp
 Metric = Literal["mineig", "logdet", "trace"]
 METRICS: tuple[str, ...] = get_args(Metric)
 
-ROWS_AT_ONCE = 4096
-"""Matrices that a thread of a CPU takes at a time: a few milliseconds."""
+ROWS_AT_ONCE = 4096  # matrices that a thread of a CPU takes at a time: a few milliseconds
 
 
 def metric_of(numbers: ArrayLike, metric: str, pivots: ArrayLike | None = None, device: str = "cpu") -> Float:
-    """One number for each sum of informations; more is better.
+    """A metric (B,) of information matrices kept as numbers (B, 15); more is better.
 
     Args:
         numbers: (B, 15), see `wheretolook.fisher.information`.
@@ -33,9 +32,6 @@ def metric_of(numbers: ArrayLike, metric: str, pivots: ArrayLike | None = None, 
             "mineig", the smallest absolute eigenvalue, which is the smallest singular value the released code takes.
         pivots: (B, 3) as in `information_matrices`.
         device: "cpu" or a CUDA device.
-
-    Returns:
-        (B,).
 
     Raises:
         ConfigError: no such metric, or no such device.
@@ -49,7 +45,7 @@ def metric_of(numbers: ArrayLike, metric: str, pivots: ArrayLike | None = None, 
 
 
 def metric_of_eigenvalues(values: Float, metric: str) -> Float:
-    """As `metric_of`, (B,), from eigenvalues (B, 6) that are known already."""
+    """As `metric_of`, (B,), from eigenvalues (B, 6)."""
     if metric == "trace":
         return np.asarray(values.sum(-1))
     if metric == "mineig":
@@ -60,17 +56,9 @@ def metric_of_eigenvalues(values: Float, metric: str) -> Float:
 
 
 def eigenvalues(numbers: ArrayLike, pivots: ArrayLike | None = None, device: str = "cpu") -> Float:
-    """Eigenvalues (B, 6), in no order, of the informations kept as numbers (B, 15).
+    """Eigenvalues (B, 6), in no order, of information matrices kept as numbers (B, 15).
 
-    Their errors are some 1e-16 of the matrix's norm.
-
-    Args:
-        numbers: (B, 15).
-        pivots: (B, 3) as in `information_matrices`.
-        device: "cpu" (all cores, if there are many) or a CUDA device.
-
-    Raises:
-        ConfigError: no such device.
+    Their errors are about 1e-16 of the matrix's norm. The arguments are those of `metric_of`.
     """
     numbers = np.ascontiguousarray(numbers, dtype=np.float64).reshape(-1, N_NUMBERS)
     arms = np.empty((0, 3)) if pivots is None else np.ascontiguousarray(pivots, dtype=np.float64).reshape(-1, 3)
@@ -78,12 +66,10 @@ def eigenvalues(numbers: ArrayLike, pivots: ArrayLike | None = None, device: str
     values = np.empty((len(numbers), 6))
 
     def work(part: slice) -> None:
-        inputs = [
-            wp.array(numbers[part], dtype=wp.float64, device=device),
-            pivots is not None,
-            wp.array(arms[part], dtype=wp.vec3d, device=device),
-        ]
+        there: Any = wp.array(numbers[part], dtype=wp.float64, device=device)
+        about: Any = wp.array(arms[part], dtype=wp.vec3d, device=device)
         found: Any = wp.empty((part.stop - part.start, 6), dtype=wp.float64, device=device)
+        inputs = [there, pivots is not None, about]
         wp.launch(eigenvalues_kernel, found.shape[0], inputs, [found], device=device)
         values[part] = found.numpy()
 

@@ -1,4 +1,4 @@
-"""Warp kernel that takes the eigenvalues of informations."""
+"""Warp kernel that computes the eigenvalues of information matrices."""
 
 # mypy: ignore-errors
 # Warp's kernel language is not Python's type system.
@@ -11,19 +11,20 @@ vec6d = wp.types.vector(length=6, dtype=wp.float64)
 mat66d = wp.types.matrix(shape=(6, 6), dtype=wp.float64)
 
 ROUNDING = wp.constant(wp.float64(1e-16))
-MOST_STEPS = wp.constant(200)
-"""About ten are needed. Without a bound, a number that is not finite would have no end."""
+MOST_STEPS = wp.constant(200)  # about ten are needed; without a bound, the loop would not end on NaN
 
 
 @wp.func
 def symmetric(numbers: wp.array2d[wp.float64], row: wp.int32, first: wp.int32) -> wp.mat33d:
-    xx = numbers[row, first]
-    xy = numbers[row, first + 1]
-    xz = numbers[row, first + 2]
-    yy = numbers[row, first + 3]
-    yz = numbers[row, first + 4]
-    zz = numbers[row, first + 5]
-    return wp.mat33d(xx, xy, xz, xy, yy, yz, xz, yz, zz)
+    """Symmetric matrix of xx, xy, xz, yy, yz and zz from number `first` on."""
+    matrix = wp.mat33d()
+    number = first
+    for i in range(3):
+        for j in range(i, 3):
+            matrix[i, j] = numbers[row, number]
+            matrix[j, i] = numbers[row, number]
+            number += 1
+    return matrix
 
 
 @wp.func
@@ -46,7 +47,7 @@ def information_matrix(numbers: wp.array2d[wp.float64], row: wp.int32, pivot: wp
 
 @wp.func
 def tridiagonal(matrix: mat66d) -> mat66d:
-    """A tridiagonal matrix with the same eigenvalues, by Householder's reflections."""
+    """A tridiagonal matrix with the same eigenvalues, by Householder reflections."""
     m = matrix
     for k in range(4):
         v = vec6d()
@@ -75,7 +76,7 @@ def eigenvalues(matrix: mat66d) -> vec6d:
     """
     m = tridiagonal(matrix)
     d = vec6d()
-    squares = vec6d()  # of what is beside the diagonal; the last is zero
+    squares = vec6d()  # of the elements beside the diagonal; the last is zero
     size = wp.float64(0.0)
     for i in range(6):
         d[i] = m[i, i]
@@ -125,10 +126,7 @@ def eigenvalues(matrix: mat66d) -> vec6d:
 
 @wp.kernel(enable_backward=False)
 def eigenvalues_kernel(
-    numbers: wp.array2d[wp.float64],
-    pivoted: wp.bool,
-    pivots: wp.array[wp.vec3d],
-    values: wp.array2d[wp.float64],
+    numbers: wp.array2d[wp.float64], pivoted: wp.bool, pivots: wp.array[wp.vec3d], values: wp.array2d[wp.float64]
 ):
     row = wp.tid()
     pivot = wp.vec3d()

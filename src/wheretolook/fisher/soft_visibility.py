@@ -1,9 +1,9 @@
-"""Visibility as a product of what depends on the camera's axis and what depends on the landmark (Zhang and Scaramuzza,
-Fisher Information Field, 2020, Sec. V).
+"""Whether a landmark is in view, approximated by a product of a function of the camera's axis and one of the landmark.
 
-A landmark's visibility v from a camera with the optical axis z is taken to depend on the angle between z and the
-landmark's bearing f alone, and approximated by v(z, f) = a(z) . b(f) with F factors. Sums over landmarks of
-(information x b) can then be stored for a location; times a(z), they give the information in any direction.
+Zhang and Scaramuzza, Fisher Information Field, 2020, Sec. V: the visibility v of a landmark from a camera with the
+optical axis z is taken to depend only on the angle between z and the landmark's bearing f, and approximated by
+v(z, f) = a(z) . b(f) with F factors. Sums over landmarks of (information x b) can then be stored for a location; their
+product with a(z) is the information in any direction.
 """
 
 from __future__ import annotations
@@ -26,27 +26,27 @@ class SoftVisibility(ABC):
 
     @abstractmethod
     def of_axes(self, axes: Float) -> Float:
-        """a of optical axes (D, 3), of unit length; (D, F)."""
+        """a(z) of optical axes (D, 3) of unit length; (D, F)."""
 
     @abstractmethod
     def of_bearings(self, bearings: Float) -> Float:
-        """What is summed for bearings (N, 3) of unit length, (N, F): b, but for `finish`."""
+        """What is summed over landmarks with bearings (N, 3) of unit length, (N, F): b(f), after `finish`."""
 
     def finish(self, sums: Float) -> Float:
-        """Turn sums (..., F, K) over what `of_bearings` gives into sums over b. Linear, so it can wait to the end."""
+        """Turn sums (..., F, K) over `of_bearings` into sums over b(f): linear, so it can be applied at the end."""
         return sums
 
 
 @dataclass(frozen=True)
 class QuadraticVisibility(SoftVisibility):
-    """k1 c^2 + k2 c + k3 of the cosine c between axis and bearing: 10 factors.
+    """v = k1 c^2 + k2 c + k3, with the cosine c between axis and bearing: 10 factors.
 
     Args:
         half_angle_rad: of the cone that stands for the field of view.
         boundary: v at the cone's edge.
         boundary_to_mid: v at the cone's edge as a share of v straight ahead. 0.8, as in the Fisher field's experiment
-            on orientations (its library's default is 0.5, where v falls to -0.33 beside the camera, sums are indefinite
-            and log det and min. eigenvalue choose worse on our validation scene).
+            on orientations. (Its library's default is 0.5, for which v falls to -0.33 beside the camera. Then sums are
+            indefinite, and log det and min. eigenvalue choose worse views on our validation scene.)
     """
 
     half_angle_rad: float
@@ -76,15 +76,15 @@ class QuadraticVisibility(SoftVisibility):
 
 @dataclass(frozen=True)
 class GaussianProcessVisibility(SoftVisibility):
-    """A Gaussian process over axes, seen at F of them: v there is a soft step at the edge of the cone.
+    """v interpolated by a Gaussian process from F sampled axes, at which it is a soft step at the edge of the cone.
 
     v(z, f) = k(z, Z) K^-1 s(Z . f) with the sampled axes Z, the kernel k(z, z') = exp(-|z - z'|^2 / 2 l^2),
     K = k(Z, Z), and s(c) = 1 / (1 + exp(-steepness (c - cos half angle))).
 
     Args:
         half_angle_rad: of the cone that stands for the field of view.
-        length: l, without unit (a chord of the unit sphere).
-        n_factors: F; axes are a Fibonacci lattice.
+        length: l, the length of a chord of the unit sphere.
+        n_factors: F; the axes are a Fibonacci lattice.
         steepness: of the soft step.
         jitter: added to K's diagonal.
     """
@@ -99,7 +99,7 @@ class GaussianProcessVisibility(SoftVisibility):
     def fitted(
         cls, half_angle_rad: float, n_factors: int = 70, steepness: float = 15.0, jitter: float = 1e-10
     ) -> GaussianProcessVisibility:
-        """The one whose length has the greatest marginal likelihood of the step seen at the axes, for many bearings."""
+        """The process whose length l maximizes the marginal likelihood of the step at the axes, for many bearings."""
         return _fitted(float(half_angle_rad), n_factors, float(steepness), float(jitter))
 
     @cached_property
@@ -117,19 +117,19 @@ class GaussianProcessVisibility(SoftVisibility):
         return np.asarray(np.exp((axes @ self.axes.T - 1) / self.length**2))  # |z - z'|^2 = 2 - 2 z . z'
 
     def of_bearings(self, bearings: Float) -> Float:
-        """s(Z . f), (N, F); K^-1 comes in `finish`."""
+        """s(Z . f), (N, F); `finish` multiplies by K^-1."""
         return self.step(bearings @ self.axes.T)
 
     def finish(self, sums: Float) -> Float:
-        """K^-1 of sums (..., F, K)."""
+        """K^-1 times sums (..., F, K)."""
         return np.asarray(self.inverse @ sums)
 
     def step(self, cosines: Float) -> Float:
-        """s of cosines between axis and bearing."""
+        """s(c) of cosines between axis and bearing."""
         return np.asarray(0.5 * (1 + np.tanh(0.5 * self.steepness * (cosines - np.cos(self.half_angle_rad)))))
 
     def held_out_error(self, n_bearings: int = 1000, n_axes: int = 1000, seed: int = 1) -> float:
-        """Root mean square of v(z, f) - s(z . f) over random bearings and axes, neither of which the fit has seen."""
+        """Root mean square of v(z, f) - s(z . f) over random bearings and axes that the fit was not made with."""
         rng = np.random.default_rng(seed)
         bearings, axes = (_unit(rng.normal(size=(n, 3))) for n in (n_bearings, n_axes))
         predicted = self.of_axes(axes) @ self.finish(self.of_bearings(bearings).T)
@@ -149,7 +149,7 @@ def _fitted(half_angle_rad: float, n_factors: int, steepness: float, jitter: flo
         sign, log_determinant = np.linalg.slogdet(kernel)
         if sign <= 0:
             return np.inf
-        # the kernel's variance that is best for this length is known in closed form
+        # the best variance of the kernel for this length, in closed form
         variance = float(np.mean(seen * np.linalg.solve(kernel, seen)))
         return float(np.inf if variance <= 0 else n_factors * np.log(variance) + log_determinant)
 
@@ -158,7 +158,7 @@ def _fitted(half_angle_rad: float, n_factors: int, steepness: float, jitter: flo
 
 
 def cone_half_angle(camera: Camera) -> float:
-    """Half the opening angle, in radians, of the cone with the solid angle of a camera's field of view."""
+    """Half the opening angle, in radians, of the cone with the same solid angle as a camera's field of view."""
     if isinstance(camera, ColmapCamera):
         directions = fibonacci_sphere(20_000)
         share = float(np.mean(camera.sees(directions)))

@@ -28,9 +28,8 @@ class PinholeCamera:
 
     def __post_init__(self) -> None:
         if self.width < 1 or self.height < 1 or not self.focal_px > 0:
-            raise ConfigError(
-                "camera needs a positive width, height and focal_px", value=(self.width, self.height, self.focal_px)
-            )
+            value = (self.width, self.height, self.focal_px)
+            raise ConfigError("camera needs a positive width, height and focal_px", value=value)
 
     @property
     def cx(self) -> float:
@@ -48,14 +47,7 @@ class PinholeCamera:
         return np.array([[self.focal_px, 0, self.cx], [0, self.focal_px, self.cy], [0, 0, 1]])
 
     def project(self, points_cam: ArrayLike) -> Float:
-        """Project points given in the camera frame.
-
-        Args:
-            points_cam: (..., 3) in metres; z must not be zero for a meaningful result.
-
-        Returns:
-            (..., 2) pixel coordinates (x, y). Points behind the camera project too: test z first.
-        """
+        """Pixels (..., 2) of points (..., 3) in the camera frame. Points behind the camera project too, so test z."""
         points = np.asarray(points_cam, dtype=np.float64)
         with np.errstate(divide="ignore", invalid="ignore"):
             return points[..., :2] / points[..., 2:] * self.focal_px + (self.cx, self.cy)

@@ -17,17 +17,16 @@ from wheretolook.utils.errors import ConfigError, MapError
 if TYPE_CHECKING:
     import pycolmap
 
-MAX_RAY_ERROR = 1e-4
-"""A pixel's ray may miss the point that was projected to it by this much (chord, about radians)."""
+MAX_RAY_ERROR = 1e-4  # largest distance between a point's direction and its pixel's ray (chord, about radians)
 
 
 @dataclass(frozen=True)
 class ColmapCamera:
     """A camera of any COLMAP model.
 
-    Distortion polynomials turn back beyond the field of view they were fitted to and then map points far outside it
-    into the image. A point counts as seen only if the ray of its pixel, by COLMAP's own inverse, leads back to it.
-    COLMAP's fisheye models see nothing 90 degrees off the axis and beyond.
+    Beyond the field of view that they were fitted to, distortion polynomials turn back and map points far outside of it
+    into the image. So a point counts as seen only if the ray of its pixel, by COLMAP's own inverse, leads back to it.
+    COLMAP's fisheye models see nothing at 90 degrees from the axis and beyond.
 
     Args:
         model: COLMAP's name of the model, such as "OPENCV" or "OPENCV_FISHEYE".
@@ -49,15 +48,12 @@ class ColmapCamera:
 
         names = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
         if self.model not in names:
-            raise ConfigError(
-                "COLMAP has no such camera model", value=self.model, fix=f"Use one of {', '.join(names)}."
-            )
+            fix = f"Use one of {', '.join(names)}."
+            raise ConfigError("COLMAP has no such camera model", value=self.model, fix=fix)
         expected = pycolmap.Camera.create_from_model_name(1, self.model, 1.0, 1, 1).params_info
         if len(self.params) != len(expected.split(",")) or self.width < 1 or self.height < 1:
-            raise ConfigError(
-                f"camera model {self.model} needs a positive size and the parameters {expected}",
-                value=(self.width, self.height, *self.params),
-            )
+            problem = f"camera model {self.model} needs a positive size and the parameters {expected}"
+            raise ConfigError(problem, value=(self.width, self.height, *self.params))
         has_focal_length = len(self._camera.focal_length_idxs()) > 0
         if not np.isfinite(self.params).all() or (has_focal_length and not self._camera.mean_focal_length() > 0):
             raise ConfigError("a camera needs finite parameters and a positive focal length", value=self.params)
@@ -69,10 +65,7 @@ class ColmapCamera:
 
     @classmethod
     def of_map(cls, model: str | Path) -> ColmapCamera:
-        """The camera that made a map.
-
-        Args:
-            model: folder of a COLMAP model.
+        """The camera with which the COLMAP model in a folder was made.
 
         Raises:
             MapError: the model cannot be read or has not exactly one camera.
@@ -85,8 +78,8 @@ class ColmapCamera:
         except Exception as error:
             raise MapError(f"cannot read the cameras: {error}", path=path, fix="Give a COLMAP model folder.") from error
         if len(cameras) != 1:
-            raise MapError("the map has not one camera but several", path=path, value=len(cameras),
-                           fix="Choose one: ColmapCamera.of(reconstruction.cameras[camera_id]).")  # fmt: skip
+            fix = "Choose one: ColmapCamera.of(reconstruction.cameras[camera_id])."
+            raise MapError("the map has not one camera but several", path=path, value=len(cameras), fix=fix)
         return cls.of(next(iter(cameras.values())))
 
     @cached_property
@@ -97,27 +90,16 @@ class ColmapCamera:
 
     @property
     def matrix(self) -> Float:
-        """Intrinsic matrix K, (3, 3).
-
-        Raises:
-            ConfigError: the model has distortion.
-        """
+        """Intrinsic matrix K, (3, 3). Raises ConfigError if the model has distortion."""
         if self.model not in ("SIMPLE_PINHOLE", "PINHOLE"):
-            raise ConfigError(
-                "a camera with distortion has no intrinsic matrix", value=self.model,
-                fix="Undistort the images, for instance with COLMAP's image_undistorter.",
-            )  # fmt: skip
+            fix = "Undistort the images, for instance with COLMAP's image_undistorter."
+            raise ConfigError("a camera with distortion has no intrinsic matrix", value=self.model, fix=fix)
         return np.asarray(self._camera.calibration_matrix())
 
     def project(self, points_cam: ArrayLike) -> Float:
-        """Project points given in the camera frame.
+        """Pixel coordinates (..., 2) of points (..., 3) in the camera frame.
 
-        Args:
-            points_cam: (..., 3) in metres.
-
-        Returns:
-            (..., 2) pixel coordinates (x, y); NaN where the model does not project the point, or projects it to a pixel
-            in the image that shows something else.
+        NaN where the model does not project the point, or projects it to a pixel that shows something else.
         """
         points = np.asarray(points_cam, dtype=np.float64)
         flat = points.reshape(-1, 3)
@@ -146,5 +128,4 @@ class ColmapCamera:
         return self.in_image(self.project(points_cam))
 
 
-Camera = PinholeCamera | ColmapCamera
-"""What visibility can be computed for."""
+Camera = PinholeCamera | ColmapCamera  # what visibility can be computed for

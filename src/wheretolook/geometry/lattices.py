@@ -1,7 +1,8 @@
-"""Where cameras may stand and look: a voxel grid of locations and lattices of directions (paper, Sec. 3.1)."""
+"""Candidate viewpoints: a voxel grid of locations and lattices of viewing directions (paper, Sec. 3.1)."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -21,8 +22,7 @@ Lattice = Literal["fibonacci", "azimuth-elevation", "released", "yaw-pitch"]
 class VoxelGrid:
     """A box cut into equal cuboids; a voxel's centre is a location (paper, Sec. 3.1 "Location").
 
-    A location's id is its position in row-major (x, y, z) order, so id and centre follow from each other by arithmetic:
-    a perfect hash, O(1) both ways and without a table.
+    A location's id is its position in row-major (x, y, z) order, so id and centre follow from each other by arithmetic.
 
     Args:
         lower: lowest corner (x, y, z) in metres.
@@ -72,18 +72,50 @@ class VoxelGrid:
         return np.where(inside, (index[..., 0] * ny + index[..., 1]) * nz + index[..., 2], -1)
 
 
+@dataclass(frozen=True)
+class ViewLattice:
+    """The views that are looked at in a scene: a grid of locations, and the same directions at each of them.
+
+    Args:
+        grid: voxels along x, y and z over the scene's bounds.
+        directions: directions at each location.
+        lattice: how directions are spread: fibonacci, azimuth-elevation, released or yaw-pitch. The first is even, the
+            second the paper's comparison, the third what the released code does, and "yaw-pitch" are ActLoc's 6 pitches
+            x 18 yaws, whatever `directions` says.
+
+    Raises:
+        ConfigError: no voxel, no direction, or no such lattice.
+    """
+
+    grid: tuple[int, int, int] = (8, 8, 8)
+    directions: int = 500
+    lattice: Lattice = "fibonacci"
+
+    def __post_init__(self) -> None:
+        if min(self.grid) < 1:
+            raise ConfigError("grid needs at least one voxel along every axis", value=self.grid)
+        _positive(self.directions)
+        if self.lattice not in LATTICES:
+            raise ConfigError("unknown lattice", value=self.lattice, fix=f"Use one of {', '.join(LATTICES)}.")
+
+    def voxels(self, bounds: ArrayLike) -> VoxelGrid:
+        """The grid over a scene's bounds (2, 3): lowest and highest corner in metres."""
+        return VoxelGrid.over(bounds, self.grid)
+
+    def axes(self) -> Float:
+        """The directions, (D, 3) unit vectors in the world."""
+        return direction_lattice(self.directions, self.lattice)
+
+
 def fibonacci_sphere(n: int) -> Float:
-    """Spherical Fibonacci lattice: n directions spread almost evenly over the sphere (González 2010).
+    """Spherical Fibonacci lattice: n unit vectors (n, 3), from +z to -z, spread almost evenly (González 2010).
 
     z_i = 1 - (2 i + 1) / n and azimuth_i = i * pi * (1 + sqrt 5), i = 0 .. n-1.
 
-    The paper (Eq. 2) prints arccos((1 - 2 i) / N), which is undefined for half its indices; the released code has the
-    right arccos but uses it as the azimuth and the golden angle as the polar angle, so that its directions crowd at two
-    poles: at n = 500 some direction lies 20.4 degrees from the nearest of them, against 7.0 degrees here (exact
-    covering radii; random probing finds 20.3 and 6.9). See `released_lattice`.
-
-    Returns:
-        (n, 3) unit vectors, from +z to -z.
+    The paper (Eq. 2) prints arccos((1 - 2 i) / N), which is undefined for half of its indices. The released code has
+    the right arccos but takes it for the azimuth and the golden angle for the polar angle (`released_lattice`), so that
+    its directions crowd at two poles: at n = 500 the direction farthest from all of them is 20.4 degrees away, against
+    7.0 degrees here (exact covering radii).
     """
     index = np.arange(_positive(n))
     z = 1 - (2 * index + 1) / n
@@ -92,35 +124,27 @@ def fibonacci_sphere(n: int) -> Float:
 
 
 def azimuth_elevation_lattice(n: int) -> Float:
-    """Classical lattice with equal steps of azimuth and elevation, the paper's comparison: crowded at the poles.
+    """Equal steps of azimuth and elevation, the paper's comparison: unit vectors (m, 3), crowded at the poles.
 
-    Rows of constant elevation number about sqrt(n / 2), with twice as many azimuths in each, so that the steps are
-    nearly equal; the rows are centred, none lies on a pole.
-
-    Returns:
-        (m, 3) unit vectors, m the product of rows and columns nearest to n, from +z to -z.
+    There are about sqrt(n / 2) rows of constant elevation, none on a pole, with about twice as many azimuths in each,
+    so that the steps are nearly equal; m is the product of rows and azimuths. From +z to -z.
     """
     rows = max(1, round(np.sqrt(_positive(n) / 2)))
     columns = max(1, round(n / rows))
-    polar, azimuth = np.meshgrid(
-        (np.arange(rows) + 0.5) * np.pi / rows, np.arange(columns) * 2 * np.pi / columns, indexing="ij"
-    )
-    lattice = np.stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], axis=-1)
-    return lattice.reshape(-1, 3)
+    polars, azimuths = (np.arange(rows) + 0.5) * np.pi / rows, np.arange(columns) * 2 * np.pi / columns
+    polar, azimuth = (angle.ravel() for angle in np.meshgrid(polars, azimuths, indexing="ij"))
+    return np.stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], axis=-1)
 
 
 def released_lattice(n: int) -> Float:
-    """The optical axes of the paper's released code, kept to show the difference: R = Rz(azimuth) Rx(elevation) with
-    azimuth = arccos(1 - 2 (i + 0.5) / n) and elevation = (i + 0.5) * pi * (1 + sqrt 5).
+    """The optical axes (n, 3) of the paper's released code, kept to show the difference.
 
-    Returns:
-        (n, 3) unit vectors.
+    R = Rz(azimuth) Rx(elevation), azimuth = arccos(1 - 2 (i + 0.5) / n), elevation = (i + 0.5) * pi * (1 + sqrt 5).
     """
     index = np.arange(_positive(n)) + 0.5
     azimuth, elevation = np.arccos(1 - 2 * index / n), GOLDEN_ANGLE * index
-    return np.stack(
-        [np.sin(azimuth) * np.sin(elevation), -np.cos(azimuth) * np.sin(elevation), np.cos(elevation)], axis=-1
-    )
+    sine = np.sin(elevation)
+    return np.stack([np.sin(azimuth) * sine, -np.cos(azimuth) * sine, np.cos(elevation)], axis=-1)
 
 
 def yaw_pitch_angles() -> Float:
@@ -140,15 +164,18 @@ def direction_lattice(n: int, lattice: Lattice = "fibonacci") -> Float:
 
     m = n, except for "azimuth-elevation", where it is the nearest product, and "yaw-pitch", which are ActLoc's 108.
     """
-    lattices = {
-        "fibonacci": fibonacci_sphere,
-        "azimuth-elevation": azimuth_elevation_lattice,
-        "released": released_lattice,
-        "yaw-pitch": lambda n: axes_of_angles(yaw_pitch_angles()),
-    }
-    if lattice not in lattices:
-        raise ConfigError("unknown lattice", value=lattice, fix=f"Use one of {', '.join(lattices)}.")
-    return lattices[lattice](n)
+    if lattice not in LATTICES:
+        raise ConfigError("unknown lattice", value=lattice, fix=f"Use one of {', '.join(LATTICES)}.")
+    return LATTICES[lattice](n)
+
+
+LATTICES: dict[str, Callable[[int], Float]] = {
+    "fibonacci": fibonacci_sphere,
+    "azimuth-elevation": azimuth_elevation_lattice,
+    "released": released_lattice,
+    "yaw-pitch": lambda n: axes_of_angles(yaw_pitch_angles()),
+}
+"""What makes the directions of each `Lattice`."""
 
 
 def _positive(n: int) -> int:

@@ -1,8 +1,8 @@
-"""The textured triangle mesh every scene becomes, wherever it was loaded or generated from."""
+"""The textured triangle mesh that every scene is, whether loaded or generated."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,3 +33,18 @@ class TexturedMesh:
     def bounds(self) -> NDArray[np.float64]:
         """Lowest and highest corner of the vertices, (2, 3) metres."""
         return np.stack([self.vertices.min(0), self.vertices.max(0)]).astype(np.float64)
+
+    @property
+    def normals(self) -> NDArray[np.float64]:
+        """Normals of the triangles (T, 3), towards the front, as long as twice the triangle's area."""
+        a, b, c = np.moveaxis(self.vertices[self.triangles].astype(np.float64), 1, 0)
+        return np.cross(b - a, c - a)
+
+    def only(self, keep: NDArray[np.bool_]) -> TexturedMesh:
+        """The mesh with only some of its triangles, (T,) bool, and all of its vertices."""
+        return replace(
+            self,
+            triangles=self.triangles[keep],
+            corner_uvs=self.corner_uvs[keep],
+            triangle_texture=self.triangle_texture[keep],
+        )

@@ -39,16 +39,10 @@ def split_poses(cam_from_world: ArrayLike) -> tuple[Float, Float]:
 
 
 def rotation_looking_along(directions: ArrayLike) -> Float:
-    """Rotations of cameras that look along the given world directions and do not roll.
+    """cam_from_world rotations (..., 3, 3) of cameras that look along world directions (..., 3) and do not roll.
 
-    The image's x axis is horizontal and its y axis points down as far as it can (world z is up). Looking straight up or
-    down leaves the roll free: the image's x axis is then world x when looking down, and the limit is taken along +y.
-
-    Args:
-        directions: (..., 3), need not be of unit length.
-
-    Returns:
-        (..., 3, 3) cam_from_world rotations; their rows are the camera's axes in the world.
+    The image's x axis is horizontal and its y axis points down as far as it can (world z is up). Of a camera that looks
+    straight up or down, the image's x axis is the world's. Directions need not be of unit length.
     """
     forward = np.asarray(directions, dtype=np.float64)
     forward = forward / np.linalg.norm(forward, axis=-1, keepdims=True)
@@ -87,8 +81,7 @@ def rotation_from_quaternion(quaternion_wxyz: ArrayLike) -> Float:
 def rotation_angle_deg(rotation_a: ArrayLike, rotation_b: ArrayLike) -> Float:
     """Angle of the rotation between (..., 3, 3) and (..., 3, 3), in degrees, in [0, 180].
 
-    Taken from the chord |A - B|_F = 2 sqrt(2) sin(angle / 2), which is accurate at small angles where arccos of the
-    trace is not.
+    From |A - B|_F = 2 sqrt(2) sin(angle / 2), which is accurate at small angles, where arccos of the trace is not.
     """
     chord = np.linalg.norm(np.asarray(rotation_a) - np.asarray(rotation_b), axis=(-2, -1))
     return np.degrees(2 * np.arcsin(np.clip(chord / (2 * np.sqrt(2)), 0, 1)))

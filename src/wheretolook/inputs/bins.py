@@ -1,12 +1,13 @@
-"""The network's input: visible landmarks averaged in the cells of a grid over the image (paper, Sec. 3.3 "Data").
+"""The network's input: landmarks in view, averaged in the cells of a grid over the image (paper, Sec. 3.3 "Data").
 
-Every landmark a viewpoint sees falls into one of 30 x 30 bins by its pixel. A bin holds the mean of its landmarks'
-channels; an empty bin holds zero *in place*. The paper says so; its released code instead drops empty bins and moves
-the filled ones to the front, so that an input has no fixed place in the image. That layout is kept as "compact".
+Every landmark in view falls into one of 30 x 30 bins by its pixel. A bin holds the mean of its landmarks' channels, and
+zero if it is empty, as the paper says. Its released code instead drops empty bins and moves the filled ones to the
+front, so that an input has no fixed place in the image. That layout is kept as "compact".
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -17,19 +18,20 @@ from numpy.typing import NDArray
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.colmap_camera import Camera, ColmapCamera
 from wheretolook.geometry.poses import Float, split_poses
-from wheretolook.inputs.bins_kernel import bin_kernel, count_bins_kernel
+from wheretolook.inputs.bins_kernel import BinGrid, bin_kernel, count_bins_kernel
 from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS, Layout
 from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.warp import start_warp
 from wheretolook.visibility.frustum import (
-    MIN_DEPTH_M,
-    VisibleSets,
-    frustum_sides,
+    LandmarkSets,
     in_view,
     offsets_from,
     pixels_of,
+    points_on_device,
     rotate,
+    sets_on_device,
+    views_on_device,
 )
 
 if TYPE_CHECKING:
@@ -43,18 +45,13 @@ GPU_LANES = 32
 
 @dataclass(frozen=True, eq=False)
 class BinnedViews:
-    """Landmarks of a batch of views, binned.
+    """Landmarks of a batch of views, binned."""
 
-    Attributes:
-        means: (B, C, bins, bins) float32, mean of each channel over a bin's landmarks, zero where there are none, NaN
-            where a landmark's value is not known. Rows go down the image, columns right.
-        counts: (B, bins, bins) int32, landmarks in each bin.
-        channels: names of the C channels.
-    """
-
+    # (B, C, bins, bins) float32, mean of each channel over a bin's landmarks, zero where there are none, NaN where a
+    # landmark's value is not known. Rows go down the image, columns right.
     means: NDArray[np.float32]
-    counts: NDArray[np.int32]
-    channels: tuple[str, ...]
+    counts: NDArray[np.int32]  # (B, bins, bins) landmarks in each bin
+    channels: tuple[str, ...]  # names of the C channels
 
     def __len__(self) -> int:
         return len(self.means)
@@ -82,16 +79,10 @@ class BinnedViews:
 
 
 def arrange(means: NDArray[np.float32], filled: NDArray[np.bool_], layout: Layout) -> NDArray[np.float32]:
-    """Lay out bins for a network with a flat input.
+    """Lay out bins (B, C, bins, bins), which are zero where not `filled` (B, bins, bins), for a network.
 
-    Args:
-        means: (B, C, bins, bins), empty bins zero.
-        filled: (B, bins, bins).
-        layout: "in_place" keeps every bin where it is; "compact" moves the filled bins to the front in row-major order,
-            as the released code does.
-
-    Returns:
-        (B, C, bins, bins).
+    "in_place" keeps every bin where it is; "compact" moves the filled bins to the front in row-major order, as the
+    released code does.
     """
     if layout == "in_place":
         return means
@@ -106,60 +97,46 @@ def bin_views(
     camera: Camera,
     cam_from_world: Float,
     points: Float,
-    visible: VisibleSets,
+    unoccluded: LandmarkSets,
     location_rows: NDArray[np.integer[Any]],
     bins: int = 30,
     device: str = "cpu",
     block_bytes: int = 1 << 30,
     landmarks: Landmarks | None = None,
 ) -> BinnedViews:
-    """Bin the visible landmarks of every view, with all of `CHANNELS` or, on request, of `ALL_CHANNELS`.
+    """Bin the landmarks in view of each of B views, with all of `CHANNELS` or, on request, of `ALL_CHANNELS`.
 
     Args:
-        camera: pinhole, or any COLMAP model (which is projected by COLMAP on the CPU).
+        camera: pinhole, or any COLMAP model (which COLMAP projects on the CPU).
         cam_from_world: (B, 3, 4).
         points: (N, 3) landmarks in metres.
-        visible: landmarks not occluded from each of L locations.
-        location_rows: (B,) row of each view's location in `visible`.
+        unoccluded: landmarks each of L locations has a free line of sight to.
+        location_rows: (B,) row of each view's location in `unoccluded`.
         bins: bins along each side of the image.
         device: "cpu" or a CUDA device; one thread a view, so that sums do not depend on the order of threads.
-        block_bytes: views are worked through in blocks of about this many bytes.
+        block_bytes: about how many bytes of views are worked on at a time.
         landmarks: whose the points are; with them the bins also have `LANDMARK_CHANNELS`, for about three times the
             memory.
     """
     if isinstance(camera, ColmapCamera):
-        return bin_views_plain(camera, cam_from_world, points, visible, location_rows, bins, landmarks)
+        return bin_views_plain(camera, cam_from_world, points, unoccluded, location_rows, bins, landmarks)
     device = start_warp(device)
     channels = CHANNELS if landmarks is None else ALL_CHANNELS
     n_views, n_channels = len(cam_from_world), len(channels)
     means = np.empty((n_views, n_channels, bins, bins), dtype=np.float32)
     counts = np.empty((n_views, bins, bins), dtype=np.int32)
-    block = max(1, block_bytes // (bins * bins * (n_channels + 1) * 4))
-    points_on_device: Any = wp.array(np.asarray(points, dtype=np.float64), dtype=wp.vec3d, device=device)
     directions: Any = wp.empty(0, dtype=wp.vec3, device=device)
     attributes: Any = wp.empty((0, len(MAP_ATTRIBUTES)), dtype=wp.float32, device=device)
     if landmarks is not None:
         directions = wp.array(landmarks.mapping_direction, dtype=wp.vec3, device=device)
         attributes = wp.array(landmarks.attributes(), dtype=wp.float32, device=device)
-    starts: Any = wp.array(visible.starts, dtype=wp.int32, device=device)
-    indices: Any = wp.array(visible.indices, dtype=wp.int32, device=device)
-    for begin in range(0, n_views, block):
-        rows = slice(begin, min(begin + block, n_views))
-        rotations, centers = split_poses(cam_from_world[rows])
-        shape = (len(centers), bins * bins)
-        block_means = wp.zeros((shape[0], n_channels, shape[1]), dtype=wp.float32, device=device)
-        block_counts = wp.zeros(shape, dtype=wp.int32, device=device)
-        wp.launch(
-            bin_kernel,
-            dim=len(centers),
-            inputs=[
-                *_of_views(camera, rotations, centers, location_rows[rows], device),
-                points_on_device, directions, attributes, starts, indices,
-                *_of_camera(camera, bins), bins,
-            ],
-            outputs=[block_means, block_counts],
-            device=device,
-        )  # fmt: skip
+    block = max(1, block_bytes // (bins * bins * (n_channels + 1) * 4))
+    for rows, views, grid in _blocks(camera, cam_from_world, points, unoccluded, location_rows, bins, device, block):
+        n = rows.stop - rows.start
+        block_means = wp.zeros((n, n_channels, bins * bins), dtype=wp.float32, device=device)
+        block_counts = wp.zeros((n, bins * bins), dtype=wp.int32, device=device)
+        inputs, outputs = [views, grid, directions, attributes], [block_means, block_counts]
+        wp.launch(bin_kernel, n, inputs, outputs, device=device)
         means[rows] = block_means.numpy().reshape(-1, n_channels, bins, bins)
         counts[rows] = block_counts.numpy().reshape(-1, bins, bins)
     return BinnedViews(means, counts, channels)
@@ -169,72 +146,62 @@ def count_bins(
     camera: Camera,
     cam_from_world: Float,
     points: Float,
-    visible: VisibleSets,
+    unoccluded: LandmarkSets,
     location_rows: NDArray[np.integer[Any]],
     bins: int = 30,
     device: str = "cpu",
     block_bytes: int = 1 << 30,
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """`BinnedViews.n_visible` and `BinnedViews.n_filled` of views, (B,) each, without binning anything else.
+    """`BinnedViews.n_visible` and `BinnedViews.n_filled` of views, (B,) each, without the bins' means.
 
-    Args:
-        camera, cam_from_world, points, visible, location_rows, bins: as for `bin_views`, the plain twin of this.
-        device: "cpu" or a CUDA device.
-        block_bytes: views are worked through in blocks of about this many bytes.
+    The arguments are those of `bin_views`, which is the plain twin of this.
     """
     if isinstance(camera, ColmapCamera):
-        binned = bin_views_plain(camera, cam_from_world, points, visible, location_rows, bins)
+        binned = bin_views_plain(camera, cam_from_world, points, unoccluded, location_rows, bins)
         return binned.n_visible, binned.n_filled
     device = start_warp(device)
     lanes = GPU_LANES if device != "cpu" else 1
-    n_visible, n_filled = (np.empty(len(cam_from_world), dtype=np.int32) for _ in range(2))
+    n_in_view, n_filled = (np.empty(len(cam_from_world), dtype=np.int32) for _ in range(2))
     block = max(1, block_bytes // (bins * bins * 4))
-    points_on_device: Any = wp.array(np.asarray(points, dtype=np.float64), dtype=wp.vec3d, device=device)
-    starts: Any = wp.array(visible.starts, dtype=wp.int32, device=device)
-    indices: Any = wp.array(visible.indices, dtype=wp.int32, device=device)
-    for begin in range(0, len(cam_from_world), block):
-        rows = slice(begin, min(begin + block, len(cam_from_world)))
-        rotations, centers = split_poses(cam_from_world[rows])
-        counted = [wp.zeros(len(centers), dtype=wp.int32, device=device) for _ in range(2)]
-        wp.launch(
-            count_bins_kernel,
-            dim=(len(centers), lanes),
-            inputs=[
-                *_of_views(camera, rotations, centers, location_rows[rows], device),
-                points_on_device, starts, indices,
-                *_of_camera(camera, bins), bins, lanes,
-                wp.zeros((len(centers), bins * bins), dtype=wp.int32, device=device),
-            ],
-            outputs=counted,
-            device=device,
-        )  # fmt: skip
-        n_visible[rows], n_filled[rows] = (one.numpy() for one in counted)
-    return n_visible, n_filled
+    for rows, views, grid in _blocks(camera, cam_from_world, points, unoccluded, location_rows, bins, device, block):
+        n = rows.stop - rows.start
+        taken = wp.zeros((n, bins * bins), dtype=wp.int32, device=device)
+        outputs = [wp.zeros(n, dtype=wp.int32, device=device) for _ in range(2)]
+        wp.launch(count_bins_kernel, (n, lanes), [views, grid, lanes, taken], outputs, device=device)
+        n_in_view[rows], n_filled[rows] = (numbers.numpy() for numbers in outputs)
+    return n_in_view, n_filled
 
 
-def _of_views(
-    camera: PinholeCamera, rotations: Float, centers: Float, location_rows: NDArray[np.integer[Any]], device: str
-) -> list[Any]:
-    """What both kernels are told of the views."""
-    return [
-        wp.array(frustum_sides(camera, rotations), dtype=wp.vec3, device=device),
-        wp.array(rotations.astype(np.float32), dtype=wp.mat33, device=device),
-        wp.array(centers, dtype=wp.vec3d, device=device),
-        wp.array(np.asarray(location_rows, dtype=np.int32), dtype=wp.int32, device=device),
-    ]
-
-
-def _of_camera(camera: PinholeCamera, bins: int) -> list[Any]:
-    """What both kernels are told of the camera."""
-    values = (camera.focal_px, camera.cx, camera.cy, bins / camera.width, bins / camera.height, MIN_DEPTH_M)
-    return [wp.float64(value) for value in values]
+def _blocks(
+    camera: PinholeCamera,
+    cam_from_world: Float,
+    points: Float,
+    unoccluded: LandmarkSets,
+    location_rows: NDArray[np.integer[Any]],
+    bins: int,
+    device: str,
+    block: int,
+) -> Iterator[tuple[slice, Any, Any]]:
+    """Up to `block` views at a time: which of the views, and `Views` and `BinGrid` of them on the device."""
+    poses, landmarks, sets = (
+        np.asarray(cam_from_world),
+        points_on_device(points, device),
+        sets_on_device(unoccluded, device),
+    )
+    for begin in range(0, len(poses), block):
+        rows = slice(begin, min(begin + block, len(poses)))
+        grid: Any = BinGrid()
+        grid.rotations = wp.array(poses[rows, :, :3].astype(np.float32), dtype=wp.mat33, device=device)
+        grid.focal, grid.cx, grid.cy, grid.bins = camera.focal_px, camera.cx, camera.cy, bins
+        grid.columns_per_pixel, grid.rows_per_pixel = bins / camera.width, bins / camera.height
+        yield rows, views_on_device(camera, poses[rows], landmarks, sets, location_rows[rows], device), grid
 
 
 def bin_views_plain(
     camera: Camera,
     cam_from_world: Float,
     points: Float,
-    visible: VisibleSets,
+    unoccluded: LandmarkSets,
     location_rows: NDArray[np.integer[Any]],
     bins: int = 30,
     landmarks: Landmarks | None = None,
@@ -247,21 +214,21 @@ def bin_views_plain(
     counts = np.zeros((n_views, n_cells), dtype=np.int32)
     rows = zip(*split_poses(cam_from_world), location_rows, strict=True)
     for view, (rotation, center, location) in enumerate(rows):
-        in_sight = visible[int(location)]
-        offsets = offsets_from(center, points[in_sight])
-        inside = in_view(camera, rotation[None], offsets)[0]
-        offsets, in_sight = offsets[inside], in_sight[inside]
-        seen = rotate(rotation.astype(np.float32), offsets)
-        pixels = pixels_of(camera, seen)
+        candidates = unoccluded[int(location)]
+        offsets = offsets_from(center, points[candidates])
+        seen = in_view(camera, rotation[None], offsets)[0]
+        offsets, seen_rows = offsets[seen], candidates[seen]
+        points_cam = rotate(rotation.astype(np.float32), offsets)
+        pixels = pixels_of(camera, points_cam)
         scale = np.array([bins / camera.width, bins / camera.height])
         column, row = np.clip((pixels * scale).astype(int), 0, bins - 1).T
         cell = row * bins + column
         counts[view] = np.bincount(cell, minlength=n_cells)
-        columns = [*pixels.T, *seen.T]
+        columns = [*pixels.T, *points_cam.T]
         if landmarks is not None and attributes is not None:
             distance = np.linalg.norm(offsets.astype(np.float64), axis=1)
-            along = (offsets.astype(np.float64) * landmarks.mapping_direction[in_sight]).sum(1)
-            of_map = attributes[in_sight]
+            along = (offsets.astype(np.float64) * landmarks.mapping_direction[seen_rows]).sum(1)
+            of_map = attributes[seen_rows]
             ratio = np.log(distance) - of_map[:, MAP_ATTRIBUTES.index("mapped_distance")]
             columns += [along / distance, ratio, *of_map.T]
         for channel, values in enumerate(columns):

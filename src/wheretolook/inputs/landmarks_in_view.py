@@ -1,7 +1,7 @@
-"""What is known of each landmark that a view sees: where it lies in the image, and how it was mapped.
+"""Attributes of each landmark in view: where it lies in the image, and how it was mapped.
 
-The paper's network is told where landmarks are. Whether they will be found again depends as much on what they are like:
-from where they were mapped, how well, and how unlike others. All of it is known from the map and the pose alone.
+The paper's network is given the landmarks' positions only. Whether they will be found again depends as much on other
+attributes: from where they were mapped, how well, and how distinctive they are. All are known from map and pose alone.
 """
 
 from __future__ import annotations
@@ -19,15 +19,14 @@ from wheretolook.geometry.poses import Float, split_poses
 from wheretolook.inputs.channels import ATTRIBUTES
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
-from wheretolook.visibility.frustum import VisibleSets
+from wheretolook.visibility.frustum import LandmarkSets
 
-BLOCK_ENTRIES = {"cpu": 1 << 15, "cuda": 1 << 22}
-"""Landmarks in view that a network over them looks at together: what stays in the cache, or a gigabyte of a GPU's."""
+BLOCK_ENTRIES = {"cpu": 1 << 15, "cuda": 1 << 22}  # landmarks in view a block: fits the cache, or takes 1 GB of a GPU
 
 
 @dataclass(frozen=True, eq=False)
 class ViewLandmarks:
-    """The landmarks that B views see, E in all, one view after the other.
+    """The landmarks in view of each of B views, E entries in all, one view after the other.
 
     Attributes:
         starts: (B + 1,) int64; view b has entries `starts[b]` to `starts[b + 1]`.
@@ -56,7 +55,7 @@ class ViewLandmarks:
 
 
 class LandmarkDescriber:
-    """Describes the landmarks that views of a map see.
+    """Finds the landmarks that views of a map see, and their attributes, on the map's device.
 
     Args:
         localization_map: landmarks, camera, occlusion, and the device to work on.
@@ -71,20 +70,12 @@ class LandmarkDescriber:
         self._directions = torch.from_numpy(landmarks.mapping_direction).to(device)
         self._attributes = torch.from_numpy(landmarks.attributes()).to(device)
 
-    def describe(self, cam_from_world: Float, visible: VisibleSets | None = None) -> ViewLandmarks:
-        """What views see.
-
-        Args:
-            cam_from_world: (B, 3, 4).
-            visible: the landmarks each of them sees, if that is known already.
-
-        Returns:
-            On the map's device.
-        """
-        if visible is None:
-            starts, indices = self.localization_map.visible_on_device(cam_from_world)
+    def describe(self, cam_from_world: Float, in_view: LandmarkSets | None = None) -> ViewLandmarks:
+        """Landmarks of views (B, 3, 4); `in_view` are those each of them sees, if that is known already."""
+        if in_view is None:
+            starts, indices = self.localization_map.in_view_on_device(cam_from_world)
         else:
-            starts, indices = visible.starts.astype(np.int64), torch.from_numpy(visible.indices)
+            starts, indices = in_view.starts.astype(np.int64), torch.from_numpy(in_view.indices)
         return self._describe(cam_from_world, torch.from_numpy(starts), indices)
 
     def _describe(self, cam_from_world: Float, starts: Tensor, indices: Tensor) -> ViewLandmarks:
@@ -92,25 +83,18 @@ class LandmarkDescriber:
         starts, rows = starts.to(device), indices.to(device, torch.int64)
         rotations, centers = split_poses(np.asarray(cam_from_world, dtype=np.float64))
         from_centers, axes = torch.from_numpy(centers).to(device), torch.from_numpy(rotations).to(device, torch.float32)
-        if len(starts) > 2:  # what the only view sees need not be told whose it is
+        if len(starts) > 2:  # a single view needs no index of views
             views = torch.arange(len(starts) - 1, device=device).repeat_interleave(starts.diff())
             from_centers, axes = from_centers[views], axes[views]
         offsets = (self._points[rows] - from_centers).float()
         distance = offsets.norm(dim=1)
         x, y, z = (offsets[:, None] @ axes.mT)[:, 0].unbind(1)
-        of_map = self._attributes[rows]
+        map_values = self._attributes[rows]
         log_distance = distance.log()
-        of_pose = torch.stack(
-            [
-                x / z,
-                y / z,
-                log_distance,
-                (offsets * self._directions[rows]).sum(1) / distance,
-                log_distance - of_map[:, MAP_ATTRIBUTES.index("mapped_distance")],
-            ],
-            dim=1,
-        )
-        values = torch.cat([of_pose, of_map], dim=1)
+        mapped_angle = (offsets * self._directions[rows]).sum(1) / distance
+        ratio = log_distance - map_values[:, MAP_ATTRIBUTES.index("mapped_distance")]
+        pose_values = torch.stack([x / z, y / z, log_distance, mapped_angle, ratio], dim=1)
+        values = torch.cat([pose_values, map_values], dim=1)
         if self.attributes != ATTRIBUTES:
             values = values[:, self._columns]
         return ViewLandmarks(starts, rows, values, self.attributes)
@@ -118,33 +102,33 @@ class LandmarkDescriber:
     def in_blocks(
         self, cam_from_world: Float, most: int | None = None
     ) -> Iterator[tuple[slice, ViewLandmarks, Tensor]]:
-        """What views (B, 3, 4) see, so many at a time that a network over the landmarks has room to work.
+        """Landmarks of views (B, 3, 4), in blocks of views that leave a network over the landmarks room to work.
 
         Args:
             cam_from_world: (B, 3, 4).
-            most: describe at most so many landmarks of a view, evenly spread over those it sees in the map's order.
+            most: describe at most this many landmarks of a view, evenly spread over those it sees in the map's order.
 
         Yields:
             Which of the views, their landmarks, and how many each of them sees in all.
         """
-        starts, indices = self.localization_map.visible_on_device(cam_from_world)
-        visible = np.diff(starts)
-        if most is not None and len(visible) and visible.max() > most:
+        starts, indices = self.localization_map.in_view_on_device(cam_from_world)
+        n_in_view = np.diff(starts)
+        if most is not None and len(n_in_view) and n_in_view.max() > most:
             starts, indices = _thinned(torch.from_numpy(starts), indices, most)
         begin, room = 0, BLOCK_ENTRIES[self._points.device.type]
-        while begin < len(visible):
-            # as many views as have at most so many landmarks, but one at least
+        while begin < len(n_in_view):
+            # as many views as have at most `room` landmarks together, but at least one
             end = int(np.searchsorted(starts, starts[begin] + room, side="right")) - 1
-            end = min(max(end, begin + 1), len(visible))
+            end = min(max(end, begin + 1), len(n_in_view))
             rows = slice(begin, end)
             part = torch.from_numpy(starts[begin : end + 1] - starts[begin])
             described = self._describe(cam_from_world[rows], part, indices[int(starts[begin]) : int(starts[end])])
-            yield rows, described, torch.from_numpy(visible[rows]).to(self._points.device)
+            yield rows, described, torch.from_numpy(n_in_view[rows]).to(self._points.device)
             begin = end
 
 
 def _thinned(starts: Tensor, indices: Tensor, most: int) -> tuple[NDArray[np.int64], Tensor]:
-    """At most so many entries of each set, evenly spread over it."""
+    """At most `most` entries of each set, evenly spread over it."""
     if len(starts) == 2:
         return np.array([0, most]), indices[torch.arange(most, device=indices.device) * int(starts[1]) // most]
     lengths = starts.diff()
@@ -158,46 +142,38 @@ def _thinned(starts: Tensor, indices: Tensor, most: int) -> tuple[NDArray[np.int
     return new.numpy(), indices[there[0] + place * there[1] // there[2]]
 
 
-FILLED = 30
-"""Bins along each side of the image, of which the filled ones are counted, as in the paper."""
-
-COARSE = 4
-"""Bins along each side of the coarse grid."""
+FILLED = 30  # bins along each side of the image, of which the filled ones are counted, as in the paper
+COARSE = 4  # bins along each side of the coarse grid
 
 QUANTILES = (0.1, 0.5, 0.9)
 
 POOLED = (
-    "log_visible", "log_filled", "coarse_filled", "log_coarse_lower_half", "axis_height",
+    "log_visible",  # log(1 + landmarks)
+    "log_filled",  # log(1 + filled bins of 30 x 30)
+    "coarse_filled",  # filled bins of 4 x 4
+    "log_coarse_lower_half",  # sum of log(1 + landmarks) over the fuller half of those
+    "axis_height",  # height of the optical axis, -1 to 1
     *(f"{name}_{kind}" for name in ATTRIBUTES for kind in ("mean", "std", *(f"q{100 * q:.0f}" for q in QUANTILES))),
-)  # fmt: skip
-"""What `pool` tells of a view: log(1 + landmarks), log(1 + filled bins of 30 x 30), filled bins of 4 x 4, the sum of
-log(1 + landmarks) over the fuller half of those, the height of the optical axis; and of each attribute its mean,
-standard deviation and quantiles over the landmarks."""
+)
+"""What `pool` tells of a view: five numbers, and mean, standard deviation and quantiles of each attribute."""
 
 
 def pool(landmarks: ViewLandmarks, cam_from_world: Float, camera: Camera) -> Tensor:
-    """Statistics of the landmarks of each view, (B, len(POOLED)) float32; NaN where a view has none to tell of.
-
-    Args:
-        landmarks: of the views.
-        cam_from_world: (B, 3, 4), for the height of the axis.
-        camera: whose image the bins divide.
-    """
+    """Statistics of the landmarks of views (B, 3, 4), (B, len(POOLED)) float32; NaN where a view has no landmarks."""
     n, views, device = len(landmarks), landmarks.views, landmarks.values.device
     counts = landmarks.counts.float()
     fine, coarse = (_occupied(landmarks, views, camera, bins) for bins in (FILLED, COARSE))
     fuller = coarse.sort(dim=1).values[:, COARSE**2 // 2 :]
     axis = torch.from_numpy(np.asarray(cam_from_world, dtype=np.float32)[:, 2, 2]).to(device)
-    parts = [
-        counts.log1p(), (fine > 0).sum(1).float().log1p(), (coarse > 0).sum(1).float(), fuller.log1p().sum(1), axis,
-    ]  # fmt: skip
-    some = counts.clamp(min=1)
-    middle = torch.where(counts > 0, 1.0, torch.nan)  # of nothing there is no mean
+    filled, coarse_filled = (fine > 0).sum(1).float(), (coarse > 0).sum(1).float()
+    parts = [counts.log1p(), filled.log1p(), coarse_filled, fuller.log1p().sum(1), axis]
+    divisor = counts.clamp(min=1)
+    nan_if_empty = torch.where(counts > 0, 1.0, torch.nan)
     for column in range(len(ATTRIBUTES)):
         values = landmarks.values[:, column].double()
-        mean = _sums(values, views, n) / some
-        spread = (_sums((values - mean[views]) ** 2, views, n) / some).sqrt()
-        parts += [(mean * middle).float(), (spread * middle).float()]
+        mean = _sums(values, views, n) / divisor
+        spread = (_sums((values - mean[views]) ** 2, views, n) / divisor).sqrt()
+        parts += [(mean * nan_if_empty).float(), (spread * nan_if_empty).float()]
         parts += _quantiles(values, landmarks, views)
     return torch.stack(parts, dim=1)
 
@@ -228,7 +204,7 @@ def image_cells(landmarks: ViewLandmarks, camera: Camera, bins: int) -> Tensor:
 def _quantiles(values: Tensor, landmarks: ViewLandmarks, views: Tensor) -> list[Tensor]:
     """Nearest-rank quantiles of each view's values, (B,) each."""
     unknown = values.isnan()
-    # one sort for all views: the view is the key's whole part, the value's place in it the fraction
+    # one sort serves all views: the integer part of the key is the view, its fraction follows the value
     key = views.double() + (values.nan_to_num().atan() / torch.pi + 0.5) * 0.999
     ordered = values[key.argsort()]
     counts, starts = landmarks.counts, landmarks.starts[:-1]

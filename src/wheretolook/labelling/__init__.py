@@ -1,1 +1,1 @@
-"""Labels without people: render a viewpoint, localize the image against the map, measure the pose error."""
+"""Labels without annotators: render a viewpoint, localize the image against the map, measure the pose error."""

@@ -13,15 +13,19 @@ class LocalizerConfig:
     """Settings of matching and pose estimation.
 
     Args:
-        max_ratio: Lowe's ratio: the nearest landmark's descriptor distance over the second nearest's must be below it.
-        min_matches: with fewer matches no pose is sought; four is the least that determines and checks one.
+        max_ratio: Lowe's ratio: below it, a match counts. The nearest landmark's descriptor distance over the second
+            nearest's.
         max_error_px: reprojection error under which RANSAC counts a match as an inlier.
-        min_inliers: poses with fewer inliers are taken for accidents: RANSAC finds some pose for almost any image.
-        seed: of RANSAC, the same for every image, so that a label depends on its viewpoint alone.
+        min_inliers: inliers that a pose needs. With fewer it is taken for an accident: RANSAC finds some pose for
+            almost any image.
+        seed: seed of RANSAC. The same for every image, so that a label depends on its viewpoint alone.
+
+    Attributes:
+        min_matches: with fewer matches no pose is sought; four is the least that determines and checks one.
     """
 
     max_ratio: float = 0.85
-    min_matches: int = 4
+    min_matches: int = field(default=4, init=False)
     max_error_px: float = 8.0
     min_inliers: int = 10
     seed: int = 0
@@ -29,10 +33,9 @@ class LocalizerConfig:
     def __post_init__(self) -> None:
         if not 0 < self.max_ratio <= 1:
             raise ConfigError("max_ratio must be in (0, 1]", value=self.max_ratio)
-        if self.min_matches < 4 or self.min_inliers < 4 or self.max_error_px <= 0:
+        if self.min_inliers < 4 or self.max_error_px <= 0:
             raise ConfigError(
-                "the localizer needs min_matches >= 4, min_inliers >= 4 and max_error_px > 0",
-                value=(self.min_matches, self.min_inliers, self.max_error_px),
+                "the localizer needs min_inliers >= 4 and max_error_px > 0", value=(self.min_inliers, self.max_error_px)
             )
 
 
@@ -42,14 +45,14 @@ class LabelConfig:
 
     Args:
         localizer: matching and pose estimation.
-        engine: "local" works in processes on this machine, "ray" the same shards on a Ray cluster
-            (`pip install ray`).
-        ray_address: the cluster's address, such as "auto" on one of its machines, or "ray://head:10001" from elsewhere
-            (which needs `pip install 'ray[client]'`); empty starts one on this machine.
-        workers: processes of the local engine; 0 means one for each CPU core this process may use.
-        shard_size: viewpoints a shard, the unit of work and of what an interruption can lose.
-        store_matches: keep the rows of the landmarks that each view matched, and which agree with its pose, in the
-            columns matched_rows and inlier_rows; needed to learn matchability.
+        engine: where labels are made: local, in processes here, or ray, on a Ray cluster. Of the same shards (`pip
+            install ray`).
+        ray_address: address of the Ray cluster; empty starts one on this machine. Such as "auto" on one of its
+            machines, or "ray://head:10001" from elsewhere (which needs `pip install 'ray[client]'`).
+        workers: worker processes on this machine; 0 means one for each CPU core that may be used.
+        shard_size: viewpoints a shard, which is what an interruption can lose.
+        store_matches: keep which landmarks each view matched; needed to learn matchability. Their rows, and of those
+            that agree with the view's pose, in the columns matched_rows and inlier_rows.
     """
 
     localizer: LocalizerConfig = field(default_factory=LocalizerConfig)

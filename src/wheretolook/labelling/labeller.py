@@ -1,4 +1,4 @@
-"""Labels tables of viewpoints, in shards that survive interruption."""
+"""Labels tables of viewpoints in shards, which are kept when the work is interrupted."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from wheretolook.utils.version import VERSION
 from wheretolook.viewpoints.table import SCHEMA, read_table, write_table
 
 MANIFEST = "manifest.json"
-"""In the folder of shards while work goes on, and as `labels.json` beside a finished table."""
+"""File in the folder of shards that says what the labels are made with; later `labels.json` beside the table."""
 
 LABELS = ("status", "error_m", "error_deg", "n_inliers")
 """Columns of a table that labelling fills in."""
@@ -36,14 +36,7 @@ LABELS = ("status", "error_m", "error_deg", "n_inliers")
 
 @dataclass(frozen=True, eq=False)
 class LabelTask:
-    """A scene to label.
-
-    Attributes:
-        name: of the scene.
-        job: what workers need.
-        table: its viewpoints, see `wheretolook.viewpoints.table.SCHEMA`.
-        shards: folder for finished shards.
-    """
+    """A scene to label: its name, what workers need, its viewpoints (`viewpoints.table.SCHEMA`), folder of shards."""
 
     name: str
     job: SceneJob
@@ -56,11 +49,11 @@ class LabelledScene:
     """A scene all of whose viewpoints are labelled.
 
     Attributes:
-        task: what was asked.
+        task: the scene that was to be labelled.
         table: the viewpoints with status, error_m, error_deg and n_inliers; the paper's label y follows from them by
             `viewpoints.table.is_good`. If the job stores matches, also `viewpoints.table.MATCH_FIELDS`.
-        manifest: what the labels were made with: versions, settings, fingerprints, and each shard's name and content.
-        seconds: workers' time in each step, of the shards made in this run.
+        manifest: versions, settings and fingerprints of what made the labels, and each shard's name and SHA-256.
+        seconds: the workers' time in each step, for shards made in this run.
     """
 
     task: LabelTask
@@ -81,28 +74,12 @@ def label_viewpoints(
     progress: bool = True,
     description: str = "label",
 ) -> pd.DataFrame:
-    """Render every viewpoint of one scene, localize its image and measure the error: `label_scenes` for one scene.
+    """`label_scenes` for one scene: the table with its labels, see `LabelledScene`.
 
-    Args:
-        table: viewpoints, see `wheretolook.viewpoints.table.SCHEMA`.
-        mesh: file of the scene's mesh.
-        landmarks: file of the map's landmarks, with descriptors.
-        camera: intrinsics of the viewpoints.
-        shards: folder for finished shards.
-        config: how.
-        extractor: what the map was made with.
-        device: where images are rendered, keypoints extracted and descriptors matched.
-        progress: show a progress bar.
-        description: the bar's title.
-
-    Returns:
-        The table with its labels, see `LabelledScene`.
-
-    Raises:
-        As `label_scenes`.
+    `SceneJob` describes the mesh, landmarks, camera, extractor and device, `LabelTask` the table and folder of shards.
+    `description` is the title of the progress bar.
     """
-    config = config or LabelConfig()
-    extractor = extractor or ExtractorConfig()
+    config, extractor = config or LabelConfig(), extractor or ExtractorConfig()
     job = SceneJob(mesh, landmarks, camera, config.localizer, extractor, device, config.store_matches)
     (scene,) = label_scenes([LabelTask(description, job, table, shards)], config, progress, description)
     return scene.table
@@ -113,13 +90,13 @@ def label_scenes(
 ) -> Generator[LabelledScene, None, None]:
     """Render every viewpoint, localize its image against the map and measure the error (paper, Sec. 3.3).
 
-    Work is cut into shards. A finished shard is a file named by all that decides its labels (viewpoints, mesh,
-    landmarks, settings, versions), so that a run which was interrupted, or killed, goes on where it stopped and ends
-    with the same table, whichever engine and however many workers are at it.
+    Work is cut into shards. A finished shard is a file named by a hash of all that decides its labels (viewpoints,
+    mesh, landmarks, settings, versions). A run that was interrupted or killed therefore goes on where it stopped and
+    ends with the same table, for any engine and any number of workers.
 
     Args:
         tasks: the scenes; workers go from one to the next without pause.
-        config: how.
+        config: settings of labelling.
         progress: show one progress bar for all scenes.
         description: the bar's title.
 
@@ -129,27 +106,23 @@ def label_scenes(
     Raises:
         SceneError, MapError: a mesh or landmarks cannot be used.
         TableError: a table is empty.
-        WorkerError: workers were killed again and again, or something failed in one.
+        WorkerError: workers were killed repeatedly, or something failed in one.
         StorageError: a shard or its manifest cannot be written, as when the disk is full.
         ConfigError: the Ray engine cannot be used.
     """
-    scenes = [_Scene.of(task, config.shard_size) for task in tasks]
-    by_path = {shard.path: scene for scene in scenes for shard in scene.missing}
-    missing = [shard for scene in scenes for shard in scene.missing]
+    scenes = [_SceneInProgress.of(task, config.shard_size) for task in tasks]
+    scene_of_shard = {shard: scene for scene in scenes for shard in scene.missing}
+    missing = list(scene_of_shard)
     total, left = sum(len(task.table) for task in tasks), sum(len(shard.rows) for shard in missing)
-    with (
-        tqdm(
-            total=total, initial=total - left, desc=description, unit="view", disable=not progress, smoothing=0.05
-        ) as bar,
-        closing(_run(missing, config, bar.update)) as results,  # so that an error here ends the workers
-    ):
+    bar = tqdm(total=total, initial=total - left, desc=description, unit="view", disable=not progress, smoothing=0.05)
+    with bar, closing(_run(missing, config, bar.update)) as results:  # closing: an error here ends the workers
         for scene in scenes:
             if not scene.missing:
                 yield scene.result()
         for shard, labelled in results:
             with storing(shard.path):
                 write_table(labelled.rows, shard.path)
-            scene = by_path[shard.path]
+            scene = scene_of_shard[shard]
             scene.missing.remove(shard)
             for step, seconds in labelled.seconds.items():
                 scene.seconds[step] = scene.seconds.get(step, 0.0) + seconds
@@ -160,7 +133,7 @@ def label_scenes(
 
 @cache
 def versions() -> dict[str, str]:
-    """Versions of what decides a label."""
+    """Versions of the packages that decide a label."""
     found = {"wheretolook": VERSION}
     for package in ("pycolmap", "opencv-python-headless", "warp-lang", "numpy", "torch"):
         try:
@@ -171,8 +144,8 @@ def versions() -> dict[str, str]:
 
 
 @dataclass(eq=False)
-class _Scene:
-    """A scene on its way."""
+class _SceneInProgress:
+    """A scene whose shards are being labelled; `missing` are those without a file yet."""
 
     task: LabelTask
     settings: dict[str, Any]
@@ -181,7 +154,7 @@ class _Scene:
     seconds: dict[str, float] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, task: LabelTask, shard_size: int) -> _Scene:
+    def of(cls, task: LabelTask, shard_size: int) -> _SceneInProgress:
         job, table = task.job, task.table
         if table.empty:
             raise TableError("no viewpoints to label", value=task.name, fix="Run the sample stage with other settings.")
@@ -195,11 +168,11 @@ class _Scene:
             "localizer": asdict(job.localizer),
             "extractor": asdict(job.extractor),
             "camera": asdict(job.camera),
-            "renderer": _renderer(job.device),
+            "renderer": _renderer_name(job.device),
             "mesh": fingerprint(job.mesh),
             "landmarks": fingerprint(job.landmarks),
         }
-        if job.store_matches:  # shards without matches keep the names they always had
+        if job.store_matches:  # only then, so that shards without matches keep their names from earlier versions
             settings["store_matches"] = True
         text = json.dumps(settings, sort_keys=True).encode()
         inputs = [name for name in SCHEMA.names if name not in LABELS]  # a shard's file holds them all
@@ -226,17 +199,16 @@ class _Scene:
         for shard in self.shards:
             rows = _finished(shard)
             if rows is None:
-                raise StorageError(
-                    "a finished shard was damaged or removed", path=shard.path, fix="Run again: it is made anew."
-                )
+                fix = "Run again: it is made anew."
+                raise StorageError("a finished shard was damaged or removed", path=shard.path, fix=fix)
             parts.append(rows)
         contents = {shard.path.name: {"n": len(shard.rows), "sha256": sha256(shard.path)} for shard in self.shards}
         manifest = {**self.manifest(), "shards": contents}
         return LabelledScene(self.task, pd.concat(parts, ignore_index=True), manifest, self.seconds)
 
 
-def _renderer(device: str) -> str:
-    """Kind of device and method, which round some pixels otherwise."""
+def _renderer_name(device: str) -> str:
+    """Kind of device and rendering method: they differ in the rounding of some pixels."""
     from wheretolook.rendering.warp_renderer import method_on
 
     kind = device.partition(":")[0]
@@ -258,18 +230,17 @@ def _run(
 
 @contextmanager
 def storing(path: Path) -> Iterator[None]:
-    """Say in a StorageError which file of a labelling run could not be written."""
+    """Turn an OSError into a StorageError that names the file of a labelling run that could not be written."""
     try:
         yield
     except OSError as error:
-        raise StorageError(
-            f"this file cannot be written: {error.strerror or error}", path=path,
-            fix="Make room (or mend the disk) and run again: finished shards are kept.",
-        ) from error  # fmt: skip
+        problem = f"this file cannot be written: {error.strerror or error}"
+        fix = "Make room (or mend the disk) and run again: finished shards are kept."
+        raise StorageError(problem, path=path, fix=fix) from error
 
 
 def _finished(shard: Shard) -> pd.DataFrame | None:
-    """A shard's labelled rows, if its file is whole; a damaged one is removed and made again."""
+    """A shard's labelled rows, or None if its file is missing or of other viewpoints; a damaged file is removed."""
     if not shard.path.exists():
         return None
     try:

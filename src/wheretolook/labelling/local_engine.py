@@ -1,4 +1,4 @@
-"""The local engine: shards in processes of this machine. A process that dies is replaced, and its shard done again."""
+"""The local engine: labels shards in processes of this machine. A process that dies is replaced, its shard redone."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from wheretolook.utils.errors import WorkerError
 from wheretolook.utils.workers import end_with_parent, spawning
 
 MAX_DEATHS = 3
-"""A shard whose worker was killed so often is given up."""
+"""Labelling ends with an error when a shard's worker was killed this many times."""
 
 
 @dataclass(eq=False)
@@ -34,7 +34,7 @@ def run_local(
     Args:
         shards: begun in this order.
         workers: number of processes.
-        tick: called with the number of viewpoints just finished, negative for those of a worker that died.
+        tick: called with the number of viewpoints just finished, negative when a worker died and they are redone.
 
     Yields:
         Shards as they are finished.
@@ -63,11 +63,13 @@ def run_local(
                     tick(-worker.ticked)
                     deaths[shard] += 1
                     if deaths[shard] == MAX_DEATHS:
+                        problem = f"{MAX_DEATHS} labelling processes were killed at the same viewpoints"
                         raise WorkerError(
-                            f"{MAX_DEATHS} labelling processes were killed at the same viewpoints, probably for lack "
-                            "of memory", path=shard.job.mesh, value=f"{workers} workers",
+                            f"{problem}, probably for lack of memory",
+                            path=shard.job.mesh,
+                            value=f"{workers} workers",
                             fix="Lower label.workers and run again: finished shards are kept.",
-                        ) from None  # fmt: skip
+                        ) from None
                     waiting.appendleft(shard)
                     worker.process.join()
                     number = team.index(worker)
@@ -95,7 +97,7 @@ def _start(number: int) -> _Worker:
     ours, theirs = context.Pipe()
     process = context.Process(target=_work, args=(theirs, number), daemon=True)
     process.start()
-    theirs.close()  # so that its death closes the pipe
+    theirs.close()  # the child holds the only copy then, so its death closes the pipe
     return _Worker(process, ours)
 
 
@@ -103,7 +105,7 @@ def _give(worker: _Worker, waiting: deque[Shard]) -> None:
     """Hand the next shard to a worker, if there is one."""
     worker.shard, worker.ticked = (waiting.popleft() if waiting else None), 0
     if worker.shard is not None:
-        with suppress(OSError):  # it died; reading from it says so
+        with suppress(OSError):  # the worker has died, which the next read from its pipe will show
             worker.pipe.send((worker.shard.job, worker.shard.rows))
 
 

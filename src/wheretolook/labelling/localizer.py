@@ -1,4 +1,4 @@
-"""Global localization of one image against a map of landmarks, without any knowledge of its pose."""
+"""Global localization of an image against a map of landmarks, without a prior on its pose."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from wheretolook.viewpoints.table import LOCALIZED, NO_POSE, TOO_FEW_MATCHES
 
 @dataclass(frozen=True, eq=False)
 class Localization:
-    """What came of localizing one image.
+    """Result of localizing one image.
 
     Attributes:
         status: "localized", "too_few_matches" or "no_pose".
-        cam_from_world: (3, 4) estimated pose, None if RANSAC found none. A pose with too few inliers is kept for the
-            record, but its status is "no_pose".
-        n_matches: 2D-3D matches.
+        cam_from_world: (3, 4) estimated pose, None if RANSAC found none. A pose with too few inliers is kept, but its
+            status is "no_pose".
+        n_matches: number of 2D-3D matches.
         inlier_rows: (I,) rows of the landmarks that were matched and agree with the pose.
         matched_rows: (M,) rows of all landmarks that were matched, whatever the status.
     """
@@ -43,8 +43,8 @@ class Localization:
 class Localizer:
     """Localizes images against landmarks (paper, Sec. 3.3 "Self-supervision").
 
-    SIFT, one matrix product against the landmarks' mean descriptors, Lowe's ratio test, then PnP in LO-RANSAC and
-    refinement by pycolmap.
+    Keypoints are extracted and matched to the landmarks' mean descriptors with Lowe's ratio test; pycolmap estimates
+    the pose by PnP in LO-RANSAC and refines it.
 
     Args:
         landmarks: with descriptors.
@@ -70,12 +70,8 @@ class Localizer:
         self.landmarks, self.config = landmarks, config or LocalizerConfig()
         self.extractor = KeypointExtractor(extractor, device)
         self._matcher = DescriptorMatcher(landmarks.descriptors, device)
-        self._camera = pycolmap.Camera(
-            model="SIMPLE_PINHOLE",
-            width=camera.width,
-            height=camera.height,
-            params=[camera.focal_px, camera.cx, camera.cy],
-        )
+        params = [camera.focal_px, camera.cx, camera.cy]
+        self._camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=camera.width, height=camera.height, params=params)
         self._estimation = pycolmap.AbsolutePoseEstimationOptions()
         self._estimation.ransac.max_error = self.config.max_error_px
         self._estimation.ransac.random_seed = self.config.seed
@@ -91,8 +87,9 @@ class Localizer:
         return self.extractor.extract_batch(images)
 
     def match(self, keypoints: Sequence[Keypoints]) -> list[Matches]:
-        """Step 2: 2D-3D matches of several images at once, which do not depend on each other."""
-        return match(self._matcher, [quantize_descriptors(one.descriptors) for one in keypoints], self.config.max_ratio)
+        """Step 2: 2D-3D matches of several images at once; those of one image do not depend on the others."""
+        descriptors = [quantize_descriptors(of_image.descriptors) for of_image in keypoints]
+        return match(self._matcher, descriptors, self.config.max_ratio)
 
     def estimate(
         self, keypoints: Keypoints, keypoint_rows: NDArray[np.int64], landmark_rows: NDArray[np.int64]

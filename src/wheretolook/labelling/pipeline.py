@@ -1,15 +1,16 @@
-"""Steps that run at the same time, each in a thread of its own, with bounded queues between them."""
+"""Steps that run at the same time, each in a thread of its own, with few items under way."""
 
 from __future__ import annotations
 
-import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from queue import Empty, Full, Queue
 from typing import Any
 
-_LOOK_S = 0.1  # how often a waiting thread looks whether to stop
+_END = object()
+"""Passed through the steps after the last item."""
 
 
 @dataclass(frozen=True)
@@ -30,14 +31,13 @@ def run_pipeline(
 ) -> Iterator[Any]:
     """Pass items through steps; while one item is in the second step, the next is in the first.
 
-    Steps that wait for a GPU, or that release Python's lock, overlap. At most `depth` items wait before each step, so
-    that memory is bounded.
+    Steps that wait for a GPU, or that release Python's lock, overlap.
 
     Args:
-        items: read in the calling order, in a thread.
+        items: read in a thread of their own.
         steps: at least one.
-        seconds: gets the time spent in each step added, by name.
-        depth: length of each queue.
+        seconds: the time spent in each step is added to it, by the step's name.
+        depth: items under way for each step and for the source, which bounds the memory.
 
     Yields:
         What the last step returns, in the order of the items.
@@ -45,71 +45,32 @@ def run_pipeline(
     Raises:
         BaseException: whatever a step or the source of items raised; the other threads are stopped then.
     """
-    stop, seconds = threading.Event(), {} if seconds is None else seconds
-    queues: list[Queue[_Message]] = [Queue(depth) for _ in range(len(steps) + 1)]
-    threads = [threading.Thread(target=_feed, args=(items, queues[0], stop), daemon=True)]
-    for step, source, target in zip(steps, queues[:-1], queues[1:], strict=True):
-        threads.append(threading.Thread(target=_work, args=(step, source, target, stop, seconds), daemon=True))
-    for thread in threads:
-        thread.start()
+    iterator, seconds = iter(items), {} if seconds is None else seconds
+    under_way: deque[Future[Any]] = deque()
+    threads = [ThreadPoolExecutor(1) for _ in range(len(steps) + 1)]
     try:
-        while (message := _get(queues[-1], stop)) is not None and not message.last:
-            if message.error is not None:
-                raise message.error
-            yield message.item
-    finally:
-        stop.set()
-        for thread in threads:
-            thread.join()
-
-
-@dataclass(frozen=True)
-class _Message:
-    item: Any = None
-    error: BaseException | None = None
-    last: bool = False
-
-
-def _feed(items: Iterable[Any], target: Queue[_Message], stop: threading.Event) -> None:
-    try:
-        for item in items:
-            _put(target, _Message(item), stop)
-            if stop.is_set():
+        while True:
+            while len(under_way) < depth * len(threads):
+                future = threads[0].submit(next, iterator, _END)
+                for thread, step in zip(threads[1:], steps, strict=True):
+                    future = thread.submit(_run, step, future, seconds)
+                under_way.append(future)
+            item = under_way.popleft().result()
+            if item is _END:
                 return
-        _put(target, _Message(last=True), stop)
-    except BaseException as error:  # the caller's thread raises it
-        _put(target, _Message(error=error), stop)
+            yield item
+    finally:
+        for thread in threads:
+            thread.shutdown(wait=False, cancel_futures=True)
+        for thread in threads:
+            thread.shutdown()
 
 
-def _work(
-    step: Step, source: Queue[_Message], target: Queue[_Message], stop: threading.Event, seconds: dict[str, float]
-) -> None:
-    while (message := _get(source, stop)) is not None:
-        if message.last or message.error is not None:
-            _put(target, message, stop)
-            return
-        try:
-            start = time.perf_counter()
-            item = step.run(message.item)
-            seconds[step.name] = seconds.get(step.name, 0.0) + time.perf_counter() - start
-            _put(target, _Message(item), stop)
-        except BaseException as error:
-            _put(target, _Message(error=error), stop)
-            return
-
-
-def _put(queue: Queue[_Message], message: _Message, stop: threading.Event) -> None:
-    while not stop.is_set():
-        try:
-            return queue.put(message, timeout=_LOOK_S)
-        except Full:
-            continue
-
-
-def _get(queue: Queue[_Message], stop: threading.Event) -> _Message | None:
-    while not stop.is_set():
-        try:
-            return queue.get(timeout=_LOOK_S)
-        except Empty:
-            continue
-    return None
+def _run(step: Step, source: Future[Any], seconds: dict[str, float]) -> Any:
+    item = source.result()
+    if item is _END:
+        return item
+    start = time.perf_counter()
+    item = step.run(item)
+    seconds[step.name] = seconds.get(step.name, 0.0) + time.perf_counter() - start
+    return item

@@ -1,7 +1,7 @@
-"""The Ray engine: the same shards on a cluster, for whoever outgrows one machine.
+"""The Ray engine: labels the same shards on a cluster of machines.
 
-Machines need not share a file system: meshes and landmarks travel through Ray's object store, labels come back to the
-driver, which alone writes. What a removed machine had in hand, Ray gives to another.
+Machines need not share a file system: meshes and landmarks travel through Ray's object store, and labels come back to
+the driver, which writes them. Ray restarts the shards of a machine that is removed on another one.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from wheretolook.labelling.shard import LabelledShard, SceneJob, Shard, ShardWor
 from wheretolook.utils.errors import ConfigError, WhereToLookError, WorkerError
 
 MAX_RETRIES = 5
-"""How often Ray starts a shard again whose process or machine was lost."""
+"""How often Ray restarts a shard whose process or machine was lost."""
 
 KEEP_S = 24 * 3600.0
-"""How long a machine keeps meshes and landmarks that no shard has asked for, in seconds."""
+"""How many seconds a machine keeps meshes and landmarks that no shard uses."""
 
 WORKERS_A_GPU = 16
 """Shards that share one GPU."""
@@ -36,7 +36,7 @@ WORKERS_A_GPU = 16
 def run_ray(
     shards: Sequence[Shard], address: str = "", tick: Callable[[int], None] = lambda n: None
 ) -> Iterator[tuple[Shard, LabelledShard]]:
-    """Label shards on a Ray cluster, one core each; with device "cuda" also a sixteenth of a GPU.
+    """Label shards on a Ray cluster, each on one core and, with device "cuda", `1 / WORKERS_A_GPU` of a GPU.
 
     Args:
         shards: begun in this order.
@@ -69,23 +69,23 @@ def run_ray(
 def _connect(ray: Any, address: str) -> None:
     host, _, port = address.removeprefix("ray://").rpartition(":")
     try:
-        if port.isdigit():  # where nothing listens, Ray itself would try for many minutes
+        if port.isdigit():  # fail soon where nothing listens: Ray itself would try for many minutes
             socket.create_connection((host, int(port)), timeout=10).close()
-        ray.init(address=address or "local", log_to_driver=False, include_dashboard=False if not address else None,
-                 logging_level="ERROR")  # fmt: skip
+        dashboard = None if address else False
+        ray.init(address or "local", log_to_driver=False, include_dashboard=dashboard, logging_level="ERROR")
     except (OSError, RuntimeError, ValueError, ImportError) as error:
         fix = "Start it (`ray start --head`), or correct label.ray_address."
         raise ConfigError(f"no Ray cluster there: {error}", value=address, fix=fix) from error
 
 
 def _check_resources(resources: Mapping[str, float], needs_gpu: bool) -> None:
-    """What no machine of the cluster has, Ray would wait for without a word."""
-    for name, needed in (("CPU", True), ("GPU", needs_gpu)):
+    """Raise ConfigError if the cluster lacks a CPU or GPU: Ray would wait for one silently."""
+    for name, needed, fix in (
+        ("CPU", True, "Add a machine."),
+        ("GPU", needs_gpu, "Add a machine that has one, or give --device cpu."),
+    ):
         if needed and resources.get(name, 0) == 0:
-            raise ConfigError(
-                f"the Ray cluster has no {name}", value=dict(resources),
-                fix="Add a machine that has one, or give --device cpu." if name == "GPU" else "Add a machine.",
-            )  # fmt: skip
+            raise ConfigError(f"the Ray cluster has no {name}", value=dict(resources), fix=fix)
 
 
 def _run(ray: Any, shards: Sequence[Shard], tick: Callable[[int], None]) -> Iterator[tuple[Shard, LabelledShard]]:
@@ -114,18 +114,16 @@ def _run(ray: Any, shards: Sequence[Shard], tick: Callable[[int], None]) -> Iter
             except ray.exceptions.RayTaskError as error:
                 if isinstance(error.cause, WhereToLookError):
                     raise error.cause from None
-                raise WorkerError(
-                    f"labelling failed: {type(error.cause).__name__}: {error.cause}", path=shard.job.mesh,
-                    fix="Finished shards are kept: mend the cause and run again.",
-                ) from error  # fmt: skip
+                problem = f"labelling failed: {type(error.cause).__name__}: {error.cause}"
+                fix = "Finished shards are kept: mend the cause and run again."
+                raise WorkerError(problem, path=shard.job.mesh, fix=fix) from error
             except ray.exceptions.RayError as error:
-                raise WorkerError(
-                    f"a shard was lost more than {MAX_RETRIES} times: {error}", path=shard.job.mesh,
-                    fix="Finished shards are kept: mend the cluster and run again.",
-                ) from error  # fmt: skip
+                problem = f"a shard was lost more than {MAX_RETRIES} times: {error}"
+                fix = "Finished shards are kept: mend the cluster and run again."
+                raise WorkerError(problem, path=shard.job.mesh, fix=fix) from error
             tick(len(shard.rows))
             yield shard, labelled
-    finally:  # a cluster that is not ours would go on with what nobody waits for
+    finally:  # otherwise a cluster that goes on after this run would finish the tasks
         for unfinished in running:
             ray.cancel(unfinished)
 
@@ -134,7 +132,7 @@ _worker: ShardWorker | None = None
 
 
 def _label_shard(job: SceneJob, files: tuple[bytes, bytes], rows: pd.DataFrame) -> LabelledShard:
-    """Runs on the cluster. The scene's files are laid down once a machine, named by their content."""
+    """Label a shard, on a machine of the cluster, which keeps the scene's files under names made of their content."""
     global _worker
     if _worker is None:
         os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -143,28 +141,29 @@ def _label_shard(job: SceneJob, files: tuple[bytes, bytes], rows: pd.DataFrame) 
     folder.mkdir(exist_ok=True)
     if job.device != "cpu":
         job = replace(job, device="cuda")  # the only one that Ray lets this task see
-    mesh = _lay_down(folder, files[0], job.mesh.suffix)
-    landmarks = _lay_down(folder, files[1], job.landmarks.suffix)
+    mesh = _cached_file(folder, files[0], job.mesh.suffix)
+    landmarks = _cached_file(folder, files[1], job.landmarks.suffix)
     try:
         return _worker.label(replace(job, mesh=mesh, landmarks=landmarks), rows)
-    except WhereToLookError as error:  # the user knows the files by their own names
+    except WhereToLookError as error:  # name the user's files, not the copies
         path = {mesh: job.mesh, landmarks: job.landmarks}.get(Path(error.path or ""), error.path)
         raise type(error)(error.problem, path=path, value=error.value, fix=error.fix) from error
 
 
-def _lay_down(folder: Path, content: bytes, suffix: str) -> Path:
+def _cached_file(folder: Path, content: bytes, suffix: str) -> Path:
+    """File with the given content, written unless it is there; files that have not been used for long are removed."""
     path = folder / f"{hashlib.sha256(content).hexdigest()[:32]}{suffix}"
     try:
         os.utime(path)
     except FileNotFoundError:
-        partial = path.with_name(f"{path.name}.{os.getpid()}.partial")  # others may be at it
+        partial = path.with_name(f"{path.name}.{os.getpid()}.partial")  # other workers may write the same file
         try:
             partial.write_bytes(content)
             os.replace(partial, path)
         finally:
             partial.unlink(missing_ok=True)
         for file in folder.iterdir():
-            with suppress(FileNotFoundError):  # others may be at it here, too
+            with suppress(FileNotFoundError):  # another worker may have removed it
                 if file.stat().st_mtime < time.time() - KEEP_S:
                     file.unlink()
     return path

@@ -1,4 +1,4 @@
-"""What the labels of a dataset look like: their balance, the errors behind them, and whether the thresholds matter."""
+"""Report on the labels of a dataset: their balance, the pose errors, and how much the labels depend on thresholds."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.utils.markdown import markdown_table
-from wheretolook.viewpoints.table import LOCALIZED, NO_POSE, TOO_FEW_MATCHES, Split, is_good, poses
+from wheretolook.viewpoints.config import Split
+from wheretolook.viewpoints.table import LOCALIZED, NO_POSE, TOO_FEW_MATCHES, is_good, poses
 from wheretolook.viewpoints.thresholds import ALL, THRESHOLDS, threshold_key, threshold_label
 
 LABELS_CSV, LABELS_MD, LABELS_PNG = "labels.csv", "labels.md", "labels.png"
@@ -20,7 +21,10 @@ LABELS_CSV, LABELS_MD, LABELS_PNG = "labels.csv", "labels.md", "labels.png"
 
 STATUSES = (LOCALIZED, TOO_FEW_MATCHES, NO_POSE)
 POSITIVE = tuple(f"positive_{threshold_key(threshold)}" for threshold in THRESHOLDS)
-"""Columns of the shares of positives, from the finest threshold (the label) to the coarsest, one within the next."""
+"""Columns of the shares of positives, from the finest threshold (the label) to the coarsest.
+
+Positives at one threshold are positives at all coarser ones.
+"""
 
 BINS_A_DECADE = 5
 ERROR_EDGES_M = np.logspace(-4, 2, 6 * BINS_A_DECADE + 1)
@@ -28,34 +32,34 @@ ERROR_EDGES_DEG = np.logspace(-3, 2.4, 27 + 1)
 """Edges of the error histograms, metres and degrees. Errors beyond an end count in the last bin there."""
 
 VISIBLE_EDGES = (0, 1, 10, 30, 100, 300, 1000, 3000, np.inf)
-"""Edges of the bands of visible landmarks."""
+"""Edges of the bands of the number of landmarks in view."""
 
 HEIGHT_BANDS_M, MAX_HEIGHT_BANDS = (0.5, 1.0, 2.0, 5.0, 10.0), 7
-"""Widths of a height band; the narrowest is taken that needs no more bands than this."""
+"""Possible widths of a height band, of which the narrowest is taken that gives at most this many bands."""
 
 COINCIDE, NEARLY_COINCIDE = 0.95, 0.8
-"""From which share of the coarsest threshold's positives, positive also at the finest, the words say so."""
+"""Of the coarsest threshold's positives, the shares that must also be positive at the finest for these verdicts."""
 
 
 @dataclass(frozen=True, eq=False)
 class LabelSummary:
-    """What the labels of a dataset look like. Every share is in [0, 1].
+    """Statistics of the labels of a dataset. Every share is in [0, 1].
 
     Attributes:
-        shares: a row a scene; then, with `ALL` for the scene's name, a row for each split and, with `ALL` for the split
-            too, one for all scenes. Columns: `scene`, `split`, `n_views`, `n_locations`; the share of viewpoints of
-            each status (`STATUSES`) and without any pose (`without_pose`); the share of positives at each threshold
+        shares: one row for each scene; then, with `ALL` for the scene's name, one for each split and, with `ALL` for
+            the split too, one for all scenes. Columns: `scene`, `split`, `n_views`, `n_locations`; the share of
+            viewpoints of each status (`STATUSES`) and without any pose (`without_pose`); of positives at each threshold
             (`POSITIVE`); `locations_positive`, the share of locations with a positive at the finest;
             `finest_of_coarsest`, the share of the coarsest's positives that are positive at the finest;
             `same_label_share`, the share of viewpoints whose labels are all equal; `spearman`, the rank correlation of
             the finest and the coarsest label; median errors of the poses found for the coarsest's positives
             (`median_within_m`, `median_within_deg`) and for the others (`median_beyond_m`, `median_beyond_deg`). NaN
             where there is nothing to count.
-        by_height: a row a band of the camera's height above its scene's lowest location: `low`, `high` in metres,
-            `n_views`, shares of positives. Bands within the range may be empty.
-        by_visible: the same by number of visible landmarks; `high` is exclusive, infinite in the last.
-        errors_m: a row a bin of the position error: `low`, `high` in metres, and how many viewpoints have such a pose,
-            `localized` and `disbelieved` (found, but with too few inliers: status "no_pose").
+        by_height: one row for each band of the camera's height above its scene's lowest location: `low`, `high` in
+            metres, `n_views`, shares of positives. Bands within the range may be empty.
+        by_visible: the same by the number of landmarks in view; `high` is exclusive, infinite in the last.
+        errors_m: one row for each bin of the position error: `low`, `high` in metres, and the number of viewpoints with
+            such an error whose pose was `localized` or `disbelieved` (with too few inliers: status "no_pose").
         errors_deg: the same of the rotation error, in degrees.
     """
 
@@ -100,7 +104,7 @@ def label_summary(tables: Mapping[str, pd.DataFrame], splits: Mapping[str, Split
 def _views(scene: str, table: pd.DataFrame, split: str) -> pd.DataFrame:
     """The columns that the summary needs, with heights and the label at each threshold."""
     height = camera_centers(poses(table))[:, 2]
-    height = np.round(height - height.min(), 6)  # so that rounding does not part the views of a location
+    height = np.round(height - height.min(), 6)  # so that all views of a location fall into one band
     labels = {name: is_good(table, *limits) for name, limits in zip(POSITIVE, THRESHOLDS, strict=True)}
     columns = table[["location_id", "n_visible", "status", "error_m", "error_deg"]]
     return columns.assign(scene=scene, split=split, height_m=height, **labels)
@@ -130,13 +134,13 @@ def _shares(views: pd.DataFrame) -> dict[str, Any]:
 
 
 def _correlation(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> float:
-    """Correlation of two labels (B,): of two values each, so that Spearman's and Pearson's are the same."""
+    """Correlation of two labels (B,). Of binary values, Spearman's and Pearson's are the same."""
     spread = a.std() * b.std()
     return float(((a & b).mean() - a.mean() * b.mean()) / spread) if spread > 0 else np.nan
 
 
 def _by_band(views: pd.DataFrame, values: Float, edges: Float) -> pd.DataFrame:
-    """Views and positives of each band, from the first to the last that is not empty. The edges hold all values."""
+    """Views and positives of each band, from the first to the last that is not empty. No value is beyond the edges."""
     band = np.digitize(values, edges) - 1
     kept = np.arange(band.min(), band.max() + 1)
     by_band = views.groupby(band)
@@ -155,7 +159,7 @@ def _histogram(views: pd.DataFrame, column: str, edges: Float) -> pd.DataFrame:
 
 
 def threshold_sentence(summary: LabelSummary) -> str:
-    """Whether the thresholds matter, in words that follow from the numbers over all scenes."""
+    """A sentence on how much the labels depend on the threshold, from the numbers over all scenes."""
     row, labels = summary.overall, _labels()
     if not row[POSITIVE[-1]]:
         return f"No viewpoint is within {labels[-1]}: all are negative at every threshold."
@@ -165,35 +169,33 @@ def threshold_sentence(summary: LabelSummary) -> str:
         verdict = "The thresholds differ little"
     else:
         verdict = "The thresholds differ"
-    finer = [f"{_percent(row[name] / row[POSITIVE[-1]])} % are within {label}"
-             for name, label in zip(POSITIVE[:-1], labels[:-1], strict=True)]  # fmt: skip
-    within = _median_error(row["median_within_m"], row["median_within_deg"])
+    finer = [
+        f"{_percent(row[name] / row[POSITIVE[-1]])} % are within {label}"
+        for name, label in zip(POSITIVE[:-1], labels[:-1], strict=True)
+    ]
+    within, beyond = (
+        _median_error(row[f"median_{name}_m"], row[f"median_{name}_deg"]) for name in ("within", "beyond")
+    )
     errors = f"Their median errors are {within}"
     if pd.notna(row["median_beyond_m"]):
-        errors += (
-            f"; those of the other poses found are {_median_error(row['median_beyond_m'], row['median_beyond_deg'])}"
-        )
+        errors += f"; those of the other poses found are {beyond}"
     same = f"{_percent(row['same_label_share'])} % of the viewpoints have the same label at all {len(POSITIVE)}"
     return f"{verdict}: {same}. Of those within {labels[-1]}, {', '.join(finer)}. {errors}."
 
 
 def label_markdown(summary: LabelSummary, title: str = "Labels") -> str:
-    """The summary as tables in Markdown, under the sentence on the thresholds.
-
-    Args:
-        summary: what to tell.
-        title: first line.
-    """
-    shares, row, labels = summary.shares, summary.overall, _labels()
-    header = ["scene", "split", "views", "locations", *labels, "locations with a positive", "localized",
-              "too few matches", "no pose", "finest of coarsest", "same label", "Spearman"]  # fmt: skip
+    """The summary as tables in Markdown, under a title and `threshold_sentence`."""
+    row, labels = summary.overall, _labels()
+    header = ["scene", "split", "views", "locations", *labels, "locations with a positive"]
+    header += ["localized", "too few matches", "no pose", "finest of coarsest", "same label", "Spearman"]
     percents = [*POSITIVE, "locations_positive", *STATUSES, "finest_of_coarsest", "same_label_share"]
-    lines = [
-        [one["scene"], one["split"], f"{one['n_views']:,}", f"{one['n_locations']:,}",
-         *[_percent(one[name]) for name in percents], _or_dash(one["spearman"], ".2f")]
-        for one in shares.to_dict("records")
-    ]  # fmt: skip
-    return "\n\n".join([
+    lines = []
+    for part in summary.shares.to_dict("records"):
+        counts = [f"{part['n_views']:,}", f"{part['n_locations']:,}"]
+        shares = [_percent(part[name]) for name in percents]
+        lines.append([part["scene"], part["split"], *counts, *shares, _or_dash(part["spearman"], ".2f")])
+    errors = (("position error (m)", summary.errors_m), ("rotation error (°)", summary.errors_deg))
+    sections = [
         f"# {title}",
         threshold_sentence(summary),
         f"{row['n_views']:,} viewpoints at {row['n_locations']:,} locations; shares in % of viewpoints. Positive at "
@@ -209,14 +211,11 @@ def label_markdown(summary: LabelSummary, title: str = "Labels") -> str:
         "## Errors of the poses found",
         f"In % of all viewpoints; {_percent(row['without_pose'])} % have no pose at all. Disbelieved poses have too "
         "few inliers and count as not localized. Errors beyond the first and the last row count there.",
-        *(
-            markdown_table([error, "localized", "disbelieved"], _error_lines(errors, row["n_views"]))
-            for error, errors in (
-                ("position error (m)", summary.errors_m),
-                ("rotation error (°)", summary.errors_deg),
-            )
-        ),
-    ]) + "\n"  # fmt: skip
+    ]
+    sections += [
+        markdown_table([name, "localized", "disbelieved"], _error_lines(bins, row["n_views"])) for name, bins in errors
+    ]
+    return "\n\n".join(sections) + "\n"
 
 
 def _height_label(low: float, high: float) -> str:
@@ -225,14 +224,14 @@ def _height_label(low: float, high: float) -> str:
 
 
 def _visible_label(low: float, high: float) -> str:
-    """Name of a band of visible landmarks: `low` to `high`, exclusive."""
+    """Name of a band of the number of landmarks in view: `low` to `high`, exclusive."""
     if np.isinf(high):
         return f"≥ {low:,.0f}"
     return f"{low:,.0f}" if high == low + 1 else f"{low:,.0f}–{high - 1:,.0f}"
 
 
 def _labels() -> list[str]:
-    """The thresholds for people, in their order."""
+    """The thresholds as text, from the finest to the coarsest."""
     return [threshold_label(threshold_key(threshold)) for threshold in THRESHOLDS]
 
 
@@ -244,7 +243,7 @@ def _band_lines(bands: pd.DataFrame, name: Any) -> list[list[str]]:
 
 
 def _error_lines(errors: pd.DataFrame, n_views: int) -> list[list[str]]:
-    """Histogram bins, taken together by decades."""
+    """Histogram bins, summed by decades."""
     starts = np.arange(0, len(errors), BINS_A_DECADE)
     lows, highs = errors["low"].to_numpy()[starts], [*errors["low"].to_numpy()[starts[1:]], None]
     counts = np.add.reduceat(errors[["localized", "disbelieved"]].to_numpy(), starts, axis=0)

@@ -1,15 +1,14 @@
-"""What a worker does, whichever engine runs it: label the viewpoints of one shard."""
+"""Labels the viewpoints of one shard: what every worker does, whichever engine runs it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from wheretolook.features.keypoints import ExtractorConfig
 from wheretolook.geometry.camera import PinholeCamera
@@ -25,7 +24,7 @@ if TYPE_CHECKING:
     from wheretolook.rendering.types import Renderer
 
 BATCH = 8
-"""Viewpoints that go through the steps together."""
+"""Number of viewpoints that are rendered, extracted and matched together."""
 
 Tick = Callable[[int], None]
 
@@ -40,8 +39,8 @@ class SceneJob:
         camera: intrinsics of the viewpoints.
         localizer: matching and pose estimation.
         extractor: what the map was made with.
-        device: where images are rendered, keypoints extracted and descriptors matched; "cuda" is spread over all GPUs
-            there are.
+        device: where images are rendered, keypoints extracted and descriptors matched; with "cuda", workers spread over
+            all GPUs.
         store_matches: whether labelled rows get the columns of `wheretolook.viewpoints.table.MATCH_FIELDS`.
     """
 
@@ -65,22 +64,17 @@ class Shard:
 
 @dataclass(frozen=True, eq=False)
 class LabelledShard:
-    """What a worker returns.
-
-    Attributes:
-        rows: the shard's viewpoints with their labels.
-        seconds: time the worker spent in each step; steps overlap.
-    """
+    """The viewpoints of a shard with their labels, and the time the worker spent in each step; steps overlap."""
 
     rows: pd.DataFrame
     seconds: dict[str, float] = field(default_factory=dict)
 
 
 class ShardWorker:
-    """Labels shards in this process, and keeps what a scene needs until a shard of another scene comes.
+    """Labels shards in this process; the renderer and map stay loaded until a shard of another scene comes.
 
     Args:
-        number: of this worker among its engine's, from 0; tells which GPU it takes.
+        number: of this worker among its engine's, from 0, which decides the GPU it uses.
     """
 
     def __init__(self, number: int = 0) -> None:
@@ -92,12 +86,7 @@ class ShardWorker:
         self._scene: tuple[SceneJob, Renderer, Localizer] | None = None
 
     def label(self, job: SceneJob, rows: pd.DataFrame, tick: Tick = lambda n: None) -> LabelledShard:
-        """Label viewpoints.
-
-        Args:
-            job: their scene.
-            rows: viewpoints, see `wheretolook.viewpoints.table.SCHEMA`.
-            tick: called with the number of viewpoints just finished.
+        """Label viewpoints of a scene; `tick` is called with the number of viewpoints just finished.
 
         Raises:
             SceneError, MapError: the mesh or the landmarks cannot be used.
@@ -111,12 +100,10 @@ class ShardWorker:
         except WhereToLookError:
             raise
         except Exception as error:
-            raise WorkerError(
-                f"labelling failed: {type(error).__name__}: {error}",
-                path=job.mesh,
-                value=f"viewpoints {rows['viewpoint_id'].iloc[0]} to {rows['viewpoint_id'].iloc[-1]}",
-                fix="Finished shards are kept: mend the cause and run again.",
-            ) from error
+            problem = f"labelling failed: {type(error).__name__}: {error}"
+            viewpoints = f"viewpoints {rows['viewpoint_id'].iloc[0]} to {rows['viewpoint_id'].iloc[-1]}"
+            fix = "Finished shards are kept: mend the cause and run again."
+            raise WorkerError(problem, path=job.mesh, value=viewpoints, fix=fix) from error
 
     def _open(self, job: SceneJob) -> tuple[Renderer, Localizer]:
         from wheretolook.labelling.localizer import Localizer
@@ -125,7 +112,7 @@ class ShardWorker:
         from wheretolook.scenes.loading import load_mesh
 
         if self._scene is None or self._scene[0] != job:
-            self._scene = None  # make room first
+            self._scene = None  # free its memory first
             device = _device(job.device, self.number)
             renderer = WarpRenderer(load_mesh(job.mesh), device)
             localizer = Localizer(Landmarks.load(job.landmarks), job.camera, job.localizer, job.extractor, device)
@@ -144,55 +131,40 @@ def label_rows(
 ) -> pd.DataFrame:
     """Render viewpoints, localize the images and measure the errors, in batched steps that overlap in this process.
 
-    Args:
-        table: viewpoints.
-        renderer: of the scene.
-        localizer: of its map.
-        camera: intrinsics of the viewpoints.
-        seconds: gets the time spent in each step added: render, extract, match, pose.
-        tick: called with the number of viewpoints just finished.
-        store_matches: also tell which landmarks were matched.
+    The time spent in each step (render, extract, match, pose) is added to `seconds`, and `tick` is called with the
+    number of viewpoints just finished.
 
     Returns:
-        The table with status, error_m, error_deg and n_inliers filled in, and with `store_matches` the columns of
-        `wheretolook.viewpoints.table.MATCH_FIELDS`. Those it had before, of earlier labels, go in any case.
+        The table with status, error_m, error_deg and n_inliers filled in. It has the columns of
+        `wheretolook.viewpoints.table.MATCH_FIELDS` only with `store_matches`; those of earlier labels are dropped.
     """
     true_poses = poses(table)
-
-    def estimate(batch: list[Any]) -> list[Localization]:
-        return [localizer.estimate(keypoints, *matches) for keypoints, matches in batch]
-
     steps = [
         Step("render", lambda batch: renderer.render(camera, batch).rgb),
         Step("extract", localizer.extract),
-        Step("match", lambda found: list(zip(found, localizer.match(found), strict=True))),
-        Step("pose", estimate),
+        Step("match", lambda keypoints: list(zip(keypoints, localizer.match(keypoints), strict=True))),
+        Step("pose", lambda pairs: [localizer.estimate(keypoints, *matches) for keypoints, matches in pairs]),
     ]
     batches = [true_poses[start : start + BATCH] for start in range(0, len(true_poses), BATCH)]
-    found: list[Localization] = []
-    for part in run_pipeline(batches, steps, seconds):
-        found += part
-        tick(len(part))
+    results: list[Localization] = []
+    for batch in run_pipeline(batches, steps, seconds):
+        results += batch
+        tick(len(batch))
     none: Float = np.full((3, 4), np.nan)
-    estimates = np.stack([none if one.cam_from_world is None else one.cam_from_world for one in found])
+    estimates = np.stack([none if result.cam_from_world is None else result.cam_from_world for result in results])
     error_m, error_deg = pose_error(estimates, true_poses)
     labelled = table.drop(columns=MATCH_FIELDS.names, errors="ignore").assign(
-        status=[one.status for one in found],
+        status=[result.status for result in results],
         error_m=error_m.astype(np.float32),
         error_deg=error_deg.astype(np.float32),
-        n_inliers=np.array([len(one.inlier_rows) for one in found], dtype=np.int32),
+        n_inliers=np.array([len(result.inlier_rows) for result in results], dtype=np.int32),
     )
     if not store_matches:
         return labelled
     return labelled.assign(
-        matched_rows=[_ascending(one.matched_rows) for one in found],
-        inlier_rows=[_ascending(one.inlier_rows) for one in found],
+        matched_rows=[np.sort(result.matched_rows).astype(np.int32) for result in results],
+        inlier_rows=[np.sort(result.inlier_rows).astype(np.int32) for result in results],
     )
-
-
-def _ascending(rows: NDArray[np.int64]) -> NDArray[np.int32]:
-    """Rows of landmarks as a table holds them."""
-    return np.sort(rows).astype(np.int32)
 
 
 def _device(device: str, number: int) -> str:

@@ -25,7 +25,8 @@ from tqdm.auto import tqdm
 from wheretolook.learning.classifier import ViewpointClassifier
 from wheretolook.learning.config import FittingConfig, SharedConfig
 from wheretolook.utils.errors import ConfigError, WorkerError
-from wheretolook.utils.tracking import TrackingConfig, client
+from wheretolook.utils.tracking import client
+from wheretolook.utils.tracking_config import TrackingConfig
 
 if TYPE_CHECKING:
     from mlflow.entities import Metric

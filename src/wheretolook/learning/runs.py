@@ -12,7 +12,8 @@ import pandas as pd
 from wheretolook.dataset.folders import Dataset
 from wheretolook.learning.old_names import name_of_variant, with_name, with_names
 from wheretolook.utils.files import write_text
-from wheretolook.utils.tracking import TrackingConfig, artifact, client, finished_runs
+from wheretolook.utils.tracking import artifact, client, finished_runs
+from wheretolook.utils.tracking_config import TrackingConfig
 
 if TYPE_CHECKING:
     from mlflow.entities import Run

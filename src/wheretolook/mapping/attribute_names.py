@@ -1,10 +1,12 @@
-"""Names of what a map knows of its landmarks: apart from `Landmarks`, so that options can be read without PyTorch."""
+"""Names of the attributes of a map's landmarks. Not in `landmarks.py`, so that options are read without PyTorch."""
 
 MAP_ATTRIBUTES = (
-    "track_length", "reprojection_error", "triangulation_angle", "direction_spread", "ambiguity", "mapped_distance",
-    "distance_spread",
-)  # fmt: skip
-"""What a scorer is told of a landmark in its map: the logarithm of the number of observations; the mean error in
-pixels; the logarithm of the largest angle between two rays, in degrees; 1 - |mean mapping direction|; the cosine
-between its descriptor and the nearest other one; the logarithm of the mean mapping distance, in metres; the standard
-deviation of the mapping distances over their mean. NaN where one is not known."""
+    "track_length",  # logarithm of the number of observations
+    "reprojection_error",  # mean error in pixels
+    "triangulation_angle",  # logarithm of the largest angle between two rays, in degrees
+    "direction_spread",  # 1 - |mean mapping direction|
+    "ambiguity",  # cosine between the landmark's descriptor and the nearest one of another landmark
+    "mapped_distance",  # logarithm of the mean mapping distance, in metres
+    "distance_spread",  # standard deviation of the mapping distances over their mean
+)
+"""What a scorer is told of a landmark in its map; NaN where a value is not known."""

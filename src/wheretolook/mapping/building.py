@@ -6,7 +6,8 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Generator, Iterable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -40,43 +41,24 @@ LANDMARKS_FILE, REPORT_FILE, DATABASE_FILE, IMAGES_FOLDER = "landmarks.npz", "re
 
 @dataclass(frozen=True)
 class MapReport:
-    """What came out of building a map; `report.json`.
+    """What came out of building a map; `report.json`."""
 
-    Attributes:
-        n_images: images rendered.
-        n_registered: images that see a landmark.
-        n_keypoints: keypoints of all images.
-        n_pairs: pairs of images matched.
-        n_landmarks: landmarks after the filter.
-        n_landmarks_removed: points the filter removed.
-        median_track_length: observations of a landmark.
-        mean_reprojection_error_px: mean over the landmarks.
-        median_distance_to_mesh_cm: median distance from a landmark to the mesh.
-        p90_distance_to_mesh_cm: 90th percentile of the same.
-        walk_length_m: length of the walk.
-        coverage: share of the reachable floor that the walk visits.
-        visit_radius_m: walking distance from the walk within which floor counts as visited.
-        seed: seed of the walk and of COLMAP.
-        config: the configuration, as a dictionary.
-        seconds: wall-clock time of each step.
-    """
-
-    n_images: int
-    n_registered: int
-    n_keypoints: int
-    n_pairs: int
-    n_landmarks: int
-    n_landmarks_removed: int
-    median_track_length: float
-    mean_reprojection_error_px: float
-    median_distance_to_mesh_cm: float
-    p90_distance_to_mesh_cm: float
-    walk_length_m: float
-    coverage: float
-    visit_radius_m: float
-    seed: int
-    config: dict[str, Any]
-    seconds: dict[str, float]
+    n_images: int  # images rendered
+    n_registered: int  # images that see a landmark
+    n_keypoints: int  # keypoints of all images
+    n_pairs: int  # pairs of images matched
+    n_landmarks: int  # landmarks after the filter
+    n_landmarks_removed: int  # points the filter removed
+    median_track_length: float  # observations of a landmark
+    mean_reprojection_error_px: float  # mean over the landmarks
+    median_distance_to_mesh_cm: float  # median distance from a landmark to the mesh
+    p90_distance_to_mesh_cm: float  # 90th percentile of the same
+    walk_length_m: float  # length of the walk
+    coverage: float  # share of the reachable floor that the walk visits
+    visit_radius_m: float  # walking distance from the walk within which floor counts as visited
+    seed: int  # seed of the walk and of COLMAP
+    config: dict[str, Any]  # the configuration, as a dictionary
+    seconds: dict[str, float]  # wall-clock time of each step
 
 
 def build_map(
@@ -94,10 +76,10 @@ def build_map(
 ) -> MapReport:
     """Map a scene: walk, render, extract, match, triangulate with known poses, filter.
 
-    The result is a COLMAP model (binary) that any COLMAP tool opens, with `landmarks.npz`, `cameras.npz`
-    and `report.json` beside it.
-    The model holds the filtered points only, so that every reader sees the same map. The folder appears when all is
-    done; an interrupted or failed build leaves nothing and does not touch an earlier map.
+    The result is a COLMAP model (binary) that any COLMAP tool opens, with `landmarks.npz`, `cameras.npz` and
+    `report.json`, which is also returned, beside it. The model holds the filtered points only, so that every reader
+    gets the same map. The folder appears when all is done; an interrupted or failed build leaves nothing behind and
+    does not touch an earlier map.
 
     Args:
         mesh: the scene, metres, z up.
@@ -113,9 +95,6 @@ def build_map(
         device: where keypoints are extracted, "cpu" or a CUDA device.
         progress: show progress bars.
 
-    Returns:
-        The content of `report.json`.
-
     Raises:
         MapError: the images give no landmark, or `out_dir` holds something that is not a map.
         SceneError: there is no floor to walk on.
@@ -127,39 +106,28 @@ def build_map(
             walk = plan_walk(free_space, mesh.bounds, config.n_images, config.walk, seed)
             poses = poses_looking_along(walk.positions, walk.directions)
         with clock("render_and_extract"):
-            keypoints, colors, depth_m = _render_and_extract(
-                renderer, camera, poses, config, partial, processes, progress, device
-            )
+            depth: list[NDArray[np.float32]] = []
+            images = _rendered(renderer, camera, poses, depth, partial / IMAGES_FOLDER if config.keep_images else None)
+            extractor = KeypointExtractor(config.extractor, device)
+            extracted = extract_with_colors(extractor, images, len(poses), processes, "map: render, extract", progress)
+            keypoints, colors = zip(*extracted, strict=True)
         with clock("pairs"):
-            pairs = choose_pairs(surface_overlap(camera, poses, depth_m), config.partners)
+            pairs = choose_pairs(surface_overlap(camera, poses, np.stack(depth)), config.partners)
         database = partial / DATABASE_FILE
-        model = triangulate_known_poses(
-            database,
-            camera,
-            poses,
-            keypoints,
-            colors,
-            pairs,
-            clock,
-            max_epipolar_error_px=config.max_epipolar_error_px,
-            min_triangulation_angle_deg=config.min_triangulation_angle_deg,
-            two_view_landmarks=config.two_view_landmarks,
-            seed=seed,
-            processes=processes,
-            progress=progress,
-        )
+        views = camera, poses, keypoints, colors
+        model = triangulate_known_poses(database, *views, pairs, config, clock, seed, processes, progress)
         with clock("filter_and_write"):
-            n_removed = remove_inaccurate(
-                model, config.max_reprojection_error_px, out_dir,
-                fix="Map with more images (n_images), or check that the scene has texture.",
-            )  # fmt: skip
+            fix = "Map with more images (n_images), or check that the scene has texture."
+            n_removed = remove_inaccurate(model, config.max_reprojection_error_px, out_dir, fix)
             model.write_binary(str(partial))
         with clock("landmarks"):
-            landmarks = load_colmap_landmarks(partial, database, config.max_reprojection_error_px)
-            landmarks.save(partial / LANDMARKS_FILE)
-            save_mapping_poses(colmap_poses(partial), partial / CAMERAS_FILE)
+            landmarks = save_landmarks(partial, database, config.max_reprojection_error_px)
         with clock("accuracy"):
-            distance_cm = _surface_distance_cm(landmarks, mesh, raycaster)
+            from wheretolook.rendering.raycasting import MeshRaycaster
+
+            farthest_m = float(np.linalg.norm(mesh.bounds[1] - mesh.bounds[0]))
+            caster = raycaster or MeshRaycaster(mesh)
+            distance_cm = 100.0 * caster.distance_to_surface(landmarks.points, farthest_m).astype(np.float64)
         if not config.keep_database:
             database.unlink()
         report = MapReport(
@@ -187,16 +155,23 @@ def build_map(
 def refuse_foreign_folder(out_dir: Path) -> None:
     """Raise MapError if a folder, or a file in its place, holds anything but a map built here."""
     if out_dir.exists() and not (out_dir / REPORT_FILE).is_file() and (not out_dir.is_dir() or any(out_dir.iterdir())):
-        raise MapError(
-            "will not be replaced: it is not a map built here", path=out_dir, fix="Give another folder, or remove it."
-        )
+        problem, fix = "will not be replaced: it is not a map built here", "Give another folder, or remove it."
+        raise MapError(problem, path=out_dir, fix=fix)
+
+
+def save_landmarks(folder: Path, database: Path, max_reprojection_error_px: float) -> Landmarks:
+    """Write the landmarks and the mapping images' poses of the COLMAP model in a folder beside it."""
+    landmarks = load_colmap_landmarks(folder, database, max_reprojection_error_px)
+    landmarks.save(folder / LANDMARKS_FILE)
+    save_mapping_poses(colmap_poses(folder), folder / CAMERAS_FILE)
+    return landmarks
 
 
 def remove_inaccurate(model: Any, max_reprojection_error_px: float, out_dir: Path, fix: str) -> int:
-    """Remove a reconstruction's points with a larger mean reprojection error. Returns how many.
+    """Remove the points of a reconstruction with a larger mean reprojection error. Returns how many.
 
     Raises:
-        MapError: none is left.
+        MapError: no point is left.
     """
     errors = {i: point.error for i, point in model.points3D.items()}
     removed = [i for i, error in errors.items() if not error <= max_reprojection_error_px]
@@ -209,7 +184,7 @@ def remove_inaccurate(model: Any, max_reprojection_error_px: float, out_dir: Pat
 
 
 class Clock:
-    """Wall-clock time of each step, `seconds`."""
+    """Times the steps of a map: `with clock("step"):`. Wall-clock times by step are in `seconds`."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
@@ -239,54 +214,52 @@ def partial_folder(out_dir: Path) -> Iterator[Path]:
         raise
 
 
-def _render_and_extract(
+def extract_with_colors(
+    extractor: KeypointExtractor,
+    images: Iterable[NDArray[np.uint8]],
+    n_images: int,
+    processes: Processes,
+    title: str,
+    progress: bool,
+    same_size: bool = True,
+) -> Iterator[tuple[Keypoints, NDArray[np.uint8]]]:
+    """Keypoints of images (H, W, 3) uint8, in their order, and the colours (N, 3) uint8 at them.
+
+    The images are made while others are worked on. A GPU works on batches if all are of the same size.
+    """
+    waiting: deque[NDArray[np.uint8]] = deque()
+
+    def remembered() -> Iterator[NDArray[np.uint8]]:
+        for rgb in images:
+            waiting.append(rgb)
+            yield rgb
+
+    if extractor.on_gpu and not same_size:
+        extracted: Generator[Keypoints, None, None] = (extractor.extract(rgb) for rgb in remembered())
+    else:
+        extracted = extractor.extract_many(remembered(), processes)
+    with closing(extracted):
+        for keypoints in tqdm(extracted, title, total=n_images, disable=not progress, unit="image"):
+            rgb = waiting.popleft()
+            column, row = keypoints.pixels.astype(np.int64).T
+            yield keypoints, rgb[np.clip(row, 0, rgb.shape[0] - 1), np.clip(column, 0, rgb.shape[1] - 1)]
+
+
+def _rendered(
     renderer: Renderer,
     camera: PinholeCamera,
     poses: NDArray[np.floating[Any]],
-    config: MapConfig,
-    partial: Path,
-    processes: Processes,
-    progress: bool,
-    device: str,
-) -> tuple[list[Keypoints], list[NDArray[np.uint8]], NDArray[np.float32]]:
-    """Keypoints and their colours, image by image, and shrunk depth (I, h, w). Rendering overlaps with extraction."""
-    depth: list[NDArray[np.float32]] = []
-    waiting: list[NDArray[np.uint8]] = []
-
-    def images() -> Iterator[NDArray[np.uint8]]:
-        for start in range(0, len(poses), _RENDER_BATCH):
-            rendering = renderer.render(camera, poses[start : start + _RENDER_BATCH])
-            depth.extend(shrink_depth(rendering.depth_m))
-            for offset, rgb in enumerate(rendering.rgb):
-                if config.keep_images:
-                    _write_png(partial / IMAGES_FOLDER / image_name(start + offset), rgb)
-                waiting.append(rgb)
-                yield rgb
-
-    extracted = KeypointExtractor(config.extractor, device).extract_many(images(), processes)
-    keypoints, colors = [], []
-    with closing(extracted):
-        for found in tqdm(extracted, "map: render, extract", total=len(poses), disable=not progress, unit="image"):
-            column, row = found.pixels.astype(np.int64).T
-            rgb = waiting.pop(0)
-            colors.append(rgb[np.clip(row, 0, camera.height - 1), np.clip(column, 0, camera.width - 1)])
-            keypoints.append(found)
-    return keypoints, colors, np.stack(depth)
-
-
-def _write_png(path: Path, rgb: NDArray[np.uint8]) -> None:
+    depth: list[NDArray[np.float32]],
+    keep_in: Path | None,
+) -> Iterator[NDArray[np.uint8]]:
+    """Images (H, W, 3) of poses (I, 3, 4), written to a folder if one is given. Adds their shrunk depth to `depth`."""
     import cv2
 
-    path.parent.mkdir(exist_ok=True)
-    cv2.imwrite(str(path), cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
-
-
-def _surface_distance_cm(
-    landmarks: Landmarks, mesh: TexturedMesh, raycaster: MeshRaycaster | None
-) -> NDArray[np.float64]:
-    if raycaster is None:
-        from wheretolook.rendering.raycasting import MeshRaycaster
-
-        raycaster = MeshRaycaster(mesh)
-    farthest_m = float(np.linalg.norm(mesh.bounds[1] - mesh.bounds[0]))
-    return 100.0 * raycaster.distance_to_surface(landmarks.points, farthest_m).astype(np.float64)
+    for start in range(0, len(poses), _RENDER_BATCH):
+        rendering = renderer.render(camera, poses[start : start + _RENDER_BATCH])
+        depth.extend(shrink_depth(rendering.depth_m))
+        for offset, rgb in enumerate(rendering.rgb):
+            if keep_in is not None:
+                keep_in.mkdir(exist_ok=True)
+                cv2.imwrite(str(keep_in / image_name(start + offset)), cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
+            yield rgb

@@ -1,8 +1,7 @@
-"""Where a map's images were taken from and where they looked: small enough to travel without the COLMAP model."""
+"""Poses of the images that a map was made from, in a file small enough to travel without the COLMAP model."""
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,20 +10,18 @@ import numpy as np
 from wheretolook.geometry.poses import Float
 from wheretolook.mapping.colmap_model import MODEL_FILES, read_model
 from wheretolook.utils.errors import MapError
+from wheretolook.utils.npz_files import load_npz, save_npz
 
 if TYPE_CHECKING:
     import pycolmap
 
-CAMERAS_FILE = "cameras.npz"
-"""Lies beside the landmarks."""
+CAMERAS_FILE = "cameras.npz"  # lies beside the landmarks
 
 
 def colmap_poses(model_dir: str | Path, reconstruction: pycolmap.Reconstruction | None = None) -> Float:
     """Poses cam_from_world (M, 3, 4) float64 of the images of a COLMAP model that have one, in the order of their ids.
 
-    Args:
-        model_dir: folder of the model.
-        reconstruction: the model, if it has been read already.
+    The model is read from its folder unless the reconstruction is given.
 
     Raises:
         MapError: the folder or a file is missing or corrupt, or no image has a pose.
@@ -43,11 +40,7 @@ def holds_model(folder: Path) -> bool:
 
 def save_mapping_poses(cam_from_world: Float, path: str | Path) -> None:
     """Write poses (M, 3, 4) in single precision as an NPZ file, atomically. The same poses give the same bytes."""
-    path = Path(path)
-    partial = path.with_name(path.name + ".partial")
-    with partial.open("wb") as file:
-        np.savez(file, cam_from_world=np.asarray(cam_from_world, dtype=np.float32))
-    os.replace(partial, path)
+    save_npz(Path(path), {"cam_from_world": np.asarray(cam_from_world, dtype=np.float32)})
 
 
 def load_mapping_poses(path: str | Path) -> Float:
@@ -60,9 +53,8 @@ def load_mapping_poses(path: str | Path) -> Float:
     if not path.is_file():
         raise MapError("there is no file of the mapping images' poses", path=path, fix="Run the map stage again.")
     try:
-        with np.load(path) as stored:
-            poses = stored["cam_from_world"]
-    except Exception as error:  # a damaged zip raises many kinds of errors
+        poses = load_npz(path)["cam_from_world"]
+    except (ValueError, KeyError) as error:
         raise MapError(f"cannot read the mapping images' poses: {error}", path=path, fix=fix) from error
     if poses.ndim != 3 or poses.shape[1:] != (3, 4) or not len(poses) or not np.isfinite(poses).all():
         raise MapError("these are no poses of mapping images", path=path, value=poses.shape, fix=fix)

@@ -1,4 +1,4 @@
-"""Reading COLMAP models into arrays, with errors that say what is wrong with a file."""
+"""Reads COLMAP models into arrays, with errors that say what is wrong with a file."""
 
 from __future__ import annotations
 
@@ -15,43 +15,28 @@ from wheretolook.utils.errors import MapError
 
 MODEL_FILES = ("cameras", "images", "points3D")
 _REBUILD = "Copy or build the model again."
-# Bytes an entry needs at least: an empty name, no 2D points, no track, a rig of one sensor, a frame of one image.
+# The least bytes of an entry: an image with an empty name and no 2D points, a rig of one sensor, a frame of one image.
 _LEAST_BYTES = {"images.bin": 73, "rigs.bin": 8, "frames.bin": 68}
 _POINT_BYTES = 51  # id, position, colour, error, track length; the track's elements follow
 
 
 @dataclass(frozen=True, eq=False)
 class ModelArrays:
-    """A reconstruction as arrays. Points are sorted by id, observations by point and then as in the point's track.
+    """A reconstruction as arrays. Points are sorted by id, observations by point and then as in the point's track."""
 
-    Attributes:
-        point_ids: (P,) int64.
-        points: (P, 3) float64, world.
-        errors_px: (P,) float64, mean reprojection error.
-        image_ids: (I,) int64, ascending.
-        image_names: I names.
-        image_centers: (I, 3) float64, camera centres in the world.
-        observation_start: (P + 1,) int64; observations start[i] to start[i + 1] belong to point i.
-        observation_image: (O,) int64, row in `image_ids`.
-        observation_keypoint: (O,) int64, index of the keypoint in its image.
-    """
-
-    point_ids: NDArray[np.int64]
-    points: NDArray[np.float64]
-    errors_px: NDArray[np.float64]
-    image_ids: NDArray[np.int64]
-    image_names: list[str]
-    image_centers: NDArray[np.float64]
-    observation_start: NDArray[np.int64]
-    observation_image: NDArray[np.int64]
-    observation_keypoint: NDArray[np.int64]
+    point_ids: NDArray[np.int64]  # (P,)
+    points: NDArray[np.float64]  # (P, 3) world
+    errors_px: NDArray[np.float64]  # (P,) mean reprojection error
+    image_ids: NDArray[np.int64]  # (I,) ascending
+    image_names: list[str]  # I names
+    image_centers: NDArray[np.float64]  # (I, 3) camera centres in the world
+    observation_start: NDArray[np.int64]  # (P + 1,); observations start[i] to start[i + 1] belong to point i
+    observation_image: NDArray[np.int64]  # (O,) row in `image_ids`
+    observation_keypoint: NDArray[np.int64]  # (O,) index of the keypoint in its image
 
 
 def read_model(model_dir: str | Path) -> Any:
-    """Read a COLMAP model, binary or text, with or without the rigs and frames of COLMAP 3.12 and later.
-
-    Returns:
-        A `pycolmap.Reconstruction`.
+    """Read a COLMAP model as a `pycolmap.Reconstruction`, binary or text, with or without rigs and frames (3.12).
 
     Raises:
         MapError: the folder or a file is missing, or a file is truncated or corrupt.
@@ -60,23 +45,17 @@ def read_model(model_dir: str | Path) -> Any:
 
     folder = Path(model_dir)
     if not folder.is_dir():
-        raise MapError(
-            "there is no such folder",
-            path=folder,
-            fix="Give the folder that holds cameras.bin, images.bin and points3D.bin.",
-        )
+        fix = "Give the folder that holds cameras.bin, images.bin and points3D.bin."
+        raise MapError("there is no such folder", path=folder, fix=fix)
     suffix = next((s for s in (".bin", ".txt") if any((folder / (n + s)).is_file() for n in MODEL_FILES)), None)
     if suffix is None:
-        raise MapError(
-            "no COLMAP model here",
-            path=folder,
-            fix="Give the folder that holds cameras, images and points3D (.bin or .txt).",
-        )
+        fix = "Give the folder that holds cameras, images and points3D (.bin or .txt)."
+        raise MapError("no COLMAP model here", path=folder, fix=fix)
     for name in MODEL_FILES:
         if not (folder / (name + suffix)).is_file():
             raise MapError("a file of the COLMAP model is missing", path=folder / (name + suffix), fix=_REBUILD)
     if suffix == ".bin":
-        # pycolmap takes a count from whatever is there and may then read for ever.
+        # From a damaged file pycolmap may read a count so large that it does not come back.
         for name, least in _LEAST_BYTES.items():
             _check_count(folder / name, least)
         _check_points(folder / "points3D.bin")
@@ -107,9 +86,8 @@ def model_arrays(reconstruction: Any) -> ModelArrays:
     image_ids = np.array(sorted(i for i, image in reconstruction.images.items() if image.has_pose), dtype=np.int64)
     images = [reconstruction.images[i] for i in image_ids]
     tracks = [p.track.elements for p in ordered]
-    observations = np.array([(e.image_id, e.point2D_idx) for track in tracks for e in track], dtype=np.int64).reshape(
-        -1, 2
-    )
+    elements = [(element.image_id, element.point2D_idx) for track in tracks for element in track]
+    observations = np.array(elements, dtype=np.int64).reshape(-1, 2)
     if not np.isin(observations[:, 0], image_ids).all():
         raise MapError("points were observed by images without a pose", fix=_REBUILD)
     return ModelArrays(
@@ -137,9 +115,8 @@ def read_descriptors(
 
     path = Path(database)
     if not path.is_file():
-        raise MapError(
-            "there is no such database", path=path, fix="Give the database.db the model was built from, or none."
-        )
+        fix = "Give the database.db the model was built from, or none."
+        raise MapError("there is no such database", path=path, fix=fix)
     mismatch = f"Give the database that {model_dir} was built from, or none."
     descriptors = []
     try:
@@ -154,13 +131,10 @@ def read_descriptors(
                 if len(keypoints) != image.num_points2D() or len(values) != image.num_points2D():
                     problem = f"the database and the model disagree on the number of keypoints of {name}"
                     raise MapError(problem, path=path, value=(len(values), image.num_points2D()), fix=mismatch)
-                if (
-                    len(keypoints)
-                    and np.abs(keypoints[[0, -1], :2] - [image.points2D[0].xy, image.points2D[-1].xy]).max() > 0.01
-                ):
-                    raise MapError(
-                        "the database holds other keypoints than the model", path=path, value=name, fix=mismatch
-                    )
+                ends = [image.points2D[0].xy, image.points2D[-1].xy] if len(keypoints) else []
+                if len(keypoints) and np.abs(keypoints[[0, -1], :2] - ends).max() > 0.01:
+                    problem = "the database holds other keypoints than the model"
+                    raise MapError(problem, path=path, value=name, fix=mismatch)
                 if values.ndim != 2 or values.shape[1] != 128 or values.dtype != np.uint8:
                     raise MapError("the descriptors are not SIFT", path=path, value=values.shape, fix=mismatch)
                 descriptors.append(values)

@@ -1,4 +1,4 @@
-"""Which way is up in a map, from how its photographs were held."""
+"""Which way is up in a map of photographs, from how the camera was held."""
 
 from __future__ import annotations
 
@@ -11,42 +11,32 @@ from numpy.typing import ArrayLike
 from wheretolook.geometry.poses import Float
 
 _ITERATIONS = 50
-_SOFT = np.sin(np.radians(0.5))  # residuals below count like this one, so that weights stay finite
-_LEAST_TURN = np.sin(np.radians(5.0))
-_CLEARLY = 3.0
+_SOFT = np.sin(np.radians(0.5))  # smaller residuals count like this one, so that weights stay finite
+_LEAST_TURN = np.sin(np.radians(5.0))  # spread of the x axes within the level plane that fixes the plane
+_CLEARLY = 3.0  # how many times their spread across the plane that must be
 
 
 @dataclass(frozen=True, eq=False)
 class Gravity:
-    """The direction up, and how well the photographs agree on it.
+    """The direction up, and how well the photographs agree on it."""
 
-    Attributes:
-        up: (3,) unit vector in the frame of the poses.
-        method: "level" when up is the direction most nearly at right angles to the images' x axes; "mean" when the
-            cameras turned too little for that and it is the mean of the images' own; "given" when a direction in the
-            cameras was given.
-        residual_deg: (M,) how far each photograph is off: its roll for "level", else the angle between its up and `up`.
-    """
-
-    up: Float
+    up: Float  # (3,) unit vector in the frame of the poses
+    # "level": the direction most nearly at right angles to the images' x axes. "mean": the cameras turned too little
+    # for that, so it is the mean of the images' own up directions. "given": the direction in the camera was given.
     method: Literal["level", "mean", "given"]
-    residual_deg: Float
+    residual_deg: Float  # (M,) of each photograph: its roll for "level", else the angle between its own up and `up`
 
     @property
     def rotation(self) -> Float:
-        """(3, 3), the least rotation that takes `up` to z."""
+        """(3, 3), the smallest rotation that takes `up` to z."""
         return rotation_to_z(self.up)
 
 
 def estimate_gravity(cam_from_world: ArrayLike, up_in_camera: tuple[float, float, float] | None = None) -> Gravity:
-    """Estimate the direction up from poses (M, 3, 4).
+    """Estimate the direction up from poses (M, 3, 4), or from up in every camera's frame if that is known.
 
-    People tilt a camera up and down at will but hardly roll it: the images' x axes are level, so up is the direction d
-    of least sum |x . d|, which a minority of rolled photographs does not move. Iteratively reweighted least squares.
-
-    Args:
-        cam_from_world: poses of the photographs.
-        up_in_camera: up in every camera's frame, if it is known; any length.
+    People tilt a camera up and down but hardly roll it: the images' x axes are level. So up is the direction d with the
+    least sum of |x . d|, which a minority of rolled photographs does not move. Iteratively reweighted least squares.
     """
     rotation = np.asarray(cam_from_world, dtype=np.float64)[:, :, :3]
     direction = np.array([0.0, -1.0, 0.0]) if up_in_camera is None else np.asarray(up_in_camera, dtype=np.float64)
@@ -62,7 +52,7 @@ def estimate_gravity(cam_from_world: ArrayLike, up_in_camera: tuple[float, float
 
 
 def rotation_to_z(up: ArrayLike) -> Float:
-    """The least rotation (3, 3) that takes a direction (3,) to z; about x when it points down."""
+    """The smallest rotation (3, 3) that takes a direction (3,) to z; about x if it points straight down."""
     a = np.asarray(up, dtype=np.float64)
     x, y, z = a / np.linalg.norm(a)
     if z < -1 + 1e-12:
@@ -73,7 +63,7 @@ def rotation_to_z(up: ArrayLike) -> Float:
 
 
 def _level_direction(axes: Float) -> Float | None:
-    """The direction most nearly at right angles to unit axes (M, 3); None if they leave it open."""
+    """The direction most nearly at right angles to unit axes (M, 3); None if they do not determine it."""
     weights = np.ones(len(axes))
     for _ in range(_ITERATIONS):
         values, vectors = np.linalg.eigh((axes.T * weights) @ axes / weights.sum())
@@ -83,7 +73,7 @@ def _level_direction(axes: Float) -> Float | None:
 
 
 def _median_direction(directions: Float) -> Float:
-    """The unit vector of least sum of angles to unit vectors (M, 3), about: Weiszfeld's iteration on the sphere."""
+    """The unit vector with about the least sum of angles to unit vectors (M, 3): Weiszfeld's iteration on a sphere."""
     at: Float = directions.mean(0)
     for _ in range(_ITERATIONS):
         at = at / max(float(np.linalg.norm(at)), 1e-12)

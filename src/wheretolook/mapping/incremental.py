@@ -1,4 +1,4 @@
-"""Poses and points of photographs by COLMAP's incremental mapping, step by step: a finished step is not done again."""
+"""Poses and points of photographs by COLMAP's incremental mapping. Finished steps are kept and not done again."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import json
 import os
 import shutil
 from collections.abc import Iterator
-from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from tqdm.auto import tqdm
 
 from wheretolook.features.extraction import KeypointExtractor
 from wheretolook.features.keypoints import ExtractorConfig
+from wheretolook.mapping.building import extract_with_colors
 from wheretolook.mapping.colmap_model import read_model
 from wheretolook.mapping.photographs import (
     PhotographCameras,
@@ -29,47 +29,32 @@ from wheretolook.mapping.photographs import (
 from wheretolook.mapping.triangulation import Stored, fill_database, match_pairs, stored_keypoints
 from wheretolook.utils.colmap import quiet_colmap
 from wheretolook.utils.errors import MapError
+from wheretolook.utils.npz_files import load_npz, save_npz
 from wheretolook.utils.processes import Processes
 
-_LEAST_IMAGES = 3  # of a model: two photographs alone fix no camera
-_VERSION = 1  # of what is kept of the steps
+_LEAST_IMAGES = 3  # of a model: two photographs alone do not determine a camera
+_VERSION = 1  # of the format in which finished steps are kept
 
 
 @dataclass(frozen=True, eq=False)
 class PhotographFeatures:
-    """Keypoints of photographs.
+    """Keypoints of photographs."""
 
-    Attributes:
-        names: of the I photographs, relative to their folder.
-        full_sizes: (I, 2) int64, width and height as taken, upright.
-        sizes: (I, 2) int64, width and height as mapped.
-        stored: pixels and descriptors of each photograph's keypoints.
-        colors: (N_i, 3) uint8 of each photograph's keypoints.
-        key: changes with all that the keypoints depend on.
-    """
-
-    names: list[str]
-    full_sizes: NDArray[np.int64]
-    sizes: NDArray[np.int64]
-    stored: list[Stored]
-    colors: list[NDArray[np.uint8]]
-    key: str
+    names: list[str]  # of the I photographs, relative to their folder
+    full_sizes: NDArray[np.int64]  # (I, 2) width and height as taken, upright
+    sizes: NDArray[np.int64]  # (I, 2) width and height as mapped
+    stored: list[Stored]  # pixels and descriptors of each photograph's keypoints
+    colors: list[NDArray[np.uint8]]  # (N_i, 3) uint8 of each photograph's keypoints
+    key: str  # changes whenever something changes that the keypoints depend on
 
 
 @dataclass(frozen=True, eq=False)
 class MappedPhotographs:
-    """What incremental mapping made of photographs.
+    """The result of incremental mapping."""
 
-    Attributes:
-        model: the largest `pycolmap.Reconstruction`, in a frame and a scale of its own. Image i of the names has id
-            i + 1.
-        database: COLMAP's database of keypoints and verified matches.
-        model_sizes: photographs in each model, the largest first.
-    """
-
-    model: Any
-    database: Path
-    model_sizes: list[int]
+    model: Any  # the largest `pycolmap.Reconstruction`, in a frame and scale of its own; photograph i has the id i + 1
+    database: Path  # COLMAP's database of keypoints and verified matches
+    model_sizes: list[int]  # photographs in each model, the largest first
 
 
 def photograph_features(
@@ -91,13 +76,12 @@ def photograph_features(
     key, path = _key([files, max_side_px, asdict(extractor)]), work / "features.npz"
     kept = _load(path, key)
     if kept is None:
-        kept = _extract(folder, names, max_side_px, extractor, processes, device, progress)
-        _save(path, key, kept)
+        kept = _extract(folder, names, max_side_px, KeypointExtractor(extractor, device), processes, progress)
+        save_npz(path, {"key": np.array(key), **kept})
     ends = np.cumsum(kept["counts"])[:-1]
     pixels, descriptors, colors = (np.split(kept[name], ends) for name in ("pixels", "descriptors", "colors"))
-    return PhotographFeatures(
-        names, kept["full_sizes"], kept["sizes"], list(zip(pixels, descriptors, strict=True)), colors, key
-    )
+    stored = list(zip(pixels, descriptors, strict=True))
+    return PhotographFeatures(names, kept["full_sizes"], kept["sizes"], stored, colors, key)
 
 
 def map_incrementally(
@@ -112,15 +96,8 @@ def map_incrementally(
 ) -> MappedPhotographs:
     """Match photographs, verify the matches, and map incrementally (Schonberger and Frahm, CVPR 2016).
 
-    Args:
-        work: folder where finished steps are kept.
-        features: keypoints of the photographs.
-        cameras: intrinsics to start from, or to keep.
-        exhaustive_up_to: see `photograph_pairs`.
-        overlap: see `photograph_pairs`.
-        seed: of COLMAP's sampling.
-        processes: match; COLMAP's bundle adjustment takes as many threads.
-        progress: show progress bars.
+    Finished steps are kept in `work`. For `exhaustive_up_to` and `overlap` see `photograph_pairs`. The processes match;
+    COLMAP's bundle adjustment takes as many threads.
 
     Raises:
         MapError: the photographs do not overlap enough for any map.
@@ -132,7 +109,7 @@ def map_incrementally(
     if kept is None:
         matches = list(match_pairs(features.stored, pairs, work, processes, progress))
         kept = {"matches": np.concatenate(matches), "counts": np.array([len(found) for found in matches])}
-        _save(work / "matches.npz", key, kept)
+        save_npz(work / "matches.npz", {"key": np.array(key), **kept})
     intrinsics = [camera.todict() for camera in cameras.cameras]
     key = _key([key, intrinsics, cameras.camera_of.tolist(), cameras.given, seed])
     database, folder, note = work / "database.db", work / "sparse", work / "sparse.json"
@@ -148,43 +125,29 @@ def map_incrementally(
 
 
 def _extract(
-    folder: Path, names: list[str], max_side_px: int, config: ExtractorConfig, processes: Processes, device: str,
-    progress: bool,
-) -> dict[str, NDArray[Any]]:  # fmt: skip
-    extractor = KeypointExtractor(config, device)
-    full_sizes, sizes, pixels, descriptors, colors = [], [], [], [], []
-    waiting: list[NDArray[np.uint8]] = []
+    folder: Path, names: list[str], max_side_px: int, extractor: KeypointExtractor, processes: Processes, progress: bool
+) -> dict[str, NDArray[Any]]:
+    full_sizes, sizes, counts, pixels, descriptors, colors = [], [], [], [], [], []
 
     def photographs() -> Iterator[NDArray[np.uint8]]:
         for name in names:
             rgb = read_photograph(folder / name)
+            reduced = reduce_photograph(rgb, max_side_px)
             full_sizes.append(rgb.shape[1::-1])
-            waiting.append(reduce_photograph(rgb, max_side_px))
-            sizes.append(waiting[-1].shape[1::-1])
-            yield waiting[-1]
+            sizes.append(reduced.shape[1::-1])
+            yield reduced
 
-    # one at a time on a GPU: its batches are of images of one size
-    extracted = (
-        (extractor.extract(rgb) for rgb in photographs())
-        if extractor.on_gpu
-        else extractor.extract_many(photographs(), processes)
-    )
-    with closing(extracted):
-        for found in tqdm(extracted, "map: extract", total=len(names), disable=not progress, unit="image"):
-            rgb = waiting.pop(0)
-            column, row = found.pixels.astype(np.int64).T
-            colors.append(rgb[np.clip(row, 0, rgb.shape[0] - 1), np.clip(column, 0, rgb.shape[1] - 1)])
-            stored = stored_keypoints(found)
-            pixels.append(stored[0])
-            descriptors.append(stored[1])
-    return {
-        "full_sizes": np.array(full_sizes, dtype=np.int64),
-        "sizes": np.array(sizes, dtype=np.int64),
-        "counts": np.array([len(one) for one in pixels]),
-        "pixels": np.concatenate(pixels),
-        "descriptors": np.concatenate(descriptors),
-        "colors": np.concatenate(colors),
-    }
+    n = len(names)
+    extracted = extract_with_colors(extractor, photographs(), n, processes, "map: extract", progress, same_size=False)
+    for keypoints, color in extracted:
+        counts.append(len(keypoints))
+        stored = stored_keypoints(keypoints)
+        pixels.append(stored[0])
+        descriptors.append(stored[1])
+        colors.append(color)
+    parts: dict[str, list[NDArray[Any]]] = {"pixels": pixels, "descriptors": descriptors, "colors": colors}
+    joined = {name: np.concatenate(values) for name, values in parts.items()}
+    return {"full_sizes": np.array(full_sizes), "sizes": np.array(sizes), "counts": np.array(counts), **joined}
 
 
 def _fill(
@@ -194,7 +157,7 @@ def _fill(
     pairs: NDArray[np.int64],
     matches: list[NDArray[np.uint32]],
 ) -> None:
-    """Make a database of photographs without poses, with their matches."""
+    """Make a COLMAP database of photographs without poses, and write their matches into it."""
     import pycolmap
 
     model = pycolmap.Reconstruction()
@@ -212,16 +175,15 @@ def _fill(
 def _reconstruct(
     database: Path, folder: Path, n_images: int, given: bool, seed: int, processes: Processes, progress: bool
 ) -> list[int]:
-    """Verify matches, map, and write the largest model. Returns the photographs in each, the largest first."""
+    """Verify matches, map, and write the largest model. Returns the number of photographs in each, largest first."""
     import pycolmap
 
     threads = processes.workers
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
-    options = pycolmap.IncrementalPipelineOptions(
-        random_seed=seed, num_threads=threads, extract_colors=False, min_model_size=_LEAST_IMAGES,
-        ba_refine_focal_length=not given, ba_refine_extra_params=not given,
-    )  # fmt: skip
+    options = pycolmap.IncrementalPipelineOptions(random_seed=seed, num_threads=threads, extract_colors=False)
+    options.min_model_size = _LEAST_IMAGES
+    options.ba_refine_focal_length = options.ba_refine_extra_params = not given
     options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = not given
     options.triangulation.random_seed = options.mapper.random_seed = seed
     options.mapper.num_threads = threads
@@ -229,26 +191,24 @@ def _reconstruct(
     models = folder.with_name("models.partial")
     shutil.rmtree(models, ignore_errors=True)
     models.mkdir()
-    with (
-        quiet_colmap("ERROR"),
-        tqdm(total=n_images, desc="map: register", disable=not progress, unit="image") as bar,
-    ):
-        pycolmap.geometric_verification(
-            str(database), pycolmap.GeometricVerifierOptions(num_threads=threads),
-            two_view_geometry_options=verification,
-        )  # fmt: skip
-        found = pycolmap.incremental_mapping(
-            str(database), str(models), str(models), options,
-            initial_image_pair_callback=lambda: bar.update(2), next_image_callback=lambda: bar.update(1),
-        )  # fmt: skip
+    bar = tqdm(total=n_images, desc="map: register", disable=not progress, unit="image")
+    callbacks: dict[str, Any] = {
+        "initial_image_pair_callback": lambda: bar.update(2),
+        "next_image_callback": lambda: bar.update(1),
+    }
+    with quiet_colmap("ERROR"), bar:
+        verifier = pycolmap.GeometricVerifierOptions(num_threads=threads)
+        pycolmap.geometric_verification(str(database), verifier, two_view_geometry_options=verification)
+        found = pycolmap.incremental_mapping(str(database), str(models), str(models), options, **callbacks)
     ordered = sorted(found.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
     shutil.rmtree(models)
     if not ordered:
-        raise MapError(
-            "the photographs do not overlap enough for a map", value=f"{n_images} photographs, none placed",
-            fix=f"Give at least {_LEAST_IMAGES} sharp photographs that share most of what they show with the next, "
-            "from different places; a focal length (map.photographs.camera_params) helps.",
-        )  # fmt: skip
+        fix = (
+            f"Give at least {_LEAST_IMAGES} sharp photographs that share most of what they show with the next, "
+            "from different places; a focal length (map.photographs.camera_params) helps."
+        )
+        value = f"{n_images} photographs, none placed"
+        raise MapError("the photographs do not overlap enough for a map", value=value, fix=fix)
     models.mkdir()
     ordered[0].write_binary(str(models))
     os.replace(models, folder)
@@ -270,16 +230,7 @@ def _note(path: Path) -> dict[str, Any]:
 def _load(path: Path, key: str) -> dict[str, NDArray[Any]] | None:
     """Arrays of a finished step; None if it was not finished, or from other inputs."""
     try:
-        with np.load(path) as stored:
-            kept = {name: stored[name] for name in stored.files}
-    except Exception:  # a damaged zip raises many kinds of errors, and is then made anew
+        kept = load_npz(path)
+    except ValueError:
         return None
     return kept if str(kept.pop("key", "")) == key else None
-
-
-def _save(path: Path, key: str, arrays: dict[str, NDArray[Any]]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
-    with partial.open("wb") as file:
-        np.savez(file, **{"key": np.array(key), **arrays})  # type: ignore[arg-type]  # its stub takes a flag by name
-    os.replace(partial, path)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import os
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,44 +14,31 @@ from wheretolook.features.keypoints import quantize_descriptors, unit_descriptor
 from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 from wheretolook.mapping.colmap_model import ModelArrays, model_arrays, read_descriptors, read_model
 from wheretolook.utils.errors import MapError
+from wheretolook.utils.npz_files import load_npz, save_npz
 
 if TYPE_CHECKING:
     import pycolmap
 
 _BLOCK = 4096  # landmarks whose tracks are gathered at a time
+_TILE = 512  # descriptors along a side of a product that stays in the cache
 
 
 @dataclass(frozen=True, eq=False)
 class Landmarks:
-    """Landmarks, one a row, sorted by id.
+    """Landmarks, one a row, sorted by id."""
 
-    Attributes:
-        ids: (N,) int64, COLMAP's point3D_id.
-        points: (N, 3) float64, world, metres.
-        track_length: (N,) int32, number of observations.
-        reprojection_error_px: (N,) float32, mean over the observations.
-        triangulation_angle_deg: (N,) float32, largest angle between two rays of the track.
-        mapping_direction: (N, 3) float32, unit mean direction from the mapping cameras to the landmark, world.
-        mapping_direction_spread: (N,) float32, 1 - |mean of the unit directions|: 0 when all look from one side.
-        mapping_distance_m: (N,) float32, mean distance of the mapping cameras.
-        mapping_distance_spread: (N,) float32, standard deviation of these distances over their mean; NaN where a file
-            of an earlier version does not say.
-        descriptors: (N, 128) uint8, mean over the track of the unit descriptors, as COLMAP stores descriptors (512
-            times the unit vector); None where the model came without a database.
-        ambiguity: (N,) float32, cosine between the landmark's descriptor and the nearest one of another landmark; NaN
-            without descriptors or other landmarks.
-    """
-
-    ids: NDArray[np.int64]
-    points: NDArray[np.float64]
-    track_length: NDArray[np.int32]
-    reprojection_error_px: NDArray[np.float32]
-    triangulation_angle_deg: NDArray[np.float32]
-    mapping_direction: NDArray[np.float32]
-    mapping_direction_spread: NDArray[np.float32]
-    mapping_distance_m: NDArray[np.float32]
-    mapping_distance_spread: NDArray[np.float32]
+    ids: NDArray[np.int64]  # (N,) COLMAP's point3D_id
+    points: NDArray[np.float64]  # (N, 3) world, metres
+    track_length: NDArray[np.int32]  # (N,) number of observations
+    reprojection_error_px: NDArray[np.float32]  # (N,) mean over the observations
+    triangulation_angle_deg: NDArray[np.float32]  # (N,) largest angle between two rays of the track
+    mapping_direction: NDArray[np.float32]  # (N, 3) unit mean direction from the mapping cameras to the landmark, world
+    mapping_direction_spread: NDArray[np.float32]  # (N,) 1 - |mean of the unit directions|: 0 if all are the same
+    mapping_distance_m: NDArray[np.float32]  # (N,) mean distance of the mapping cameras
+    mapping_distance_spread: NDArray[np.float32]  # (N,) standard deviation of these over their mean; NaN in old files
+    # (N, 128) mean over the track of the unit descriptors, times 512 as COLMAP stores them; None without a database
     descriptors: NDArray[np.uint8] | None
+    # (N,) cosine between the descriptor and the nearest one of another landmark; NaN without descriptors or others
     ambiguity: NDArray[np.float32]
 
     def __len__(self) -> int:
@@ -74,20 +60,14 @@ class Landmarks:
     def save(self, path: str | Path, compact: bool = False) -> None:
         """Write an NPZ file, atomically. The same landmarks give the same bytes.
 
-        Args:
-            path: file to write.
-            compact: leave out the descriptors, keep points in single and attributes in half precision, and compress:
-                about 28 bytes a landmark. Such landmarks serve visibility, features and scorers, but no localization.
+        `compact` leaves out the descriptors, writes points in single and attributes in half precision, and compresses:
+        about 28 bytes a landmark. Such landmarks serve visibility, features and scorers, but not localization.
         """
-        path = Path(path)
-        partial = path.with_name(path.name + ".partial")
         values = {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not None}
         if compact:
             values.pop("descriptors", None)
             values = _floats(values, points=np.float32, others=np.float16)
-        with partial.open("wb") as file:
-            (np.savez_compressed if compact else np.savez)(file, **values)
-        os.replace(partial, path)
+        save_npz(Path(path), values, compress=compact)
 
     @classmethod
     def load(cls, path: str | Path) -> Landmarks:
@@ -100,10 +80,9 @@ class Landmarks:
         if not path.is_file():
             raise MapError("there is no file of landmarks", path=path, fix=fix)
         try:
-            with np.load(path) as stored:
-                values = {name: stored[name] for name in stored.files}
-        except Exception as error:  # a damaged zip raises many kinds of errors
-            raise MapError(f"not a readable NPZ file: {error}", path=path, fix=fix) from error
+            values = load_npz(path)
+        except ValueError as error:
+            raise MapError(str(error), path=path, fix=fix) from error
         names = {f.name for f in fields(cls)}
         if set(values) and "mapping_distance_spread" not in values and "mapping_distance_m" in values:
             values["mapping_distance_spread"] = np.full(len(values["mapping_distance_m"]), np.nan, dtype=np.float32)
@@ -116,7 +95,7 @@ class Landmarks:
 
 
 def _floats(values: dict[str, NDArray[Any]], points: DTypeLike, others: DTypeLike) -> dict[str, NDArray[Any]]:
-    """The same arrays, the points and the other arrays of floats in the types given."""
+    """The same arrays, with the points and all other arrays of floats cast to the types given."""
     return {
         name: value.astype(points if name == "points" else others, copy=False) if value.dtype.kind == "f" else value
         for name, value in values.items()
@@ -136,7 +115,7 @@ def load_colmap_landmarks(
         model_dir: folder of a model (binary or text), in metres. Images may differ in intrinsics.
         database: the COLMAP database the model was built from, for descriptors and ambiguity.
         max_reprojection_error_px: landmarks with a larger mean reprojection error are left out (the paper's 0.5).
-        device: torch device that searches for the nearest descriptors.
+        device: torch device for the search of the nearest descriptors.
         reconstruction: the model, if it has been read already.
 
     Raises:
@@ -144,21 +123,18 @@ def load_colmap_landmarks(
     """
     reconstruction = reconstruction or read_model(model_dir)
     if reconstruction.num_points3D() == 0:
-        raise MapError(
-            "the model has no points", path=model_dir, fix="Triangulate it, or map with more overlap or texture."
-        )
+        fix = "Triangulate it, or map with more overlap or texture."
+        raise MapError("the model has no points", path=model_dir, fix=fix)
     model = model_arrays(reconstruction)
     observed = np.diff(model.observation_start) > 0
     if not observed.any():
         raise MapError("no point of the model has a track", path=model_dir, fix="Triangulate the model from keypoints.")
     keep = np.flatnonzero(observed & (model.errors_px <= max_reprojection_error_px))
     if len(keep) == 0:
-        raise MapError(
-            f"all {observed.sum()} points have more than {max_reprojection_error_px} px mean reprojection error",
-            path=model_dir,
-            value=f"least {model.errors_px[observed].min():.2f} px",
-            fix="Raise max_reprojection_error_px, or check the intrinsics and poses of the model.",
-        )
+        problem = f"all {observed.sum()} points have more than {max_reprojection_error_px} px mean reprojection error"
+        least = f"least {model.errors_px[observed].min():.2f} px"
+        fix = "Raise max_reprojection_error_px, or check the intrinsics and poses of the model."
+        raise MapError(problem, path=model_dir, value=least, fix=fix)
     if not np.isfinite(model.points[keep]).all():
         raise MapError("some points are not finite", path=model_dir, fix="Triangulate the model again.")
     model = _select_points(model, keep)
@@ -182,35 +158,24 @@ def nearest_other_cosine(descriptors: NDArray[np.uint8], device: str = "cpu") ->
 
     Sums of products of such integers are exact in float32, so the result does not depend on the machine.
     """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(
-        1
-    )  # the blocks are small: several threads spend more time waiting for each other than working
+    n, threads = len(descriptors), torch.get_num_threads()
+    values = torch.as_tensor(descriptors, dtype=torch.float32, device=device)
+    lengths = torch.as_tensor(np.linalg.norm(descriptors.astype(np.float64), axis=1), device=device)
+    inverse = 1 / lengths.clamp(min=1).float()
+    best = torch.full((n,), -torch.inf, device=device)
+    torch.set_num_threads(1)  # products are small: several threads would mostly wait for one another
     try:
-        return _nearest_other_cosine(descriptors, device)
+        for i in range(0, n, _TILE):
+            for j in range(i, n, _TILE):  # each pair of tiles once: its product serves rows and columns
+                rows, columns = slice(i, min(i + _TILE, n)), slice(j, min(j + _TILE, n))
+                cosine = values[rows] @ values[columns].T
+                cosine *= inverse[rows, None] * inverse[columns]
+                if i == j:
+                    cosine.fill_diagonal_(-torch.inf)
+                best[rows] = torch.maximum(best[rows], cosine.amax(1))
+                best[columns] = torch.maximum(best[columns], cosine.amax(0))
     finally:
         torch.set_num_threads(threads)
-
-
-def _nearest_other_cosine(descriptors: NDArray[np.uint8], device: str) -> NDArray[np.float32]:
-    n = len(descriptors)
-    values = torch.as_tensor(descriptors, dtype=torch.float32, device=device)
-    inverse = (
-        1 / torch.as_tensor(np.linalg.norm(descriptors.astype(np.float64), axis=1), device=device).clamp(min=1).float()
-    )
-    best = torch.full((n,), -torch.inf, device=device)
-    block = 512  # products of this size stay in the cache
-    for i in range(0, n, block):
-        rows = slice(i, min(i + block, n))
-        for j in range(i, n, block):  # each pair of blocks once: the product serves rows and columns
-            columns = slice(j, min(j + block, n))
-            cosine = values[rows] @ values[columns].T
-            cosine *= inverse[rows, None] * inverse[columns]
-            if i == j:
-                cosine.fill_diagonal_(-torch.inf)
-            best[rows] = torch.maximum(best[rows], cosine.amax(1))
-            if i != j:
-                best[columns] = torch.maximum(best[columns], cosine.amax(0))
     return torch.where(best.isinf(), torch.nan, best).cpu().numpy()
 
 
@@ -218,17 +183,9 @@ def _select_points(model: ModelArrays, keep: NDArray[np.int64]) -> ModelArrays:
     lengths = np.diff(model.observation_start)[keep]
     start = np.concatenate([[0], np.cumsum(lengths)])
     rows = np.repeat(model.observation_start[keep] - start[:-1], lengths) + np.arange(start[-1])
-    return ModelArrays(
-        model.point_ids[keep],
-        model.points[keep],
-        model.errors_px[keep],
-        model.image_ids,
-        model.image_names,
-        model.image_centers,
-        start,
-        model.observation_image[rows],
-        model.observation_keypoint[rows],
-    )
+    points = {name: getattr(model, name)[keep] for name in ("point_ids", "points", "errors_px")}
+    observations = {name: getattr(model, name)[rows] for name in ("observation_image", "observation_keypoint")}
+    return replace(model, **points, **observations, observation_start=start)
 
 
 def _viewing_geometry(model: ModelArrays) -> dict[str, NDArray[np.float32]]:

@@ -1,4 +1,4 @@
-"""Corners of a marker in an image to hundredths of a pixel, from the edges between them."""
+"""Finds the corners of a marker in an image to hundredths of a pixel, from the edges between them."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from numpy.typing import NDArray
 
 from wheretolook.geometry.poses import Float
 
-_ROUNDS = 3
-_SAMPLES = 32  # along an edge
+_ROUNDS = 3  # of fitting lines to the edges between the corners
+_SAMPLES = 32  # profiles across an edge
 _AWAY_FROM_CORNERS = 0.15  # share of an edge left out at either end, where its neighbours blur into it
-_STEPS_PER_PX = 4
+_STEPS_PER_PX = 4  # samples of a profile
 
 
 def refine_corners(grey: NDArray[np.uint8], corners: Float) -> Float:
     """Move a marker's corners to where lines through its edges meet.
 
     OpenCV's refinement looks at a window around each corner. Blur rounds a corner off, so that it is found inside the
-    square: on rendered images sides come out 0.6 % short, which would be the error of the map's scale. Blur leaves an
-    edge where it is.
+    square: in rendered images the sides come out 0.6 % short, which would become an error of the map's scale. Blur does
+    not move an edge.
 
     Args:
         grey: (H, W) uint8.
@@ -45,7 +45,7 @@ def refine_corners(grey: NDArray[np.uint8], corners: Float) -> Float:
 def _edge_line(grey: NDArray[np.uint8], start: Float, end: Float, inside: Float) -> Float | None:
     """The line (a, b, c), a x + b y + c = 0, of an edge between dark inside and bright outside; None if there is none.
 
-    Across the edge, the mean of the brightness's rise tells its place.
+    In a profile across the edge, the edge is at the mean position of the rise in brightness.
     """
     import cv2
 

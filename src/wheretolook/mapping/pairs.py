@@ -1,4 +1,4 @@
-"""Which images of a map to match: those whose views share surface."""
+"""Chooses which images of a map to match: those whose views share surface."""
 
 from __future__ import annotations
 
@@ -11,15 +11,14 @@ from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import camera_centers, transform
 
 _SAMPLES_ACROSS = 16  # surface points taken from an image, in x
-DEPTH_STRIDE = 4
-"""Depth images are kept at every fourth pixel, the centre of each 4 x 4 block being the one at index 2."""
+DEPTH_STRIDE = 4  # depth images are kept at every fourth pixel, the centre of each 4 x 4 block being the one at index 2
 _ANGLE_DEG = (1.0, 55.0)  # between the rays of two images: less triangulates badly, more than that SIFT does not match
 _DEPTH_RATIO = 2.5  # between the distances of two images to a point: beyond it, the scales differ too much
 _DEPTH_TOLERANCE = 0.05
 
 
 def shrink_depth(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Every fourth pixel of depth images (..., H, W), as `surface_overlap` takes them."""
+    """Every fourth pixel of depth images (..., H, W), for `surface_overlap`."""
     half = DEPTH_STRIDE // 2
     return depth_m[..., half::DEPTH_STRIDE, half::DEPTH_STRIDE].copy()
 
@@ -27,7 +26,7 @@ def shrink_depth(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
 def surface_overlap(
     camera: PinholeCamera, cam_from_world: NDArray[np.floating[Any]], depth_m: NDArray[np.float32]
 ) -> NDArray[np.float64]:
-    """Share of the surface seen by one image that another sees too, in a way that lets both be matched.
+    """Share of the surface in one image that another image sees too, similarly enough for the two to be matched.
 
     A point counts if the other image's depth agrees with it (5 %), if the rays of the two images meet at 1 to 55
     degrees, and if their depths differ by less than a factor of 2.5.
@@ -61,24 +60,19 @@ def surface_overlap(
         there = depth_m[j, np.minimum(index[..., 1], h - 1), np.minimum(index[..., 0], w - 1)]
         ray = points - centers[j]
         cosine = (ray * seen_from).sum(-1) / np.maximum(np.linalg.norm(ray, axis=-1), 1e-9)
-        visible = inside & (np.abs(there - z) < _DEPTH_TOLERANCE * z)
-        visible &= (cosine > farthest) & (cosine < closest)
-        visible &= (z < _DEPTH_RATIO * depth) & (depth < _DEPTH_RATIO * z)
-        share[:, j] = visible.mean(1)
+        shared = inside & (np.abs(there - z) < _DEPTH_TOLERANCE * z)
+        shared &= (cosine > farthest) & (cosine < closest)
+        shared &= (z < _DEPTH_RATIO * depth) & (depth < _DEPTH_RATIO * z)
+        share[:, j] = shared.mean(1)
     np.fill_diagonal(share, 0)
     return (share + share.T) / 2
 
 
 def choose_pairs(overlap: NDArray[np.float64], partners: int, min_overlap: float = 0.05) -> NDArray[np.int64]:
-    """For each image its `partners` images of largest overlap, if at least `min_overlap`.
+    """Pairs (P, 2) of each image with its `partners` images of largest overlap; i < j, sorted, each pair once.
 
-    Args:
-        overlap: (I, I) symmetric.
-        partners: the most partners an image chooses; it can be chosen by more.
-        min_overlap: the least overlap of a pair.
-
-    Returns:
-        (P, 2) pairs i < j, sorted, each once.
+    `overlap` (I, I) is symmetric; pairs of less than `min_overlap` are left out. An image can be in more than
+    `partners` pairs, since others choose it too.
     """
     best = np.argsort(-overlap, axis=1, kind="stable")[:, :partners]
     first = np.repeat(np.arange(len(overlap)), best.shape[1])

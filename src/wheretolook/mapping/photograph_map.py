@@ -15,20 +15,18 @@ from tqdm.auto import tqdm
 from wheretolook.geometry.poses import Float
 from wheretolook.mapping.building import (
     DATABASE_FILE,
-    LANDMARKS_FILE,
     REPORT_FILE,
     Clock,
     partial_folder,
     refuse_foreign_folder,
     remove_inaccurate,
+    save_landmarks,
 )
-from wheretolook.mapping.cameras import CAMERAS_FILE, colmap_poses, save_mapping_poses
 from wheretolook.mapping.config import MapConfig
 from wheretolook.mapping.gravity import estimate_gravity
 from wheretolook.mapping.incremental import MappedPhotographs, map_incrementally, photograph_features
-from wheretolook.mapping.landmarks import load_colmap_landmarks
 from wheretolook.mapping.markers import Marker, MarkerView, detect_markers, marker_detector, place_marker
-from wheretolook.mapping.photograph_config import KnownDistance, ScaleConfig
+from wheretolook.mapping.photograph_config import ScaleConfig
 from wheretolook.mapping.photographs import photograph_cameras, read_photograph
 from wheretolook.mapping.scale import (
     MapScale,
@@ -46,44 +44,24 @@ from wheretolook.utils.processes import Processes
 
 @dataclass(frozen=True)
 class PhotographMapReport:
-    """What came out of mapping photographs; `report.json`.
+    """What came out of mapping photographs; `report.json`."""
 
-    Attributes:
-        n_images: photographs in the folder.
-        n_registered: photographs the map could place.
-        unregistered: names of the others.
-        model_sizes: photographs in each model that did not connect with another; the first is the map.
-        n_keypoints: keypoints of all photographs.
-        n_landmarks: landmarks after the filter.
-        n_landmarks_removed: points the filter removed.
-        median_track_length: observations of a landmark.
-        mean_reprojection_error_px: mean over the landmarks.
-        cameras: COLMAP's intrinsics of the reduced photographs.
-        n_known_focal: how many of the cameras started from a focal length given or of EXIF data.
-        gravity: how up was found ("level", "mean", "given", or "positions"), and the residuals' median and maximum in
-            degrees.
-        scale: where the scale comes from, its factor and residuals; see `MapScale`.
-        seed: seed of COLMAP.
-        config: the configuration, as a dictionary.
-        seconds: wall-clock time of each step.
-    """
-
-    n_images: int
-    n_registered: int
-    unregistered: list[str]
-    model_sizes: list[int]
-    n_keypoints: int
-    n_landmarks: int
-    n_landmarks_removed: int
-    median_track_length: float
-    mean_reprojection_error_px: float
-    cameras: list[dict[str, Any]]
-    n_known_focal: int
-    gravity: dict[str, Any]
+    n_images: int  # photographs in the folder
+    n_registered: int  # photographs the map could place
+    unregistered: list[str]  # names of the others
+    model_sizes: list[int]  # photographs in each model that did not connect with another; the first is the map
+    n_keypoints: int  # keypoints of all photographs
+    n_landmarks: int  # landmarks after the filter
+    n_landmarks_removed: int  # points the filter removed
+    median_track_length: float  # observations of a landmark
+    mean_reprojection_error_px: float  # mean over the landmarks
+    cameras: list[dict[str, Any]]  # COLMAP's intrinsics of the reduced photographs
+    n_known_focal: int  # how many of the cameras started from a focal length that was given or is in the EXIF data
+    gravity: dict[str, Any]  # "method" ("positions" or that of `Gravity`), "median_deg" and "max_deg" of its residuals
     scale: MapScale
-    seed: int
-    config: dict[str, Any]
-    seconds: dict[str, float]
+    seed: int  # seed of COLMAP
+    config: dict[str, Any]  # the configuration, as a dictionary
+    seconds: dict[str, float]  # wall-clock time of each step
 
 
 def map_photographs(
@@ -97,51 +75,44 @@ def map_photographs(
 ) -> PhotographMapReport:
     """Map the photographs in `config.photographs.images`.
 
-    The result is a COLMAP model with `landmarks.npz`, `cameras.npz` and `report.json` beside it, as `build_map` makes:
-    z up, and in metres if the report's scale has a source. Its folder appears when all is done. The origin is the mean
-    of the cameras' positions, the heading arbitrary, unless positions are given.
+    The result is what `build_map` makes: a COLMAP model with `landmarks.npz`, `cameras.npz` and `report.json`, which is
+    also returned, beside it; z up, and in metres if the report's scale has a source. The folder appears when all is
+    done. Unless positions are given, the origin is the mean of the cameras' positions and the heading is arbitrary.
 
     Args:
-        config: `photographs`, `extractor` and `keep_database` count.
+        config: only `photographs`, `extractor` and `keep_database` count.
         out_dir: folder to make; an earlier map there is replaced.
         work: folder where finished steps are kept, so that another run, for instance with another source of scale,
             does not start over.
         seed: of COLMAP's sampling.
-        workers: processes that extract and match, threads of COLMAP's bundle adjustment. The same seed gives the same
-            map with one worker; with more, COLMAP adds up large problems in another order each time.
+        workers: processes that extract and match, and threads of COLMAP's bundle adjustment. With one worker the same
+            seed gives the same map; with more, COLMAP sums large problems in another order each time.
         device: where keypoints are extracted, "cpu" or a CUDA device.
         progress: show progress bars.
 
-    Returns:
-        The content of `report.json`.
-
     Raises:
-        MapError: the photographs are missing, unreadable or do not overlap; the scale asked for cannot be had from
-            them; or `out_dir` holds something that is not a map.
+        MapError: the photographs are missing, unreadable or do not overlap; they do not give the scale asked for; or
+            `out_dir` holds something that is not a map.
         ConfigError: a table of markers or positions is damaged, or there is no such camera model or dictionary.
     """
     settings, out_dir, work, clock = config.photographs, Path(out_dir), Path(work), Clock()
     if settings.images is None:
         raise ConfigError("no folder of photographs was named", fix="Set map.photographs.images.")
     refuse_foreign_folder(out_dir)
-    known = _KnownScale.read(settings.scale)  # a damaged table is told before the work
+    known = _KnownScale.read(settings.scale)  # a damaged table is reported before the work
     work.mkdir(parents=True, exist_ok=True)
     with partial_folder(out_dir) as partial, Processes(workers) as processes:
         with clock("extract"):
-            features = photograph_features(
-                settings.images, work, settings.max_side_px, config.extractor, processes, device, progress
-            )
+            side_px, extractor = settings.max_side_px, config.extractor
+            features = photograph_features(settings.images, work, side_px, extractor, processes, device, progress)
         with clock("map"):
             cameras = photograph_cameras(settings.images, features.names, features.full_sizes, features.sizes, settings)
-            mapped = map_incrementally(
-                work, features, cameras, settings.exhaustive_up_to, settings.overlap, seed, processes, progress
-            )
+            matched = settings.exhaustive_up_to, settings.overlap
+            mapped = map_incrementally(work, features, cameras, *matched, seed, processes, progress)
         model, names = mapped.model, _registered(mapped)
         with clock("gravity"):
             poses = np.stack([model.images[number].cam_from_world().matrix() for number in names])
             gravity = estimate_gravity(poses, settings.up_in_camera)
-            residual_deg = {"median_deg": float(np.median(gravity.residual_deg)),
-                            "max_deg": float(gravity.residual_deg.max())}  # fmt: skip
             centers = np.stack([model.images[number].projection_center() for number in names])
             upright = Similarity(1.0, gravity.rotation, -gravity.rotation @ centers.mean(0))
         with clock("scale"):
@@ -149,16 +120,12 @@ def map_photographs(
             to_world.transform_model(model)
         with clock("filter_and_write"):
             model.update_point_3d_errors()
-            n_removed = remove_inaccurate(
-                model, settings.max_reprojection_error_px, out_dir,
-                fix="Raise map.photographs.max_reprojection_error_px, or take sharper photographs.",
-            )  # fmt: skip
+            fix = "Raise map.photographs.max_reprojection_error_px, or take sharper photographs."
+            n_removed = remove_inaccurate(model, settings.max_reprojection_error_px, out_dir, fix)
             color_points(model, features.colors)
             model.write_binary(str(partial))
         with clock("landmarks"):
-            landmarks = load_colmap_landmarks(partial, mapped.database, settings.max_reprojection_error_px)
-            landmarks.save(partial / LANDMARKS_FILE)
-            save_mapping_poses(colmap_poses(partial), partial / CAMERAS_FILE)
+            landmarks = save_landmarks(partial, mapped.database, settings.max_reprojection_error_px)
         if config.keep_database:
             shutil.copyfile(mapped.database, partial / DATABASE_FILE)
         registered = set(names.values())
@@ -174,7 +141,11 @@ def map_photographs(
             mean_reprojection_error_px=float(landmarks.reprojection_error_px.mean()),
             cameras=[_describe(camera) for _, camera in sorted(model.cameras.items())],
             n_known_focal=cameras.n_known_focal,
-            gravity={"method": "positions" if known.positions else gravity.method, **residual_deg},
+            gravity={
+                "method": "positions" if known.positions else gravity.method,
+                "median_deg": float(np.median(gravity.residual_deg)),
+                "max_deg": float(gravity.residual_deg.max()),
+            },
             scale=scale,
             seed=seed,
             config=asdict(config),
@@ -186,7 +157,7 @@ def map_photographs(
 
 @dataclass(frozen=True, eq=False)
 class _KnownScale:
-    """What gives the scale, its tables read."""
+    """The settings that give the scale, with the tables they name."""
 
     config: ScaleConfig
     sizes_m: Mapping[int, float] | float
@@ -195,7 +166,7 @@ class _KnownScale:
     @staticmethod
     def read(config: ScaleConfig) -> _KnownScale:
         if config.has_marker_sizes or (config.distance is not None and config.distance.marker_ids):
-            marker_detector(config.dictionary)  # says if there is no such dictionary
+            marker_detector(config.dictionary)  # raises if there is no such dictionary
         sizes = config.marker_size_m if config.marker_table is None else read_marker_table(config.marker_table)
         return _KnownScale(config, sizes, {} if config.positions is None else read_positions(config.positions))
 
@@ -218,16 +189,16 @@ def _scale(
     elif config.distance is not None:
         wanted = config.distance.marker_ids
         views = _marker_views(mapped, folder, config.dictionary, full_sizes, progress) if wanted else {}
-        ends = [_end(end, config.distance, centers, views, folder)
-                for end in (config.distance.first, config.distance.second)]  # fmt: skip
-        scale = scale_from_distance(ends[0], ends[1], config.distance.distance_m)
+        names_of_ends = config.distance.first, config.distance.second
+        first, second = (_place_of(end, centers, views, folder) for end in names_of_ends)
+        scale = scale_from_distance(first, second, config.distance.distance_m)
     return scale, replace(upright, scale=scale.factor, translation=scale.factor * upright.translation)
 
 
 def _marker_views(
     mapped: MappedPhotographs, folder: Path, dictionary: str, full_sizes: Any, progress: bool
 ) -> dict[int, list[MarkerView]]:
-    """Where placed photographs see markers, by marker. Searched for at full size, told in the map's pixels."""
+    """Views of markers in photographs with a pose, by marker. Found at full size, given in pixels of the map."""
     found: dict[int, list[MarkerView]] = {}
     for number, name in tqdm(_registered(mapped).items(), "map: markers", disable=not progress, unit="image"):
         image = mapped.model.images[number]
@@ -241,7 +212,7 @@ def _marker_views(
 
 
 def _place(views: Mapping[int, list[MarkerView]]) -> tuple[list[Marker], dict[str, str]]:
-    """Markers placed, and why others could not be: a false detection in one photograph must not cost the map."""
+    """Markers placed, and why others could not be placed: a false detection in one photograph must not stop the map."""
     markers, unused = [], {}
     for marker, seen in views.items():
         try:
@@ -251,26 +222,17 @@ def _place(views: Mapping[int, list[MarkerView]]) -> tuple[list[Marker], dict[st
     return markers, unused
 
 
-def _end(
-    end: str,
-    distance: KnownDistance,
-    centers: Mapping[str, Float],
-    views: Mapping[int, list[MarkerView]],
-    folder: Path,
-) -> Float:
-    """An end of a known distance, (3,) in COLMAP's frame."""
+def _place_of(end: str, centers: Mapping[str, Float], views: Mapping[int, list[MarkerView]], folder: Path) -> Float:
+    """Where an end of a known distance is, (3,) in COLMAP's frame."""
     if end.startswith("marker:"):
         number = int(end.removeprefix("marker:"))
         if number not in views:
-            raise MapError(
-                f"no placed photograph sees marker {number}", path=folder, value=distance, fix="Name another."
-            )
+            problem = f"no placed photograph sees marker {number}"
+            raise MapError(problem, path=folder, value=end, fix="Name another.")
         return place_marker(number, views[number]).center
     if end not in centers:
-        raise MapError(
-            "the map has no such photograph", path=folder, value=end,
-            fix="Name one that was placed, relative to its folder; markers are written marker:7.",
-        )  # fmt: skip
+        fix = "Name one that was placed, relative to its folder; markers are written marker:7."
+        raise MapError("the map has no such photograph", path=folder, value=end, fix=fix)
     return centers[end]
 
 

@@ -1,4 +1,4 @@
-"""Photographs in a folder: their pixels, upright and reduced, and the cameras that took them."""
+"""Reads the photographs in a folder, upright and reduced, and the intrinsics of the cameras that took them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 
 
 def list_photographs(folder: Path) -> list[str]:
-    """Names of the photographs in a folder and its folders, relative to it, sorted.
+    """Names of the photographs in a folder and its subfolders, relative to it, sorted.
 
     Raises:
         MapError: there is no such folder, or it holds fewer than two photographs.
@@ -32,10 +32,8 @@ def list_photographs(folder: Path) -> list[str]:
     files = (path for path in folder.rglob("*") if path.is_file() and path.suffix.lower() in SUFFIXES)
     names = sorted(path.relative_to(folder).as_posix() for path in files)
     if len(names) < 2:
-        raise MapError(
-            "a map needs at least two photographs", path=folder, value=len(names),
-            fix=f"Files that end in {', '.join(SUFFIXES)} count.",
-        )  # fmt: skip
+        fix = f"Files that end in {', '.join(SUFFIXES)} count."
+        raise MapError("a map needs at least two photographs", path=folder, value=len(names), fix=fix)
     return names
 
 
@@ -70,17 +68,11 @@ def reduce_photograph(rgb: NDArray[np.uint8], max_side_px: int) -> NDArray[np.ui
 
 @dataclass(frozen=True, eq=False)
 class PhotographCameras:
-    """Intrinsics of photographs as the mapping starts from them.
+    """Intrinsics of photographs that the mapping starts from."""
 
-    Attributes:
-        cameras: `pycolmap.Camera`s of the reduced photographs, with ids from 1.
-        camera_of: (I,) int64, each photograph's row in `cameras`.
-        given: whether the intrinsics are to be kept as they are.
-    """
-
-    cameras: list[pycolmap.Camera]
-    camera_of: NDArray[np.int64]
-    given: bool
+    cameras: list[pycolmap.Camera]  # of the reduced photographs, with ids from 1
+    camera_of: NDArray[np.int64]  # (I,) each photograph's row in `cameras`
+    given: bool  # whether the intrinsics are to be kept as they are
 
     @property
     def n_known_focal(self) -> int:
@@ -93,25 +85,19 @@ def photograph_cameras(
 ) -> PhotographCameras:
     """Intrinsics of photographs, given or from their EXIF data.
 
-    Args:
-        folder: of the photographs.
-        names: of the I photographs.
-        full_sizes: (I, 2) width and height as taken, upright.
-        sizes: (I, 2) width and height as mapped.
-        config: the camera, and whether photographs share one.
+    Takes width and height (I, 2) of each photograph as taken, upright, and as mapped.
 
     Raises:
         ConfigError: COLMAP has no such camera, or intrinsics are given for photographs of different sizes.
     """
     given = len(config.camera_params) > 0
     if given and len(np.unique(full_sizes, axis=0)) > 1:
-        raise ConfigError(
-            "camera_params are for photographs of one size", path=folder, value=np.unique(full_sizes, axis=0).tolist(),
-            fix="Leave camera_params out, or map the photographs of each size apart.",
-        )  # fmt: skip
+        value = np.unique(full_sizes, axis=0).tolist()
+        fix = "Leave camera_params out, or map the photographs of each size apart."
+        raise ConfigError("camera_params are for photographs of one size", path=folder, value=value, fix=fix)
     if given:
         width, height = full_sizes[0].tolist()
-        ColmapCamera(config.camera_model, width, height, config.camera_params)  # says what does not fit
+        ColmapCamera(config.camera_model, width, height, config.camera_params)  # raises if they do not fit the model
     keys: dict[Any, int] = {}
     cameras: list[pycolmap.Camera] = []
     camera_of = []
@@ -127,10 +113,10 @@ def photograph_cameras(
 
 
 def photograph_pairs(n: int, exhaustive_up_to: int, overlap: int) -> NDArray[np.int64]:
-    """Pairs (P, 2) of n photographs to match, i < j.
+    """Pairs (P, 2) of n photographs to match, i < j: all pairs, if n is at most `exhaustive_up_to`.
 
-    All of few. Of many, each with the `overlap` that follow it and as many at distances that double, as COLMAP's
-    sequential matching does: that needs no vocabulary, but photographs in the order they were taken.
+    Otherwise each with the `overlap` that follow it and as many at distances that double, as COLMAP's sequential
+    matching does. This needs no vocabulary tree, but names in the order in which the photographs were taken.
     """
     if n <= exhaustive_up_to:
         return np.array(list(itertools.combinations(range(n), 2)), dtype=np.int64).reshape(-1, 2)
@@ -144,10 +130,8 @@ def _camera(
     import pycolmap
 
     if config.camera_params:
-        camera = pycolmap.Camera(
-            camera_id=camera_id, model=config.camera_model, width=full[0], height=full[1],
-            params=list(config.camera_params),
-        )  # fmt: skip
+        camera = pycolmap.Camera(model=config.camera_model, width=full[0], height=full[1], params=config.camera_params)
+        camera.camera_id = camera_id
     else:
         camera = pycolmap.Camera.create_from_model_name(camera_id, config.camera_model, focal_px, *full)
     camera.rescale(*reduced)
@@ -156,7 +140,7 @@ def _camera(
 
 
 def _exif_focal(path: Path, camera_model: str) -> tuple[float, bool]:
-    """Focal length in pixels of the full photograph, and whether its EXIF data told it."""
+    """Focal length in pixels of the photograph at full size, and whether it comes from its EXIF data."""
     import pycolmap
 
     if camera_model not in pycolmap.CameraModelId.__members__ or camera_model == "INVALID":

@@ -1,4 +1,4 @@
-"""How many metres a unit of a map from photographs has: from markers, a known distance, or known positions."""
+"""The scale of a map from photographs, in metres a unit: from markers, a known distance, or known positions."""
 
 from __future__ import annotations
 
@@ -23,26 +23,17 @@ REPORT_FILE = "report.json"
 
 @dataclass(frozen=True)
 class MapScale:
-    """The scale of a map from photographs; `scale` in its `report.json`.
+    """The scale of a map from photographs; `scale` in its `report.json`."""
 
-    Attributes:
-        source: what the scale comes from; "unknown" if nothing said it, and the map is not in metres.
-        factor: metres of a unit of COLMAP's own frame; 1 if unknown.
-        residuals: how far each marker's side (in percent) or photograph's position (in metres) is off. Empty for a
-            single distance, which cannot contradict itself.
-        unit: of the residuals: "percent", "m", or "" where there are none.
-        unused: what was seen but could not be used, and why.
-        marker_error_px: root mean square reprojection error of each marker's corners.
-        marker_views: number of photographs that see each marker. Two alone do not tell whether they see one marker in
-            one place: most wrong places fit as well.
-    """
-
-    source: Source = "unknown"
-    factor: float = 1.0
+    source: Source = "unknown"  # what the scale comes from; "unknown" if the map is not in metres
+    factor: float = 1.0  # metres in a unit of COLMAP's own frame; 1 if unknown
+    # How far each marker's side (in percent) or photograph's position (in metres) is off; empty for a single distance.
     residuals: dict[str, float] = field(default_factory=dict)
-    unit: Literal["percent", "m", ""] = ""
-    unused: dict[str, str] = field(default_factory=dict)
-    marker_error_px: dict[str, float] = field(default_factory=dict)
+    unit: Literal["percent", "m", ""] = ""  # of the residuals: "percent", "m", or "" where there are none
+    unused: dict[str, str] = field(default_factory=dict)  # what was seen but could not be used, and why
+    marker_error_px: dict[str, float] = field(default_factory=dict)  # root mean square over each marker's corners
+    # Number of photographs that see each marker. Two alone cannot show that the marker was moved between them: some
+    # place in the map fits both anyway.
     marker_views: dict[str, int] = field(default_factory=dict)
 
     @property
@@ -71,55 +62,40 @@ def scale_from_markers(
     tolerance_percent: float = 5.0,
     unused: Mapping[str, str] | None = None,
 ) -> MapScale:
-    """The median, over the sides of all markers, of size over length.
+    """The median of true size over length in the map, over the sides of all markers.
 
-    Args:
-        markers: at least one, placed in the map.
-        size_m: side of every marker, or of each by its id.
-        tolerance_percent: how far a side may be off.
-        unused: markers that could not be placed, and why.
+    `size_m` is the side of all markers, or of each by its id; `unused` are markers that could not be placed, and why.
 
     Raises:
-        MapError: there is no marker, or sides of one marker or of several do not agree.
+        MapError: there is no marker, or a side is off by more than the tolerance.
     """
     if not markers:
-        reasons = "; ".join((unused or {}).values())
-        raise MapError(
-            "no marker gives the map its scale", value=reasons or "no marker of a known size was found",
-            fix="Check scale.dictionary and the sizes, and let at least two photographs see a marker whole.",
-        )  # fmt: skip
+        reasons = "; ".join((unused or {}).values()) or "no marker of a known size was found"
+        fix = "Check scale.dictionary and the sizes, and let at least two photographs see a marker whole."
+        raise MapError("no marker gives the map its scale", value=reasons, fix=fix)
     sizes = [size_m if isinstance(size_m, float | int) else size_m[marker.marker_id] for marker in markers]
     lengths = np.stack([marker.sides for marker in markers])
     factor = float(np.median(np.array(sizes)[:, None] / lengths))
     off = 100 * (factor * lengths / np.array(sizes)[:, None] - 1)
-    residuals = {
-        f"marker {marker.marker_id} side {side}": float(off[row, side])
-        for row, marker in enumerate(markers)
-        for side in range(4)
-    }
+    names = [f"marker {marker.marker_id}" for marker in markers]
+    sides = [f"{name} side {side}" for name in names for side in range(4)]
+    residuals = dict(zip(sides, off.ravel().tolist(), strict=True))
     if np.abs(off).max() > tolerance_percent:
         worst = ", ".join(
-            f"marker {marker.marker_id}: {' '.join(f'{value:+.1f}' for value in row)} %"
-            for marker, row in zip(markers, off, strict=True)
+            f"{name}: {' '.join(f'{value:+.1f}' for value in row)} %"
+            for name, row in zip(names, off, strict=True)
             if np.abs(row).max() > tolerance_percent
         )
-        raise MapError(
-            f"the markers do not agree on a scale: sides off by more than {tolerance_percent:g} %", value=worst,
-            fix="Measure the black squares; give markers of different sizes in a marker_table.",
-        )  # fmt: skip
-    return MapScale(
-        "markers", factor, residuals, "percent", dict(unused or {}),
-        {f"marker {marker.marker_id}": marker.error_px for marker in markers},
-        {f"marker {marker.marker_id}": len(set(marker.images)) for marker in markers},
-    )  # fmt: skip
+        problem = f"the markers do not agree on a scale: sides off by more than {tolerance_percent:g} %"
+        fix = "Measure the black squares; give markers of different sizes in a marker_table."
+        raise MapError(problem, value=worst, fix=fix)
+    errors_px = dict(zip(names, (marker.error_px for marker in markers), strict=True))
+    n_views = dict(zip(names, (len(set(marker.images)) for marker in markers), strict=True))
+    return MapScale("markers", factor, residuals, "percent", dict(unused or {}), errors_px, n_views)
 
 
 def scale_from_distance(first: ArrayLike, second: ArrayLike, distance_m: float) -> MapScale:
-    """The scale that makes a distance between two points (3,) of the map that many metres.
-
-    Raises:
-        MapError: the points are in the same place.
-    """
+    """The scale at which two points (3,) of the map are `distance_m` apart. Raises MapError if they coincide."""
     length = float(np.linalg.norm(np.asarray(first) - np.asarray(second)))
     if not length > 0:
         raise MapError("the two ends of the known distance are in the same place", value=length, fix="Give others.")
@@ -132,12 +108,12 @@ def scale_from_positions(
     """The scale, and the similarity that takes the map to the frame of known camera positions.
 
     Args:
-        centers: where the map has the photographs, by name.
-        positions: where they were taken, metres, z up. Photographs that the map lacks are not used.
+        centers: camera centres in the map, by photograph.
+        positions: where photographs were taken, metres, z up. Those that the map lacks are not used.
         tolerance_percent: how far a position may be off, of the diagonal of the box around those that are used.
 
     Raises:
-        MapError: fewer than three of them are in the map, all are on a line, or one is off by more.
+        MapError: fewer than three of the photographs are in the map, all are on a line, or one is off by more.
     """
     names = [name for name in positions if name in centers]
     source = np.array([centers[name] for name in names]).reshape(-1, 3)
@@ -149,11 +125,10 @@ def scale_from_positions(
     limit_m = tolerance_percent / 100 * float(np.linalg.norm(np.ptp(target, axis=0)))
     if off.max() > limit_m:
         worst = sorted((name for name in names if residuals[name] > limit_m), key=lambda name: -residuals[name])
-        raise MapError(
-            f"the positions do not agree with the map: off by more than {limit_m:.3g} m, {tolerance_percent:g} % of "
-            "their extent", value=", ".join(f"{name}: {residuals[name]:.3g} m" for name in worst[:5]),
-            fix="The first is the worst: check its position, their units and names, or raise tolerance_percent.",
-        )  # fmt: skip
+        off_by = f"off by more than {limit_m:.3g} m, {tolerance_percent:g} % of their extent"
+        value = ", ".join(f"{name}: {residuals[name]:.3g} m" for name in worst[:5])
+        fix = "The first is the worst: check its position, their units and names, or raise tolerance_percent."
+        raise MapError(f"the positions do not agree with the map: {off_by}", value=value, fix=fix)
     return MapScale("positions", similarity.scale, residuals, "m", unused), similarity
 
 
@@ -172,9 +147,8 @@ def read_marker_table(path: Path) -> dict[int, float]:
         if not 0 < size < np.inf:
             raise ConfigError("a marker's size must be positive", path=path, value=row)
         if sizes.setdefault(marker, size) != size:
-            raise ConfigError(
-                f"marker {marker} has two sizes", path=path, value=(sizes[marker], size), fix="Leave one of them."
-            )
+            value = (sizes[marker], size)
+            raise ConfigError(f"marker {marker} has two sizes", path=path, value=value, fix="Leave one of them.")
     return sizes
 
 
@@ -205,7 +179,7 @@ def read_positions(path: Path) -> dict[str, Float]:
 
 
 def read_scale(map_dir: Path) -> MapScale | None:
-    """The scale that a map's report tells; None for maps of known poses, which are in metres by construction.
+    """The scale in a map's report; None for maps of known poses, which are in metres by construction.
 
     Raises:
         MapError: the report is damaged.
@@ -226,9 +200,8 @@ def _rows(path: Path, columns: tuple[str, ...]) -> list[dict[str, str]]:
             reader = csv.DictReader(file, skipinitialspace=True)
             rows = [{name: (row[name] or "").strip() for name in columns} for row in reader]
     except (OSError, UnicodeDecodeError, KeyError, csv.Error) as error:
-        raise ConfigError(
-            f"not a table with the columns {', '.join(columns)}: {error}", path=path, fix="Write a CSV file with them."
-        ) from error
+        problem = f"not a table with the columns {', '.join(columns)}: {error}"
+        raise ConfigError(problem, path=path, fix="Write a CSV file with them.") from error
     if not rows:
         raise ConfigError("the table is empty", path=path, value=0, fix=f"Its columns are {', '.join(columns)}.")
     return rows

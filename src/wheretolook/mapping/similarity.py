@@ -11,27 +11,20 @@ from numpy.typing import ArrayLike
 from wheretolook.geometry.poses import Float
 from wheretolook.utils.errors import MapError
 
-_FLAT = 1e-6  # ratio of standard deviations below which points lie on a line
+_FLAT = 1e-6  # points whose second largest spread is below this share of the largest lie on a line
 
 
 @dataclass(frozen=True, eq=False)
 class Similarity:
-    """x -> scale * rotation x + translation.
+    """x -> scale * rotation x + translation."""
 
-    Attributes:
-        scale: positive.
-        rotation: (3, 3).
-        translation: (3,), in units of the target.
-    """
-
-    scale: float
-    rotation: Float
-    translation: Float
+    scale: float  # positive
+    rotation: Float  # (3, 3)
+    translation: Float  # (3,), in units of the target
 
     def apply(self, points: ArrayLike) -> Float:
         """Transform points (..., 3)."""
-        moved: Float = self.scale * np.asarray(points, dtype=np.float64) @ self.rotation.T + self.translation
-        return moved
+        return np.asarray(self.scale * np.asarray(points, dtype=np.float64) @ self.rotation.T + self.translation)
 
     def transform_model(self, model: Any) -> None:
         """Transform a `pycolmap.Reconstruction` in place."""
@@ -46,7 +39,7 @@ def fit_similarity(source: ArrayLike, target: ArrayLike) -> Similarity:
     Umeyama, "Least-Squares Estimation of Transformation Parameters Between Two Point Patterns", TPAMI 1991.
 
     Raises:
-        MapError: fewer than three points, or all on a line: the rotation about it would be a guess.
+        MapError: fewer than three points, or all on a line, which leaves the rotation about it open.
     """
     a, b = np.asarray(source, dtype=np.float64), np.asarray(target, dtype=np.float64)
     if len(a) < 3:
@@ -55,9 +48,8 @@ def fit_similarity(source: ArrayLike, target: ArrayLike) -> Similarity:
     for points in (a - mean_a, b - mean_b):
         spread = np.linalg.svd(points, compute_uv=False)
         if spread[1] <= _FLAT * max(spread[0], 1e-12):
-            raise MapError(
-                "positions on one line do not fix a frame", value=len(a), fix="Give positions that are not on a line."
-            )
+            fix = "Give positions that are not on a line."
+            raise MapError("positions on one line do not fix a frame", value=len(a), fix=fix)
     u, singular, vt = np.linalg.svd((b - mean_b).T @ (a - mean_a) / len(a))
     sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
     rotation = (u * sign) @ vt

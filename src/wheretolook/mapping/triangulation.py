@@ -1,13 +1,12 @@
-"""Matching and triangulation with known poses in COLMAP."""
+"""Matches images and triangulates landmarks with known poses, in COLMAP."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +17,10 @@ from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.utils.colmap import quiet_colmap
 from wheretolook.utils.processes import Processes
 
-_PAIRS_AT_A_TIME = 64  # of a process; also a step of the progress bar
+if TYPE_CHECKING:
+    from wheretolook.mapping.config import MapConfig
+
+_PAIRS_AT_A_TIME = 64  # that a process matches; also the step of the progress bar
 
 
 def image_name(index: int) -> str:
@@ -33,13 +35,11 @@ def triangulate_known_poses(
     keypoints: Sequence[Keypoints],
     colors: Sequence[NDArray[np.uint8]],
     pairs: NDArray[np.int64],
+    config: MapConfig,
     clock: Callable[[str], AbstractContextManager[None]],
-    max_epipolar_error_px: float = 2.0,
-    min_triangulation_angle_deg: float = 1.5,
-    two_view_landmarks: bool = False,
-    seed: int = 0,
-    processes: Processes | None = None,
-    progress: bool = True,
+    seed: int,
+    processes: Processes,
+    progress: bool,
 ) -> Any:
     """Match pairs of images, verify the matches against the known poses, and triangulate.
 
@@ -50,20 +50,17 @@ def triangulate_known_poses(
         keypoints: of the I images.
         colors: (N_i, 3) uint8 colours of the keypoints.
         pairs: (P, 2) indices of the images to match, i < j.
+        config: thresholds of verification and triangulation.
         clock: times a step.
-        max_epipolar_error_px: matches farther from the epipolar line are dropped.
-        min_triangulation_angle_deg: points whose rays meet at less are not made.
-        two_view_landmarks: whether two observations make a point.
         seed: of COLMAP's sampling.
-        processes: match; as many threads verify. This process and one thread if None.
+        processes: match; as many threads verify.
         progress: show a progress bar.
 
     Returns:
-        A `pycolmap.Reconstruction`, not filtered by reprojection error yet.
+        A `pycolmap.Reconstruction`, not yet filtered by reprojection error.
     """
     import pycolmap
 
-    processes = processes or Processes(1)
     folder = database.parent
     seed %= 2**31  # COLMAP keeps it in an int
     pycolmap.set_random_seed(seed)
@@ -80,19 +77,18 @@ def triangulate_known_poses(
             db.write_matches(i + 1, j + 1, matched)
     with clock("verify"):
         verification = pycolmap.TwoViewGeometryOptions()
-        verification.ransac.max_error = max_epipolar_error_px
+        verification.ransac.max_error = config.max_epipolar_error_px
         verification.ransac.random_seed = seed
         with quiet_colmap():
             pycolmap.guided_geometric_verification(
                 model, str(database), two_view_geometry_options=verification, num_threads=processes.workers
             )
     with clock("triangulate"):
-        options = pycolmap.IncrementalPipelineOptions(
-            random_seed=seed, num_threads=1, extract_colors=False, load_all_images=True
-        )
+        options = pycolmap.IncrementalPipelineOptions(random_seed=seed, num_threads=1, extract_colors=False)
+        options.load_all_images = True
         options.triangulation.random_seed = options.mapper.random_seed = seed
-        options.triangulation.ignore_two_view_tracks = not two_view_landmarks
-        options.triangulation.min_angle = options.mapper.filter_min_tri_angle = min_triangulation_angle_deg
+        options.triangulation.ignore_two_view_tracks = not config.two_view_landmarks
+        options.triangulation.min_angle = options.mapper.filter_min_tri_angle = config.min_triangulation_angle_deg
         with quiet_colmap("ERROR"):  # it warns of every image it cannot read colours from
             model = pycolmap.triangulate_points(model, str(database), str(folder), str(folder), options=options)
         model.update_point_3d_errors()
@@ -102,10 +98,10 @@ def triangulate_known_poses(
 
 
 def color_points(model: Any, colors: Sequence[NDArray[np.uint8]]) -> None:
-    """Give a reconstruction's points the mean colour of their keypoints, (N_i, 3) uint8 of the image of id i + 1."""
+    """Give each point of a reconstruction the mean colour of its keypoints, (N_i, 3) uint8; image i has id i + 1."""
     for point in model.points3D.values():
-        seen = [colors[e.image_id - 1][e.point2D_idx] for e in point.track.elements]
-        point.color = np.rint(np.mean(seen, axis=0)).astype(np.uint8)
+        observed = [colors[element.image_id - 1][element.point2D_idx] for element in point.track.elements]
+        point.color = np.rint(np.mean(observed, axis=0)).astype(np.uint8)
 
 
 Stored = tuple[NDArray[np.float32], NDArray[np.uint8]]
@@ -115,66 +111,44 @@ Stored = tuple[NDArray[np.float32], NDArray[np.uint8]]
 def match_pairs(
     stored: Sequence[Stored], pairs: NDArray[np.int64], folder: Path, processes: Processes, progress: bool = True
 ) -> Generator[NDArray[np.uint32], None, None]:
-    """Match pairs of images, without geometric verification.
+    """Match pairs (P, 2) of images, without geometric verification. Yields (M, 2) indices of keypoints, pair by pair.
 
-    In processes: pycolmap's BLAS is built without locks, and when two threads call it, now and then both get the same
-    buffer. The nearest neighbours of a pair then come out wrong, and another map with them.
-
-    Args:
-        stored: keypoints of the images.
-        pairs: (P, 2) indices of the images to match.
-        folder: where small databases may lie meanwhile.
-        processes: match.
-        progress: show a progress bar.
-
-    Yields:
-        (M, 2) indices of matched keypoints, pair by pair.
+    Works in processes instead of threads: pycolmap's BLAS is built without locks, so that two threads sometimes get the
+    same buffer, and the nearest neighbours come out wrong. Small databases are made in `folder` meanwhile.
     """
     chunks = [pairs[start : start + _PAIRS_AT_A_TIME] for start in range(0, len(pairs), _PAIRS_AT_A_TIME)]
-    jobs = (_MatchJob.of(chunk, stored, folder) for chunk in chunks)
+    jobs = (_match_job(chunk, stored, folder) for chunk in chunks)
     with tqdm(total=len(pairs), desc="map: match", disable=not progress, unit="pair") as bar:
-        for matches in processes.map(_match_job, jobs):
+        for matches in processes.map(_run_match_job, jobs):
             yield from matches
             bar.update(len(matches))
 
 
-@dataclass(frozen=True, eq=False)
-class _MatchJob:
-    """Pairs to match, self-contained: in a small database of only their images.
-
-    Attributes:
-        pairs: (P, 2) indices into `stored`.
-        stored: keypoints of the images.
-        folder: where to put the database.
-    """
-
-    pairs: NDArray[np.int64]
-    stored: list[Stored]
-    folder: Path
-
-    @staticmethod
-    def of(pairs: NDArray[np.int64], stored: Sequence[Stored], folder: Path) -> _MatchJob:
-        images, renumbered = np.unique(pairs, return_inverse=True)
-        return _MatchJob(renumbered.reshape(-1, 2), [stored[i] for i in images], folder)
+MatchJob = tuple[NDArray[np.int64], list[Stored], Path]
 
 
-def _match_job(job: _MatchJob) -> list[NDArray[np.uint32]]:
+def _match_job(pairs: NDArray[np.int64], stored: Sequence[Stored], folder: Path) -> MatchJob:
+    """Pairs (P, 2) renumbered to index the keypoints of their own images, these keypoints, and where to work."""
+    images, renumbered = np.unique(pairs, return_inverse=True)
+    return renumbered.reshape(-1, 2), [stored[i] for i in images], folder
+
+
+def _run_match_job(job: MatchJob) -> list[NDArray[np.uint32]]:
     """(M, 2) indices of matched keypoints, of each pair."""
     import pycolmap
 
+    pairs, stored, parent = job
     matching = pycolmap.FeatureMatchingOptions(num_threads=1, skip_geometric_verification=True)
-    with TemporaryDirectory(dir=job.folder) as folder:
+    with TemporaryDirectory(dir=parent) as folder:
         database, listed = Path(folder) / "database.db", Path(folder) / "pairs.txt"
-        anywhere = np.tile(np.eye(3, 4), (len(job.stored), 1, 1))
-        fill_database(
-            database, _posed_model(PinholeCamera(), anywhere), job.stored
-        )  # any camera: only verification asks
-        listed.write_text("".join(f"{image_name(i)} {image_name(j)}\n" for i, j in job.pairs))
+        # Any camera and poses do: only verification would use them.
+        fill_database(database, _posed_model(PinholeCamera(), np.tile(np.eye(3, 4), (len(stored), 1, 1))), stored)
+        listed.write_text("".join(f"{image_name(i)} {image_name(j)}\n" for i, j in pairs))
         pairing = pycolmap.ImportedPairingOptions(match_list_path=str(listed))
         with quiet_colmap():
             pycolmap.match_image_pairs(str(database), matching, pairing, device=pycolmap.Device.cpu)
         with pycolmap.Database.open(str(database)) as db:
-            return [db.read_matches(i + 1, j + 1) for i, j in job.pairs.tolist()]
+            return [db.read_matches(i + 1, j + 1) for i, j in pairs.tolist()]
 
 
 def _posed_model(camera: PinholeCamera, cam_from_world: NDArray[np.floating[Any]]) -> Any:
@@ -183,11 +157,10 @@ def _posed_model(camera: PinholeCamera, cam_from_world: NDArray[np.floating[Any]
 
     model = pycolmap.Reconstruction()
     parameters = [camera.focal_px, camera.cx, camera.cy]
-    model.add_camera_with_trivial_rig(
-        pycolmap.Camera(
-            camera_id=1, model="SIMPLE_PINHOLE", width=camera.width, height=camera.height, params=parameters
-        )
+    colmap_camera = pycolmap.Camera(
+        camera_id=1, model="SIMPLE_PINHOLE", width=camera.width, height=camera.height, params=parameters
     )
+    model.add_camera_with_trivial_rig(colmap_camera)
     for index, pose in enumerate(np.asarray(cam_from_world, dtype=np.float64)):
         image = pycolmap.Image(name=image_name(index), camera_id=1, image_id=index + 1)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:, :3]), pose[:, 3]))

@@ -1,4 +1,4 @@
-"""A walk through a scene with a camera at eye height, which leaves part of the floor unvisited."""
+"""Plans a walk through a scene with a camera at eye height, which leaves part of the floor unvisited."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
 
+from wheretolook.mapping.config import WalkConfig
 from wheretolook.utils.errors import ConfigError, SceneError
 
 Float = NDArray[np.float64]
 
 
 class FreeSpaceQueries(Protocol):
-    """What a walk asks of free space, see `wheretolook.space.free_space.FreeSpace`."""
+    """The part of `wheretolook.space.free_space.FreeSpace` that a walk uses."""
 
     def is_free(self, points: Any) -> NDArray[np.bool_]: ...
 
@@ -25,68 +26,15 @@ class FreeSpaceQueries(Protocol):
     def floor_below(self, points: Any) -> NDArray[np.floating[Any]]: ...
 
 
-@dataclass(frozen=True)
-class WalkConfig:
-    """How a person with a camera walks through a scene.
-
-    Args:
-        coverage: share of the reachable floor that gets visited; the walk ends there.
-        visit_radius_m: floor within this walking distance of the walk counts as visited. It grows until the walk is
-            short enough for the images to be `image_spacing_m` apart.
-        image_spacing_m: largest distance along the walk between two images. Images farther apart overlap too little.
-        eye_height_m: mean height of the camera above the floor in metres.
-        eye_height_variation_m: largest deviation from it.
-        cell_m: distance between neighbouring places of the grid that the walk runs on.
-        max_step_height_m: largest change of the floor's height from one place to the next (stairs).
-        swing_deg: how far the camera swings to either side of the walk.
-        swing_period: number of images in one swing from left to right and back.
-        pitch_deg: mean pitch, negative is down.
-        pitch_variation_deg: largest deviation from it.
-    """
-
-    coverage: float = 0.7
-    visit_radius_m: float = 1.0
-    image_spacing_m: float = 0.6
-    eye_height_m: float = 1.45
-    eye_height_variation_m: float = 0.2
-    cell_m: float = 0.3
-    max_step_height_m: float = 0.4
-    swing_deg: float = 40.0
-    swing_period: float = 12.0
-    pitch_deg: float = -5.0
-    pitch_variation_deg: float = 10.0
-
-    def __post_init__(self) -> None:
-        if not 0 < self.coverage <= 1:
-            raise ConfigError("coverage must be in (0, 1]", value=self.coverage)
-        for name in ("visit_radius_m", "image_spacing_m", "eye_height_m", "cell_m", "swing_period"):
-            if not getattr(self, name) > 0:
-                raise ConfigError(f"{name} must be positive", value=getattr(self, name))
-        if not 0 <= self.eye_height_variation_m < self.eye_height_m:
-            raise ConfigError(
-                "eye_height_variation_m must be at least 0 and below eye_height_m", value=self.eye_height_variation_m
-            )
-        if not abs(self.pitch_deg) + abs(self.pitch_variation_deg) < 90:
-            raise ConfigError("the pitch must stay within 90 degrees", value=(self.pitch_deg, self.pitch_variation_deg))
-
-
 @dataclass(frozen=True, eq=False)
 class Walk:
-    """A walk and the camera poses along it.
+    """A walk and the camera poses along it."""
 
-    Attributes:
-        positions: (n, 3) metres, camera centres in the order of the walk.
-        directions: (n, 3) unit optical axes in the world.
-        path: (M, 3) metres, corners of the walk at mean eye height; every segment between two corners is free.
-        coverage: share of the reachable floor within `visit_radius_m` walking distance of the walk.
-        visit_radius_m: the radius used.
-    """
-
-    positions: Float
-    directions: Float
-    path: Float
-    coverage: float
-    visit_radius_m: float
+    positions: Float  # (n, 3) metres, camera centres in the order of the walk
+    directions: Float  # (n, 3) unit optical axes in the world
+    path: Float  # (M, 3) metres, corners of the walk at mean eye height; every segment between two corners is free
+    coverage: float  # share of the reachable floor within `visit_radius_m` walking distance of the walk
+    visit_radius_m: float  # the radius used
 
     @property
     def length_m(self) -> float:
@@ -105,17 +53,14 @@ class _Places:
 def plan_walk(
     free_space: FreeSpaceQueries, bounds: ArrayLike, n_images: int, config: WalkConfig | None = None, seed: int = 0
 ) -> Walk:
-    """Plan a walk from a random place, always on to the nearest unvisited floor, until enough of it is visited.
+    """Plan a walk that starts at a random place and goes on to the nearest unvisited floor until enough is visited.
 
     Args:
         free_space: what is free and where the floor is.
         bounds: (2, 3) metres, lowest and highest corner of the scene.
-        n_images: number of poses, spaced evenly along the walk.
+        n_images: number of poses, spaced evenly along the walk. Cameras look mostly along it.
         config: see `WalkConfig`.
         seed: of the start and of the camera's motion.
-
-    Returns:
-        The walk. Cameras look mostly along it.
 
     Raises:
         ConfigError: fewer than two images.
@@ -153,23 +98,21 @@ def _reachable_places(free_space: FreeSpaceQueries, bounds: Float, config: WalkC
     probes = np.column_stack([low[:2] + (cell + 0.5) * config.cell_m, heights[h.ravel()]])
     floor = _floor(free_space, probes)
     found = np.isfinite(floor)
-    # One place for each floor of a cell, however many probes fell on it.
+    # Several probes of a cell may find the same floor: keep one place for each floor of each cell.
     key = np.column_stack([cell[found], np.rint(100 * floor[found]).astype(np.int64)])
     key, first = np.unique(key, axis=0, return_index=True)
     eyes = probes[found][first]
     eyes[:, 2] = floor[found][first] + config.eye_height_m
-    # Below the top of the scene: a roof is no floor.
+    # Only below the top of the scene: a roof is not a floor to walk on.
     free = eyes[:, 2] < high[2]
     free[free] = free_space.is_free(eyes[free])
     key, eyes = key[free], eyes[free]
     if len(eyes) == 0:
-        raise SceneError(
-            "there is no free floor to walk on at eye height",
-            value=f"eye height {config.eye_height_m} m",
-            fix="Check that the scene is in metres with z up, or lower eye_height_m or the clearance of free space.",
-        )
+        value = f"eye height {config.eye_height_m} m"
+        fix = "Check that the scene is in metres with z up, or lower eye_height_m or the clearance of free space."
+        raise SceneError("there is no free floor to walk on at eye height", value=value, fix=fix)
     a, b = _neighbours(key)
-    # The floor must go on from one place to the next, also half way: no stepping off a gallery or over a gap.
+    # There must be floor at about the same height at both places and half way: no step off a gallery or over a gap.
     middle = (eyes[a] + eyes[b]) / 2
     drop = np.column_stack([eyes[a, 2] - eyes[b, 2], middle[:, 2] - config.eye_height_m - _floor(free_space, middle)])
     near = (np.abs(drop) <= config.max_step_height_m).all(1)  # False where there is no floor (NaN)
@@ -183,11 +126,9 @@ def _reachable_places(free_space: FreeSpaceQueries, bounds: Float, config: WalkC
     _, component = connected_components(steps, directed=False)
     members = np.flatnonzero(component == np.bincount(component).argmax())
     if len(members) < 2:
-        raise SceneError(
-            "no two neighbouring places of the floor are joined by a free step",
-            value=f"cell {config.cell_m} m",
-            fix="Lower cell_m or the clearance of free space.",
-        )
+        problem = "no two neighbouring places of the floor are joined by a free step"
+        fix = "Lower cell_m or the clearance of free space."
+        raise SceneError(problem, value=f"cell {config.cell_m} m", fix=fix)
     return _Places(eyes[members], steps[members][:, members])
 
 
@@ -245,7 +186,7 @@ def _along(path: Float, n_images: int, rng: np.random.Generator) -> tuple[Float,
     behind = np.maximum(np.minimum(at, start[-1] - look_ahead_m), 0)
     heading = point(behind + look_ahead_m) - point(behind)
     heading[:, 2] = 0
-    # Where the walk turns back on itself, its two halves cancel; keep the last heading there.
+    # Where the walk turns back on itself, the heading vanishes; keep the last one there.
     length = np.linalg.norm(heading, axis=1)
     angle = rng.uniform(0, 2 * np.pi)
     last = np.array([np.cos(angle), np.sin(angle), 0.0])

@@ -32,18 +32,18 @@ class MaxVisibilityScorer(Scorer):
 
     def score(self, cam_from_world: Float) -> Float:
         """(B,) in [0, 1]."""
-        from wheretolook.visibility.frustum import VisibleSets, visible_landmarks  # Warp takes seconds to load
+        from wheretolook.visibility.frustum import LandmarkSets, landmarks_in_view  # Warp takes seconds to load
 
         poses = check_poses(cam_from_world)
         camera, device = self.localization_map.camera, self.localization_map.device
         points = self.localization_map.landmarks.points
         everything = np.arange(len(points), dtype=np.int32)
-        candidates = VisibleSets(np.array([0, len(points)], dtype=np.int32), everything)
+        candidates = LandmarkSets(np.array([0, len(points)], dtype=np.int32), everything)
         counts = np.empty(len(poses))
         for begin in range(0, len(poses), VIEWS_AT_ONCE):
             block = poses[begin : begin + VIEWS_AT_ONCE]
             rows = np.zeros(len(block), dtype=np.int64)
-            seen = visible_landmarks(camera, block, points, candidates, rows, device)
+            seen = landmarks_in_view(camera, block, points, candidates, rows, device)
             view = np.repeat(np.arange(len(block)), np.diff(seen.starts))
             depth = np.einsum("ni,ni->n", points[seen.indices], block[view, 2, :3]) + block[view, 2, 3]
             counts[begin : begin + len(block)] = np.bincount(view[depth < MAX_DEPTH_M], minlength=len(block))

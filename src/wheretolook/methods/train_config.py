@@ -11,7 +11,7 @@ from wheretolook.methods.registry import learned, methods_named
 from wheretolook.utils.errors import ConfigError
 
 MOVED = {
-    "train.variants": "train.methods, with the names of methods: mlp-2d+z for 2d+z",
+    "train.variants": "It is train.methods now, with the names of methods: mlp-2d+z for 2d+z.",
     **{
         f"train.{name}": f"train.mlp.{name}"
         for name in (

@@ -1,4 +1,4 @@
-"""What a viewpoint map knows near places where it has no voxel of its own."""
+"""Views for places whose voxel is not free: those of a voxel nearby."""
 
 from __future__ import annotations
 
@@ -10,23 +10,17 @@ from wheretolook.planning.path_planning import Space
 from wheretolook.planning.viewpoint_map import ViewpointMap
 
 REACH = 2
-"""Voxels that lend to one lie within so many along each axis."""
+"""A voxel borrows from voxels at most this many away along each axis."""
 
 INSIDE = np.stack(np.meshgrid(*[(-1 / 3, 0.0, 1 / 3)] * 3, indexing="ij"), -1).reshape(-1, 3)
-"""Points of a voxel that are looked at, from its centre in shares of its size."""
+"""Points of a voxel that are tested for free space (27, 3), relative to its centre in units of its size."""
 
 
 def with_borrowed_views(viewpoint_map: ViewpointMap, space: Space) -> ViewpointMap:
-    """The map for planners: voxels with free space but an occupied centre have the views of the nearest one in reach.
+    """A map for planners: voxels with free space but an occupied centre get the views of the nearest voxel in reach.
 
-    In reach is a voxel whose centre a camera can go straight to, so that nothing is borrowed through walls.
-
-    Args:
-        viewpoint_map: of the space.
-        space: where a camera can be.
-
-    Returns:
-        A derived map (`MapOrigin.derived`): voxels share rows in it, so it is neither saved nor updated.
+    A voxel is in reach if a camera can go straight to its centre, so nothing is borrowed through walls. In the result,
+    a derived map (`MapOrigin.derived`), voxels share rows, so it can be neither saved nor updated.
     """
     grid = viewpoint_map.grid
     rows, centers = viewpoint_map.row_of_voxel.copy(), grid.centers()
@@ -39,7 +33,7 @@ def with_borrowed_views(viewpoint_map: ViewpointMap, space: Space) -> ViewpointM
     for voxel, own, is_free in zip(unknown, points, free, strict=True):
         if not is_free.any():
             continue
-        start = own[order[is_free[order]][0]]
+        start = own[order[is_free[order]][0]]  # the free point nearest to the centre
         near = known[(np.abs(centers[known] - centers[voxel]) <= (REACH + 1e-6) * size).all(1)]
         near = near[np.argsort(np.linalg.norm(centers[near] - start, axis=1), kind="stable")]
         if len(near):

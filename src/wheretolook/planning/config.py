@@ -7,35 +7,30 @@ from math import inf, isfinite
 from pathlib import Path
 from typing import Literal
 
-from wheretolook.geometry.lattices import Lattice
+from wheretolook.geometry.lattices import ViewLattice
 from wheretolook.utils.errors import ConfigError
 
 
 @dataclass(frozen=True)
-class ViewpointMapConfig:
+class ViewpointMapConfig(ViewLattice):
     """What a viewpoint map is made of.
 
     Args:
-        scene: name of the scene's folder; empty for all scenes of the dataset.
-        method: that scores the views, see `wheretolook evaluate --list-methods`; empty for the one that the weights are
-            of, or bins if there are none.
+        scene: name of the scene; empty for all scenes of the dataset.
+        method: method that scores the views. See `wheretolook evaluate --list-methods`; empty for the one that the
+            weights are of, or bins if there are none.
         weights: file of weights that the train stage wrote, for a method that has learnt. Unless a method is named,
             the best of the dataset, or else of the release, for cameras with their field of view.
         out: folder to write; empty for `<data>/<name>/<scene>/viewpoint-map`. Only with a scene.
-        grid: voxels along x, y and z over the scene's bounds.
-        directions: directions at each voxel.
-        lattice: how they are spread: fibonacci is even; yaw-pitch are ActLoc's 6 x 18, whatever `directions` says.
     """
 
     scene: str = ""
     method: str = ""
     weights: Path | None = None
     out: Path | None = None
-    grid: tuple[int, int, int] = (8, 8, 8)
-    directions: int = 500
-    lattice: Lattice = "fibonacci"
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.out is not None and not self.scene:
             raise ConfigError("viewpoint_map.out is the folder of one scene", value=str(self.out), fix="Name a scene.")
 
@@ -48,13 +43,15 @@ class PathConfig:
     every metre times one less the score of the views along it.
 
     Args:
-        score_weight: metres that a metre without any hope to localize costs beside its length (the paper's lambda).
+        score_weight: metres that a metre without any hope to localize costs beside its length. The paper's lambda.
         turn_weight_m: metres that turning by one radian costs.
         pitch_deg: least and greatest pitch of the optical axis, degrees above the horizon.
-        max_turn_deg_per_m: the camera turns by no more while it moves by a metre.
+        max_turn_deg_per_m: degrees that the camera turns at most while it moves by a metre.
         spacing_m: distance of the views along a path.
-        step_m: longest straight piece that the planner adds at once.
-        time_s: time to plan. The path only gets better with time.
+        time_s: seconds to plan; the path only gets better with time.
+
+    Attributes:
+        step_m: longest straight piece that the planner adds at once; longer ones seldom stay free indoors.
     """
 
     score_weight: float = 3.0
@@ -62,14 +59,14 @@ class PathConfig:
     pitch_deg: tuple[float, float] = (-40.0, 40.0)
     max_turn_deg_per_m: float = 150.0
     spacing_m: float = 0.2
-    step_m: float = 1.0
+    step_m: float = field(default=1.0, init=False)
     time_s: float = 5.0
 
     def __post_init__(self) -> None:
         low, high = self.pitch_deg
         if not -90 < low <= high < 90:
             raise ConfigError("pitch_deg needs a range inside -90 to 90", value=self.pitch_deg)
-        for name in ("max_turn_deg_per_m", "spacing_m", "step_m", "time_s"):
+        for name in ("max_turn_deg_per_m", "spacing_m", "time_s"):
             if not 0 < getattr(self, name) < inf:
                 raise ConfigError(f"{name} must be positive and finite", value=getattr(self, name))
         for name in ("score_weight", "turn_weight_m"):
@@ -78,25 +75,22 @@ class PathConfig:
 
 
 @dataclass(frozen=True)
-class PathsConfig:
+class PathsConfig(ViewLattice):
     """How methods are compared by planned paths.
 
     Args:
-        scenes: names of scenes; none for all of the test split.
+        scenes: names of the scenes; none for all of the test split.
         pairs: starts and goals in each scene.
-        seed: of these.
+        seed: seed of the starts and goals.
         min_distance_m: least distance of a goal from its start.
         height_m: range of the heights of starts and goals above the floor.
-        methods: "forward", the shortest path looking ahead, and methods that score views, see `wheretolook evaluate
+        methods: methods to compare: forward, the shortest path, and some that score views. See `wheretolook evaluate
             --list-methods`. Scores that are no probabilities enter by their ranks.
-        weights: of the methods that have learnt, those that are of another kind; by default, and for the others, the
-            best of each method in the dataset, or else in the release.
-        grid: voxels of the viewpoint maps along x, y and z.
-        directions: directions at each voxel.
-        lattice: how they are spread: fibonacci is even; yaw-pitch are ActLoc's 6 x 18, whatever `directions` says.
+        weights: file of weights, for a method that has learnt. By default, and for methods of another kind, the best of
+            each method in the dataset, or else in the release.
         max_turn_deg: along a path that is given, the camera turns by no more from one waypoint to the next.
         max_error_m: a view is good if it localizes with a smaller error of its position.
-        max_error_deg: and of its orientation.
+        max_error_deg: and with a smaller error of its orientation.
         resamples: of the pairs, for 95 % intervals.
         planner: costs and limits of the paths, time to plan each.
     """
@@ -108,9 +102,6 @@ class PathsConfig:
     height_m: tuple[float, float] = (1.2, 1.6)
     methods: tuple[str, ...] = ("forward", "fisher-trace-gp", "set")
     weights: Path | None = None
-    grid: tuple[int, int, int] = (8, 8, 8)
-    directions: int = 500
-    lattice: Lattice = "fibonacci"
     max_turn_deg: float = 30.0
     max_error_m: float = 0.25
     max_error_deg: float = 2.0
@@ -118,16 +109,8 @@ class PathsConfig:
     planner: PathConfig = field(default_factory=PathConfig)
 
     def __post_init__(self) -> None:
-        positive = (
-            "pairs",
-            "min_distance_m",
-            "directions",
-            "max_turn_deg",
-            "max_error_m",
-            "max_error_deg",
-            "resamples",
-        )
-        for name in positive:
+        super().__post_init__()
+        for name in ("pairs", "min_distance_m", "max_turn_deg", "max_error_m", "max_error_deg", "resamples"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"{name} must be positive", value=getattr(self, name))
         if not 0 < self.height_m[0] <= self.height_m[1]:
@@ -137,23 +120,20 @@ class PathsConfig:
 
 
 @dataclass(frozen=True)
-class PlanConfig:
+class PlanConfig(ViewLattice):
     """A path to plan, and what to write about it.
 
     Args:
-        scene: name of the scene's folder.
-        start: x, y, z in metres.
-        goal: x, y, z in metres.
+        scene: name of the scene.
+        start: where the path starts: x, y, z in metres.
+        goal: where it ends: x, y, z in metres.
         out: folder to write; empty for `<data>/<name>/<scene>/path`.
-        method: that scores the views; "forward" for the shortest path, looking ahead; empty as for the viewpoint map.
+        method: method that scores the views; forward for the shortest path, looking ahead. Empty as for the viewpoint
+            map.
         weights: file of weights, for a method that has learnt; by default the best there are.
-        against: further methods to plan by, to be drawn to the left of it as `methods.png`, such as "forward" and
-            "fisher-trace-gp".
-        film: "gif", "mp4" or "none".
-        rerun: whether to write a recording for the Rerun viewer (needs `pip install rerun-sdk`).
-        grid: voxels of the viewpoint map along x, y and z.
-        directions: directions at each voxel.
-        lattice: how they are spread, fibonacci or yaw-pitch.
+        against: further methods to plan by, drawn beside it. As `methods.png`, such as "forward" and "fisher-trace-gp".
+        film: kind of film to make: gif, mp4 or none.
+        rerun: write a recording for the Rerun viewer too (needs `pip install rerun-sdk`).
         planner: costs and limits of the path, time to plan.
     """
 
@@ -166,12 +146,10 @@ class PlanConfig:
     against: tuple[str, ...] = ()
     film: Literal["gif", "mp4", "none"] = "gif"
     rerun: bool = False
-    grid: tuple[int, int, int] = (8, 8, 8)
-    directions: int = 500
-    lattice: Lattice = "fibonacci"
     planner: PathConfig = field(default_factory=PathConfig)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.film not in ("gif", "mp4", "none"):
             raise ConfigError("unknown kind of film", value=self.film, fix="Use gif, mp4 or none.")
         for name in ("start", "goal"):

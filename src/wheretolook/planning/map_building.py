@@ -13,26 +13,25 @@ from tqdm.auto import tqdm
 from wheretolook.geometry.colmap_camera import Camera, ColmapCamera
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float, rotation_looking_along
-from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.methods.base import Scorer
 from wheretolook.planning.refine import score_directions
 from wheretolook.planning.viewpoint_map import MapOrigin, ViewpointMap
 from wheretolook.utils.errors import ConfigError, MapError, SceneError
-from wheretolook.visibility.occlusion import StoredOcclusion
+from wheretolook.visibility.occlusion import OcclusionModel, StoredOcclusion
 from wheretolook.visibility.survey import survey
 
 VIEWS_AT_ONCE = 16_384
-"""Views handed to the scorer at a time, whole locations: enough for a GPU, and the progress bar moves."""
+"""Views scored at a time, in whole locations: enough to fill a GPU, few enough for the progress bar to move."""
 
 SIGHT_BYTES = 1 << 28
-"""Lines of sight asked for at a time in an update."""
+"""Lines of sight tested at a time in an update, one byte each."""
 
 MAX_DIRECTIONS = 1 << 16
 """Ids of directions are stored in 16 bits."""
 
 SAME_SCORE = 1e-4
-"""Scores of a voxel computed again may differ by this much, absolute or relative: networks sum in another order."""
+"""Absolute and relative tolerance for scores of a voxel computed again; networks may sum in another order."""
 
 
 def build_viewpoint_map(
@@ -46,19 +45,19 @@ def build_viewpoint_map(
     """Score every direction at the centre of every free voxel.
 
     Args:
-        scorer: any method; it knows its map, and so landmarks, camera, occlusion and device.
-        grid: voxels of the world.
-        free: where a camera can be: ids of voxels, (L,), such as `viewpoints.sampling.free_locations` finds, or a mask
+        scorer: any method, on the localization map to be used.
+        grid: voxels of the world, metres.
+        free: where a camera can be: ids of voxels (L,), such as `viewpoints.sampling.free_locations` finds, or a mask
             of all voxels, (V,) bool.
         directions: (D, 3) optical axes in the world, of any length, such as `direction_lattice` gives.
-        lattice: their name, to be told to readers.
+        lattice: their name, kept in the map's origin.
         progress: text of progress bars; None shows none.
 
     Raises:
         SceneError: no voxel is free, or the centre of one lies inside geometry.
         MapError: the map has no landmarks, or one whose position is not finite.
         ConfigError: more than 65,536 directions, ids outside the grid, or neither ids nor a mask of its voxels.
-        ValueError: directions of another shape, or such that have no direction.
+        ValueError: directions that are not (D, 3), not finite or of length 0.
     """
     axes = _unit(directions)
     rows = _ids(free, len(grid))
@@ -69,76 +68,65 @@ def build_viewpoint_map(
     _check_landmarks(scorer.localization_map.landmarks)
     row_of_voxel = np.full(len(grid), -1, dtype=np.int32)
     row_of_voxel[rows] = np.arange(len(rows))
-    ranked, scores, n_visible = _score_and_count(scorer, grid.centers()[rows], axes, progress)
-    one = scorer.localization_map
-    digests = landmark_digests(one.landmarks)
-    return ViewpointMap(
-        grid, row_of_voxel, axes, ranked, scores, n_visible, one.landmarks.ids, digests,
-        _origin(scorer, lattice, digests),
-    )  # fmt: skip
+    by_row = _score_and_count(scorer, grid.centers()[rows], axes, progress)
+    landmarks = scorer.localization_map.landmarks
+    digests = landmark_digests(landmarks)
+    origin = _origin(scorer, lattice, digests)
+    return ViewpointMap(grid, row_of_voxel, axes, *by_row, landmarks.ids, digests, origin)
 
 
 def update_viewpoint_map(
     old: ViewpointMap, scorer: Scorer, progress: str | None = None
 ) -> tuple[ViewpointMap, NDArray[np.int64]]:
-    """The viewpoint map of a map to which landmarks were added, equal to one built anew.
+    """Update a viewpoint map after landmarks were added; equal to building it anew, for networks up to rounding.
 
-    Landmarks are compared by id. Voxels with a free line of sight to one that is new, or whose attributes have changed,
-    are scored again. This is all that can change if scores depend on no other landmarks (`Scorer.local`) and landmarks
-    do not hide one another (`OcclusionModel.landmarks_hide`). Otherwise, and if landmarks were removed or moved, all
-    voxels are scored again. What stands in the scene must be the same: where it changed, build anew.
+    Landmarks are compared by id. Voxels from which a new landmark, or one whose attributes have changed, is unoccluded
+    are scored again. Nothing else can change if a score depends only on landmarks in view (`Scorer.local`) and
+    landmarks do not hide one another (`OcclusionModel.landmarks_hide`). Otherwise, and if landmarks were removed or
+    moved, all voxels are scored again. The scene's geometry must be the same; if it changed, build the map anew.
 
     Args:
         old: made with the same method, camera and occlusion.
-        scorer: the method on the new map.
+        scorer: the method, on the new localization map.
         progress: text of progress bars; None shows none.
 
     Returns:
-        The new map; the old one stays as it is. And the ids of the voxels that were scored again. Where networks score,
-        the numbers equal those of a new build up to rounding.
+        The new map, and the ids of the voxels that were scored again.
 
     Raises:
-        ConfigError: the map was derived from another; the method, camera or occlusion model is another; or the scores
-            or counts of a voxel that should not have changed did, so that weights or geometry must be others.
+        ConfigError: the map was derived from another; the method, camera or occlusion model differs; or scores or
+            counts changed in a voxel where they cannot, so that weights or geometry must have changed.
         SceneError, MapError: as in `build_viewpoint_map`.
     """
-    one = scorer.localization_map
-    if old.origin.derived:
-        raise ConfigError(
-            "a viewpoint map derived from another cannot be updated", value=old.origin.derived,
-            fix="Update the one it was derived from, and derive it again.",
-        )  # fmt: skip
-    _check_landmarks(one.landmarks)
-    digests = landmark_digests(one.landmarks)
+    landmarks, occlusion = scorer.localization_map.landmarks, scorer.localization_map.occlusion
+    if derived := old.origin.derived:
+        fix = "Update the one it was derived from, and derive it again."
+        raise ConfigError("a viewpoint map derived from another cannot be updated", value=derived, fix=fix)
+    _check_landmarks(landmarks)
+    digests = landmark_digests(landmarks)
     origin = _origin(scorer, old.origin.lattice, digests)
     for name in ("scorer", "camera", "occlusion"):
-        if getattr(origin, name) != getattr(old.origin, name):
-            raise ConfigError(
-                f"the viewpoint map was built with another {name}", value=getattr(origin, name),
-                fix=f"Use {getattr(old.origin, name)!r}, or build it anew.",
-            )  # fmt: skip
-    changed = _changed_landmarks(old, one.landmarks, digests)
-    if changed is None or one.occlusion.landmarks_hide or not scorer.local:
-        seen = np.ones(len(old.scores), dtype=bool)
+        now, before = getattr(origin, name), getattr(old.origin, name)
+        if now != before:
+            fix = f"Use {before!r}, or build it anew."
+            raise ConfigError(f"the viewpoint map was built with another {name}", value=now, fix=fix)
+    changed = _changed_landmarks(old, landmarks, digests)
+    if changed is None or occlusion.landmarks_hide or not scorer.local:
+        stale = np.ones(len(old.scores), dtype=bool)
     else:
-        seen = _which_see(one, old.locations, changed)
-        _check_unchanged(old, scorer, np.flatnonzero(~seen)[:1])
-    ranked, scores, n_visible = old.ranked.copy(), old.scores.copy(), old.n_visible.copy()
-    if seen.any():
-        again = _score_and_count(scorer, old.locations[seen], old.directions, progress)
-        ranked[seen], scores[seen], n_visible[seen] = again
-    new = replace(
-        old, ranked=ranked, scores=scores, n_visible=n_visible, landmark_ids=one.landmarks.ids,
-        landmark_digests=digests, origin=origin,
-    )  # fmt: skip
-    return new, old.voxel_of_row[seen]
+        stale = _any_unoccluded(occlusion, landmarks.points, changed, old.locations)
+        _check_unchanged(old, scorer, np.flatnonzero(~stale)[:1])
+    by_row = {name: getattr(old, name).copy() for name in ("ranked", "scores", "n_visible")}
+    if stale.any():
+        again = _score_and_count(scorer, old.locations[stale], old.directions, progress)
+        for array, values in zip(by_row.values(), again, strict=True):
+            array[stale] = values
+    new = replace(old, **by_row, landmark_ids=landmarks.ids, landmark_digests=digests, origin=origin)
+    return new, old.voxel_of_row[stale]
 
 
 def landmark_digests(landmarks: Landmarks) -> NDArray[np.uint64]:
-    """Digests (N, 2) of each landmark's position and of what else scorers are told about it.
-
-    A digest is the first 8 bytes of BLAKE2b, little-endian.
-    """
+    """Digests (N, 2) of each landmark's position and of its attributes: BLAKE2b of 8 bytes, little-endian."""
     attributes = np.concatenate([landmarks.mapping_direction, landmarks.attributes()], axis=1)
     return np.stack([_digests(landmarks.points), _digests(attributes)], axis=1)
 
@@ -152,18 +140,23 @@ def _digests(rows: NDArray[Any]) -> NDArray[np.uint64]:
 def _score_and_count(
     scorer: Scorer, locations: Float, directions: Float, progress: str | None
 ) -> tuple[NDArray[np.uint16], NDArray[np.float32], NDArray[np.uint32]]:
-    """Ranked ids, scores and visible counts, each (L, D), of all directions at locations (L, 3) m."""
-    one = scorer.localization_map
+    """Ranked ids, scores and numbers of landmarks in view, each (L, D), of all directions at locations (L, 3) m."""
+    localization_map, rotations = scorer.localization_map, rotation_looking_along(directions)
+    options: dict[str, Any] = {"keep": 1, "keep_occlusion": False, "device": localization_map.device}
+    options["progress"] = progress and f"{progress}: count"
     counted = survey(
-        one.camera, rotation_looking_along(directions), locations, one.landmarks.points, one.occlusion,
-        keep=1, keep_occlusion=False, device=one.device, progress=progress and f"{progress}: count",
-    )  # fmt: skip
+        localization_map.camera,
+        rotations,
+        locations,
+        localization_map.landmarks.points,
+        localization_map.occlusion,
+        **options,
+    )
     ranked = np.empty((len(locations), len(directions)), dtype=np.uint16)
     scores = np.empty(ranked.shape, dtype=np.float32)
     block = max(1, VIEWS_AT_ONCE // len(directions))
-    with tqdm(
-        total=len(locations), desc=progress and f"{progress}: score", unit="voxel", disable=progress is None
-    ) as bar:
+    text = progress and f"{progress}: score"
+    with tqdm(total=len(locations), desc=text, unit="voxel", disable=progress is None) as bar:
         for begin in range(0, len(locations), block):
             rows = slice(begin, begin + block)
             values = score_directions(scorer, locations[rows], directions)
@@ -174,26 +167,23 @@ def _score_and_count(
 
 
 def _ids(free: ArrayLike, n_voxels: int) -> NDArray[np.int64]:
-    """Ids of free voxels, ascending, each once, of ids or a mask."""
+    """Ids of free voxels, ascending, each once, from ids or a mask."""
     given = np.asarray(free)
     if given.dtype == bool:
         if given.shape != (n_voxels,):
-            raise ConfigError("a mask of free voxels has a value for each voxel", value=given.shape,
-                              fix=f"Give one of shape ({n_voxels},), in the order of VoxelGrid.centers.")  # fmt: skip
+            fix = f"Give one of shape ({n_voxels},), in the order of VoxelGrid.centers."
+            raise ConfigError("a mask of free voxels has a value for each voxel", value=given.shape, fix=fix)
         return np.flatnonzero(given)
     if given.size and not np.issubdtype(given.dtype, np.integer):
-        raise ConfigError("free voxels are given by ids or a mask", value=str(given.dtype),
-                          fix="Give integers, or a boolean for each voxel.")  # fmt: skip
+        fix = "Give integers, or a boolean for each voxel."
+        raise ConfigError("free voxels are given by ids or a mask", value=str(given.dtype), fix=fix)
     return np.unique(given.astype(np.int64))
 
 
 def _check_landmarks(landmarks: Landmarks) -> None:
-    bad = np.flatnonzero(~np.isfinite(landmarks.points).all(axis=1))
-    if len(bad):
-        raise MapError(
-            f"the position of landmark {landmarks.ids[bad[0]]} is not finite",
-            value=tuple(landmarks.points[bad[0]].tolist()), fix="Remove it, or run the map stage again.",
-        )  # fmt: skip
+    for row in np.flatnonzero(~np.isfinite(landmarks.points).all(axis=1)):
+        problem, value = f"the position of landmark {landmarks.ids[row]} is not finite", landmarks.points[row].tolist()
+        raise MapError(problem, value=tuple(value), fix="Remove it, or run the map stage again.")
 
 
 def _unit(directions: ArrayLike) -> Float:
@@ -205,7 +195,7 @@ def _unit(directions: ArrayLike) -> Float:
     length = np.linalg.norm(axes, axis=1, keepdims=True)
     if not np.all((length > 0) & (length < np.inf)):
         raise ValueError("directions must be finite and of some length")
-    return np.where(np.abs(length - 1) < 1e-12, axes, axes / length)  # those of a lattice stay as they are
+    return np.where(np.abs(length - 1) < 1e-12, axes, axes / length)  # unit vectors stay the same to the bit
 
 
 def _changed_landmarks(
@@ -222,30 +212,29 @@ def _changed_landmarks(
     return np.flatnonzero(~same)
 
 
-def _which_see(one: LocalizationMap, locations: Float, landmarks: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Which locations (L, 3) m have a free line of sight to at least one of these rows of the map's landmarks; (L,)."""
-    points = one.landmarks.points
-    everything = isinstance(one.occlusion, StoredOcclusion)  # which answers for its whole map only
-    asked = points if everything else points[landmarks]
-    columns = landmarks if everything else slice(None)
-    seen = np.zeros(len(locations), dtype=bool)
-    if len(landmarks) == 0:
-        return seen
-    block = max(1, SIGHT_BYTES // len(asked))
-    for begin in range(0, len(locations), block):
-        rows = slice(begin, begin + block)
-        seen[rows] = one.occlusion.unoccluded(locations[rows], asked)[:, columns].any(axis=1)
-    return seen
+def _any_unoccluded(
+    occlusion: OcclusionModel, points: Float, rows: NDArray[np.int64], locations: Float
+) -> NDArray[np.bool_]:
+    """Whether at least one of the landmarks at some rows of points (N, 3) m is unoccluded from locations (L, 3) m."""
+    found = np.zeros(len(locations), dtype=bool)
+    if len(rows) == 0:
+        return found
+    whole = isinstance(occlusion, StoredOcclusion)  # it answers only for all landmarks of its map
+    asked, columns = (points, rows) if whole else (points[rows], slice(None))
+    step = max(1, SIGHT_BYTES // len(asked))
+    for begin in range(0, len(locations), step):
+        block = slice(begin, begin + step)
+        found[block] = occlusion.unoccluded(locations[block], asked)[:, columns].any(axis=1)
+    return found
 
 
 def _check_unchanged(old: ViewpointMap, scorer: Scorer, rows: NDArray[np.int64]) -> None:
-    """A voxel that sees nothing new tells whether weights and geometry are those of the old map."""
+    """Raise a ConfigError if rows that see nothing new have other scores or counts: weights or geometry changed."""
     if len(rows) == 0:
         return
     _, scores, n_visible = _score_and_count(scorer, old.locations[rows], old.directions, None)
-    if not np.array_equal(n_visible, old.n_visible[rows]) or not np.allclose(
-        scores, old.scores[rows], rtol=SAME_SCORE, atol=SAME_SCORE
-    ):
+    same_scores = np.allclose(scores, old.scores[rows], rtol=SAME_SCORE, atol=SAME_SCORE)
+    if not (same_scores and np.array_equal(n_visible, old.n_visible[rows])):
         raise ConfigError(
             "a voxel that sees none of the added landmarks has other scores or counts than in the viewpoint map",
             value=tuple(np.round(old.locations[rows[0]], 3).tolist()),
@@ -254,13 +243,15 @@ def _check_unchanged(old: ViewpointMap, scorer: Scorer, rows: NDArray[np.int64])
 
 
 def _origin(scorer: Scorer, lattice: str, digests: NDArray[np.uint64]) -> MapOrigin:
-    one = scorer.localization_map
-    digest = hashlib.sha256(one.landmarks.ids.tobytes() + digests.tobytes())
-    return MapOrigin(scorer.name, lattice, _intrinsics(one.camera), one.occlusion.name, digest.hexdigest()[:16])
+    localization_map = scorer.localization_map
+    digest = hashlib.sha256(localization_map.landmarks.ids.tobytes() + digests.tobytes()).hexdigest()[:16]
+    return MapOrigin(
+        scorer.name, lattice, _intrinsics(localization_map.camera), localization_map.occlusion.name, digest
+    )
 
 
 def _intrinsics(camera: Camera) -> dict[str, Any]:
-    """As COLMAP describes a camera."""
+    """Intrinsics as `MapOrigin.camera` holds them."""
     if isinstance(camera, ColmapCamera):
         model, params = camera.model, camera.params
     else:

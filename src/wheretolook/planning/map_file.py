@@ -1,4 +1,4 @@
-"""A viewpoint map on disk: plain arrays in a folder that any language reads, with the layout written beside them."""
+"""A viewpoint map on disk: a folder of plain arrays that any language can read, and a description of their layout."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import json
 import shutil
 import tempfile
 from collections.abc import Mapping
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.utils.errors import MapFormatError
-from wheretolook.utils.files import write_json, write_text
+from wheretolook.utils.files import sha256, write_json, write_text
 
 FORMAT, VERSION = "wheretolook viewpoint map", 1
 
@@ -34,7 +33,7 @@ ARRAYS = {
 """Type, little-endian, and shape of each array; each is a file `<name>.npy`."""
 
 _OLD = "old"
-"""Where a map that is being replaced lies in the hidden folder of the one who saves."""
+"""Name of a map that is being replaced, in the hidden folder where the new one is written."""
 
 REBUILD = "Build it anew with `wheretolook viewpoint-map`, or get the folder again."
 
@@ -107,20 +106,16 @@ def write_map(
 ) -> None:
     """Write a folder; one that holds a viewpoint map and nothing else is replaced once the new one is complete.
 
-    The same map gives the same bytes. The layout is described in the folder's own `LAYOUT.txt`. The new map is made in
-    a hidden folder beside it, `.<name>.<some letters>`, where the old one is put until the new one has its place.
-    Whoever is killed at that moment leaves both there, and `read_map` says where.
+    The same map gives the same bytes; the folder's own `LAYOUT.txt` describes them. The new map is written in a hidden
+    folder beside it, `.<name>.<some letters>`, into which the old one is moved until the new one is in place. A process
+    killed in between leaves both there, and `read_map` says where.
 
-    Args:
-        folder: of the map.
-        grid: voxels of the world.
-        origin: fields of `MapOrigin`, without `derived`.
-        arrays: those of `ARRAYS`, by name.
+    `origin` has the fields of `MapOrigin` but `derived`, `arrays` those of `ARRAYS` by name.
 
     Raises:
-        MapFormatError: the folder holds something else, or something beside a map.
+        MapFormatError: the folder holds anything that is not part of a viewpoint map.
     """
-    folder = Path(folder).resolve()  # which has a name, also for "."
+    folder = Path(folder).resolve()  # so that "." has a name too
     _refuse_something_else(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
     work = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
@@ -134,7 +129,7 @@ def write_map(
     finally:
         if old.exists() and not folder.exists():
             old.rename(folder)
-        shutil.rmtree(work, ignore_errors=True)  # who has mapped the old files keeps them
+        shutil.rmtree(work, ignore_errors=True)  # processes that have mapped the old files still read them
 
 
 def _refuse_something_else(folder: Path) -> None:
@@ -148,19 +143,16 @@ def _refuse_something_else(folder: Path) -> None:
     if not is_map:
         raise MapFormatError("something else is here", path=folder, fix="Name a new folder, or remove this.")
     known = {DESCRIPTION, LAYOUT, *(f"{name}.npy" for name in ARRAYS)}
-    others = sorted(path.name for path in folder.iterdir() if path.name not in known)
-    if others:
-        raise MapFormatError(
-            "this is no file of the viewpoint map that is to be replaced", path=folder / others[0],
-            fix="Move it elsewhere, or name a new folder for the map.",
-        )  # fmt: skip
+    for name in sorted(path.name for path in folder.iterdir() if path.name not in known):
+        fix = "Move it elsewhere, or name a new folder for the map."
+        raise MapFormatError("this is no file of the viewpoint map that is to be replaced", path=folder / name, fix=fix)
 
 
 def _write(folder: Path, grid: VoxelGrid, origin: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> None:
     checksums = {}
     for name, (kind, _) in ARRAYS.items():
         np.save(folder / f"{name}.npy", np.ascontiguousarray(arrays[name], dtype=kind))
-        checksums[f"{name}.npy"] = _sha256(folder / f"{name}.npy")
+        checksums[f"{name}.npy"] = sha256(folder / f"{name}.npy")
     n_rows, n_directions = arrays["scores"].shape
     files = "\n".join(
         f"  {name + '.npy':<20}{np.dtype(kind).name:<9}({shape + ')':<7}{_MEANINGS[name]}"
@@ -182,10 +174,8 @@ def _write(folder: Path, grid: VoxelGrid, origin: Mapping[str, Any], arrays: Map
 def read_map(folder: str | Path, mmap: bool = False) -> tuple[VoxelGrid, dict[str, Any], dict[str, NDArray[Any]]]:
     """Read what `write_map` wrote: grid, origin and arrays.
 
-    Args:
-        folder: of the map.
-        mmap: map the files into memory, read-only, and read only what is asked for. Sizes and types are checked all
-            the same, but not the checksums, for which every byte would have to be read.
+    With `mmap` the files are mapped into memory, read-only, and read where they are used. Sizes and types are still
+    checked, but not the checksums, for which every byte would have to be read.
 
     Raises:
         MapFormatError: there is no map, it is damaged, or of another version.
@@ -193,9 +183,8 @@ def read_map(folder: str | Path, mmap: bool = False) -> tuple[VoxelGrid, dict[st
     folder = Path(folder)
     path = folder / DESCRIPTION
     if not path.is_file():
-        raise MapFormatError(
-            "there is no viewpoint map in this folder", path=folder, fix=_left_behind(folder) or REBUILD
-        )
+        fix = _left_behind(folder) or REBUILD
+        raise MapFormatError("there is no viewpoint map in this folder", path=folder, fix=fix)
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         found = content.get("format"), content.get("version")
@@ -215,13 +204,13 @@ def read_map(folder: str | Path, mmap: bool = False) -> tuple[VoxelGrid, dict[st
     arrays: dict[str, NDArray[Any]] = {}
     for name, shape in expected.items():
         arrays[name] = _read(folder / f"{name}.npy", ARRAYS[name][0], shape, mmap)
-        if not mmap and _sha256(folder / f"{name}.npy") != checksums.get(f"{name}.npy"):
+        if not mmap and sha256(folder / f"{name}.npy") != checksums.get(f"{name}.npy"):
             raise MapFormatError("damaged: the checksum differs", path=folder / f"{name}.npy", fix=REBUILD)
     return grid, origin, arrays
 
 
 def _left_behind(folder: Path) -> str:
-    """Where the map lies that a save took away and, killed, did not replace; empty if there is none."""
+    """Where an interrupted save left the map that it was about to replace, as a sentence; "" if there is none."""
     folder = folder.resolve()
     found = sorted(folder.parent.glob(f".{glob.escape(folder.name)}.*/{_OLD}/{DESCRIPTION}"))
     return f"A save was interrupted: the map from before is {found[-1].parent}, move it here." if found else ""
@@ -231,21 +220,11 @@ def _read(path: Path, kind: str, shape: tuple[int, ...], mmap: bool) -> NDArray[
     if not path.is_file():
         raise MapFormatError("this file is missing", path=path, fix=REBUILD)
     try:
-        # the plain array over the mapped memory: NumPy's class for it is slow to index
+        # a plain array over the mapped memory, because np.memmap is slow to index
         array = np.asarray(np.load(path, mmap_mode="r" if mmap else None, allow_pickle=False))
     except Exception as error:  # a damaged header raises many kinds of errors
         raise MapFormatError(f"not a readable array: {error}", path=path, fix=REBUILD) from error
     if array.shape != shape or array.dtype != np.dtype(kind) or not array.flags.c_contiguous:
-        raise MapFormatError(
-            f"not an array of {np.dtype(kind).name} of shape {shape}", path=path, value=(array.dtype.name, array.shape),
-            fix=REBUILD,
-        )  # fmt: skip
+        problem = f"not an array of {np.dtype(kind).name} of shape {shape}"
+        raise MapFormatError(problem, path=path, value=(array.dtype.name, array.shape), fix=REBUILD)
     return array
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        digest = sha256()
-        while block := file.read(1 << 20):
-            digest.update(block)
-    return digest.hexdigest()

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from wheretolook.dataset.folders import Dataset, SceneFolder
+from wheretolook.dataset.folders import Dataset
+from wheretolook.dataset.scene import Scene
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
@@ -20,28 +20,25 @@ from wheretolook.planning.planner_map import check_methods, planner_map
 from wheretolook.planning.route_views import PlannedPath
 from wheretolook.planning.scene_map import weights_for
 from wheretolook.rendering.warp_renderer import WarpRenderer
-from wheretolook.space.free_space import FreeSpace
-from wheretolook.space.mapped_space import MappedSpace
-from wheretolook.visibility.occlusion import OcclusionModel
 
 
 def plan_by_methods(
-    methods: Iterable[str], start: ArrayLike, goal: ArrayLike, scene: SceneFolder, dataset: Dataset,
-    space: FreeSpace | MappedSpace, occlusion: OcclusionModel, weights: Path | None = None,
-    config: PlanConfig = PlanConfig(), device: str = "cpu",
-) -> dict[str, PlannedPath]:  # fmt: skip
+    scene: Scene,
+    dataset: Dataset,
+    methods: Iterable[str],
+    start: ArrayLike,
+    goal: ArrayLike,
+    config: PlanConfig = PlanConfig(),
+) -> dict[str, PlannedPath]:
     """Plan a path by each method, with progress bars; what a method thinks of the views is its own map's scores.
 
     Args:
+        scene: where a camera can be, and what it sees.
+        dataset: the scene's, for weights.
         methods: "forward", or names of scorers; empty for that of the weights, or bins without.
         start, goal: (3,) world, metres.
-        scene: its landmarks.
-        dataset: gives the camera.
-        space: where a camera can be.
-        occlusion: which landmarks nothing stands in front of.
-        weights: for methods that have learnt, if they are of their kind; see `weights_for`.
-        config: grid and directions of the viewpoint maps, costs and limits of paths.
-        device: where kernels run.
+        config: voxels and directions of the viewpoint maps, costs and limits of paths, and weights for methods that
+            have learnt, if they are of their kind (`weights_for`).
 
     Returns:
         Paths by the names of their methods, in the order given.
@@ -49,17 +46,14 @@ def plan_by_methods(
     Raises:
         ConfigError: a method needs weights, or there is none of that name. PlanningError: no path can be found.
     """
-    methods = tuple(methods)
+    methods, space = tuple(methods), scene.space
     check_methods(methods)
     check_ends(np.asarray([start, goal], dtype=np.float64), space, space.bounds)  # before maps are built
     paths: dict[str, PlannedPath] = {}
     for method in methods:
         views, name = None, method
         if method != FORWARD:
-            used = weights_for(method, dataset, weights)
-            views = planner_map(
-                method, used, config.grid, config.directions, config.lattice, scene, dataset, space, occlusion, device
-            )
+            views = planner_map(scene, dataset, config, method, weights_for(method, dataset, config.weights))
             name = method or views.origin.scorer
         paths.pop(name, None)  # named twice, it is what was asked for last
         paths[name] = plan_path(start, goal, space, space.bounds, views, config.planner)
@@ -79,13 +73,12 @@ def path_views(
     camera, points = localization_map.camera, localization_map.landmarks.points
     assert isinstance(camera, PinholeCamera)
     cam_from_world = poses_looking_along(path.positions, path.axes)
-    visible = localization_map.visible_landmarks(cam_from_world)
+    visible = localization_map.landmarks_in_view(cam_from_world)
     rgb = None if renderer is None else renderer.render(camera, cam_from_world).rgb
     views = []
     for number, pose in enumerate(cam_from_world):
         local = points[visible[number]] @ pose[:, :3].T + pose[:, 3]
-        views.append(
-            PathView(path.positions[number], path.axes[number], float(path.scores[number]), camera.project(local),
-                     (camera.width, camera.height), None if rgb is None else rgb[number])
-        )  # fmt: skip
+        image = None if rgb is None else rgb[number]
+        position, axis, score = path.positions[number], path.axes[number], float(path.scores[number])
+        views.append(PathView(position, axis, score, camera.project(local), (camera.width, camera.height), image))
     return views

@@ -46,9 +46,9 @@ class ComparedPaths:
 
     Attributes:
         paths: a row for each pair, task (`PLANNED`, `GIVEN`) and method: `planned`, whether there is a path, its
-        `length_m`, `turn_deg`, `n_views`, `promised`, the mean score of its views by the method's own map (NaN for
-        "forward"), and `found_by` (`PlannedPath.found_by`).
-    views: a row for each view along them: pair, task, method, waypoint, score, and
+            `length_m`, `turn_deg`, `n_views`, `promised`, the mean score of its views by the method's own map (NaN for
+            "forward"), and `found_by` (`PlannedPath.found_by`).
+        views: a row for each view along them: pair, task, method, waypoint, score, and
             `wheretolook.viewpoints.table.POSE_COLUMNS`.
     """
 
@@ -81,8 +81,9 @@ def draw_pairs(space: FreeSpace | MappedSpace, config: PathsConfig) -> Float:
     if len(found) < config.pairs:
         raise SceneError(
             f"found only {len(found)} starts and goals {config.min_distance_m:g} m apart with a way between them",
-            value=config.pairs, fix="Lower paths.min_distance_m or paths.pairs.",
-        )  # fmt: skip
+            value=config.pairs,
+            fix="Lower paths.min_distance_m or paths.pairs.",
+        )
     return np.array(found)
 
 
@@ -106,9 +107,12 @@ def shares_below(viewpoint_map: ViewpointMap) -> ViewpointMap:
 
 
 def plan_pairs(
-    pairs: Float, space: FreeSpace | MappedSpace, maps: Mapping[str, ViewpointMap], config: PathsConfig,
+    pairs: Float,
+    space: FreeSpace | MappedSpace,
+    maps: Mapping[str, ViewpointMap],
+    config: PathsConfig,
     progress: str | None = None,
-) -> ComparedPaths:  # fmt: skip
+) -> ComparedPaths:
     """Plan between pairs by every method; then choose views along the shortest paths by every method.
 
     Args:
@@ -122,7 +126,7 @@ def plan_pairs(
         PlanningError: no path was found at all.
     """
     paths: list[dict[str, Any]] = []
-    views: list[pd.DataFrame] = []
+    tables: list[pd.DataFrame] = []
 
     def add(pair: int, task: str, method: str, path: PlannedPath | None) -> None:
         about = {"pair": pair, "task": task, "method": method, "planned": path is not None}
@@ -132,30 +136,41 @@ def plan_pairs(
             )
             return
         promised = float(path.scores.mean())
-        paths.append({**about, "length_m": path.length_m, "turn_deg": path.turn_deg, "n_views": len(path.positions),
-                      "promised": promised, "found_by": path.found_by})  # fmt: skip
-        of_view = {"waypoint": np.arange(len(path.positions)), "score": path.scores,
-                   **pose_columns(poses_looking_along(path.positions, path.axes))}  # fmt: skip
-        views.append(pd.DataFrame({"pair": pair, "task": task, "method": method, **of_view}))
+        paths.append(
+            {
+                **about,
+                "length_m": path.length_m,
+                "turn_deg": path.turn_deg,
+                "n_views": len(path.positions),
+                "promised": promised,
+                "found_by": path.found_by,
+            }
+        )
+        of_view = {
+            "waypoint": np.arange(len(path.positions)),
+            "score": path.scores,
+            **pose_columns(poses_looking_along(path.positions, path.axes)),
+        }
+        tables.append(pd.DataFrame({"pair": pair, "task": task, "method": method, **of_view}))
 
-    limits = {name: TurnLimit.of(one.directions, config.max_turn_deg) for name, one in maps.items()}
+    limits = {name: TurnLimit.of(views.directions, config.max_turn_deg) for name, views in maps.items()}
     with tqdm(total=len(pairs) * (1 + len(maps)), desc=progress, unit="path", disable=progress is None) as bar:
         for number, ends in enumerate(pairs):
             shortest = _planned(ends, space, None, config.planner)
             add(number, PLANNED, FORWARD, shortest)
             bar.update()
-            for name, one in maps.items():
-                add(number, PLANNED, name, _planned(ends, space, one, config.planner))
+            for name, views in maps.items():
+                add(number, PLANNED, name, _planned(ends, space, views, config.planner))
                 bar.update()
             along = None if shortest is None else resample_path(shortest.positions, config.planner.spacing_m)
             add(number, GIVEN, FORWARD, _looking_ahead(shortest, along))
-            for name, one in maps.items():
+            for name, views in maps.items():
                 for rule, choose in RULES.items():
-                    path = None if along is None else _looking_about(along, one, limits[name], config, choose)
+                    path = None if along is None else _looking_about(along, views, limits[name], config, choose)
                     add(number, GIVEN, f"{name} {rule}".strip(), path)
-    if not views:
+    if not tables:
         raise PlanningError("no path was found at all", value=f"{len(pairs)} pairs", fix="Raise paths.planner.time_s.")
-    return ComparedPaths(pd.DataFrame(paths), pd.concat(views, ignore_index=True))
+    return ComparedPaths(pd.DataFrame(paths), pd.concat(tables, ignore_index=True))
 
 
 def _planned(

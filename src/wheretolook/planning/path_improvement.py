@@ -1,4 +1,4 @@
-"""Making a route better: a random local search over its corners, for as long as there is time."""
+"""Improving a route by a random local search over its corners."""
 
 from __future__ import annotations
 
@@ -10,41 +10,52 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.geometry.poses import Float
-
-STEPS_M = (0.05, 1.0)
-"""Least and greatest typical distance by which a corner is moved."""
+from wheretolook.planning.polylines import between, lengths_along
 
 
-class Segments(Protocol):
-    """Tells where a camera can go straight."""
+class Space(Protocol):
+    """Where a camera may be: `wheretolook.space.free_space.FreeSpace`, or anything that answers the same."""
+
+    def is_free(self, points: ArrayLike) -> NDArray[np.bool_]:
+        """Whether a camera may be at points (N, 3) m; (N,)."""
 
     def segments_are_free(self, a: ArrayLike, b: ArrayLike) -> NDArray[np.bool_]:
         """Whether it may go straight from points a to points b, (N, 3) m each; (N,)."""
 
 
-def improve(
-    places: Float, cost_below: Callable[[Float, float], float | None], cost: float, space: Segments, bounds: Float,
-    seconds: float, rng: np.random.Generator, most: int | None = None,
-) -> Float:  # fmt: skip
-    """The best route that is found from one by cutting it short, and by moving, adding and leaving out corners.
+STEPS_M = (0.05, 1.0)
+"""Range of the standard deviation by which a corner is moved."""
 
-    Every route tried is free and keeps its ends; one is taken if it costs less.
+
+def improve(
+    places: Float,
+    cost_below: Callable[[Float, float], float | None],
+    cost: float,
+    space: Space,
+    bounds: Float,
+    seconds: float,
+    rng: np.random.Generator,
+    most: int | None = None,
+) -> Float:
+    """Improve a route by shortcuts and by moving, adding and removing corners; returns the cheapest found, (S', 3) m.
+
+    Every route tried lies in free space and keeps its ends.
 
     Args:
         places: (S, 3) corners of a free route, metres.
-        cost_below: what a route costs, if that is less than a number; else None.
-        cost: of the route given.
+        cost_below: the cost of a route if that is less than a limit, else None.
+        cost: cost of the route given.
         space: where a camera can go.
-        bounds: (2, 3) lowest and highest corner of the space to plan in.
+        bounds: (2, 3) lowest and highest corner of the space to plan in, metres.
         seconds: time to search.
-        rng: draws.
+        rng: random numbers.
         most: routes to try at most.
     """
     end, tried = time.monotonic() + seconds, 0
     while time.monotonic() < end and (most is None or tried < most):
         tried += 1
         candidate, first, last = _varied(places, bounds, rng)
-        # only what is new between two corners needs to be looked at
+        # only the changed segments need to be tested
         if not space.segments_are_free(candidate[first:last], candidate[first + 1 : last + 1]).all():
             continue
         found = cost_below(candidate, cost)
@@ -54,23 +65,22 @@ def improve(
 
 
 def _varied(places: Float, bounds: Float, rng: np.random.Generator) -> tuple[Float, int, int]:
-    """Another route, and the corners between which it differs."""
+    """A random variation of a route, and the first and last corner between which it differs."""
     n, step = len(places), np.exp(rng.uniform(*np.log(STEPS_M)))
     kind = rng.integers(4) if n > 2 else rng.integers(2)
-    if kind == 0:  # a new corner, somewhere beside a piece
+    if kind == 0:  # a new corner beside a random point of the route
         after = int(rng.integers(1, n))
         t = rng.random()
         new = places[after - 1] * (1 - t) + places[after] * t + rng.normal(0, step, 3)
         return np.insert(places, after, new.clip(*bounds), axis=0), after - 1, after + 1
-    if kind == 1:  # straight from somewhere to somewhere else
-        pieces = np.linalg.norm(np.diff(places, axis=0), axis=1)
-        at = np.concatenate([[0.0], np.cumsum(pieces)])
+    if kind == 1:  # a shortcut between two random points of the route
+        at = lengths_along(places)
         a, b = np.sort(rng.uniform(0, at[-1], 2))
-        ends = np.stack([np.interp([a, b], at, column) for column in places.T], axis=1)
+        ends = between(at, places, np.array([a, b]))
         before, after = int((at < a).sum()), int((at <= b).sum())
         return np.concatenate([places[:before], ends, places[after:]]), before - 1, before + 2
     row = int(rng.integers(1, n - 1))
-    if kind == 2:  # without a corner
+    if kind == 2:  # remove a corner
         return np.delete(places, row, axis=0), row - 1, row
     moved = places.copy()
     moved[row] = (moved[row] + rng.normal(0, step, 3)).clip(*bounds)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,16 +14,9 @@ from tqdm.auto import tqdm
 from wheretolook.geometry.lattices import axes_of_angles
 from wheretolook.geometry.poses import Float
 from wheretolook.planning.config import PathConfig
-from wheretolook.planning.path_improvement import improve
-from wheretolook.planning.route_views import (
-    IMPROVEMENT,
-    SEARCH,
-    SHORT_ROUTE,
-    PlannedPath,
-    RouteSamples,
-    RouteViews,
-    between,
-)
+from wheretolook.planning.path_improvement import Space, improve
+from wheretolook.planning.polylines import between
+from wheretolook.planning.route_views import IMPROVEMENT, SEARCH, SHORT_ROUTE, PlannedPath, RouteSamples, RouteViews
 from wheretolook.planning.turns import check_axis
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.utils.errors import PlanningError
@@ -31,30 +24,20 @@ from wheretolook.utils.errors import PlanningError
 __all__ = ["PathConfig", "PlannedPath", "Space", "plan_path"]
 
 TABLE_STEP_DEG = 2.0
-"""Step of yaw and pitch of the table that finds the map's direction nearest to an axis."""
+"""Step of yaw and pitch of the table of the map's direction nearest to an axis."""
 
 SHORT_SHARE, SEARCH_SHARE, SHORTEN_SHARE = 0.25, 0.3, 0.05
-"""Shares of the time in which a short path is looked for, in which places and views are looked for together, and in
-which the short path is made shorter. In the rest what costs least is improved."""
+"""Shares of the time for finding a short path, for searching places and views together, and for shortening the short
+path. The rest is for improving the cheapest path."""
 
 AHEAD_SHARE = 0.5
-"""Share of the time in which a short path is looked for where there is nothing else to look for."""
+"""Share of the time for finding a short path without a viewpoint map; the rest is for shortening it."""
 
 SAME_M = 1e-6
-"""Points nearer to each other are the same."""
+"""Points closer than this count as equal."""
 
 STARTS = 12
-"""Orientations that a path may start with where none is given."""
-
-
-class Space(Protocol):
-    """Where a camera may be: `wheretolook.space.free_space.FreeSpace`, or anything that answers the same."""
-
-    def is_free(self, points: ArrayLike) -> NDArray[np.bool_]:
-        """Whether a camera may be at points (N, 3) m; (N,)."""
-
-    def segments_are_free(self, a: ArrayLike, b: ArrayLike) -> NDArray[np.bool_]:
-        """Whether it may go straight from points a to points b, (N, 3) m each; (N,)."""
+"""Number of start orientations to choose from if none is given."""
 
 
 def plan_path(
@@ -67,25 +50,22 @@ def plan_path(
     start_axis: ArrayLike | None = None,
     progress: bool = True,
 ) -> PlannedPath:
-    """Plan a path on which the camera sees what it needs to know where it is.
+    """Plan a path along which a robot can localize; the best found in `config.time_s` is returned.
 
-    RRT* (Karaman and Frazzoli 2011) looks for a short path, then for places and views together. Along either, the views
-    are chosen anew, exactly (`best_sequence`); what costs least is then improved by moving its corners.
+    RRT* (Karaman and Frazzoli 2011) searches for a short path, then for places and views together. The views along
+    either are then chosen exactly (`best_sequence`), and the cheapest path is improved by moving its corners.
 
-    Without a viewpoint map the path is the shortest that is found, and the camera looks forward along it, as level as
-    `PathConfig.pitch_deg` allows; it is then the front of the robot, and no limit on turns holds.
+    Without a viewpoint map the path is the shortest found. The camera, fixed to the front of the robot, looks forward
+    along it, as level as `PathConfig.pitch_deg` allows, without limit on turns.
 
     Args:
         start, goal: (3,) world, metres.
         space: where the camera may be.
-        bounds: (2, 3) lowest and highest corner of the space to plan in.
-        viewpoint_map: what the views along a path are worth, in [0, 1].
+        bounds: (2, 3) lowest and highest corner of the space to plan in, metres.
+        viewpoint_map: scores of views, in [0, 1].
         config: costs and limits.
-        start_axis: (3,) optical axis to start with; None lets the planner choose.
+        start_axis: (3,) optical axis to start with, world; None lets the planner choose.
         progress: show a progress bar.
-
-    Returns:
-        The best path found in the time given.
 
     Raises:
         PlanningError: the start or the goal is not free or lies outside the bounds; they are the same; the axis is
@@ -93,25 +73,23 @@ def plan_path(
         ValueError: a point is not finite, or the axis has no direction.
     """
     ends = np.asarray([start, goal], dtype=np.float64)
-    low, high = np.asarray(bounds, dtype=np.float64)
+    box = np.array(bounds, dtype=np.float64)
     if not np.isfinite(ends).all():
         raise ValueError(f"start and goal must be finite, got {ends.tolist()}")
-    check_ends(ends, space, np.array([low, high]))
+    check_ends(ends, space, box)
     if viewpoint_map is None and start_axis is not None:
-        raise PlanningError(
-            "without a viewpoint map the camera looks ahead", value=start_axis, fix="Give no start axis."
-        )
-    problem = _Problem(ends, low, high, space, viewpoint_map, config)
+        problem_text = "without a viewpoint map the camera looks ahead"
+        raise PlanningError(problem_text, value=start_axis, fix="Give no start axis.")
+    problem = _Problem(ends, box, space, viewpoint_map, config)
     orientations = problem.start_orientations(start_axis)
     rng = np.random.default_rng(0)
-    box = np.array([low, high])
     with tqdm(total=round(config.time_s, 1), desc="plan", unit="s", disable=not progress) as bar:
         end, ahead = time.monotonic() + config.time_s, viewpoint_map is None
-        shortest = _Problem(ends, low, high, space, None, config)
+        shortest = _Problem(ends, box, space, None, config)
         route: Float | None = None
         try:
-            share = (AHEAD_SHARE, 1.0) if ahead else (SHORT_SHARE, 1 - SEARCH_SHARE)
-            route = shortest.solve([(0.0, 0.0)], share[0] * config.time_s, share[1] * config.time_s, bar)[:, :3]
+            least, most = (AHEAD_SHARE, 1.0) if ahead else (SHORT_SHARE, 1 - SEARCH_SHARE)
+            route = shortest.solve([(0.0, 0.0)], least * config.time_s, most * config.time_s, bar)[:, :3]
         except PlanningError:
             if ahead:
                 raise
@@ -170,17 +148,15 @@ def check_ends(ends: Float, space: Space, bounds: Float) -> None:
     low, high = bounds
     for name, point in zip(("start", "goal"), ends, strict=True):
         if not ((point >= low) & (point <= high)).all() or not space.is_free(point[None])[0]:
-            raise PlanningError(
-                f"the {name} is not in free space", value=tuple(point.tolist()),
-                fix="Give a point where the camera can be, off walls and furniture.",
-            )  # fmt: skip
+            fix = "Give a point where the camera can be, off walls and furniture."
+            raise PlanningError(f"the {name} is not in free space", value=tuple(point.tolist()), fix=fix)
     if np.linalg.norm(ends[1] - ends[0]) < SAME_M:
         fix = "Ask the map for the best view there."
         raise PlanningError("the start is the goal", value=tuple(ends[0].tolist()), fix=fix)
 
 
 def _looking_ahead(route: Float, config: PathConfig) -> PlannedPath:
-    """A route (S, 3) m, looking forward along it."""
+    """The path along a route (S, 3) m whose camera looks forward."""
     samples = RouteSamples.of(route, config.spacing_m)
     axes = _forward(samples.positions, np.radians(config.pitch_deg))
     unknown = np.full(len(samples.positions), np.nan)
@@ -197,20 +173,19 @@ def _shorter(places: Float, limit: float) -> float | None:
 
 
 class _Problem:
-    """One planning problem: five numbers x, y, z, yaw, pitch; a path without a map leaves the last two alone."""
+    """A planning problem over states x, y, z (m), yaw, pitch (radians); without a map the last two do not matter."""
 
     def __init__(
-        self, ends: Float, low: Float, high: Float, space: Space, viewpoint_map: ViewpointMap | None, config: PathConfig
+        self, ends: Float, bounds: Float, space: Space, viewpoint_map: ViewpointMap | None, config: PathConfig
     ) -> None:
-        self.ends, self.low, self.high, self.space, self.config = ends, low, high, space, config
-        self.map = viewpoint_map
+        self.ends, self.bounds, self.space, self.config, self.map = ends, bounds, space, config, viewpoint_map
         self.pitch = tuple(map(math.radians, config.pitch_deg))
         if viewpoint_map is not None:
             self._score = viewpoint_map.scores.item
             self._table = _nearest_directions(viewpoint_map.directions)
 
     def start_orientations(self, axis: ArrayLike | None) -> list[tuple[float, float]]:
-        """Yaw and pitch to start with, in radians."""
+        """Yaws and pitches that a path may start with, in radians."""
         if self.map is None:
             return [(0.0, 0.0)]
         if axis is None:
@@ -219,10 +194,11 @@ class _Problem:
         x, y, z = check_axis(axis)
         yaw, pitch = math.atan2(y, x), math.asin(z)
         if not self.pitch[0] - 1e-6 <= pitch <= self.pitch[1] + 1e-6:
-            raise PlanningError(
-                "the camera cannot be pitched as it should start", value=f"{math.degrees(pitch):.1f} deg",
-                fix=f"Start within {self.config.pitch_deg} degrees, or widen pitch_deg.",
-            )  # fmt: skip
+            value, fix = (
+                f"{math.degrees(pitch):.1f} deg",
+                f"Start within {self.config.pitch_deg} degrees, or widen pitch_deg.",
+            )
+            raise PlanningError("the camera cannot be pitched as it should start", value=value, fix=fix)
         return [(yaw, min(max(pitch, self.pitch[0]), self.pitch[1]))]
 
     def motion_cost(self, a: tuple[float, ...], b: tuple[float, ...]) -> float:
@@ -240,7 +216,7 @@ class _Problem:
         return length * (1 + config.score_weight * (1 - worth / n)) + config.turn_weight_m * _angle(a[3:], b[3:])
 
     def score(self, point: tuple[float, float, float], yaw: float, pitch: float) -> float:
-        """Score of a view, 0 where the map knows nothing."""
+        """Score of a view, 0 outside the map's free voxels."""
         assert self.map is not None
         row = self.map.row(point)
         if row < 0:
@@ -254,31 +230,24 @@ class _Problem:
         """Whether the camera can go straight from one state to another."""
         if self.map is not None:
             most = math.radians(self.config.max_turn_deg_per_m) * math.dist(a[:3], b[:3])
-            # the sum of both angles: what a camera on two axes turns is no less than the axis does
+            # the sum of yaw and pitch is never less than the angle between the axes, so the limit holds
             if abs(_wrapped(b[3] - a[3])) + abs(b[4] - a[4]) > most:
                 return False
         return bool(self.space.segments_are_free([a[:3]], [b[:3]])[0])
 
     def solve(self, orientations: list[tuple[float, float]], time_s: float, most_s: float, bar: Any) -> Float:
-        """States (S, 5) of the best path that is found in a time, or of the first that is found until another.
+        """States (S, 5) of the best path found in `time_s`, or else of the first one found until `most_s`.
 
         Raises:
-            PlanningError: there is none.
+            PlanningError: no path was found.
         """
         from ompl import base, geometric, util
 
         util.setLogLevel(util.LOG_NONE)
-        space = base.CompoundStateSpace()
-        place = base.RealVectorStateSpace(4)
-        bounds = base.RealVectorBounds(4)
         # without a map nothing depends on where the camera looks: the pitch has next to no range, the yaw no weight
         pitch = self.pitch if self.map is not None else (-1e-6, 1e-6)
-        for index, (low, high) in enumerate(zip((*self.low, pitch[0]), (*self.high, pitch[1]), strict=True)):
-            bounds.setLow(index, float(low))
-            bounds.setHigh(index, float(high))
-        place.setBounds(bounds)
-        space.addSubspace(place, 1.0)
-        space.addSubspace(base.SO2StateSpace(), 0.2 if self.map is not None else 1e-6)
+        low, high = self.bounds
+        space = _state_space(low, high, pitch, 0.2 if self.map is not None else 1e-6)
         information = base.SpaceInformation(space)
         information.setStateValidityChecker(lambda state: bool(self.space.is_free([_numbers(state)[:3]])[0]))
 
@@ -303,7 +272,7 @@ class _Problem:
             _write(state, (*self.ends[0], start_pitch, yaw))
             definition.addStartState(state)
         around_goal = base.GoalSpace(information)
-        around_goal.setSpace(self._goal_space(base, pitch))
+        around_goal.setSpace(_state_space(self.ends[1] - 1e-9, self.ends[1] + 1e-9, pitch, 1.0))
         definition.setGoal(around_goal)
         objective = Costs(information)
         definition.setOptimizationObjective(objective)
@@ -317,38 +286,38 @@ class _Problem:
             spent += step
             bar.update(min(step, max(0.0, bar.total - bar.n)))
         if not definition.hasExactSolution():
-            raise PlanningError(
-                "no path was found in time", value=f"{spent:.2g} s",
-                fix="Give it more time, or loosen the camera's limits.",
-            )  # fmt: skip
+            fix = "Give it more time, or loosen the camera's limits."
+            raise PlanningError("no path was found in time", value=f"{spent:.2g} s", fix=fix)
         found = definition.getSolutionPath()
         return np.array([_numbers(found.getState(index)) for index in range(found.getStateCount())])
 
-    def _goal_space(self, base: Any, pitch: tuple[float, ...]) -> Any:
-        """The goal with every orientation."""
-        space, place, bounds = base.CompoundStateSpace(), base.RealVectorStateSpace(4), base.RealVectorBounds(4)
-        for index, value in enumerate(self.ends[1]):
-            bounds.setLow(index, float(value) - 1e-9)
-            bounds.setHigh(index, float(value) + 1e-9)
-        bounds.setLow(3, pitch[0])
-        bounds.setHigh(3, pitch[1])
-        place.setBounds(bounds)
-        space.addSubspace(place, 1.0)
-        space.addSubspace(base.SO2StateSpace(), 1.0)
-        return space
-
     def path(self, states: Float, views: RouteViews) -> PlannedPath:
-        """The path through some states (S, 5), its views those of the states."""
+        """The path through states (S, 5) that keeps their views."""
         samples = RouteSamples.of(states[:, :3], self.config.spacing_m)
         angles = np.column_stack([np.unwrap(states[:, 3]), states[:, 4]])
-        return views.costed(
-            samples.positions, axes_of_angles(np.degrees(between(samples.corners, angles, samples.along)))
-        )
+        axes = axes_of_angles(np.degrees(between(samples.corners, angles, samples.along)))
+        return views.costed(samples.positions, axes)
+
+
+def _state_space(low: Float, high: Float, pitch: tuple[float, ...], yaw_weight: float) -> Any:
+    """OMPL's space of states: x, y, z and pitch within bounds, and the yaw, with its weight in distances."""
+    from ompl import base
+
+    space, place, bounds = base.CompoundStateSpace(), base.RealVectorStateSpace(4), base.RealVectorBounds(4)
+    for index, ends in enumerate(zip((*low, pitch[0]), (*high, pitch[1]), strict=True)):
+        bounds.setLow(index, float(ends[0]))
+        bounds.setHigh(index, float(ends[1]))
+    place.setBounds(bounds)
+    space.addSubspace(place, 1.0)
+    space.addSubspace(base.SO2StateSpace(), yaw_weight)
+    return space
 
 
 def _forward(positions: Float, pitch: Float) -> Float:
-    """Unit axes (W, 3) that look along a path (W, 3), as level as the pitch (2,) may be, in radians; where it goes
-    straight up or down, as before."""
+    """Unit axes (W, 3) that look along a path (W, 3), as level as the limits of the pitch (2,) allow, in radians.
+
+    Where the path goes straight up or down, the yaw stays as before.
+    """
     steps = np.gradient(positions, axis=0)[:, :2] if len(positions) > 1 else np.array([[1.0, 0.0]])
     length = np.linalg.norm(steps, axis=1)
     known = length > 1e-9
@@ -386,7 +355,7 @@ def _angle(a: tuple[float, ...], b: tuple[float, ...]) -> float:
 
 
 def _nearest_directions(directions: Float) -> NDArray[np.int64]:
-    """The direction nearest to the middle of every cell of pitch (rows) and yaw (columns)."""
+    """Table of the direction nearest to the centre of each cell of pitch (rows) and yaw (columns)."""
     pitch = np.arange(-90 + TABLE_STEP_DEG / 2, 90, TABLE_STEP_DEG)
     yaw = np.arange(-180 + TABLE_STEP_DEG / 2, 180, TABLE_STEP_DEG)
     axes = axes_of_angles(np.stack(np.meshgrid(yaw, pitch), axis=-1))

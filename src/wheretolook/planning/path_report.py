@@ -1,4 +1,4 @@
-"""What planned paths were worth: the share of their views that localize, with intervals, and what that costs."""
+"""Results of a comparison of planned paths: the share of their views that localize, their lengths and turns."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from wheretolook.planning.config import PathsConfig
 from wheretolook.planning.path_comparison import FORWARD
 from wheretolook.utils.markdown import markdown_table
-from wheretolook.utils.tracking import NestedRun, TrackingConfig, log_nested, start_run
+from wheretolook.utils.tracking import NestedRun, log_nested, start_run
+from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import LOCALIZED
 
 PATHS_CSV, PATHS_MD, PATHS_PNG = "paths.csv", "paths.md", "paths.png"
@@ -24,7 +25,7 @@ ALL = "all"
 
 
 def summarize_paths(paths: pd.DataFrame, views: pd.DataFrame, config: PathsConfig) -> pd.DataFrame:
-    """A row for each scene, and for all, task and method.
+    """A row for each scene (and all of them), task and method.
 
     Args:
         paths: `wheretolook.planning.path_comparison.ComparedPaths.paths` of all scenes, with a column `scene`.
@@ -32,10 +33,10 @@ def summarize_paths(paths: pd.DataFrame, views: pd.DataFrame, config: PathsConfi
         config: limits of the errors, resamples, seed.
 
     Returns:
-        `localized`, the share of all views that localize; over the pairs that both planned, `times_forward`, that share
-        over the one of "forward", and `times_forward_length`; the former two with the ends of 95 % intervals by
-        resampling pairs within scenes; `failures` to plan, `turn_deg_per_m`, `promised`. What there is nothing to tell
-        of is NaN.
+        `localized`, the share of all views that localize; `times_forward` and `times_forward_length`, the ratios of
+        this share and of the length to those of "forward", over the pairs that both could plan; 95 % intervals of the
+        first two by resampling pairs within scenes; `failures` to plan, `turn_deg_per_m`, and `promised`, the mean
+        score. NaN where there is no data.
     """
     good = (
         (views["status"] == LOCALIZED)
@@ -59,7 +60,7 @@ def summarize_paths(paths: pd.DataFrame, views: pd.DataFrame, config: PathsConfi
 
 
 def _draws(table: pd.DataFrame, config: PathsConfig) -> NDArray[np.int64]:
-    """How often each pair of `_pairs_of` is drawn, (resamples, P): pairs within their scenes, with replacement."""
+    """How often each pair of `_pairs_of` is drawn, (resamples, P), with replacement within its scene."""
     pairs = _pairs_of(table)
     rng = np.random.default_rng(config.seed)
     times = np.zeros((config.resamples, len(pairs)), dtype=np.int64)
@@ -78,27 +79,26 @@ def _pairs_of(table: pd.DataFrame) -> pd.MultiIndex:
 
 def _row(of_method: pd.DataFrame, forward: pd.DataFrame, draws: NDArray[np.int64]) -> dict[str, Any]:
     index = _pairs_of(forward)
-    one, base = (table.set_index(["scene", "pair"]).reindex(index) for table in (of_method, forward))
-    both = (one["planned"] & base["planned"]).fillna(False).to_numpy(bool)
-    counts = {name: table[["good", "n"]].fillna(0).to_numpy() for name, table in (("one", one), ("base", base))}
+    method, base = (table.set_index(["scene", "pair"]).reindex(index) for table in (of_method, forward))
+    both = (method["planned"] & base["planned"]).fillna(False).to_numpy(bool)
+    counts, base_counts = (table[["good", "n"]].fillna(0).to_numpy() for table in (method, base))
 
-    def share(name: str, weights: NDArray[Any]) -> NDArray[Any]:
-        good, n = (weights @ counts[name]).T
-        return np.divide(good, n, out=np.full(len(weights), np.nan), where=n > 0)
+    def quotient(a: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
+        return np.divide(a, b, out=np.full(len(a), np.nan), where=b > 0)
 
     def ratio(weights: NDArray[Any]) -> NDArray[Any]:
-        ours, theirs = (share(name, weights * both) for name in ("one", "base"))
-        return np.divide(ours, theirs, out=np.full(len(weights), np.nan), where=theirs > 0)
+        ours, theirs = (quotient(*((weights * both) @ table).T) for table in (counts, base_counts))
+        return quotient(ours, theirs)
 
     whole = np.ones((1, len(index)))
-    shares, ratios = _interval(share("one", draws)), _interval(ratio(draws))
+    shares, ratios = _interval(quotient(*(draws @ counts).T)), _interval(ratio(draws))
     metres = float(of_method["length_m"].sum())
-    lengths = one["length_m"].to_numpy()[both].sum(), base["length_m"].to_numpy()[both].sum()
+    lengths = [table["length_m"].to_numpy()[both].sum() for table in (method, base)]
     return {
         "pairs": len(of_method),
         "failures": int((~of_method["planned"]).sum()),
-        "views": int(counts["one"][:, 1].sum()),
-        "localized": float(share("one", whole)[0]),
+        "views": int(counts[:, 1].sum()),
+        "localized": float(quotient(*(whole @ counts).T)[0]),
         "localized_low": shares[0],
         "localized_high": shares[1],
         "times_forward": float(ratio(whole)[0]),
@@ -112,7 +112,7 @@ def _row(of_method: pd.DataFrame, forward: pd.DataFrame, draws: NDArray[np.int64
 
 
 def _interval(draws: NDArray[Any]) -> tuple[float, float]:
-    """Ends of the 95 % interval of what is known."""
+    """Ends of the 95 % interval of the draws that are finite."""
     known = draws[np.isfinite(draws)]
     low, high = np.percentile(known, (2.5, 97.5)) if len(known) else (np.nan, np.nan)
     return float(low), float(high)
@@ -120,20 +120,18 @@ def _interval(draws: NDArray[Any]) -> tuple[float, float]:
 
 def path_markdown(summary: pd.DataFrame, config: PathsConfig) -> str:
     """The summary as Markdown, a table for each task."""
-    text = [f"Share of the views along paths that localize within {config.max_error_m:g} m and "
-            f"{config.max_error_deg:g}°, in % [95 % interval over pairs]."]  # fmt: skip
+    limits = f"{config.max_error_m:g} m and {config.max_error_deg:g}°"
+    text = [f"Share of the views along paths that localize within {limits}, in % [95 % interval over pairs]."]
     titles = {"planned": "Places and views planned", "given": "Views along a given path"}
     for task, rows in summary.groupby("task", sort=False):
         header = ["scene", "method", "localized", "times forward", "length / forward's", "turn, °/m", "not found"]
-        lines = [
-            [
-                str(row["scene"]), str(row["method"]),
-                f"{100 * row['localized']:.1f} [{100 * row['localized_low']:.1f}, {100 * row['localized_high']:.1f}]",
-                f"{row['times_forward']:.2f} [{row['times_forward_low']:.2f}, {row['times_forward_high']:.2f}]",
-                f"{row['times_forward_length']:.2f}", f"{row['turn_deg_per_m']:.0f}", f"{row['failures']}",
-            ]
-            for _, row in rows.iterrows()
-        ]  # fmt: skip
+        lines = []
+        for _, row in rows.iterrows():
+            localized, low, high = (f"{100 * row[f'localized{end}']:.1f}" for end in ("", "_low", "_high"))
+            times, least, most = (f"{row[f'times_forward{end}']:.2f}" for end in ("", "_low", "_high"))
+            cells = [f"{localized} [{low}, {high}]", f"{times} [{least}, {most}]", f"{row['times_forward_length']:.2f}"]
+            cells += [f"{row['turn_deg_per_m']:.0f}", f"{row['failures']}"]
+            lines.append([str(row["scene"]), str(row["method"]), *cells])
         text += [f"{titles[str(task)]}:", markdown_table(header, lines)]
     return "\n\n".join(text) + "\n"
 
@@ -147,15 +145,8 @@ def log_paths(
 ) -> str:
     """Log a comparison: a run with its files, and in it one for each task and method over all scenes.
 
-    Args:
-        params: of the comparison, such as the dataset.
-        summary: of `summarize_paths`.
-        results: folder of the files; those that are missing are left out.
-        tracking: where to log.
-        tags: further tags.
-
-    Returns:
-        Id of the run.
+    `params` describe the comparison, `summary` is of `summarize_paths`, `results` the folder of the files, of which
+    missing ones are left out. Returns the id of the run.
     """
     pooled = summary[summary["scene"] == summary["scene"].iloc[-1]]
     with start_run(tracking, f"paths {params['dataset']}", "paths", params, tags=tags) as (client, run):

@@ -19,10 +19,10 @@ class PathView:
     Attributes:
         position: (3,) world, metres.
         axis: (3,) unit optical axis, world.
-        score: of the view in [0, 1]; NaN where it is not known.
-        pixels: (K, 2) of the landmarks in view.
+        score: score of the view in [0, 1]; NaN if unknown.
+        pixels: (K, 2) pixels of the landmarks in view.
         size_px: width and height of the image.
-        rgb: (H, W, 3) uint8 what the camera sees; None where nothing can be rendered.
+        rgb: (H, W, 3) uint8, the image; None if the scene cannot be rendered.
     """
 
     position: Float

@@ -1,7 +1,6 @@
-"""Views without a viewpoint map: any direction scored, and a grid's best made better by a local search.
+"""Scores of any directions, and a local search that improves a direction between those of a lattice.
 
-A scorer answers for any pose, on a lattice or off it: `scorer.score(cam_from_world)`. The paper notes that its function
-may be asked so, beyond its 500 directions.
+A scorer can score any pose, not only those of a lattice; the paper notes this of its own, beyond its 500 directions.
 """
 
 from __future__ import annotations
@@ -21,14 +20,8 @@ COMPASS = np.stack([np.cos(np.arange(8) * np.pi / 4), np.sin(np.arange(8) * np.p
 
 @dataclass(frozen=True, eq=False)
 class RefinedViews:
-    """Axes found by a local search, B of them.
-
-    Attributes:
-        axes: (B, 3) unit optical axes in the world.
-        scores: (B,) of these, never less than those of the start.
-        start_scores: (B,) of the axes that the search began with.
-        n_scored: views that were scored in all.
-    """
+    """Axes found by a local search: (B, 3) unit vectors in the world, their scores (B,), which are never less than the
+    scores (B,) at the start, and the number of views that were scored."""
 
     axes: Float
     scores: Float
@@ -55,23 +48,23 @@ def refine_directions(
     first_step_deg: float = 4.0,
     last_step_deg: float = 0.25,
 ) -> RefinedViews:
-    """Make axes better by a pattern search on the sphere (Hooke and Jeeves 1961; compass search, Kolda et al. 2003).
+    """Improve axes by a pattern search on the sphere (Hooke and Jeeves 1961; compass search, Kolda et al. 2003).
 
-    Eight axes around the current one are scored, one step away; the best of them is taken if it is better, otherwise
-    the step is halved. All views are searched together, so that the scorer gets batches. Scores need no derivative, and
-    may jump, as counts of bins do.
+    Eight axes one step away from the current one are scored; the best of them replaces it if it scores higher,
+    otherwise the step is halved. All views are searched together, so that the scorer gets batches. Scores need not be
+    continuous.
 
     Args:
         scorer: any method.
-        locations: (B, 3) metres.
-        axes: (B, 3) to begin with, such as the best of a lattice; of any length.
-        max_angle_deg: the axes found are no farther from the first than this; the default is above the distance of
-            neighbours on a lattice of 500 directions.
-        first_step_deg: about half that distance is a good step to begin with.
+        locations: (B, 3) world, metres.
+        axes: (B, 3) to begin with, of any length, such as the best of a lattice.
+        max_angle_deg: largest angle from the first axis; the default exceeds the distance of neighbours on a lattice of
+            500 directions.
+        first_step_deg: first step; about half that distance works well.
         last_step_deg: the search ends when the step falls below this.
 
     Raises:
-        ValueError: locations or axes are not finite, of no length or not as many, or an angle is not positive.
+        ValueError: locations or axes are not finite, have no length or differ in number, or an angle is not positive.
     """
     at, start = (np.asarray(values, dtype=np.float64).reshape(-1, 3) for values in (locations, axes))
     length = np.linalg.norm(start, axis=1, keepdims=True)
@@ -100,7 +93,7 @@ def refine_directions(
 
 def _around(axes: Float, step_deg: Float) -> Float:
     """Eight unit vectors (B, 8, 3) at angles of `step_deg` (B,) around axes (B, 3)."""
-    smallest = np.eye(3)[np.abs(axes).argmin(axis=1)]  # never along the axis
+    smallest = np.eye(3)[np.abs(axes).argmin(axis=1)]  # a coordinate axis that is not parallel to the axis
     u = np.cross(axes, smallest)
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     v = np.cross(axes, u)
@@ -110,7 +103,7 @@ def _around(axes: Float, step_deg: Float) -> Float:
 
 
 def _within(candidates: Float, start: Float, max_angle_deg: float) -> Float:
-    """Candidates (B, 8, 3), those too far from their start (B, 1, 3) pulled back to the border."""
+    """Candidates (B, 8, 3); those too far from their start (B, 1, 3) are moved back to the limit."""
     angle = angles_to_axis_deg(candidates, start)[..., None]
     outside: NDArray[np.bool_] = angle > max_angle_deg
     limit = np.radians(max_angle_deg)

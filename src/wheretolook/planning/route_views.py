@@ -1,4 +1,4 @@
-"""Views along a route: the best that a camera can turn to one after the other, and what the route then costs."""
+"""Views along a route: the best sequence that a camera can turn through, and the cost of the path."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from numpy.typing import NDArray
 from wheretolook.geometry.lattices import axes_of_angles
 from wheretolook.geometry.poses import Float
 from wheretolook.planning.config import PathConfig
+from wheretolook.planning.polylines import between, lengths_along
 from wheretolook.planning.sequences import TurnLimit, best_sequence
 from wheretolook.planning.turns import pan_tilt_angles
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.utils.errors import PlanningError
 
 LIMIT_STEP_DEG = 0.5
-"""Limits on turns are rounded down to multiples of this, so that routes of about the same length share one."""
-
+"""Limits on turns are rounded down to multiples of this, so that routes of similar spacing share a `TurnLimit`."""
 
 SHORT_ROUTE, SEARCH, IMPROVEMENT = "short route", "search", "improvement"
-"""What finds paths: a short route with views chosen along it, the search over places and views, the improvement of
-either."""
+"""How a path was found: as a short route with views chosen along it, by the search over places and views, or by
+improving either."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,9 +32,9 @@ class PlannedPath:
     Attributes:
         positions: (W, 3) world, metres.
         axes: (W, 3) unit optical axes in the world.
-        scores: (W,) of the viewpoint map at the views, 0 where it knows nothing; NaN without a map.
-        cost: of the path (`PathConfig`), its scores taken from view to view.
-        found_by: `SHORT_ROUTE`, `SEARCH` or `IMPROVEMENT`; empty where it was not planned.
+        scores: (W,) scores of the views in the viewpoint map, 0 outside its free voxels; NaN without a map.
+        cost: as `PathConfig` defines it, by the trapezoidal rule over the views.
+        found_by: `SHORT_ROUTE`, `SEARCH` or `IMPROVEMENT`; empty if it was not planned.
     """
 
     positions: Float
@@ -50,20 +50,20 @@ class PlannedPath:
 
     @property
     def turn_deg(self) -> float:
-        """By how much the camera turns on its way, in all."""
+        """Sum of the angles between consecutive axes."""
         cosines = (self.axes[1:] * self.axes[:-1]).sum(1).clip(-1, 1)
         return float(np.degrees(np.arccos(cosines)).sum())
 
 
 @dataclass(frozen=True, eq=False)
 class RouteSamples:
-    """Where a route is looked from.
+    """Points along a route, by arc length in metres.
 
     Attributes:
-        corners: (S,) arc lengths of its corners, metres.
-        even: (E,) of even steps, no longer than the spacing.
-        along: (W,) of both together: without its corners a path would lead through those of the walls.
-        positions: (W, 3) at `along`.
+        corners: (S,) arc lengths of its corners.
+        even: (E,) equal steps, no longer than the spacing.
+        along: (W,) both together; a path sampled without its corners would cut through walls.
+        positions: (W, 3) world, metres, at `along`.
     """
 
     corners: Float
@@ -73,8 +73,8 @@ class RouteSamples:
 
     @classmethod
     def of(cls, places: Float, spacing_m: float) -> RouteSamples:
-        """Of a polyline (S, 3) m."""
-        corners = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1))])
+        """Samples of a polyline (S, 3) m."""
+        corners = lengths_along(places)
         even = np.linspace(0, corners[-1], max(1, math.ceil(corners[-1] / spacing_m - 1e-9)) + 1)
         along = np.union1d(even, corners)
         along = along[np.append(True, np.diff(along) > 1e-9)]
@@ -82,12 +82,9 @@ class RouteSamples:
 
 
 class RouteViews:
-    """Chooses the views along routes of one viewpoint map.
+    """Chooses the views along routes by the scores of a viewpoint map, which are in [0, 1].
 
-    Args:
-        viewpoint_map: what views are worth, in [0, 1].
-        config: costs and limits.
-        start_axis: (3,) unit axis that every route starts with; None for any.
+    Every route starts with the unit axis `start_axis` (3,), if given.
     """
 
     def __init__(self, viewpoint_map: ViewpointMap, config: PathConfig, start_axis: Float | None = None) -> None:
@@ -96,19 +93,18 @@ class RouteViews:
         height = viewpoint_map.directions[:, 2]
         self._inside = (height >= low) & (height <= high)
         best = viewpoint_map.scores[:, self._inside].max(axis=1, initial=0.0)
-        self._best = np.append(best, 0.0)  # of each row, and of none
+        self._best = np.append(best, 0.0)  # best score of each row; the last entry stands for row -1
         self._limits: dict[int, TurnLimit] = {}
 
     def least_cost(self, places: Float) -> float:
-        """What a route (S, 3) m would cost at least, could the camera look anywhere at once."""
+        """Lower bound of the cost of a route (S, 3) m: with the best view everywhere, and turns for free."""
         samples = RouteSamples.of(places, self.config.spacing_m)
         return self._cost(samples.positions, self._best[self.map.rows(samples.positions)])
 
     def best(self, places: Float) -> PlannedPath | None:
-        """A route (S, 3) m with the views that have the greatest sum of scores, exactly; turns are evenly made.
+        """A route (S, 3) m with the views that have the greatest sum of scores, exactly; turns are spread evenly.
 
-        Returns:
-            None where the map's directions are too coarse for so small turns.
+        None if the map's directions are too coarse for the limit on turns.
         """
         samples = RouteSamples.of(places, self.config.spacing_m)
         at = between(samples.corners, places, samples.even)
@@ -123,11 +119,11 @@ class RouteViews:
                 chosen = best_sequence(scores[1:], limit, self.start_axis).direction_ids
                 axes = np.concatenate([self.start_axis[None], limit.directions[chosen]])
         except PlanningError:
-            return None  # the lattice is too coarse for so small turns
+            return None
         return self.costed(samples.positions, turned_evenly(samples.even, axes, samples.along))
 
     def costed(self, positions: Float, axes: Float) -> PlannedPath:
-        """A path with its scores and what it costs."""
+        """The path through positions (W, 3) m with axes (W, 3), with its scores and cost."""
         rows, nearest = self.map.rows(positions), (axes @ self.map.directions.T).argmax(1)
         scores = np.where(rows >= 0, self.map.scores[rows, nearest], 0.0).astype(np.float64)
         path = PlannedPath(positions, axes, scores, 0.0)
@@ -135,7 +131,7 @@ class RouteViews:
         return replace(path, cost=turning + self._cost(positions, scores))
 
     def _cost(self, positions: Float, scores: NDArray[np.floating]) -> float:
-        """Of length and scores."""
+        """The part of the cost that depends on length and scores."""
         steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
         return float((steps * (1 + self.config.score_weight * (1 - (scores[1:] + scores[:-1]) / 2))).sum())
 
@@ -146,15 +142,10 @@ class RouteViews:
         return self._limits[number]
 
 
-def between(knots: Float, values: Float, at: Float) -> Float:
-    """Values (S, C) at knots (S,), linearly between them."""
-    return np.column_stack([np.interp(at, knots, column) for column in values.T])
-
-
 def turned_evenly(knots: Float, axes: Float, at: Float) -> Float:
-    """Unit axes (S, 3) at knots (S,), yaw and pitch turning evenly between them.
+    """Unit axes (S, 3) at knots (S,), interpolated at (W,) linearly in yaw and pitch; (W, 3).
 
-    So the pitch stays between those at the knots; on a great circle it would rise above them.
+    The pitch thus stays between those at the knots, which it would not on a great circle.
     """
     yaw, pitch = pan_tilt_angles(axes)
     return axes_of_angles(np.degrees(between(knots, np.column_stack([np.unwrap(yaw), pitch]), at)))

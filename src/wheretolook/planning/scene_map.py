@@ -5,56 +5,40 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 from pathlib import Path
 
-from wheretolook.dataset.folders import RELEASE, Dataset, SceneFolder
+from wheretolook.dataset.folders import RELEASE, Dataset
+from wheretolook.dataset.scene import Scene
 from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.geometry.lattices import VoxelGrid, direction_lattice
-from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.geometry.lattices import ViewLattice
 from wheretolook.learning.provenance import was_trained_on
 from wheretolook.learning.weights import method_of_weights, read_record, read_training, read_weights
-from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.methods.base import Scorer
 from wheretolook.methods.field_of_view import same_field_of_view
 from wheretolook.methods.registry import load_scorer, make_scorer, members, scorers
-from wheretolook.planning.config import ViewpointMapConfig
 from wheretolook.planning.map_building import build_viewpoint_map
 from wheretolook.planning.viewpoint_map import ViewpointMap
-from wheretolook.space.free_space import FreeSpace
-from wheretolook.space.mapped_space import MappedSpace
 from wheretolook.utils.errors import ConfigError, WeightsError
-from wheretolook.viewpoints.sampling import free_locations
-from wheretolook.visibility.occlusion import OcclusionModel
 
 
 def scene_viewpoint_map(
-    scene: SceneFolder,
-    camera: PinholeCamera,
-    config: ViewpointMapConfig,
-    space: FreeSpace | MappedSpace,
-    occlusion: OcclusionModel,
-    device: str = "cpu",
+    scene: Scene, views: ViewLattice, method: str = "", weights: Path | None = None
 ) -> ViewpointMap:
     """Build the viewpoint map of a scene, with progress bars.
 
     Args:
-        scene: its files.
-        camera: that will look.
-        config: voxels, directions and method.
-        space: where a camera can be.
-        occlusion: which landmarks nothing stands in front of.
-        device: where kernels run.
+        scene: where a camera can be, what it sees, and where kernels run.
+        views: voxels and directions.
+        method: that scores; empty for that of the weights, or bins without.
+        weights: of a method that has learnt.
 
     Raises:
         SceneError: no voxel is free. MapError: there are no landmarks.
         ConfigError: no such method, or it needs weights. WeightsError: the weights cannot be used.
     """
-    grid = VoxelGrid.over(space.bounds, config.grid)
-    free = free_locations(grid, space)
-    free = free[~occlusion.inside_geometry(grid.centers()[free])]  # as in the sample stage
-    one = LocalizationMap(Landmarks.load(scene.landmarks), camera, occlusion, device, scene.mapping_poses())
-    directions = direction_lattice(config.directions, config.lattice)
-    return build_viewpoint_map(
-        _scorer(one, config), grid, free, directions, config.lattice, f"viewpoint map {scene.name}"
-    )
+    grid, free = scene.free_voxels(views, scene.space)
+    if weights is not None and not method:
+        scorer = load_scorer(weights, scene.localization_map)
+    else:
+        scorer = make_scorer(method or "bins", scene.localization_map, weights=weights)
+    return build_viewpoint_map(scorer, grid, free, views.axes(), views.lattice, f"viewpoint map {scene.name}")
 
 
 def weights_for(
@@ -110,9 +94,3 @@ def default_weights(dataset: Dataset, say: Callable[[str], None] = print, kinds:
         if fitting:
             return max(fitting, key=lambda path: fitting[path])
     return None
-
-
-def _scorer(localization_map: LocalizationMap, config: ViewpointMapConfig) -> Scorer:
-    if config.weights is not None and not config.method:
-        return load_scorer(config.weights, localization_map)
-    return make_scorer(config.method or "bins", localization_map, weights=config.weights)

@@ -1,4 +1,4 @@
-"""Where to look along a path that is given: one direction for each waypoint, under a limit on the turns."""
+"""Where to look along a given path: one direction for each waypoint, under a limit on the turns between them."""
 
 from __future__ import annotations
 
@@ -8,32 +8,32 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.geometry.poses import Float, rotation_looking_along
-from wheretolook.planning.turns import check_axis, pan_tilt_turns_deg, turns_deg, turns_from_deg, within
-from wheretolook.planning.viewpoint_map import ViewpointMap
+from wheretolook.planning.polylines import between, lengths_along
+from wheretolook.planning.turns import (
+    check_axis,
+    pan_tilt_angles,
+    pan_tilt_turns_deg,
+    turns_deg,
+    turns_from_deg,
+    within,
+)
 from wheretolook.utils.errors import PlanningError
 
-SPACING_M = 0.2
-"""Between waypoints, as in the Active Localization Benchmark."""
+SPACING_M, MAX_TURN_DEG = 0.2, 30.0
+"""Distance of waypoints, and the limit on turns between them, of the Active Localization Benchmark."""
 
-MAX_TURN_DEG = 30.0
-"""From one waypoint to the next, as in the Active Localization Benchmark."""
-
-TURN_PENALTY = 0.02
-"""ActLoc's lambda: what each cell of its lattice, 20 degrees, costs the greedy rule."""
-
-CELL_DEG = 20.0
-"""Step of ActLoc's lattice of yaws and pitches."""
+CELL_DEG, TURN_PENALTY = 20.0, 0.02
+"""Step of ActLoc's lattice of yaws and pitches, and the penalty of its greedy rule (lambda) for each step."""
 
 
 @dataclass(frozen=True, eq=False)
 class TurnLimit:
-    """Which directions follow on which: those that a camera without roll reaches by one rotation within the limit.
+    """Which directions can follow each other: those that a camera without roll reaches by one rotation in the limit.
 
     Attributes:
         directions: (D, 3) unit optical axes in the world.
         max_turn_deg: largest angle of the rotation between two waypoints, included.
-        neighbours: (D, K) int64, ids reachable from each direction, itself among them, ascending; where there are
-            fewer than K, D fills up.
+        neighbours: (D, K) int64, ids reachable from each direction, including itself, ascending, padded with D.
         pan_tilt: whether the angle is that of a pan-tilt head (`wheretolook.planning.turns.pan_tilt_turns_deg`).
     """
 
@@ -44,15 +44,10 @@ class TurnLimit:
 
     @classmethod
     def of(cls, directions: ArrayLike, max_turn_deg: float = MAX_TURN_DEG, pan_tilt: bool = False) -> TurnLimit:
-        """For a lattice (D, 3), such as `direction_lattice` gives: Fibonacci's, ActLoc's yaws and pitches, or another.
-
-        Args:
-            directions: (D, 3) unit vectors.
-            max_turn_deg: largest angle.
-            pan_tilt: whether it limits what a pan-tilt head turns evenly, which is a little more.
+        """For a lattice of unit vectors (D, 3), such as `direction_lattice` gives.
 
         Raises:
-            ValueError: directions of another shape, not of unit length, or a limit that is none.
+            ValueError: directions of another shape or not of unit length, or a limit that is negative or NaN.
         """
         axes = np.asarray(directions, dtype=np.float64)
         if axes.ndim != 2 or axes.shape[1] != 3 or not np.allclose(np.linalg.norm(axes, axis=1), 1, atol=1e-6):
@@ -63,11 +58,9 @@ class TurnLimit:
         return cls(axes, float(max_turn_deg), np.sort(ids, axis=1)[:, :most], pan_tilt)
 
     def from_start(self, start: ArrayLike | None) -> NDArray[np.bool_]:
-        """Which directions (D,) the first waypoint may have: all, or those within the limit of the camera's start.
+        """Which directions (D,) the first waypoint may have: those within the limit of `start`, or all if it is None.
 
-        Args:
-            start: (3,) axis of a camera without roll, (3, 3) cam_from_world rotation, or None. For a pan-tilt head, an
-                axis.
+        `start` is the (3,) axis of a camera without roll or, not for a pan-tilt head, a (3, 3) cam_from_world rotation.
         """
         if start is None:
             return np.ones(len(self.directions), dtype=bool)
@@ -78,12 +71,7 @@ class TurnLimit:
 
 @dataclass(frozen=True, eq=False)
 class ViewSequence:
-    """One direction for each of W waypoints.
-
-    Attributes:
-        direction_ids: (W,) int64.
-        scores: (W,) float64, of these.
-    """
+    """The id (W,) int64 of the direction at each of W waypoints, and its score (W,)."""
 
     direction_ids: NDArray[np.int64]
     scores: Float
@@ -95,28 +83,28 @@ class ViewSequence:
 
 
 def best_sequence(scores: ArrayLike, limit: TurnLimit, start: ArrayLike | None = None) -> ViewSequence:
-    """The directions with the greatest sum of scores of all that keep to the limit, exactly.
+    """The sequence with the greatest sum of scores of all that keep the limit, exactly.
 
-    Dynamic programming over directions (Viterbi 1967), O(W D K). The same input gives the same sequence: of equal sums
-    the last waypoint takes the lowest id, and so on backwards.
+    Dynamic programming over directions (Viterbi 1967), O(W D K). Of several with the same sum, the one with the lowest
+    id at the last waypoint is chosen, then at the one before, and so on.
 
     Args:
         scores: (W, D) of each waypoint and direction; -inf forbids one.
         limit: on the turn between waypoints.
-        start: orientation before the first waypoint, see `TurnLimit.from_start`; None leaves the first one free.
+        start: orientation before the first waypoint, see `TurnLimit.from_start`; None allows any direction there.
 
     Raises:
-        PlanningError: no sequence keeps to the limit; names the waypoint that cannot be reached.
+        PlanningError: no sequence keeps the limit; names the waypoint that cannot be reached.
         ValueError: scores of another shape, NaN or +inf.
     """
     values = _check(scores, limit)
     n, d = values.shape
-    before = np.zeros((n, d), dtype=np.int64)  # the direction at the waypoint before
+    before = np.zeros((n, d), dtype=np.int64)  # best direction at the previous waypoint
     total = np.where(limit.from_start(start), values[0], -np.inf)
     _check_reached(total, 0, limit, start)
     rows = np.arange(d)
     for waypoint in range(1, n):
-        candidates = np.append(total, -np.inf)[limit.neighbours]  # turns are as long there as back
+        candidates = np.append(total, -np.inf)[limit.neighbours]  # being neighbours is symmetric
         chosen = candidates.argmax(axis=1)
         before[waypoint] = limit.neighbours[rows, chosen]
         total = candidates[rows, chosen] + values[waypoint]
@@ -135,22 +123,15 @@ def greedy_sequence(
     turn_penalty: float = TURN_PENALTY,
     keep_limit: bool = True,
 ) -> ViewSequence:
-    """ActLoc's rule, to compare with: at each waypoint the greatest score less a penalty on the turn just made.
+    """ActLoc's rule, for comparison: at each waypoint the greatest score minus a penalty on the turn to it.
 
-    score - lambda (|rows| + |columns|), where rows and columns are the steps of 20 degrees between pitches and, the
-    short way round, between yaws (ActLoc, CoRL 2025, planning.py). On another lattice steps are fractions. ActLoc's
-    code has no limit on turns and does not penalize the first waypoint; with `keep_limit` its choice is among the
-    directions within the limit, so that both rules are judged alike.
-
-    Args:
-        scores: (W, D) of each waypoint and direction; -inf forbids one.
-        limit: directions, and the limit on turns.
-        start: orientation before the first waypoint, which then has to be within the limit; None leaves it free.
-        turn_penalty: lambda, at least 0.
-        keep_limit: whether the limit holds.
+    The penalty is lambda (|rows| + |columns|), where rows and columns are the steps of 20 degrees between pitches and,
+    the short way round, between yaws (ActLoc, CoRL 2025, planning.py); on another lattice steps are fractions. ActLoc's
+    code has no limit on turns and no penalty at the first waypoint; with `keep_limit` the rule chooses among directions
+    within the limit, for a fair comparison with `best_sequence`, whose other arguments it shares.
 
     Raises:
-        PlanningError: from where the rule has led, no direction keeps to the limit; names the waypoint.
+        PlanningError: no direction is within the limit of the one chosen before; names the waypoint.
         ValueError: scores of another shape, NaN or +inf, or a negative penalty.
     """
     values = _check(scores, limit)
@@ -186,36 +167,9 @@ def resample_path(points: ArrayLike, spacing_m: float = SPACING_M) -> Float:
         raise ValueError(f"a path is (P, 3) finite metres, P > 0, got an array of shape {path.shape}")
     if not 0 < spacing_m < np.inf:
         raise ValueError(f"the spacing must be a distance above 0 m, got {spacing_m}")
-    at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+    at = lengths_along(path)
     # a remainder that is only rounding adds no waypoint
-    stops = np.append(np.arange(0, at[-1] - 1e-9 * spacing_m, spacing_m), at[-1])
-    return np.stack([np.interp(stops, at, column) for column in path.T], axis=1)
-
-
-def path_scores(viewpoint_map: ViewpointMap, waypoints: ArrayLike, interpolated: bool = True) -> Float:
-    """Scores (W, D) of all directions of a viewpoint map at waypoints (W, 3) m.
-
-    Args:
-        viewpoint_map: the map.
-        waypoints: of a path.
-        interpolated: between voxels, or of the voxel that holds the waypoint.
-
-    Raises:
-        PlanningError: a waypoint lies outside the map or in a voxel that is not free; names the first.
-        ValueError: waypoints of another shape, or not finite.
-    """
-    rows = viewpoint_map.rows(waypoints)
-    points = np.asarray(waypoints, dtype=np.float64)
-    if (rows < 0).any():
-        number = int(np.argmax(rows < 0))
-        raise PlanningError(
-            f"waypoint {number} is not in a free voxel of the viewpoint map", value=tuple(points[number].tolist()),
-            fix="Lead the path through free voxels, or refine the grid.",
-        )  # fmt: skip
-    if not interpolated:
-        return viewpoint_map.scores[rows].astype(np.float64)
-    found = [viewpoint_map.interpolated(point) for point in points]
-    return np.array([values for values in found if values is not None]).reshape(len(points), -1)
+    return between(at, path, np.append(np.arange(0, at[-1] - 1e-9 * spacing_m, spacing_m), at[-1]))
 
 
 def _check(scores: ArrayLike, limit: TurnLimit) -> Float:
@@ -231,15 +185,12 @@ def _check_reached(worth: Float, waypoint: int, limit: TurnLimit, start: ArrayLi
     if np.isneginf(worth).all():
         from_where = "the start" if waypoint == 0 and start is not None else f"waypoint {waypoint - 1}"
         reach = f" within {limit.max_turn_deg:g} degrees of {from_where}" if waypoint or start is not None else ""
-        raise PlanningError(
-            f"waypoint {waypoint} has no direction that is allowed{reach}", value=waypoint,
-            fix="Raise the limit, put waypoints closer, allow more directions, or use a finer lattice.",
-        )  # fmt: skip
+        fix = "Raise the limit, put waypoints closer, allow more directions, or use a finer lattice."
+        raise PlanningError(f"waypoint {waypoint} has no direction that is allowed{reach}", value=waypoint, fix=fix)
 
 
 def _cells(directions: Float) -> Float:
-    """Steps of 20 degrees between the pitches of directions and, the short way round, their yaws, added up; (D, D)."""
-    yaw = np.degrees(np.arctan2(directions[:, 1], directions[:, 0]))
-    pitch = np.degrees(np.arcsin(np.clip(directions[:, 2], -1, 1)))
+    """Differences (D, D) of pitch plus, the short way round, of yaw between directions, in steps of 20 degrees."""
+    yaw, pitch = map(np.degrees, pan_tilt_angles(directions))
     across = np.abs(yaw[:, None] - yaw)
     return np.asarray((np.abs(pitch[:, None] - pitch) + np.minimum(across, 360 - across)) / CELL_DEG)

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from wheretolook.geometry.poses import Float, rotation_looking_along
 
 TOLERANCE_DEG = 1e-5
-"""An angle that exceeds its limit by no more than this is within it: 20 degrees are at most 20, rounding or not."""
+"""Angles may exceed a limit by this much, for rounding."""
 
 
 def within(angles_deg: Float, limit_deg: float) -> NDArray[np.bool_]:
@@ -38,15 +38,15 @@ def check_axis(axis: ArrayLike) -> Float:
 
 
 def pan_tilt_angles(axes: Float) -> tuple[Float, Float]:
-    """Yaws and pitches of unit axes (D, 3), (D,) each, in radians."""
-    return np.arctan2(axes[:, 1], axes[:, 0]), np.arcsin(axes[:, 2].clip(-1, 1))
+    """Yaws (azimuths) and pitches (elevations) of unit axes (..., 3) in radians, (...,) each."""
+    return np.arctan2(axes[..., 1], axes[..., 0]), np.arcsin(np.clip(axes[..., 2], -1, 1))
 
 
 def pan_tilt_turns_deg(a: Float, b: Float) -> Float:
-    """How far (A, B) in degrees a camera on a pan-tilt head turns that turns both evenly from axes (A, 3) to (B, 3).
+    """Angles (A, B) in degrees by which a pan-tilt head turns from axes (A, 3) to (B, 3), pan and tilt at even speed.
 
-    Pan and tilt turn about axes at right angles, so it is the root of the sum of their squares, and never less than the
-    angle of the rotation from one to the other (`turns_deg`).
+    The two axes of rotation are perpendicular, so an angle is the root of the sum of the squares of pan and tilt. It is
+    never less than that of the direct rotation (`turns_deg`).
     """
     (yaw_a, pitch_a), (yaw_b, pitch_b) = pan_tilt_angles(a), pan_tilt_angles(b)
     pan = np.abs(yaw_a[:, None] - yaw_b[None])
@@ -80,16 +80,16 @@ def turns_from_deg(current: ArrayLike, rotations: Float) -> Float:
 def turns_deg(directions: Float) -> Float:
     """Rotation angles (D, D) in degrees between cameras without roll that look along directions (D, 3).
 
-    It is the rotation of the whole camera that counts, as in the Active Localization Benchmark (evaluate_plan.py): 40
-    degrees of yaw are 40 degrees at every pitch, though the axis of a camera that looks 60 degrees down moves by 20.
+    They are angles of the whole camera's rotation, as in the Active Localization Benchmark (evaluate_plan.py): 40
+    degrees of yaw count as 40 at every pitch, though the optical axis of a camera pitched by 60 degrees moves by 20.
     """
     rotations = rotation_looking_along(directions).reshape(-1, 9)
     angles = _angles_deg(rotations, rotations)
     np.fill_diagonal(angles, 0)
-    return np.maximum(angles, angles.T)  # as far there as back, to the last bit
+    return np.maximum(angles, angles.T)  # symmetric to the last bit
 
 
 def _angles_deg(a: NDArray[Any], b: NDArray[Any]) -> Float:
-    """Between rotations (A, 9) and (B, 9): |A - B|_F^2 = 6 - 2 <A, B> = 8 sin^2(angle / 2); (A, B)."""
+    """Angles (A, B) between rotations (A, 9) and (B, 9), from |A - B|_F^2 = 6 - 2 <A, B> = 8 sin^2(angle / 2)."""
     square = np.clip((6 - 2 * (a @ b.T)) / 8, 0, 1)
     return np.degrees(2 * np.arcsin(np.sqrt(square)))

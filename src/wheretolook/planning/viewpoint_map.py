@@ -1,6 +1,6 @@
-"""The viewpoint map: for every free voxel its orientations, ranked by a score, to be looked up by a planner.
+"""The viewpoint map: the orientations of every free voxel, ranked by a score, for planners to look up.
 
-A query does the arithmetic of a perfect hash and reads a few numbers, so it takes the same time on a map of any size.
+A query takes the same time on a map of any size: it computes the voxel's index and reads a few numbers.
 """
 
 from __future__ import annotations
@@ -26,14 +26,9 @@ Point = Sequence[float] | NDArray[Any]
 
 
 class ViewChoice(NamedTuple):
-    """One orientation at a voxel.
-
-    Attributes:
-        direction_id: row in the map's directions.
-        axis: (3,) unit optical axis in the world, read-only; the camera does not roll (`poses_looking_along`).
-        score: as the map's scorer gives it: a probability if the scorer's is one.
-        n_visible: landmarks in view from the voxel's centre.
-    """
+    """One orientation at a voxel: its row in the map's directions, its unit optical axis (3,) in the world (read-only;
+    the camera does not roll), its score by the map's scorer, and the number of landmarks in view from the voxel's
+    centre."""
 
     direction_id: int
     axis: Float
@@ -65,12 +60,11 @@ class MapOrigin:
     Attributes:
         scorer: name of the method.
         lattice: name of the directions' lattice, "" for others.
-        camera: intrinsics: "model" ("PINHOLE", or COLMAP's name of another), "width", "height" in pixels and "params"
-            in COLMAP's order.
+        camera: intrinsics: COLMAP's name of the "model", "width" and "height" in pixels, "params" in COLMAP's order.
         occlusion: name of the occlusion model.
         landmarks: 16 hexadecimal digits that change with any landmark.
-        derived: what was done to a map since it was built, such as scores replaced by ranks; "" for the map as it was
-            built. A derived map answers queries; it is neither saved nor updated.
+        derived: what was done to the map since it was built, such as scores replaced by ranks; "" if nothing. A derived
+            map answers queries, but cannot be saved or updated.
     """
 
     scorer: str
@@ -81,7 +75,7 @@ class MapOrigin:
     derived: str = ""
 
     def derive(self, what: str) -> MapOrigin:
-        """The origin of a map to which this was done as well."""
+        """The origin of a map after one more change, described by `what`."""
         return replace(self, derived=f"{self.derived}; {what}" if self.derived else what)
 
 
@@ -89,26 +83,24 @@ class MapOrigin:
 class ViewpointMap:
     """Ranked orientations of every free voxel.
 
-    A point is answered for by the voxel that holds it, whose scores were computed at its centre; `interpolated` is
-    smooth between centres. Outside the grid, and in voxels that are not free, there is no camera to turn: queries of
-    one point then return None, batches say `found = False`. What is not finite raises a ValueError.
+    A point gets the scores of the voxel that holds it, which were computed at its centre; `interpolated` is smooth
+    between centres. For points outside the grid or in voxels that are not free, queries of one point return None, and
+    batches `found = False`. Points that are not finite raise a ValueError.
 
-    `wheretolook.planning.map_building.build_viewpoint_map` makes one.
+    `wheretolook.planning.map_building.build_viewpoint_map` makes a map.
 
     Attributes:
         grid: V voxels of the world, metres, z up.
-        row_of_voxel: (V,) int32, row of each free voxel in the arrays below, -1 for others; rows count up with voxels,
-            each used once. In derived maps voxels may share rows.
+        row_of_voxel: (V,) int32, row of each free voxel in the arrays below, in ascending order; -1 for other voxels.
+            In derived maps voxels may share rows.
         directions: (D, 3) float64 unit optical axes in the world.
-        ranked: (L, D) uint16, ids of the directions at each of L free voxels: by falling score before it was rounded
-            to single precision, then by rising id.
-        scores: (L, D) float32, by direction id. Single precision, not half or bytes: it needs no scale, so that scores
-            that are no probabilities fit and an update changes nothing elsewhere; C++ reads it as it is; and it adds
-            but a fifth to the size.
+        ranked: (L, D) uint16, ids of the directions at each of L free voxels, by falling score (in double precision),
+            then by rising id.
+        scores: (L, D) float32, by direction id. Single precision, since scores need not be probabilities, and fewer
+            bytes would need a scale and save at most a fifth of the size.
         n_visible: (L, D) uint32, landmarks in view, by direction id.
         landmark_ids: (N,) int64, of the landmarks it was built from, ascending.
-        landmark_digests: (N, 2) uint64, digests of each one's position and of its attributes; they tell an update what
-            has changed.
+        landmark_digests: (N, 2) uint64, digests of each one's position and of its attributes, for updates.
         origin: what it was made from.
     """
 
@@ -137,11 +129,7 @@ class ViewpointMap:
 
     @classmethod
     def load(cls, folder: str | Path, mmap: bool = False) -> ViewpointMap:
-        """Read what `save` wrote.
-
-        Args:
-            folder: of the map.
-            mmap: map the files into memory, read-only, and read only what is asked for; see `map_file.read_map`.
+        """Read what `save` wrote; with `mmap` the files are mapped into memory (`map_file.read_map`).
 
         Raises:
             MapFormatError: there is no map, it is damaged, or of another version.
@@ -169,12 +157,8 @@ class ViewpointMap:
         origin = asdict(self.origin)
         if derived := origin.pop("derived"):
             fix = "Save the map it was derived from."
-            raise MapFormatError(
-                "a map derived from another is for planners and not to be saved",
-                path=Path(folder),
-                value=derived,
-                fix=fix,
-            )
+            problem = "a map derived from another is for planners and not to be saved"
+            raise MapFormatError(problem, path=Path(folder), value=derived, fix=fix)
         write_map(folder, self.grid, origin, {name: getattr(self, name) for name in ARRAYS})
 
     @property
@@ -201,7 +185,7 @@ class ViewpointMap:
             ValueError: a coordinate is not finite.
         """
         x, y, z = point
-        x, y, z = float(x), float(y), float(z)  # NumPy's scalars are slow
+        x, y, z = float(x), float(y), float(z)  # faster than NumPy's scalars
         x0, y0, z0, x1, y1, z1, dx, dy, dz, nx, ny, nz, rows = self._hash
         if x0 <= x <= x1 and y0 <= y <= y1 and z0 <= z <= z1:
             i, j, k = int((x - x0) / dx), int((y - y0) / dy), int((z - z0) / dz)
@@ -243,19 +227,12 @@ class ViewpointMap:
     def best_reachable(self, point: Point, current: ArrayLike, max_turn_deg: float) -> ViewChoice | None:
         """The best orientation that the camera reaches by a single rotation of at most `max_turn_deg`.
 
-        The angle of the rotation is that of the whole camera, as the Active Localization Benchmark measures it. Near
-        the vertical, cameras that do not roll turn farther than their axes.
-
-        Args:
-            point: (3,) m in the world.
-            current: (3,) axis of a camera without roll, or (3, 3) cam_from_world rotation.
-            max_turn_deg: largest angle, included.
-
-        Returns None also if no direction of the lattice is so near.
+        The angle is that of the whole camera's rotation (`turns_deg`). `current` is the (3,) axis of a camera without
+        roll, or a (3, 3) cam_from_world rotation. Returns None also if no direction of the lattice is in reach.
 
         Raises:
-            ValueError: the point or `current` is not finite, an axis has no length, or a matrix is no rotation (one
-                that mirrors is none).
+            ValueError: the point or `current` is not finite, an axis has no length, or a matrix is not a rotation (such
+                as a reflection).
         """
         row = self.row(point)
         if np.shape(current) == (3, 3) and not np.linalg.det(np.asarray(current, dtype=np.float64)) > 0:
@@ -270,7 +247,7 @@ class ViewpointMap:
         """
         rows = self.rows(points)
         found = rows >= 0
-        direction, score, n_visible = self._best_of_rows  # their last row is for points that are not found
+        direction, score, n_visible = self._best_of_rows
         return ViewChoices(found, direction[rows], score[rows], n_visible[rows])
 
     def rows(self, points: ArrayLike) -> NDArray[np.int64]:
@@ -288,13 +265,10 @@ class ViewpointMap:
         return np.where(ids >= 0, self.row_of_voxel[ids], -1).astype(np.int64)
 
     def interpolated(self, point: Point) -> Float | None:
-        """Scores of all directions at a world point (3,) m, trilinear between the centres of voxels.
+        """Scores (D,) float64 of all directions at a world point (3,) m, trilinear between the centres of voxels.
 
-        Neighbours that are not free, or not there, are left out, and the weights of the others made to sum to 1 again;
-        the voxel that holds the point must be free itself.
-
-        Returns:
-            (D,) float64.
+        Neighbours that are not free or outside the grid are left out and the other weights normalized. None if the
+        voxel that holds the point is not free.
         """
         if self.row(point) < 0:
             return None
@@ -323,7 +297,7 @@ class ViewpointMap:
 
     @cached_property
     def _hash(self) -> tuple[Any, ...]:
-        """What `row` needs, as plain numbers."""
+        """Bounds, voxel size and shape of the grid as plain numbers, and the lookup of rows, for `row`."""
         grid = self.grid
         return (*map(float, (*grid.lower, *grid.upper, *grid.voxel_m)), *map(int, grid.shape), self.row_of_voxel.item)
 
@@ -339,7 +313,7 @@ class ViewpointMap:
 
     @cached_property
     def _best_of_rows(self) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.int64]]:
-        """Direction, score and count of the best direction of each row, and behind them those of no row."""
+        """Id, score and landmarks in view of the best direction of each row; a last entry stands for row -1."""
         best = self.ranked[:, 0].astype(np.int64)
         rows = np.arange(len(best))
         return (

@@ -1,4 +1,4 @@
-"""Whether there is a way from one place to another, by a grid of places: the same answer every time."""
+"""Whether a camera can get from one place to another, by a deterministic search on a grid."""
 
 from __future__ import annotations
 
@@ -13,21 +13,19 @@ from wheretolook.space.free_space import FreeSpace
 from wheretolook.space.mapped_space import MappedSpace
 
 MOST = 200_000
-"""Places of a grid."""
+"""Largest number of places on a grid."""
 
 BLOCK = 10_000
-"""Places that are asked for together."""
+"""Places tested for free space at a time."""
 
 NEAREST = 8
-"""Places of the grid from which a point is looked for."""
+"""Number of places on the grid from which a way to a given point is tried."""
 
 
 class Ways:
-    """Places on a grid where a camera can be, joined where it can go straight from one to its neighbour.
+    """A graph of free places on a grid over `space`, with edges between neighbours where a camera can go straight.
 
-    Args:
-        space: where it can be.
-        step_m: of the grid; more where there would be more than `MOST` places.
+    `step_m` is the step of the grid; it is widened where there would be more than `MOST` places.
     """
 
     def __init__(self, space: FreeSpace | MappedSpace, step_m: float) -> None:
@@ -54,7 +52,7 @@ class Ways:
         self._tree = cKDTree(self._places) if n else None
 
     def joins(self, a: ArrayLike, b: ArrayLike) -> bool:
-        """Whether there is a way between points (3,) m, as far as the grid can tell."""
+        """Whether the grid has a way between points (3,) m."""
         return bool(self._parts_near(a) & self._parts_near(b))
 
     def _parts_near(self, point: ArrayLike) -> set[int]:

@@ -1,4 +1,4 @@
-"""Measured times of the visibility check as an MLflow run: `tests/benchmarks/bench_visibility.py` takes them."""
+"""Logs times of the visibility check, measured by `tests/benchmarks/bench_visibility.py`, as an MLflow run."""
 
 from __future__ import annotations
 
@@ -9,27 +9,28 @@ from tempfile import TemporaryDirectory
 
 import pandas as pd
 
-from wheretolook.utils.tracking import TrackingConfig, log, start_run
+from wheretolook.utils.tracking import log, start_run
+from wheretolook.utils.tracking_config import TrackingConfig
 
 RUNTIMES_CSV, SCALING_CSV = "runtimes.csv", "scaling.csv"
 """Tables for `wheretolook.figures.runtimes`: times at the paper's size, and how time and memory grow."""
 
 
 def log_runtimes(
-    tracking: TrackingConfig, sizes: pd.DataFrame, growth: pd.DataFrame, tags: Mapping[str, str] | None = None,
+    tracking: TrackingConfig,
+    sizes: pd.DataFrame,
+    growth: pd.DataFrame,
+    tags: Mapping[str, str] | None = None,
     file: Path | None = None,
-) -> str:  # fmt: skip
-    """Log measured times: a run of the stage "benchmark" with both tables and their figures.
+) -> str:
+    """Log measured times as a run of the stage "benchmark", with both tables and their figures; returns its id.
 
     Args:
         tracking: where to log.
-        sizes: as `wheretolook.figures.runtimes.runtime_figure` wants it.
-        growth: as `scaling_figure` wants it; may be empty.
+        sizes: table of `wheretolook.figures.runtimes.runtime_figure`.
+        growth: table of `scaling_figure`; may be empty.
         tags: further tags.
-        file: that `sizes` were read from, to be logged to the byte.
-
-    Returns:
-        Id of the run.
+        file: from which `sizes` were read, to be logged unchanged.
     """
     from wheretolook.figures.runtimes import runtime_figure, scaling_figure
     from wheretolook.figures.style import save_figure

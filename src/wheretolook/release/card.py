@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -58,8 +57,12 @@ them each location has a free line of sight to (`wheretolook.visibility.occlusio
 _CAMERAS = "`map/cameras.npz` holds the poses cam_from_world of the images that the map was made from."
 
 
-def write_card(release: Dataset) -> Path:
+def write_card(release: Dataset, defaults: Mapping[str, Any]) -> Path:
     """Write `<release>/README.md` from what lies in the release's folder. The same files give the same bytes.
+
+    Args:
+        release: with weights and scores.
+        defaults: of the settings in `release.json`, as JSON values: the card tells what differs from them.
 
     Returns:
         The card's path.
@@ -71,11 +74,11 @@ def write_card(release: Dataset) -> Path:
         StorageError: the release is too large.
     """
     path = release.root / CARD
-    write_text(path, release_card(release))
+    write_text(path, release_card(release, defaults))
     return path
 
 
-def release_card(release: Dataset) -> str:
+def release_card(release: Dataset, defaults: Mapping[str, Any]) -> str:
     """The card. Raises as `write_card`."""
     from wheretolook.learning.provenance import training_fingerprint
     from wheretolook.learning.weights import read_record, read_training
@@ -130,7 +133,7 @@ def release_card(release: Dataset) -> str:
         f"Shares in % of viewpoints that localize within the limits; the label is the first, "
         f"{threshold_label(threshold_key(THRESHOLDS[0]))}. Settings of `configs/{source}.yaml` that are not the "
         "defaults (all of them are in `release.json`):",
-        f"```yaml\n{_changed_settings(about['settings'])}```",
+        f"```yaml\n{_changed_settings(about['settings'], defaults)}```",
         *_label_text(release),
         _TABLES,
         *([_CAMERAS] if all(scene.mapping_cameras.is_file() for scene in release.scenes) else []),
@@ -218,11 +221,8 @@ def _label_table(release: Dataset, shares: pd.DataFrame) -> str:
     return markdown_table(["scene", "split", "landmarks", "locations", "viewpoints", *limits], lines)
 
 
-def _changed_settings(settings: Mapping[str, Any]) -> str:
+def _changed_settings(settings: Mapping[str, Any], defaults: Mapping[str, Any]) -> str:
     """Settings that differ from the defaults, as YAML."""
-    from wheretolook.config import Experiment
-
-    defaults = json.loads(json.dumps(asdict(Experiment()), default=str))
     changed = _difference(settings, defaults)
     return yaml.safe_dump(changed, sort_keys=False, default_flow_style=None, width=110)
 

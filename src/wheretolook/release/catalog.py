@@ -6,6 +6,7 @@ that makes that run, and a function from `Source` to a figure, or to texts by th
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -30,7 +31,8 @@ from wheretolook.release.copy import is_release, read_about
 from wheretolook.utils.errors import ConfigError, MissingRunError, WhereToLookError
 from wheretolook.utils.files import write_text
 from wheretolook.utils.markdown import markdown_table
-from wheretolook.utils.tracking import TrackingConfig, client, finished_runs
+from wheretolook.utils.tracking import artifact, finished_runs
+from wheretolook.utils.tracking_config import TrackingConfig
 
 if TYPE_CHECKING:
     from mlflow.entities import Run
@@ -59,7 +61,7 @@ class Source:
 
     def file(self, name: str) -> Path:
         """An artifact of the first run."""
-        return Path(self.runs[0].info.artifact_uri) / name
+        return artifact(self.tracking, self.runs[0].info.run_id, name)
 
     def scores(self) -> pd.DataFrame:
         """The score table of an evaluation."""
@@ -233,7 +235,7 @@ def _learning(source: Source) -> Figure:
     from wheretolook.release.showcase_figures import learning_of
 
     showcase, scorer, location = _shown(source, "mlp-2d+z.safetensors")
-    return learning_figure(*learning_of(showcase, cast("BinnedNetworkScorer", scorer), location).drawn)
+    return learning_figure(*learning_of(showcase, cast("BinnedNetworkScorer", scorer), location))
 
 
 def _sampling(source: Source) -> Figure:
@@ -256,7 +258,7 @@ def _peaks(source: Source) -> Figure:
     from wheretolook.figures.peaks import peaks_figure
     from wheretolook.release.showcase_figures import peaks_of
 
-    return peaks_figure(*peaks_of(*_shown(source)).drawn)
+    return peaks_figure(*peaks_of(*_shown(source)))
 
 
 def _planning(source: Source) -> Figure:
@@ -391,8 +393,10 @@ def write_items(
         content, ids = drawn
         files = _write(item.name, content, f"runs: {', '.join(ids)} ({item.stage})" if ids else "", out, config.kinds)
         for run_id in ids:
+            folder = artifact(tracking, run_id, "figures")
+            folder.mkdir(parents=True, exist_ok=True)
             for file in files:
-                client(tracking).log_artifact(run_id, str(file), "figures")
+                shutil.copy(file, folder)
         say(f"{item.name}: -> {', '.join(str(file) for file in files)}")
     return missing
 

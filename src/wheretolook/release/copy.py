@@ -10,11 +10,11 @@ import json
 import os
 import shutil
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from wheretolook.dataset.folders import Dataset, SceneFolder
+from wheretolook.dataset.folders import RELEASE_FILE, Dataset, SceneFolder
 from wheretolook.mapping.cameras import CAMERAS_FILE, save_mapping_poses
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.methods.method import Method
@@ -24,12 +24,6 @@ from wheretolook.utils.files import sha256, write_json
 from wheretolook.utils.version import VERSION
 from wheretolook.viewpoints.table import write_table
 from wheretolook.visibility.occlusion import StoredOcclusion
-
-if TYPE_CHECKING:
-    from wheretolook.config import Experiment
-
-ABOUT = "release.json"
-"""What a release was made from; the file that makes a dataset one."""
 
 CARD = "README.md"
 
@@ -42,11 +36,11 @@ MAX_BYTES = 16_000_000
 
 def is_release(dataset: Dataset) -> bool:
     """Whether a dataset is a release."""
-    return (dataset.root / ABOUT).is_file()
+    return (dataset.root / RELEASE_FILE).is_file()
 
 
-def copy_dataset(dataset: Dataset, experiment: Experiment) -> Dataset:
-    """Write a compact copy of a labelled dataset to `<data>/<release_name>/`. The same dataset gives the same bytes.
+def copy_dataset(dataset: Dataset, root: Path, settings: Mapping[str, Any]) -> Dataset:
+    """Write a compact copy of a labelled dataset. The same dataset gives the same bytes.
 
     Tables are written compact (`viewpoints.table.COMPACT_SCHEMA`), without matches, landmarks without descriptors and
     in half precision, the mapping images' poses if they are known, and what labels were made with without the list of
@@ -55,7 +49,8 @@ def copy_dataset(dataset: Dataset, experiment: Experiment) -> Dataset:
 
     Args:
         dataset: what to copy.
-        experiment: the settings it was made with, and the folder of all datasets.
+        root: where to write it, `<data>/<release_name>`.
+        settings: it was made with, as JSON values.
 
     Returns:
         The copy.
@@ -64,7 +59,6 @@ def copy_dataset(dataset: Dataset, experiment: Experiment) -> Dataset:
         ConfigError: the release's folder holds another dataset, or a release of another one.
         TableError, MapError: a scene's table, landmarks or occlusion are missing or damaged.
     """
-    root = experiment.data / experiment.release_name
     before = _release_of(root, dataset.name)
     fingerprint = None if before is None else before.fingerprint()
     copied = [(scene, SceneFolder(root / scene.name, scene.split)) for scene in dataset.scenes]
@@ -84,9 +78,9 @@ def copy_dataset(dataset: Dataset, experiment: Experiment) -> Dataset:
         "source": dataset.name,
         "source_fingerprint": dataset.fingerprint(),
         "code_version": VERSION,
-        "settings": _settings(experiment),
+        "settings": dict(settings),
     }
-    write_json(root / ABOUT, about)
+    write_json(root / RELEASE_FILE, about)
     release = Dataset(root, dataset.camera, tuple(copy for _, copy in copied))
     release.save()
     if before is not None:
@@ -215,7 +209,7 @@ def read_about(release: Dataset) -> dict[str, Any]:
     Raises:
         ConfigError: the file is missing or damaged.
     """
-    path = release.root / ABOUT
+    path = release.root / RELEASE_FILE
     try:
         about = dict(json.loads(path.read_text()))
         return {name: about[name] for name in ("source", "source_fingerprint", "code_version", "settings")}
@@ -247,17 +241,3 @@ def _manifest(path: Path) -> dict[str, Any]:
         raise TableError(
             f"not what the label stage wrote: {error}", path=path, fix="Remove it, or label the scene again."
         ) from error
-
-
-def _settings(experiment: Experiment) -> dict[str, Any]:
-    """Settings that decide what a dataset holds, as JSON values. Meshes go by name: paths mean nothing elsewhere."""
-    meshes = [{"name": mesh.scene_name, "split": mesh.split, "up": mesh.up} for mesh in experiment.scenes.meshes]
-    settings = {
-        "camera": asdict(experiment.camera),
-        "scenes": {**asdict(experiment.scenes), "meshes": meshes},
-        "map": asdict(experiment.map),
-        "occlusion": asdict(experiment.occlusion),
-        "sample": asdict(experiment.sample),
-        "label": {"localizer": asdict(experiment.label.localizer)},
-    }
-    return dict(json.loads(json.dumps(settings, default=str)))

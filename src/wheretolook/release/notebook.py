@@ -1,4 +1,4 @@
-"""Where notebooks find the release and the tracking store, from whichever folder they are opened in."""
+"""How notebooks find the release and the tracking store, from any folder inside a checkout."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from pathlib import Path
 
 from wheretolook.dataset.folders import RELEASE, Dataset
 from wheretolook.utils.errors import ConfigError
-from wheretolook.utils.tracking import TrackingConfig
+from wheretolook.utils.tracking_config import TrackingConfig
 
 RELEASE_VARIABLE, STORE_VARIABLE = "WHERETOLOOK_RELEASE", "WHERETOLOOK_MLRUNS"
-"""Environment variables that name the folders of a release and of a store, instead of the ones that are found."""
+"""Environment variables with the folders of a release and of a store, which are searched for if not given."""
 
 
 def open_release() -> Dataset:
-    """The dataset that ships: the folder that `WHERETOLOOK_RELEASE` names, or the nearest `data/release` upwards.
+    """The released dataset: the folder in `WHERETOLOOK_RELEASE`, or the nearest `data/release` here or above.
 
     Raises:
         ConfigError: there is none. TableError: it is damaged.
@@ -29,7 +29,7 @@ def open_release() -> Dataset:
 
 
 def find_store() -> TrackingConfig:
-    """The store that `WHERETOLOOK_MLRUNS` names, or the nearest `mlruns` upwards, be it empty."""
+    """The store in `WHERETOLOOK_MLRUNS`, or the nearest folder `mlruns` here or above, even if it is empty."""
     here, named = Path.cwd(), os.environ.get(STORE_VARIABLE)
     folders = [folder / "mlruns" for folder in (here, *here.parents)]
     nearest = next((folder for folder in folders if folder.is_dir()), folders[0])
@@ -37,10 +37,7 @@ def find_store() -> TrackingConfig:
 
 
 def open_store(release: Dataset | None = None) -> TrackingConfig:
-    """The store of `find_store` with the runs of a release in it: logged now if it lacks them, which takes seconds.
-
-    Args:
-        release: that of `open_release` if not given.
+    """The store of `find_store`; the runs of a release (`open_release` by default) are logged if it lacks them.
 
     Raises:
         ConfigError: there is no release. TableError: it is damaged.

@@ -1,4 +1,4 @@
-"""The paper's table of the network's layers beside the layers that were trained here."""
+"""The paper's table of the network's layers, beside the layers of a network trained here."""
 
 from __future__ import annotations
 
@@ -13,13 +13,9 @@ from wheretolook.learning.old_names import name_of_variant
 
 
 def paper_architecture_table(params: Mapping[str, str]) -> pd.DataFrame:
-    """The paper's table 1 with the layers of a network of this project.
+    """The paper's Table 1 with the layers of a network of this project, given MLflow's parameters of its train run.
 
-    Args:
-        params: of a train run of one of the paper's networks, as MLflow keeps them.
-
-    Returns:
-        A row a layer: `layer` (number in the paper's table), `paper` and `here`.
+    A row for each layer: `layer` (its number in the paper's table), `paper` and `here`.
     """
     method = params.get("method") or name_of_variant(params["variant"])
     channels, bins = PAPER_VARIANTS[method.removeprefix("mlp-")], int(params["bins"])
@@ -28,7 +24,7 @@ def paper_architecture_table(params: Mapping[str, str]) -> pd.DataFrame:
     for before, after in pairwise(widths):
         here += [f"fully connected {before} × {after}", "ReLU", f"dropout {params['dropout']}"]
     here += [f"fully connected {widths[-1]} × 1", "Sigmoid"]
-    paper = ["fully connected input-size × 300", "ReLU", "dropout 0.5", "fully connected 300 × 300", "ReLU",
-             "dropout 0.5", "fully connected 300 × 1", "Sigmoid"]  # fmt: skip
+    paper = ["fully connected input-size × 300", "ReLU", "dropout 0.5"]
+    paper += ["fully connected 300 × 300", "ReLU", "dropout 0.5", "fully connected 300 × 1", "Sigmoid"]
     layers = [str(n // 3 + 1) + (f".{n % 3}" if n % 3 else "") for n in range(max(len(here), len(paper)))]
     return pd.DataFrame({"layer": pd.Series(layers), "paper": pd.Series(paper), "here": pd.Series(here)}).fillna("")

@@ -32,7 +32,17 @@ from wheretolook.methods.registry import learned
 from wheretolook.planning.path_report import PATHS_CSV, log_paths
 from wheretolook.release.benchmark_runs import RUNTIMES_CSV, SCALING_CSV, log_runtimes
 from wheretolook.release.card import GENERALIZATION_CSV
-from wheretolook.utils.tracking import NestedRun, TrackingConfig, client, finished_runs, log, log_nested, start_run
+from wheretolook.utils.tracking import (
+    NestedRun,
+    artifact,
+    client,
+    experiment_ids,
+    finished_runs,
+    log,
+    log_nested,
+    start_run,
+)
+from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import UNLABELLED, is_good
 from wheretolook.viewpoints.thresholds import ALL
 
@@ -97,12 +107,10 @@ def _alone(tracking: TrackingConfig) -> Iterator[None]:
 def _forget_halves(tracking: TrackingConfig) -> None:
     """Delete runs that were being logged from a release when something ended it, and those nested in them."""
     mlflow = client(tracking)
-    experiment = mlflow.get_experiment_by_name(tracking.experiment)
-    if experiment is None:
-        return
+    experiments = list(experiment_ids(mlflow, tracking).values())
 
     def matching(condition: str) -> list[str]:
-        found = mlflow.search_runs([experiment.experiment_id], condition, max_results=10_000)
+        found = mlflow.search_runs(experiments, condition, max_results=10_000) if experiments else ()
         return [str(run.info.run_id) for run in found]
 
     tagged = " and ".join(f"tags.{name} = '{value}'" for name, value in TAGS.items())
@@ -149,7 +157,7 @@ def _log_missing(dataset: Dataset, tracking: TrackingConfig, say: Say) -> Releas
 def _found(tracking: TrackingConfig, stage: str, name: str, content: bytes) -> str | None:
     """Id of the newest run of a stage that has this file as an artifact."""
     for run in finished_runs(tracking, stage, file=name):
-        if (Path(run.info.artifact_uri) / name).read_bytes() == content:
+        if artifact(tracking, run.info.run_id, name).read_bytes() == content:
             return str(run.info.run_id)
     return None
 
@@ -158,7 +166,7 @@ def _train_run(tracking: TrackingConfig, path: Path, record: dict[str, Any], wit
     """The run that trained these weights, or the one that was logged from their record."""
     method = record["about"]["method"]
     for _, run in train_runs(tracking, method=method, file=HISTORY_CSV if with_history else ""):
-        logged = Path(run.info.artifact_uri) / path.name
+        logged = artifact(tracking, run.info.run_id, path.name)
         if run.info.run_id == record["run_id"] or (logged.is_file() and logged.read_bytes() == path.read_bytes()):
             return str(run.info.run_id)
     return None
@@ -204,7 +212,7 @@ def _log_evaluation(
         log(mlflow, run, metrics=metrics)
         for path in files:
             mlflow.log_artifact(run, str(path))
-        log_nested(tracking, run, "evaluate", [nested for _, nested in runs_of_rows(table, params)], TAGS)
+        log_nested(tracking, run, "evaluate", runs_of_rows(table, params), TAGS)
     return run
 
 

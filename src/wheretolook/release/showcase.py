@@ -8,31 +8,30 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.dataset.folders import Dataset, SceneFolder
-from wheretolook.dataset.scene_occlusion import scene_occlusion
+from wheretolook.dataset.folders import RELEASE_FILE, Dataset, SceneFolder
+from wheretolook.dataset.scene import Scene, SceneConfig
 from wheretolook.figures.house_image import Dollhouse, dollhouse
 from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.geometry.lattices import VoxelGrid, direction_lattice
+from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float
-from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.release.copy import ABOUT
-from wheretolook.rendering.warp_renderer import WarpRenderer
-from wheretolook.scenes.procedural.generator import ApartmentConfig, generate_apartment
-from wheretolook.space.free_space import FreeSpace, FreeSpaceConfig
+from wheretolook.scenes.config import ApartmentConfig
+from wheretolook.scenes.procedural.generator import generate_apartment
+from wheretolook.space.config import FreeSpaceConfig
 from wheretolook.utils.errors import ConfigError, SceneError
-from wheretolook.viewpoints.sampling import SampleConfig, free_locations
+from wheretolook.utils.options import recorded
+from wheretolook.viewpoints.config import SampleConfig
+from wheretolook.viewpoints.locations import instructive_location
+from wheretolook.viewpoints.sampling import free_locations
 from wheretolook.viewpoints.table import is_good
 from wheretolook.visibility.config import OcclusionConfig
-from wheretolook.visibility.occlusion import OcclusionModel, StoredOcclusion
+from wheretolook.visibility.occlusion import StoredOcclusion
 
 EYE_M = 1.45
 """Height of the locations that figures show, unless told otherwise: about that of the mapping cameras."""
@@ -45,53 +44,60 @@ _CHECKED = 16  # locations whose lines of sight are compared
 _SEEDED = re.compile(r"apartment-(\d+)")
 
 
-@dataclass(frozen=True, eq=False)
-class Showcase:
-    """A scene with everything that figures ask for.
+class Showcase(Scene):
+    """A scene of a release, with everything that figures ask for; its lines of sight are found by the mesh.
 
-    Attributes:
-        scene: its files.
-        mesh: metres, z up.
-        space: where a camera can be.
-        localization_map: with the mesh's occlusion, so that it answers for any location.
-        table: its viewpoints.
-        grid: of its locations.
-        free: ids of the locations in free space, (L,) ascending.
-        directions: (D, 3) unit optical axes that each location was looked from.
-        keep: K, the directions that the paper keeps of each location.
+    Args:
+        files, camera, config, device, mesh: see `Scene`.
+        sampling: how its viewpoints were sampled.
     """
 
-    scene: SceneFolder
-    mesh: TexturedMesh
-    space: FreeSpace
-    localization_map: LocalizationMap
-    table: pd.DataFrame
-    grid: VoxelGrid
-    free: NDArray[np.int64]
-    directions: Float
-    keep: int = 100
+    def __init__(
+        self,
+        files: SceneFolder,
+        camera: PinholeCamera,
+        config: SceneConfig,
+        device: str,
+        mesh: TexturedMesh,
+        sampling: SampleConfig,
+    ) -> None:
+        super().__init__(files, camera, config, device, mesh)
+        self.sampling = sampling
 
     @cached_property
-    def renderer(self) -> WarpRenderer:
-        """Renders the mesh."""
-        return WarpRenderer(self.mesh, self.localization_map.device)
+    def table(self) -> pd.DataFrame:
+        """The scene's viewpoints."""
+        return self.files.read_table()
+
+    @cached_property
+    def grid(self) -> VoxelGrid:
+        """Voxels whose centres are the locations."""
+        return self.sampling.voxels(self.space.bounds)
+
+    @cached_property
+    def free(self) -> NDArray[np.int64]:
+        """Ids of the locations in free space, (L,) ascending."""
+        return free_locations(self.grid, self.space)
+
+    @cached_property
+    def directions(self) -> Float:
+        """Optical axes that each location was looked from, (D, 3) unit vectors."""
+        return self.sampling.axes()
+
+    @property
+    def keep(self) -> int:
+        """K, the directions that the paper keeps of each location."""
+        return self.sampling.keep or SampleConfig().keep
 
     @cached_property
     def house(self) -> Dollhouse:
         """The scene obliquely from above, cut at the height of eyes."""
-        return dollhouse(self.mesh, cut_m=self._floor + EYE_M, device=self.localization_map.device)
+        return dollhouse(self.mesh, cut_m=self._floor + EYE_M, device=self.device)
 
     @cached_property
     def plan(self) -> Dollhouse:
         """The scene from straight above."""
-        return dollhouse(self.mesh, elevation_deg=90, device=self.localization_map.device)
-
-    @property
-    def camera(self) -> PinholeCamera:
-        """Intrinsics of every viewpoint."""
-        camera = self.localization_map.camera
-        assert isinstance(camera, PinholeCamera)
-        return camera
+        return dollhouse(self.mesh, elevation_deg=90, device=self.device)
 
     @property
     def _floor(self) -> float:
@@ -120,12 +126,13 @@ class Showcase:
 
     def summary(self) -> str:
         """How much of everything there is, as a sentence."""
-        one, n_locations = self.localization_map, self.table["location_id"].nunique()
-        cameras = "" if one.mapping_poses is None else f" of {len(one.mapping_poses)} images"
+        n_locations = self.table["location_id"].nunique()
+        cameras = "" if self.mapping_poses is None else f" of {len(self.mapping_poses)} images"
+        good = is_good(self.table).mean()
         return (
-            f"**{self.scene.name}**: {len(self.mesh.triangles):,} triangles; a map{cameras} with "
-            f"{len(one.landmarks):,} landmarks; {len(self.table):,} labelled viewpoints at {n_locations} locations, of "
-            f"which {is_good(self.table).mean():.0%} localize."
+            f"**{self.name}**: {len(self.mesh.triangles):,} triangles; a map{cameras} with {len(self.landmarks):,} "
+            f"landmarks; {len(self.table):,} labelled viewpoints at {n_locations} locations, of which {good:.0%} "
+            "localize."
         )
 
     def viewpoints(self, location_id: int) -> pd.DataFrame:
@@ -141,12 +148,12 @@ class Showcase:
         return rows
 
     def instructive_location(self, height_m: float = EYE_M) -> int:
-        """The location of a layer where the share of viewpoints that localize is nearest to one half: where to look
-        matters there. Of several, the first; if the layer has no viewpoint, one of any height.
+        """The location of a layer where to look matters most (`instructive_location`).
+
+        If the layer has no viewpoint, one of any height.
         """
         rows = self.table[self.table["location_id"].isin(self.layer(height_m))]
-        ids, shares = shares_good(rows if len(rows) else self.table)
-        return int(ids[np.argmin(np.abs(shares - 0.5))])
+        return instructive_location(rows if len(rows) else self.table)
 
 
 def open_showcase(dataset: Dataset, name: str | None = None, device: str = "cpu") -> Showcase:
@@ -161,7 +168,7 @@ def open_showcase(dataset: Dataset, name: str | None = None, device: str = "cpu"
         ConfigError: it is no release, or has no such scene. SceneError: the scene was not generated from a seed, or
             what this code makes of the seed is not the scene that was labelled.
     """
-    about = dataset.root / ABOUT
+    about = dataset.root / RELEASE_FILE
     if not about.is_file():
         raise ConfigError(
             "this dataset is no release", path=dataset.root, fix="Open one that `wheretolook release` made."
@@ -171,38 +178,25 @@ def open_showcase(dataset: Dataset, name: str | None = None, device: str = "cpu"
     seeded = _SEEDED.fullmatch(scene.name)
     if seeded is None:
         raise SceneError("this scene was not generated from a seed", path=scene.folder, value=scene.name)
-    apartment = ApartmentConfig(**settings["scenes"]["apartment"])
-    mesh = generate_apartment(apartment, int(seeded[1]), device=device)
-    space = FreeSpace(mesh, FreeSpaceConfig(**settings["scenes"]["free_space"]), device)
-    sampling = SampleConfig(**settings["sample"])
-    grid = VoxelGrid.over(space.bounds, sampling.grid)
-    landmarks = Landmarks.load(scene.landmarks)
-    rays = OcclusionConfig(**{**settings["occlusion"], "model": "mesh"})
-    occlusion = scene_occlusion(scene, dataset.camera, rays, device, mesh, space.two_sided)
+    occlusion = recorded(OcclusionConfig, {**settings["occlusion"], "model": "mesh"})
+    config = SceneConfig(occlusion, recorded(FreeSpaceConfig, settings["scenes"]["free_space"]))
+    mesh = generate_apartment(recorded(ApartmentConfig, settings["scenes"]["apartment"]), int(seeded[1]), device=device)
+    sampling = recorded(SampleConfig, settings["sample"])
+    showcase = Showcase(scene, dataset.camera, config, device, mesh, sampling)
     if settings["occlusion"]["model"] == "mesh":
-        _check_same(scene, landmarks, occlusion)
-    directions = direction_lattice(sampling.directions, sampling.lattice)
-    localization_map = LocalizationMap(landmarks, dataset.camera, occlusion, device, scene.mapping_poses())
-    return Showcase(
-        scene, mesh, space, localization_map, scene.read_table(), grid, free_locations(grid, space), directions,
-        sampling.keep or SampleConfig().keep,
-    )  # fmt: skip
+        _check_same(showcase)
+    return showcase
 
 
-def shares_good(table: pd.DataFrame) -> tuple[NDArray[np.int64], Float]:
-    """Ids (L,) of a table's locations, ascending, and the share of each one's viewpoints that localize, (L,)."""
-    ids, rows = np.unique(table["location_id"].to_numpy(np.int64), return_inverse=True)
-    return ids, np.bincount(rows, weights=is_good(table)) / np.bincount(rows)
-
-
-def _check_same(scene: SceneFolder, landmarks: Landmarks, occlusion: OcclusionModel) -> None:
+def _check_same(scene: Scene) -> None:
     """Raise a SceneError if lines of sight are not those stored."""
-    stored = StoredOcclusion.load(scene.occlusion)
+    stored, points = StoredOcclusion.load(scene.files.occlusion), scene.landmarks.points
     some = stored.locations[:: max(1, len(stored.locations) // _CHECKED)]
-    same = (occlusion.unoccluded(some, landmarks.points) == stored.unoccluded(some, landmarks.points)).mean()
+    same = (scene.occlusion.unoccluded(some, points) == stored.unoccluded(some, points)).mean()
     if not same >= SAME_OCCLUSION:
         raise SceneError(
-            "made anew from its seed, the scene is not the one that was labelled", path=scene.folder,
+            "made anew from its seed, the scene is not the one that was labelled",
+            path=scene.files.folder,
             value=f"{same:.1%} of the lines of sight are as stored",
             fix="Check out the version of the code that release.json names.",
-        )  # fmt: skip
+        )

@@ -1,15 +1,16 @@
-"""What the figures of one scene draw, taken from a `wheretolook.release.showcase.Showcase`."""
+"""The content of the figures of one scene, computed from a `wheretolook.release.showcase.Showcase`."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.dataset.folders import Dataset
+from wheretolook.dataset.scene import Scene
 from wheretolook.figures.inputs import BinnedImage
 from wheretolook.figures.overview import View
 from wheretolook.figures.peaks import spread_extrema
@@ -31,9 +32,8 @@ from wheretolook.visibility.frustum import pixels_of
 from wheretolook.visibility.survey import Survey, survey
 
 
-@dataclass(frozen=True, eq=False)
-class Peaks:
-    """What `wheretolook.figures.peaks.peaks_figure` draws; see there."""
+class Peaks(NamedTuple):
+    """The arguments of `wheretolook.figures.peaks.peaks_figure`."""
 
     directions: Float
     scores: Float
@@ -41,39 +41,23 @@ class Peaks:
     pits: tuple[View, ...]
     tried: tuple[Float, NDArray[np.bool_]]
 
-    @property
-    def drawn(self) -> tuple[Any, ...]:
-        """Arguments of `peaks_figure`."""
-        return self.directions, self.scores, self.peaks, self.pits, self.tried
 
-
-@dataclass(frozen=True, eq=False)
-class Learning:
-    """What `wheretolook.figures.learning.learning_figure` draws; see there."""
+class Learning(NamedTuple):
+    """The arguments of `wheretolook.figures.learning.learning_figure`."""
 
     image: BinnedImage
     activations: tuple[Float, ...]
     channels: tuple[str, ...]
     outcome: str
 
-    @property
-    def drawn(self) -> tuple[Any, ...]:
-        """Arguments of `learning_figure`."""
-        return self.image, self.activations, self.channels, self.outcome
-
 
 def pipeline_of(showcase: Showcase, scorer: Scorer, location_id: int, height_m: float = EYE_M) -> Pipeline:
-    """From the scene's map to the best labelled view of a location.
+    """From the scene's map to the best labelled view of the location `location_id`.
 
-    Of each location the K directions are scored that see most landmarks (paper, Sec. 3.2).
-
-    Args:
-        showcase: the scene.
-        scorer: whose scores are probabilities.
-        location_id: where the camera stands that is to be turned.
-        height_m: of the layer of locations that is shown, above the floor.
+    At each location only the K directions that see most landmarks are scored (paper, Sec. 3.2), by a scorer whose
+    scores are probabilities. Locations are those of the layer at a height above the floor.
     """
-    one = showcase.localization_map
+    localization_map = showcase.localization_map
     locations = showcase.grid.centers()[np.intersect1d(showcase.layer(height_m), showcase.free)]
     kept = _survey(showcase, locations).best
     looking = poses_looking_along(np.repeat(locations, kept.shape[1], axis=0), showcase.directions[kept.ravel()])
@@ -83,39 +67,55 @@ def pipeline_of(showcase: Showcase, scorer: Scorer, location_id: int, height_m: 
     candidate_scores = scorer.score(poses(candidates))
     row = int(np.argmax(candidate_scores))
     chosen = poses(candidates.iloc[[row]])
-    seen = np.zeros(len(one.landmarks), dtype=bool)
-    seen[one.visible_landmarks(chosen)[0]] = True
-    mapping_poses = np.zeros((0, 3, 4)) if one.mapping_poses is None else one.mapping_poses
+    seen = np.zeros(len(localization_map.landmarks), dtype=bool)
+    seen[localization_map.landmarks_in_view(chosen)[0]] = True
     return Pipeline(
-        showcase.house, one.landmarks.points, mapping_poses, showcase.camera, locations, len(showcase.free),
-        len(showcase.directions), showcase.directions[best], scores.max(1), chosen[0], float(candidate_scores[row]),
-        seen, showcase.render(chosen)[0], outcome_in_words(candidates.iloc[row]),
-    )  # fmt: skip
+        house=showcase.house,
+        landmarks=localization_map.landmarks.points,
+        mapping_poses=np.zeros((0, 3, 4)) if localization_map.mapping_poses is None else localization_map.mapping_poses,
+        camera=showcase.camera,
+        locations=locations,
+        n_locations=len(showcase.free),
+        n_directions=len(showcase.directions),
+        best_axes=showcase.directions[best],
+        best_scores=scores.max(1),
+        chosen=chosen[0],
+        chosen_score=float(candidate_scores[row]),
+        seen=seen,
+        rgb=showcase.render(chosen)[0],
+        outcome=outcome_in_words(candidates.iloc[row]),
+    )
 
 
 def sampling_of(showcase: Showcase, location_id: int) -> Sampling:
-    """The layer of voxels that holds a location, and what the location sees."""
-    one, place = showcase.localization_map, showcase.center(location_id)
+    """The layer of voxels that holds a location, and what is in view and unoccluded from there."""
+    localization_map, place = showcase.localization_map, showcase.center(location_id)
     nz = showcase.grid.shape[2]
-    ids = np.arange(len(showcase.grid))
-    layer = ids[ids % nz == location_id % nz]
-    seen = _survey(showcase, place[None])
+    layer = np.arange(location_id % nz, len(showcase.grid), nz)
+    in_view = _survey(showcase, place[None])
     kept = np.zeros(len(showcase.directions), dtype=bool)
-    best = seen.best[0]
-    kept[best[seen.counts[0, best] > 0]] = True
-    unoccluded = one.occlusion.unoccluded(place[None], one.landmarks.points)[0]
+    best = in_view.best[0]
+    kept[best[in_view.counts[0, best] > 0]] = True
     return Sampling(
-        showcase.plan, showcase.grid, layer, np.isin(layer, showcase.free), place, showcase.directions,
-        seen.counts[0].astype(np.int64), kept, one.landmarks.points, unoccluded,
-    )  # fmt: skip
+        plan=showcase.plan,
+        grid=showcase.grid,
+        layer=layer,
+        free=np.isin(layer, showcase.free),
+        place=place,
+        directions=showcase.directions,
+        n_visible=in_view.counts[0].astype(np.int64),
+        kept=kept,
+        landmarks=localization_map.landmarks.points,
+        unoccluded=localization_map.occlusion.unoccluded(place[None], localization_map.landmarks.points)[0],
+    )
 
 
 def binned_image_of(showcase: Showcase, cam_from_world: ArrayLike, bins: int = 30) -> BinnedImage:
-    """One view (3, 4), rendered and binned."""
-    one, pose = showcase.localization_map, np.asarray(cam_from_world, dtype=np.float64)[None]
-    points = one.landmarks.points[one.visible_landmarks(pose)[0]]
+    """The view of a pose cam_from_world (3, 4), rendered and binned."""
+    localization_map, pose = showcase.localization_map, np.asarray(cam_from_world, dtype=np.float64)[None]
+    points = localization_map.landmarks.points[localization_map.landmarks_in_view(pose)[0]]
     pixels = pixels_of(showcase.camera, points @ pose[0, :, :3].T + pose[0, :, 3])
-    binned = one.bin_views(pose, bins)
+    binned = localization_map.bin_views(pose, bins)
     empty = binned.counts[0] == 0
     means = {name: np.where(empty, np.nan, binned.means[0, row]) for row, name in enumerate(CHANNELS)}
     return BinnedImage(showcase.render(pose)[0], pixels, means, binned.counts[0])
@@ -135,7 +135,7 @@ def learning_of(showcase: Showcase, scorer: BinnedNetworkScorer, location_id: in
 
 
 def mistaken_location(showcase: Showcase, scorer: Scorer, height_m: float = EYE_M) -> int:
-    """The location of a layer whose predicted probabilities are farthest from the labels, on average.
+    """The location of a layer with the largest mean difference between predicted probabilities and labels.
 
     Raises:
         ConfigError: the layer has no viewpoint.
@@ -149,23 +149,15 @@ def mistaken_location(showcase: Showcase, scorer: Scorer, height_m: float = EYE_
 
 
 def peaks_of(showcase: Showcase, scorer: Scorer, location_id: int, n: int = 3, apart_deg: float = 40.0) -> Peaks:
-    """The scores of every direction at a location, and its labelled views with the highest and the lowest of them.
-
-    Args:
-        showcase: the scene.
-        scorer: whose scores are probabilities.
-        location_id: one with viewpoints.
-        n: peaks, and as many pits.
-        apart_deg: least angle between two peaks, and between two pits.
-    """
+    """The scores of all directions at a location with viewpoints, and its n labelled views with the highest and with
+    the lowest scores, at least `apart_deg` apart. Scores must be probabilities."""
     rows = showcase.viewpoints(location_id)
     looked, scores = poses(rows), scorer.score(poses(rows))
     axes = looked[:, 2, :3]
 
     def views(highest: bool) -> tuple[View, ...]:
         found = spread_extrema(axes, scores, n, apart_deg, highest)
-        shown = zip(showcase.render(looked[found]), found, strict=True)
-        return tuple(View(rgb, axes[row], float(scores[row]), outcome_in_brief(rows.iloc[row])) for rgb, row in shown)
+        return rendered_views(showcase, rows.iloc[found], scores[found], outcome_in_brief)
 
     known = (rows["status"] != UNLABELLED).to_numpy()
     everywhere = score_directions(scorer, showcase.center(location_id), showcase.directions)[0]
@@ -173,8 +165,24 @@ def peaks_of(showcase: Showcase, scorer: Scorer, location_id: int, n: int = 3, a
     return Peaks(showcase.directions, everywhere, views(True), views(False), tried)
 
 
+def rendered_views(
+    scene: Scene, rows: pd.DataFrame, scores: Float, words: Callable[[pd.Series], str]
+) -> tuple[View, ...]:
+    """Viewpoints with what a camera sees there and what became of it.
+
+    Args:
+        scene: with a mesh.
+        rows: B labelled viewpoints of it.
+        scores: (B,).
+        words: says in words how a row's label came out.
+    """
+    looked = poses(rows)
+    seen = zip(scene.renderer.render(scene.camera, looked).rgb, looked, scores, range(len(rows)), strict=True)
+    return tuple(View(rgb, pose[2, :3], float(score), words(rows.iloc[row])) for rgb, pose, score, row in seen)
+
+
 PLANNED_BY = ("forward", "fisher-trace-gp", "set")
-"""Methods of the paper's planning figure."""
+"""Methods in the figure of planned paths, by their names on the command line."""
 
 
 def planned_views(
@@ -183,25 +191,19 @@ def planned_views(
     methods: Sequence[str] = PLANNED_BY,
     config: PlanConfig = PlanConfig(grid=(8, 8, 4), directions=200),
 ) -> dict[str, list[PathView]]:
-    """What a camera sees along the paths of several methods, between a start and a goal: the farthest of ten pairs.
+    """The views along the paths of several methods between the farthest of ten random pairs of start and goal.
 
-    Args:
-        showcase: the scene.
-        dataset: it is of; its weights are used.
-        methods: names on the command line.
-        config: grid and directions of the viewpoint maps, and of the paths.
+    The methods use the weights of the scene's dataset.
     """
-    one = showcase.localization_map
     pairs = draw_pairs(showcase.space, PathsConfig(pairs=10))
     start, goal = pairs[np.linalg.norm(pairs[:, 1] - pairs[:, 0], axis=1).argmax()]
-    paths = plan_by_methods(
-        methods, start, goal, showcase.scene, dataset, showcase.space, one.occlusion, config=config, device=one.device
-    )
-    return {name: path_views(path, one) for name, path in paths.items()}
+    paths = plan_by_methods(showcase, dataset, methods, start, goal, config)
+    return {name: path_views(path, showcase.localization_map) for name, path in paths.items()}
 
 
 def _survey(showcase: Showcase, locations: Float) -> Survey:
-    one = showcase.localization_map
-    rotations = rotation_looking_along(showcase.directions)
-    return survey(showcase.camera, rotations, locations, one.landmarks.points, one.occlusion, keep=showcase.keep,
-                  keep_occlusion=False, device=one.device)  # fmt: skip
+    localization_map, rotations = showcase.localization_map, rotation_looking_along(showcase.directions)
+    options: dict[str, Any] = {"keep": showcase.keep, "keep_occlusion": False, "device": localization_map.device}
+    return survey(
+        showcase.camera, rotations, locations, localization_map.landmarks.points, localization_map.occlusion, **options
+    )

@@ -26,11 +26,7 @@ def raycasting_scene(mesh: TexturedMesh) -> Any:
 
 
 class Open3DRenderer:
-    """What `WarpRenderer` computes, with `open3d.t.geometry.RaycastingScene` and NumPy on the CPU.
-
-    Args:
-        mesh: what to render.
-    """
+    """The twin of `WarpRenderer`, with `open3d.t.geometry.RaycastingScene` and NumPy on the CPU."""
 
     def __init__(self, mesh: TexturedMesh) -> None:
         self.mesh = mesh
@@ -41,16 +37,14 @@ class Open3DRenderer:
     def render(self, camera: PinholeCamera, cam_from_world: ArrayLike) -> Rendering:
         """Render poses (B, 3, 4); see `Renderer.render`."""
         poses = check_poses(cam_from_world)
-        images = [self._render_one(camera, pose[None]) for pose in poses]
         shape = (len(poses), camera.height, camera.width)
         rgb, depth_m = np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.float32)
-        for i, (colors, depths) in enumerate(images):
-            rgb[i], depth_m[i] = colors, depths
+        for i in range(len(poses)):
+            rgb[i], depth_m[i] = self._render_one(camera, poses[i : i + 1])
         return Rendering(rgb, depth_m)
 
-    def _render_one(
-        self, camera: PinholeCamera, pose: NDArray[np.float64]
-    ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    def _render_one(self, camera: PinholeCamera, pose: Float) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        """Image (H, W, 3) and depth (H, W) of a pose (1, 3, 4)."""
         import open3d as o3d
 
         (center,), (ray_from_pixel,) = camera_rays(camera, pose)
@@ -79,7 +73,10 @@ class Open3DRenderer:
     def _footprint(
         self, face: NDArray[np.int64], t: Float, normals: Float, rays: Float, ray_from_pixel: Float
     ) -> Float:
-        """How the hit moves on the texture as the pixel moves by one in x and y: (N, 2, 2) texels a pixel."""
+        """The footprints of pixels: how far a hit moves on the texture as the pixel moves by one in x and in y.
+
+        (N, 2, 2) texels per pixel, the columns for x and y.
+        """
         slant = np.einsum("nd,nd->n", normals, rays)
         slant = np.where(np.abs(slant) < 1e-4, np.where(slant < 0, -1e-4, 1e-4), slant)
         by_pixel = ray_from_pixel[:, :2]  # (3, 2)

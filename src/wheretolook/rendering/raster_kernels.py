@@ -1,8 +1,8 @@
-"""Warp kernels of `WarpRenderer` that rasterize: for one core about three times faster than a ray for every pixel.
+"""Warp kernels of `WarpRenderer` that rasterize, which on one core is about three times as fast as tracing rays.
 
 Triangles are rasterized in homogeneous pixel coordinates (Olano and Greer, Triangle Scan Conversion using 2D
-Homogeneous Coordinates, 1997), in which one that reaches behind the camera needs no clipping, in double precision, and
-over the centres of pixels, so that each pixel shows the triangle that its ray meets first.
+Homogeneous Coordinates, 1997), where a triangle that reaches behind the camera needs no clipping. Double precision and
+coverage by pixel centres make each pixel show the triangle that its ray meets first.
 """
 
 # mypy: ignore-errors
@@ -15,10 +15,10 @@ import warp as wp
 from wheretolook.rendering.trace_kernel import Appearance, pixel_of, ray_through, shade
 
 _SLACK = wp.constant(wp.float64(1.0e-9))
-"""Pixels by which a triangle is taken to be larger, so that rounding opens no gap between neighbours."""
+"""Triangles are widened by this many pixels, so that rounding opens no gap between neighbours."""
 
 _FLAT = wp.constant(wp.float64(1.0e-13))
-"""Sine of the angle between a triangle's plane and the camera up to which the camera lies in the plane."""
+"""Up to this sine of the angle between a triangle's plane and the camera, the camera counts as in the plane."""
 
 
 @wp.kernel(enable_backward=False)
@@ -36,7 +36,7 @@ def project_kernel(
 
 @wp.func
 def _within(span: wp.vec2d, slope: wp.float64, value: wp.float64):
-    """The part of a span of x in which slope x + value >= 0."""
+    """The part of a span of x, (first, last), where slope * x + value >= 0."""
     if slope > wp.float64(0.0):
         span[0] = wp.max(span[0], -value / slope)
     elif slope < wp.float64(0.0):
@@ -53,7 +53,7 @@ def raster_kernel(
     nearness: wp.array3d[wp.float32],
     triangle: wp.array3d[wp.int32],
 ):
-    # One thread a triangle, which is safe on the CPU alone: there they run one after the other.
+    # One thread per triangle. That is safe only on the CPU, where the threads run one after the other.
     b, face = wp.tid()
     p0 = projected[b, indices[3 * face]]
     p1 = projected[b, indices[3 * face + 1]]
@@ -92,13 +92,13 @@ def raster_kernel(
     n2 = wp.cross(p0, p1)
     volume = wp.dot(p0, n0)
     if wp.abs(volume) <= _FLAT * wp.length(p0) * wp.length(n0):
-        return  # edge-on, and which side of it a pixel sees is rounding
+        return  # edge-on: rounding would decide which side a pixel sees
     if volume < zero:
         n0 = -n0
         n1 = -n1
         n2 = -n2
         volume = -volume
-    inverse_depth = (n0 + n1 + n2) / volume  # . (x, y, 1)
+    inverse_depth = (n0 + n1 + n2) / volume  # the scalar product with (x, y, 1) gives 1 / depth
 
     for row in range(first_row, last_row + 1):
         y = wp.float64(row) + half

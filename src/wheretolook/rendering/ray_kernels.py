@@ -1,4 +1,4 @@
-"""Warp kernels of `MeshRaycaster`: one thread a ray, a point or a segment."""
+"""Warp kernels of `MeshRaycaster`: one thread per ray, point or segment."""
 
 # mypy: ignore-errors
 # Warp's kernel language is not Python's type system.
@@ -14,7 +14,7 @@ def unoccluded_kernel(
     origins: wp.array[wp.vec3],
     points: wp.array[wp.vec3],
     margin_m: wp.float32,
-    free: wp.array2d[wp.bool],
+    unoccluded: wp.array2d[wp.bool],
 ):
     i, j = wp.tid()
     ray = points[j] - origins[i]
@@ -23,7 +23,7 @@ def unoccluded_kernel(
     blocked = wp.bool(False)
     if reach > 0.0:
         blocked = wp.mesh_query_ray_anyhit(mesh, origins[i], ray / distance, reach)
-    free[i, j] = not blocked
+    unoccluded[i, j] = not blocked
 
 
 @wp.kernel
@@ -67,12 +67,12 @@ def clear_kernel(
     clearance_m: wp.float32,
     clear: wp.array[wp.bool],
 ):
-    # The ball around a point up to the nearest surface is empty: step by what it leaves beyond the clearance.
+    # A ball as large as the distance to the nearest surface is empty, so step by that distance less the clearance.
     i = wp.tid()
     start = starts[i]
     length = wp.length(ends[i] - start)
     toward = (ends[i] - start) / wp.max(length, 1.0e-9)
-    reach = length + 2.0 * clearance_m  # no need to look farther for the nearest surface
+    reach = length + 2.0 * clearance_m  # surfaces beyond this distance do not matter
     travelled = wp.float32(0.0)
     result = wp.bool(True)
     while result and travelled <= length:

@@ -51,13 +51,10 @@ class MeshRaycaster:
         self.warp_mesh = warp_mesh(mesh, self.device)
 
     def occluded(self, origins: ArrayLike, points: ArrayLike, margin_m: float = 0.02) -> NDArray[np.bool_]:
-        """Whether something lies between each origin and each point.
+        """Whether something lies between each of origins (L, 3) and each of points (N, 3), in metres.
 
-        Args:
-            origins: (L, 3) metres.
-            points: (N, 3) metres.
-            margin_m: geometry closer to the point than this does not count, so that a landmark on (or, by its
-                triangulation error, a little behind) a surface is not hidden by that surface.
+        Geometry closer to the point than `margin_m` does not count, so that a landmark on (or, by its triangulation
+        error, a little behind) a surface is not hidden by that surface.
 
         Returns:
             (L, N) bool, True where the open segment from the origin to `margin_m` before the point meets a triangle.
@@ -74,99 +71,57 @@ class MeshRaycaster:
 
         def work(start: int) -> None:
             rows = slice(start, start + block)
-            free = self.unoccluded_on_device(origins_at[rows], points_on_device, margin_m)
-            occluded[rows] = ~free.numpy().astype(np.bool_)
+            unoccluded = self.unoccluded_on_device(origins_at[rows], points_on_device, margin_m)
+            occluded[rows] = ~unoccluded.numpy().astype(np.bool_)
 
         with ThreadPoolExecutor(threads) as pool:  # Warp lets go of Python's lock while a kernel runs
             list(pool.map(work, range(0, len(origins_at), block)))
         return occluded
 
     def unoccluded_on_device(self, origins: ArrayLike, points: Any, margin_m: float = 0.02) -> Any:
-        """The negation of `occluded`, on the device, in one piece.
-
-        Args:
-            origins: (L, 3) metres.
-            points: (N,) Warp array of vec3 on this raycaster's device.
-            margin_m: as in `occluded`.
-
-        Returns:
-            (L, N) Warp array of bool, True where the line of sight is free.
-        """
+        """The negation of `occluded`, as a Warp array (L, N) of bool; `points` (N,) is a Warp array of vec3."""
         origins_on_device = vec3_array(origins, self.device)
-        free: Any = wp.empty((origins_on_device.shape[0], points.shape[0]), dtype=wp.bool, device=self.device)
-        wp.launch(
-            unoccluded_kernel,
-            dim=free.shape,
-            inputs=[self.warp_mesh.id, origins_on_device, points, margin_m],
-            outputs=[free],
-            device=self.device,
-        )
-        return free
+        shape = (origins_on_device.shape[0], points.shape[0])
+        (unoccluded,) = self._launch(unoccluded_kernel, shape, [origins_on_device, points, margin_m], wp.bool)
+        return unoccluded
 
     def cast(self, origins: ArrayLike, directions: ArrayLike) -> RayHits:
-        """First hit of each ray.
-
-        Args:
-            origins: (R, 3) metres.
-            directions: (R, 3), need not be of unit length.
-
-        Returns:
-            Distances, triangles and sides of the R hits.
-        """
-        origins_on_device = vec3_array(origins, self.device)
-        directions_on_device = vec3_array(directions, self.device)
-        if origins_on_device.shape != directions_on_device.shape:
-            raise ValueError(f"{origins_on_device.shape[0]} origins for {directions_on_device.shape[0]} directions")
-        n_rays = origins_on_device.shape[0]
-        distance_m = wp.empty(n_rays, dtype=wp.float32, device=self.device)
-        triangle = wp.empty(n_rays, dtype=wp.int32, device=self.device)
-        front = wp.empty(n_rays, dtype=wp.bool, device=self.device)
-        wp.launch(
-            cast_kernel,
-            dim=n_rays,
-            inputs=[self.warp_mesh.id, origins_on_device, directions_on_device],
-            outputs=[distance_m, triangle, front],
-            device=self.device,
-        )
-        return RayHits(distance_m.numpy(), triangle.numpy(), front.numpy().astype(np.bool_))
+        """First hits of rays from origins (R, 3) metres along directions (R, 3) of any length."""
+        rays = self._upload_pairs(origins=origins, directions=directions)
+        outputs = self._launch(cast_kernel, rays[0].shape, rays, wp.float32, wp.int32, wp.bool)
+        distance_m, triangle, front = (values.numpy() for values in outputs)
+        return RayHits(distance_m, triangle, front.astype(np.bool_))
 
     def distance_to_surface(self, points: ArrayLike, max_distance_m: float) -> NDArray[np.float32]:
         """Distance from points (N, 3) to the nearest triangle, (N,) metres; infinite beyond `max_distance_m`."""
-        points_on_device = vec3_array(points, self.device)
-        distance_m = wp.empty(points_on_device.shape[0], dtype=wp.float32, device=self.device)
-        wp.launch(
-            distance_kernel,
-            dim=points_on_device.shape[0],
-            inputs=[self.warp_mesh.id, points_on_device, max_distance_m],
-            outputs=[distance_m],
-            device=self.device,
-        )
-        return distance_m.numpy()
+        points_on_device: Any = vec3_array(points, self.device)
+        inputs = [points_on_device, max_distance_m]
+        (distance_m,) = self._launch(distance_kernel, points_on_device.shape, inputs, wp.float32)
+        return np.asarray(distance_m.numpy())
 
     def segments_are_clear(self, a: ArrayLike, b: ArrayLike, clearance_m: float) -> NDArray[np.bool_]:
-        """Whether straight segments keep a distance from the geometry.
+        """Whether straight segments from a (N, 3) to b (N, 3) metres keep a distance from the geometry; (N,).
 
-        Args:
-            a: (N, 3) metres.
-            b: (N, 3) metres.
-            clearance_m: least distance to any triangle along the segment. Where the segment runs parallel to a surface
-                at about this distance it is tested every tenth of it, and may come closer by less than 0.2 %.
-
-        Returns:
-            (N,) bool.
+        Where a segment runs parallel to a surface at about this distance it is tested every tenth of it, and may come
+        closer by less than 0.2 %.
         """
-        starts, ends = vec3_array(a, self.device), vec3_array(b, self.device)
-        if starts.shape != ends.shape:
-            raise ValueError(f"{starts.shape[0]} starts for {ends.shape[0]} ends")
-        clear = wp.empty(starts.shape[0], dtype=wp.bool, device=self.device)
-        wp.launch(
-            clear_kernel,
-            dim=starts.shape[0],
-            inputs=[self.warp_mesh.id, starts, ends, clearance_m],
-            outputs=[clear],
-            device=self.device,
-        )
-        return clear.numpy().astype(np.bool_)
+        segments = self._upload_pairs(starts=a, ends=b)
+        (clear,) = self._launch(clear_kernel, segments[0].shape, [*segments, clearance_m], wp.bool)
+        return np.asarray(clear.numpy().astype(np.bool_))
+
+    def _upload_pairs(self, **arrays: ArrayLike) -> list[Any]:
+        """Two arrays (N, 3) on the device. Raises ValueError if their lengths differ."""
+        uploaded: list[Any] = [vec3_array(values, self.device) for values in arrays.values()]
+        lengths = [f"{array.shape[0]} {name}" for name, array in zip(arrays, uploaded, strict=True)]
+        if uploaded[0].shape != uploaded[1].shape:
+            raise ValueError(" for ".join(lengths))
+        return uploaded
+
+    def _launch(self, kernel: Any, shape: tuple[int, ...], inputs: list[Any], *dtypes: Any) -> list[Any]:
+        """New arrays of a shape, one for each type, that a kernel has filled."""
+        outputs = [wp.empty(shape, dtype=dtype, device=self.device) for dtype in dtypes]
+        wp.launch(kernel, shape, [self.warp_mesh.id, *inputs], outputs, device=self.device)
+        return outputs
 
 
 def warp_mesh(mesh: TexturedMesh, device: str) -> wp.Mesh:

@@ -1,4 +1,4 @@
-"""Textures as one flat buffer of mip pyramids, and how densely each triangle is textured."""
+"""Textures as one flat buffer of mip pyramids, and the texel density of each triangle."""
 
 from __future__ import annotations
 
@@ -11,23 +11,25 @@ from numpy.typing import NDArray
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.utils.errors import SceneError
 
-# Longest to shortest axis of a pixel's footprint on the texture up to which the long axis is covered by several samples
-# instead of by a coarser mip level. 8 keeps floors and walls seen at a slant sharp across the slant.
 MAX_ANISOTROPY = 8
+"""Up to this ratio of a pixel footprint's axes, several samples along the long axis replace a coarser mip level.
+
+8 keeps floors and walls sharp that are seen at a slant.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class TexturePyramids:
     """The mip pyramids of all textures of a mesh.
 
-    Each level is the box average of the level below it, of the stored sRGB values. Averaging light instead would be
-    nearer to a sensor, but sRGB is the space in which the renderers used with such scenes (Open3D, Habitat's unlit
-    shader) filter and in which SIFT builds its scale space: a surface seen from afar then gives the descriptor of the
-    same surface seen near and blurred. It also needs no decoding per sample.
+    Each level is the box average of the level below it, taken of the stored sRGB values. Averaging linear light would
+    be closer to a sensor, but Open3D and Habitat's unlit shader filter in sRGB too, and SIFT builds its scale space in
+    it: a surface seen from afar then gives the same descriptor as the surface seen from near and blurred. It also needs
+    no decoding per sample.
 
     Attributes:
         texels: (S,) uint32, red in the lowest byte, rows top to bottom, level after level, texture after texture.
-        level_start: (K, L) int32, where level l of texture k starts in `texels`.
+        level_start: (K, L) int32, index in `texels` where level l of texture k starts.
         size: (K, 3) int32, width and height of level 0 and the number of levels. Level l is
             max(1, width >> l) x max(1, height >> l).
     """
@@ -67,12 +69,10 @@ def build_pyramids(textures: tuple[NDArray[np.uint8], ...]) -> TexturePyramids:
 
 
 def texel_gradients(mesh: TexturedMesh) -> NDArray[np.float32]:
-    """How the texel coordinates change along each triangle's surface.
+    """Gradients of texel x and y by the position on each triangle, (T, 2, 3) float32 in texels per metre.
 
-    Returns:
-        (T, 2, 3) float32, the gradients of texel x and texel y by the position on the triangle, in texels a metre: a
-        step of `d` metres within the plane of triangle t moves by `gradients[t] @ d` texels. Zero on triangles without
-        area.
+    A step of `d` metres (3,) within the plane of triangle t moves by `gradients[t] @ d` texels. Zero on triangles
+    without area.
     """
     corners = mesh.vertices[mesh.triangles].astype(np.float64)
     edges = corners[:, 1:] - corners[:, :1]  # (T, 2 edges, 3)

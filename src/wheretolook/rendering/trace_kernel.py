@@ -1,4 +1,4 @@
-"""Warp kernels of `WarpRenderer` that trace rays and shade hits: one thread a pixel. `Open3DRenderer` is their twin."""
+"""Warp kernel of `WarpRenderer` that traces and shades rays, one thread per pixel. `Open3DRenderer` is its twin."""
 
 # mypy: ignore-errors
 # Warp's kernel language is not Python's type system.
@@ -69,11 +69,11 @@ def shade(
     direction: wp.vec3,
     to_ray: wp.mat33,
 ):
-    """Colour of a hit, filtered over the pixel's footprint; `Open3DRenderer` says the same in NumPy."""
+    """Colour of a hit, filtered over the pixel's footprint; `Open3DRenderer` does the same in NumPy."""
     uv = weights[0] * a.corner_uvs[face, 0] + weights[1] * a.corner_uvs[face, 1] + weights[2] * a.corner_uvs[face, 2]
     texture = a.triangle_texture[face]
 
-    # How the hit moves on the plane, in metres, as the pixel moves by one to the right and one down.
+    # How far the hit moves on the plane, in metres, as the pixel moves by one to the right and by one down.
     by_x = wp.vec3(to_ray[0, 0], to_ray[1, 0], to_ray[2, 0])
     by_y = wp.vec3(to_ray[0, 1], to_ray[1, 1], to_ray[2, 1])
     slant = wp.dot(normal, direction)
@@ -132,7 +132,7 @@ def shade(
 
 @wp.func
 def pixel_of(tile: wp.int32, within: wp.int32, width: wp.int32):
-    """Column and row of a thread. They run tile by tile: neighbouring rays visit the same nodes and texels."""
+    """Column and row of a thread. Threads run tile by tile, so that neighbours read the same nodes and texels."""
     tiles_across = (width + TILE - 1) / TILE
     return wp.vec2i((tile % tiles_across) * TILE + within % TILE, (tile / tiles_across) * TILE + within / TILE)
 
@@ -164,7 +164,7 @@ def trace_kernel(
     depth = wp.float32(0.0)
     if hit.result:
         depth = hit.t
-        weights = wp.vec3(hit.u, hit.v, 1.0 - hit.u - hit.v)  # Warp's barycentrics: the first and the second corner's
+        weights = wp.vec3(hit.u, hit.v, 1.0 - hit.u - hit.v)  # Warp gives those of the first and second corner
         color = shade(appearance, hit.face, weights, depth, hit.normal, direction, ray_from_pixel[b])
     rgb[b, row, column] = color
     depth_m[b, row, column] = depth

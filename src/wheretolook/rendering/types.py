@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.poses import Float
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,8 +28,8 @@ class Rendering:
 class Renderer(Protocol):
     """Renders a fixed mesh.
 
-    The image is unlit: the texture's colour (times the vertex colour) as it is stored, seen from both sides of a
-    triangle, since light is baked into the textures of scanned and generated scenes.
+    Images are unlit, because light is baked into the textures of scanned and generated scenes: they show the texture's
+    stored colour times the vertex colour, from both sides of a triangle.
     """
 
     def render(self, camera: PinholeCamera, cam_from_world: ArrayLike) -> Rendering:
@@ -36,13 +37,11 @@ class Renderer(Protocol):
         ...
 
 
-def camera_rays(
-    camera: PinholeCamera, cam_from_world: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Camera centres (B, 3) and the maps (B, 3, 3) from a pixel (x, y, 1) to its ray in the world.
+def camera_rays(camera: PinholeCamera, cam_from_world: Float) -> tuple[Float, Float]:
+    """Camera centres (B, 3) and matrices (B, 3, 3) that turn a pixel (x, y, 1) into its ray's direction in the world.
 
-    A ray's direction has length 1 along the optical axis, so the ray parameter of a hit is its z-depth, and the first
-    two columns of the map are the derivatives of the direction by the pixel's x and y.
+    A direction has length 1 along the optical axis, so the ray parameter of a hit is its z-depth, and the first two
+    columns of the matrix are the derivatives of the direction by the pixel's x and y.
     """
     rotation = np.swapaxes(cam_from_world[:, :, :3], 1, 2)
     centers = -(rotation @ cam_from_world[:, :, 3:])[..., 0]

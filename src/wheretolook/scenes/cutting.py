@@ -16,20 +16,20 @@ def cut_above(mesh: TexturedMesh, height_m: float) -> TexturedMesh:
     below = mesh.vertices[mesh.triangles][..., 2] <= height_m
     n_below = below.sum(1)
     whole, rows = n_below == 3, np.flatnonzero((n_below == 1) | (n_below == 2))
-    # the corner that is alone on its side of the plane comes first
+    # In each triangle that is cut, the corner that is alone on its side of the plane comes first.
     lone = np.where(n_below[rows] == 1, below[rows].argmax(1), (~below[rows]).argmax(1))
     order = (lone[:, None] + np.arange(3)) % 3
     corners = np.take_along_axis(mesh.triangles[rows], order, axis=1)
     uvs = np.take_along_axis(mesh.corner_uvs[rows], order[:, :, None], axis=1)
 
-    # where the two edges from that corner meet the plane: shares of their length, (2, n, 1)
+    # Where the two edges from that corner meet the plane, as shares of their lengths (2, n, 1).
     z = mesh.vertices[corners, 2].astype(np.float64)
     along = ((height_m - z[:, :1]) / (z[:, 1:] - z[:, :1])).T[..., None]
     cut_uvs = (1 - along) * uvs[:, 0] + along * uvs[:, 1:].swapaxes(0, 1)
     on_second, on_third = len(mesh.vertices) + np.arange(2 * len(rows)).reshape(2, -1)
 
     def with_cuts(values: NDArray[Any]) -> NDArray[Any]:
-        """Values of the vertices, and of the new ones behind them."""
+        """Values of the old vertices, followed by those of the new ones on the plane."""
         new = (1 - along) * values[corners[:, 0]] + along * values[corners[:, 1:].T]
         return np.concatenate([values, new.reshape(-1, values.shape[1]).astype(values.dtype)])
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -49,16 +49,14 @@ class _Part:
 def load_mesh(path: str | PathLike[str], up: str = "z") -> TexturedMesh:
     """Read a scene in metres from a file or a Habitat-Matterport folder.
 
-    Several materials in one file stay several textures. A material without an image becomes a texture of one pixel in
-    its colour. Vertex colours multiply the texture; they are taken as stored (as sRGB). Triangles without area are
-    dropped.
+    Each material of the file becomes a texture; one without an image becomes a texture of one pixel in its colour.
+    Vertex colours, which count as sRGB, multiply the texture. Triangles without area are dropped.
 
     Args:
         path: a .glb, .ply (with texture coordinates and a `TextureFile`, or coloured vertices or faces) or .obj file
             (with its .mtl), or a folder `<id>-<name>` that holds `<name>.glb`, as in the Habitat-Matterport dataset.
-        up: the axis of the file that points up: "z", "y", "x" or one of these with a minus sign. glTF prescribes y,
-            and many exporters of GLB files obey; many scans are z up in the file nevertheless. A scene with the wrong
-            axis has no free space.
+        up: the axis of the file that points up: "z", "y", "x" or one of these with a minus sign. glTF prescribes y, but
+            many scans are z up nevertheless. A scene with the wrong axis has no free space.
 
     Raises:
         SceneError: if the file is missing, unreadable, empty, flat, not finite, without any texture or colour, or
@@ -72,16 +70,13 @@ def load_mesh(path: str | PathLike[str], up: str = "z") -> TexturedMesh:
     try:
         scene = trimesh.load_scene(str(file), process=False)
         parts = list(_parts(scene))
-    except Exception as error:  # trimesh raises whatever its parsers stumble over
+    except Exception as error:  # trimesh's parsers raise errors of many kinds
         raise SceneError("the mesh cannot be read", path=file, value=str(error), fix="Check the file") from error
     if not parts:
         raise SceneError("the file has no triangles", path=file, fix="Export the scene as a triangle mesh")
     if not any(part.colored for part in parts):
-        raise SceneError(
-            "the mesh has no texture and no colours",
-            path=file,
-            fix="Export it with its textures; a map cannot be built from a plain surface",
-        )
+        fix = "Export it with its textures; a map cannot be built from a plain surface"
+        raise SceneError("the mesh has no texture and no colours", path=file, fix=fix)
     mesh = _merge(parts, np.array(_Z_UP_FROM[up], dtype=np.float64))
     _check(mesh, file)
     return _without_degenerate(mesh, file)
@@ -91,16 +86,8 @@ def save_glb(mesh: TexturedMesh, path: str | PathLike[str], jpeg_quality: int = 
     """Write a mesh as a binary glTF file with JPEG textures, unlit and double sided, in its own z-up coordinates.
 
     Positions and texture coordinates keep their float32 values (v to within rounding, since it is flipped twice), but
-    triangles are grouped by texture and corners that share position and texture coordinates share a vertex. The file
-    appears at once or not at all.
-
-    Args:
-        mesh: what to write.
-        path: file to write, ending in .glb.
-        jpeg_quality: 1 to 100.
-
-    Raises:
-        ConfigError: if the quality is out of range.
+    triangles are grouped by texture, and corners with the same position and texture coordinates share a vertex. The
+    file is replaced in one step. Raises ConfigError if the quality is not in 1 to 100.
     """
     if not 1 <= jpeg_quality <= 100:
         raise ConfigError("JPEG quality is a number from 1 to 100", value=jpeg_quality)
@@ -119,16 +106,13 @@ def save_glb(mesh: TexturedMesh, path: str | PathLike[str], jpeg_quality: int = 
 
 
 def _mesh_file(path: Path) -> Path:
+    """The mesh file of a path, which may be a Habitat-Matterport folder. Raises SceneError if there is none."""
     file = path
     if path.is_dir():
         file = path / f"{path.name.partition('-')[2]}.glb"
         if not file.is_file():
-            raise SceneError(
-                "the folder holds no scene",
-                path=path,
-                value=file.name,
-                fix="A Habitat-Matterport folder <id>-<name> holds <name>.glb; otherwise give the mesh file itself",
-            )
+            fix = "A Habitat-Matterport folder <id>-<name> holds <name>.glb; otherwise give the mesh file itself"
+            raise SceneError("the folder holds no scene", path=path, value=file.name, fix=fix)
     if not file.is_file():
         raise SceneError("no such file", path=file, fix="Give an existing .glb, .ply or .obj file")
     if file.suffix.lower() not in _SUFFIXES:
@@ -144,18 +128,17 @@ def _parts(scene: trimesh.Scene) -> Iterator[_Part]:
     nodes = [(order[scene.graph[node][1]], node) for node in scene.graph.nodes_geometry]
     for _, node in sorted(nodes):
         matrix, name = scene.graph[node]
-        geometry: Any = scene.geometry[name]
-        if not isinstance(geometry, trimesh.Trimesh) or len(geometry.faces) == 0:
+        part: Any = scene.geometry[name]
+        if not isinstance(scene.geometry[name], trimesh.Trimesh) or len(part.faces) == 0:
             continue
-        part: Any = geometry
         if part.visual.kind == "face":  # colours by face become colours by vertex
-            part = geometry.copy()
+            part = part.copy()
             part.unmerge_vertices()
         yield _part(part, np.asarray(matrix, dtype=np.float64))
 
 
 def _part(geometry: Any, matrix: NDArray[np.float64]) -> _Part:
-    with np.errstate(invalid="ignore"):  # vertices that are not finite are reported later
+    with np.errstate(invalid="ignore"):  # `_check` reports vertices that are not finite
         vertices = np.asarray(geometry.vertices, dtype=np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
     triangles = np.asarray(geometry.faces, dtype=np.int64)
     if np.linalg.det(matrix[:3, :3]) < 0:  # a mirroring transform turns triangles inside out
@@ -174,13 +157,13 @@ def _part(geometry: Any, matrix: NDArray[np.float64]) -> _Part:
         colored = uvs is not None or factor is not None or colors is not None
     elif visual.kind in ("vertex", "face"):
         colors, colored = visual.vertex_colors, True
-    return _Part(
-        vertices, triangles, uvs, texture, None if colors is None else _as_uint8(np.asarray(colors)[:, :3]), colored
-    )
+    if colors is not None:
+        colors = _as_uint8(np.asarray(colors)[:, :3])
+    return _Part(vertices, triangles, uvs, texture, colors, colored)
 
 
 def _material(material: Any) -> tuple[Image.Image | None, NDArray[np.float64] | None]:
-    """A material's image, and the colour in sRGB 0..1 that multiplies it, or None where it has none or white."""
+    """A material's image, and the colour (3,) in sRGB 0..1 that multiplies it; each None if there is none."""
     if isinstance(material, trimesh.visual.material.PBRMaterial):
         image, factor = material.baseColorTexture, material.baseColorFactor
         if factor is None:
@@ -190,15 +173,12 @@ def _material(material: Any) -> tuple[Image.Image | None, NDArray[np.float64] | 
         return image, None if image is not None and (linear == 1).all() else color
     image = getattr(material, "image", None)
     diffuse = getattr(material, "diffuse", None)
-    # trimesh's default is a grey that no file asked for; with an image, viewers of OBJ files disagree on Kd: ignore it.
+    # For a PLY file with texture coordinates and no texture, trimesh makes up a placeholder of 2 x 2 pixels.
+    placeholder = isinstance(image, Image.Image) and image.size == (2, 2) and image.mode == "RGBA"
+    if placeholder and not hasattr(image, "filename"):
+        image = None
+    # With an image, viewers of OBJ files disagree on Kd, so it is ignored; so is the grey that is trimesh's default.
     default = trimesh.visual.material.SimpleMaterial().diffuse
-    if (
-        isinstance(image, Image.Image)
-        and image.size == (2, 2)
-        and image.mode == "RGBA"
-        and not hasattr(image, "filename")
-    ):
-        image = None  # trimesh's placeholder for a PLY file with texture coordinates and no texture
     if image is not None or diffuse is None or np.array_equal(diffuse, default):
         return image, None
     return None, np.asarray(diffuse, dtype=np.float64)[:3] / 255
@@ -233,53 +213,39 @@ def _merge(parts: list[_Part], rotation: NDArray[np.float64]) -> TexturedMesh:
         colors = np.concatenate(white)
     with np.errstate(invalid="ignore"):
         vertices = (np.concatenate([part.vertices for part in parts]) @ rotation.T).astype(np.float32)
-    return TexturedMesh(
-        vertices,
-        np.concatenate(triangles).astype(np.int32),
-        np.concatenate(corner_uvs).astype(np.float32),
-        np.concatenate(triangle_texture),
-        tuple(images),
-        colors,
-    )
+    indices, all_uvs = np.concatenate(triangles).astype(np.int32), np.concatenate(corner_uvs).astype(np.float32)
+    return TexturedMesh(vertices, indices, all_uvs, np.concatenate(triangle_texture), tuple(images), colors)
 
 
 def _check(mesh: TexturedMesh, path: Path) -> None:
     for what, values in (("vertices", mesh.vertices), ("texture coordinates", mesh.corner_uvs)):
         bad = ~np.isfinite(values).reshape(len(values), -1).all(axis=1)
         if bad.any():
-            raise SceneError(
-                f"{bad.sum()} {what} are NaN or infinite",
-                path=path,
-                value=values[np.flatnonzero(bad)[0]].tolist(),
-                fix="Clean the mesh, for instance in MeshLab",
-            )
+            first, fix = values[np.flatnonzero(bad)[0]].tolist(), "Clean the mesh, for instance in MeshLab"
+            raise SceneError(f"{bad.sum()} {what} are NaN or infinite", path=path, value=first, fix=fix)
 
 
 def _without_degenerate(mesh: TexturedMesh, path: Path) -> TexturedMesh:
     """The mesh without triangles that have no area and without vertices that nothing uses."""
-    a, b, c = np.moveaxis(mesh.vertices[mesh.triangles].astype(np.float64), 1, 0)
-    keep = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1) > _MIN_AREA_M2
+    keep = 0.5 * np.linalg.norm(mesh.normals, axis=1) > _MIN_AREA_M2
     if not keep.any():
         raise SceneError("all triangles are degenerate", path=path, value=len(keep), fix="Check the export")
     used, triangles = np.unique(mesh.triangles[keep], return_inverse=True)
-    cleaned = TexturedMesh(
-        mesh.vertices[used],
-        triangles.reshape(-1, 3).astype(np.int32),
-        mesh.corner_uvs[keep],
-        mesh.triangle_texture[keep],
-        mesh.textures,
-        None if mesh.vertex_colors is None else mesh.vertex_colors[used],
+    cleaned = replace(
+        mesh.only(keep),
+        vertices=mesh.vertices[used],
+        triangles=triangles.reshape(-1, 3).astype(np.int32),
+        vertex_colors=None if mesh.vertex_colors is None else mesh.vertex_colors[used],
     )
     extent = np.ptp(cleaned.bounds, axis=0)
     if (extent < _MIN_EXTENT_M).any():
-        raise SceneError(
-            "the mesh is flat", path=path, value=extent.tolist(), fix="A scene needs an extent in x, y and z, in metres"
-        )
+        fix = "A scene needs an extent in x, y and z, in metres"
+        raise SceneError("the mesh is flat", path=path, value=extent.tolist(), fix=fix)
     return cleaned
 
 
 def _geometry(mesh: TexturedMesh, faces: NDArray[np.int64], image: _EncodedJpeg) -> trimesh.Trimesh:
-    """The triangles of one texture, with a vertex for each position and texture coordinates they use."""
+    """The triangles of one texture, with a vertex for each pair of a position and texture coordinates."""
     index = mesh.triangles[faces].reshape(-1)
     uv = mesh.corner_uvs[faces].reshape(-1, 2)
     keys = np.column_stack([index.astype(np.int32), uv.view(np.int32)])
@@ -295,13 +261,13 @@ def _geometry(mesh: TexturedMesh, faces: NDArray[np.int64], image: _EncodedJpeg)
 
 
 class _EncodedJpeg:
-    """What trimesh needs of a PIL image, saved as the bytes given: trimesh would encode again, at quality 75."""
+    """A JPEG that trimesh takes for a PIL image and writes as it is. It would encode a real one at quality 75."""
 
     format = "JPEG"
 
     def __init__(self, texture: NDArray[np.uint8], quality: int) -> None:
         buffer = io.BytesIO()
-        # Chroma at full resolution: subsampling would bleed colours across the charts of an atlas.
+        # Chroma stays at full resolution, as subsampling would blur colours across the charts of an atlas.
         Image.fromarray(texture).save(buffer, format="JPEG", quality=quality, subsampling=0)
         self.encoded = buffer.getvalue()
 
@@ -309,11 +275,11 @@ class _EncodedJpeg:
         file.write(self.encoded)
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[np.uint8]:
-        return np.frombuffer(self.encoded, dtype=np.uint8)  # trimesh tells materials apart by it
+        return np.frombuffer(self.encoded, dtype=np.uint8)  # trimesh compares materials by this array
 
 
 def _mark_unlit(tree: dict[str, Any]) -> None:
-    """Light is baked into the textures: tell viewers (KHR_materials_unlit)."""
+    """Tell viewers that light is baked into the textures (glTF extension KHR_materials_unlit)."""
     for material in tree.get("materials", []):
         material["extensions"] = {"KHR_materials_unlit": {}}
     tree.setdefault("extensionsUsed", []).append("KHR_materials_unlit")

@@ -1,40 +1,19 @@
-"""Where a camera can be in a scene without a mesh: near where the map's images were taken, clear of landmarks."""
+"""Where a camera can be in a scene without a mesh: near the cameras of the map's images, clear of landmarks."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from wheretolook.geometry.poses import Float
-from wheretolook.utils.errors import ConfigError, MapError
+from wheretolook.space.config import MappedSpaceConfig
+from wheretolook.utils.errors import MapError
 
 STEP_M = 0.02
-"""Distance of the points of a way that must be near mapping cameras."""
+"""Step between the points of a path segment that must be near mapping cameras."""
 
-_OUTLIERS = 0.01  # share of landmarks left out at either end of each axis: a wrong one may lie anywhere
-
-
-@dataclass(frozen=True)
-class MappedSpaceConfig:
-    """What counts as free where there is no mesh. Landmarks do not say what is empty, but cameras were where they were.
-
-    Args:
-        max_camera_distance_m: greatest distance to the nearest position of a mapping camera.
-        clearance_m: least distance to any landmark.
-    """
-
-    max_camera_distance_m: float = 0.75
-    clearance_m: float = 0.25
-
-    def __post_init__(self) -> None:
-        if not self.max_camera_distance_m > 0 or not self.clearance_m >= 0:
-            raise ConfigError(
-                "the distance to cameras must be positive, the clearance not negative",
-                value=(self.max_camera_distance_m, self.clearance_m),
-            )
+_OUTLIERS = 0.01  # share of landmarks left out at either end of each axis, since a wrong one may lie anywhere
 
 
 class MappedSpace:
@@ -46,8 +25,8 @@ class MappedSpace:
         config: what counts as free.
 
     Attributes:
-        bounds: (2, 3) metres: the box around the cameras, wider by the distance they allow, within the box around
-            landmarks (all but the outermost per cent along each axis) and cameras.
+        bounds: (2, 3) metres: the box around the cameras, enlarged by `max_camera_distance_m`, within the box around
+            cameras and landmarks (without the outermost per cent along each axis).
 
     Raises:
         MapError: there are no landmarks or no cameras.
@@ -57,17 +36,14 @@ class MappedSpace:
         self.config = config or MappedSpaceConfig()
         points, centers = (np.asarray(values, dtype=np.float64).reshape(-1, 3) for values in (landmarks, cameras))
         if not len(points) or not len(centers):
-            raise MapError("the map has no landmarks or no cameras", value=(len(points), len(centers)),
-                           fix="Run the map stage again.")  # fmt: skip
+            value, fix = (len(points), len(centers)), "Run the map stage again."
+            raise MapError("the map has no landmarks or no cameras", value=value, fix=fix)
         self._landmarks, self._cameras = cKDTree(points), cKDTree(centers)
         reach, lowest, highest = self.config.max_camera_distance_m, centers.min(0), centers.max(0)
         low, high = np.quantile(points, (_OUTLIERS, 1 - _OUTLIERS), axis=0)
-        self.bounds: Float = np.stack(
-            [
-                np.maximum(lowest - reach, np.minimum(low, lowest)),
-                np.minimum(highest + reach, np.maximum(high, highest)),
-            ]
-        )
+        lower = np.maximum(lowest - reach, np.minimum(low, lowest))
+        upper = np.minimum(highest + reach, np.maximum(high, highest))
+        self.bounds: Float = np.stack([lower, upper])
 
     def is_free(self, points: ArrayLike) -> NDArray[np.bool_]:
         """Whether a camera can be at points (N, 3) metres; (N,)."""
@@ -80,8 +56,8 @@ class MappedSpace:
     def segments_are_free(self, a: ArrayLike, b: ArrayLike) -> NDArray[np.bool_]:
         """Whether a camera can move straight from a (N, 3) to b (N, 3) metres.
 
-        Both ends must be free, no landmark may lie within the clearance of the way, and the way must stay near mapping
-        cameras (looked at every 2 cm).
+        Both ends must be free, no landmark may be closer to the segment than the clearance, and the segment must stay
+        near mapping cameras (tested every 2 cm).
 
         Returns:
             (N,) bool.

@@ -14,14 +14,11 @@ from wheretolook import stages
 from wheretolook.config import Experiment
 from wheretolook.dataset.folders import Dataset
 from wheretolook.dataset.stamps import STAGES
-from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.poses import camera_centers, poses_looking_along
 from wheretolook.methods.registry import load_scorer, methods_named, scorers
-from wheretolook.rendering.warp_renderer import WarpRenderer
-from wheretolook.scenes.loading import load_mesh
+from wheretolook.stages.inputs import open_scene
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.tracking import ui_command
-from wheretolook.viewpoints.table import is_good, outcome_in_words, poses
 
 SECONDS = {"scenes": 5.0, "map": 15.0, "sample": 1.0, "label": 75.0, "train": 25.0, "evaluate": 6.0}
 """Rough cost of a stage on two cores (the first four for each scene), from which the share done is estimated."""
@@ -71,8 +68,7 @@ def run_demo(experiment: Experiment) -> None:
 def draw_overview(experiment: Experiment, weights: Path) -> Path:
     """Draw `<dataset>/results/overview.png`: the last scene's map, and what a network thinks of one place in it.
 
-    The place is the labelled location where the share of viewpoints that localize is nearest to one half, so that
-    there is something to choose.
+    The place is one where to look matters (`wheretolook.viewpoints.locations.instructive_location`).
 
     Args:
         experiment: all stages up to label have been run.
@@ -86,41 +82,30 @@ def draw_overview(experiment: Experiment, weights: Path) -> Path:
         TableError: there is no dataset, or its last scene is not labelled.
         WeightsError: the weights cannot be used.
     """
-    from wheretolook.figures.overview import View, overview_figure
+    from wheretolook.figures.overview import overview_figure
     from wheretolook.figures.style import save_figure
+    from wheretolook.release.showcase_figures import rendered_views
+    from wheretolook.viewpoints.locations import instructive_location, shares_good
+    from wheretolook.viewpoints.table import outcome_in_words, poses
 
     dataset = Dataset.load(experiment.root)
-    scene = dataset.scenes[-1]
-    table = scene.read_table()
-    localization_map = scene.localization_map(dataset.camera, experiment.warp_device)
+    scene = open_scene(experiment, dataset, dataset.scenes[-1])
+    table = scene.files.read_table()
+    localization_map = scene.files.localization_map(scene.camera, scene.device)
     scorer = load_scorer(weights, localization_map)
 
-    centers, good = camera_centers(poses(table)), is_good(table)
-    ids, first, rows = np.unique(table["location_id"], return_index=True, return_inverse=True)
-    share = np.bincount(rows, weights=good) / np.bincount(rows)
-    chosen = int(np.argmin(np.abs(share - 0.5)))
-    place = centers[first[chosen]]
-    candidates = table[table["location_id"] == ids[chosen]]
-    candidate_scores = scorer.score(poses(candidates))
-    renderer = WarpRenderer(load_mesh(scene.mesh), experiment.warp_device)
-
-    def view(row: int) -> View:
-        pose = poses(candidates.iloc[[row]])
-        label = candidates.iloc[row]
-        rgb = renderer.render(dataset.camera, pose).rgb[0]
-        return View(rgb, pose[0, 2, :3], float(candidate_scores[row]), outcome_in_words(label))
-
-    directions = direction_lattice(experiment.sample.directions, experiment.sample.lattice)
-    figure = overview_figure(
-        localization_map.landmarks.points,
-        centers[first],
-        share,
-        place,
-        directions,
-        scorer.score(poses_looking_along(np.tile(place, (len(directions), 1)), directions)),
-        view(int(np.argmax(candidate_scores))),
-        view(int(np.argmin(candidate_scores))),
-    )
+    ids, first = np.unique(table["location_id"], return_index=True)
+    locations = camera_centers(poses(table))[first]
+    chosen = instructive_location(table)
+    place = locations[np.searchsorted(ids, chosen)]
+    candidates = table[table["location_id"] == chosen]
+    scores = scorer.score(poses(candidates))
+    ends = [int(np.argmax(scores)), int(np.argmin(scores))]
+    best, worst = rendered_views(scene, candidates.iloc[ends], scores[ends], outcome_in_words)
+    directions = experiment.sample.axes()
+    around = scorer.score(poses_looking_along(np.tile(place, (len(directions), 1)), directions))
+    points, shares = localization_map.landmarks.points, shares_good(table)[1]
+    figure = overview_figure(points, locations, shares, place, directions, around, best, worst)
     path = dataset.root / "results" / OVERVIEW
     save_figure(figure, path)
     return path

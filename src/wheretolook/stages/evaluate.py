@@ -13,7 +13,7 @@ from wheretolook.dataset.folders import Dataset
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.stages.inputs import Say, Tick, dataset_after
 from wheretolook.utils.files import write_text
-from wheretolook.utils.tracking import TrackingConfig
+from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.visibility.config import OcclusionConfig
 
 if TYPE_CHECKING:
@@ -42,9 +42,9 @@ def evaluate_methods(
     """Compare all methods on the scenes of one split.
 
     Writes the table as `<dataset>/results/scores.csv` and `scores.md`, a figure `scores.png`, the reliability curves of
-    learned methods as `calibration.csv`, and an MLflow run with one nested run for each method, N, occlusion model
-    and candidate set, each with a table of what was chosen at each location, `locations.parquet`. With several
-    occlusion models `occlusion.png` compares them.
+    learned methods as `calibration.csv`, and an MLflow run with one nested run for each method, occlusion model
+    and candidate set, each with a table of what was chosen at each location for each N, `locations.parquet`. With
+    several occlusion models `occlusion.png` compares them.
 
     The temperatures of learned methods are fitted on the labelled views of the val scenes, seen by the first occlusion
     model, and hold for all rows; without val scenes, or when these are evaluated, they are not known.

@@ -9,10 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from wheretolook.config import Experiment
-from wheretolook.dataset.folders import Dataset, SceneFolder
+from wheretolook.dataset.folders import RELEASE_FILE, Dataset, SceneFolder
+from wheretolook.dataset.scene import Scene, SceneConfig
 from wheretolook.dataset.stamps import read_stamp
 from wheretolook.utils.errors import ConfigError, MapError, SceneError, TableError
 from wheretolook.utils.files import fingerprint
+from wheretolook.utils.options import recorded
 
 if TYPE_CHECKING:
     from wheretolook.features.keypoints import ExtractorConfig
@@ -36,32 +38,45 @@ def dataset_after(experiment: Experiment, needs: str) -> Dataset:
         refuse_release(experiment.root)
     if dataset.camera != experiment.camera:
         raise ConfigError(
-            "the dataset was made with another camera", path=experiment.root, value=dataset.camera,
+            "the dataset was made with another camera",
+            path=experiment.root,
+            value=dataset.camera,
             fix="Run the scenes stage with this configuration, or give the experiment another name.",
-        )  # fmt: skip
+        )
     for scene in dataset.scenes:
         if read_stamp(scene, needs) is None:
             raise TableError(
                 f"the {needs} stage has not been run for this scene, or not since an earlier stage remade its input",
-                path=scene.folder, fix=f"Run `wheretolook {needs}`.",
-            )  # fmt: skip
+                path=scene.folder,
+                fix=f"Run `wheretolook {needs}`.",
+            )
     return dataset
+
+
+def open_scene(experiment: Experiment, dataset: Dataset, files: SceneFolder) -> Scene:
+    """A scene of the dataset as the experiment looks at it; nothing is read yet."""
+    config = SceneConfig(
+        experiment.occlusion,
+        experiment.scenes.free_space,
+        experiment.scenes.mapped_space,
+        experiment.map.photographs.assume_metric,
+    )
+    return Scene(files, dataset.camera, config, experiment.device)
 
 
 def refuse_release(root: Path) -> None:
     """Raise a ConfigError if a release lies there."""
-    from wheretolook.release.copy import ABOUT
-
-    if (root / ABOUT).is_file():
+    if (root / RELEASE_FILE).is_file():
         raise ConfigError(
-            "a release has no meshes and maps, and would be lost if they were made anew", path=root,
+            "a release has no meshes and maps, and would be lost if they were made anew",
+            path=root,
             fix="Use it with train, evaluate and release alone, or give the experiment another name.",
-        )  # fmt: skip
+        )
 
 
 @contextmanager
 def naming_scene(path: Path) -> Iterator[None]:
-    """Add the scene's file to errors of those who know only its content."""
+    """Name a scene's file in errors of code that was given its content only."""
     try:
         yield
     except (SceneError, MapError) as error:
@@ -80,7 +95,7 @@ def extractor_of(scene: SceneFolder) -> ExtractorConfig:
 
     path = scene.map / "report.json"
     try:
-        return ExtractorConfig(**json.loads(path.read_text())["config"]["extractor"])
+        return recorded(ExtractorConfig, json.loads(path.read_text())["config"]["extractor"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise MapError("the map's report is missing or damaged", path=path, fix="Run the map stage again.") from error
 

@@ -4,29 +4,23 @@ from __future__ import annotations
 
 import shutil
 import time
+from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import asdict
-from typing import TYPE_CHECKING
+from pathlib import Path
+
+import pandas as pd
 
 from wheretolook.config import Experiment
 from wheretolook.dataset.folders import Dataset, SceneFolder
 from wheretolook.dataset.stamps import forget_stamp, is_done, read_stamp, stage_key, write_stamp
-from wheretolook.stages.inputs import Say, Tick, dataset_after, existing, extractor_of
-from wheretolook.utils.errors import MapError, SceneError
-from wheretolook.utils.files import write_json
-from wheretolook.viewpoints.table import write_table
-
-if TYPE_CHECKING:
-    import pandas as pd
-from collections.abc import Mapping
-
-import pandas as pd
-
 from wheretolook.labelling.report import LABELS_CSV, LABELS_MD, LABELS_PNG, LabelSummary, label_markdown, label_summary
-from wheretolook.utils.errors import TableError
-from wheretolook.utils.files import write_text
-from wheretolook.utils.tracking import TrackingConfig, log, start_run
-from wheretolook.viewpoints.table import is_good
+from wheretolook.stages.inputs import Say, Tick, dataset_after, existing, extractor_of, open_scene
+from wheretolook.utils.errors import MapError, SceneError, TableError
+from wheretolook.utils.files import write_json, write_text
+from wheretolook.utils.tracking import log, start_run
+from wheretolook.utils.tracking_config import TrackingConfig
+from wheretolook.viewpoints.table import is_good, write_table
 from wheretolook.viewpoints.thresholds import ALL
 
 
@@ -39,68 +33,98 @@ def label(experiment: Experiment, say: Say = print, tick: Tick = lambda work: No
     Raises:
         SceneError: a mesh is missing, or a scene is known from photographs alone.
     """
-    from wheretolook.labelling.labeller import LabelTask, label_scenes, storing
-    from wheretolook.labelling.report import LABELS_MD
-    from wheretolook.labelling.shard import SceneJob
-    from wheretolook.stages.photographs import refuse_labelling
-    from wheretolook.viewpoints.table import is_good
-
-    def report(scene: SceneFolder, table: pd.DataFrame) -> None:
-        say(f"{scene.name}: {is_good(table).mean():.0%} of {len(table):,} viewpoints localize within 5 cm and 0.4 "
-            f"degrees -> {scene.table}")  # fmt: skip
-        tick(1)
-
     dataset, config = dataset_after(experiment, "sample"), experiment.label
-    scenes: dict[str, tuple[SceneFolder, str]] = {}
-    tasks: list[LabelTask] = []
-    for scene in dataset.scenes:
-        refuse_labelling(scene)
-    for scene in sorted(dataset.scenes, key=lambda scene: scene.split == "train"):  # those to evaluate on come first
-        table, extractor = scene.read_table(), extractor_of(scene)
-        key = stage_key("label", [asdict(config.localizer), asdict(extractor), asdict(dataset.camera),
-                             existing(scene.mesh, SceneError, "scenes"),
-                             existing(scene.landmarks, MapError, "map"), read_stamp(scene, "sample"),
-                             *(["store_matches"] if config.store_matches else [])])  # fmt: skip
-        shards = scene.folder / "shards"
-        if is_done(scene, "label", key, scene.table):
-            shutil.rmtree(shards, ignore_errors=True)  # killed before it could remove them
-            report(scene, table)
-            continue
-        scenes[scene.name] = scene, key
-        job = SceneJob(scene.mesh, scene.landmarks, dataset.camera, config.localizer, extractor, experiment.warp_device,
-                       config.store_matches)  # fmt: skip
-        tasks.append(LabelTask(scene.name, job, table, shards))
+    for files in dataset.scenes:
+        _refuse_photographs(files)
+    to_label: list[tuple[SceneFolder, str]] = []
+    for files in sorted(dataset.scenes, key=lambda files: files.split == "train"):  # those to evaluate on come first
+        parts = [asdict(config.localizer), asdict(extractor_of(files)), asdict(dataset.camera)]
+        made_from = [existing(files.mesh, SceneError, "scenes"), existing(files.landmarks, MapError, "map")]
+        matches = ["store_matches"] if config.store_matches else []
+        key = stage_key("label", [*parts, *made_from, read_stamp(files, "sample"), *matches])
+        if is_done(files, "label", key, files.table):
+            shutil.rmtree(_shards(files), ignore_errors=True)  # killed before it could remove them
+            _report(files, files.read_table(), say)
+            tick(1)
+        else:
+            to_label.append((files, key))
+    seconds = _label(experiment, dataset, to_label, say, tick) if to_label else {}
     summary = dataset.root / "results" / LABELS_MD
-    seconds: dict[str, float] = {}
-    start, replacing = time.monotonic(), False
-    with closing(label_scenes(tasks, config, progress=bool(tasks))) as results:  # so that Ctrl-C here ends the workers
-        for labelled in results:
-            scene, key = scenes[labelled.task.name]
-            if not replacing:  # until all are labelled alike, and that is logged, nothing may use the labels
-                replacing = True
-                summary.unlink(missing_ok=True)
-                for other, _ in scenes.values():
-                    forget_stamp(other, "label")
-            with storing(scene.table):
-                write_table(labelled.table, scene.table)
-                write_json(scene.label_manifest, labelled.manifest)
-                write_stamp(scene, "label", key)
-            shutil.rmtree(labelled.task.shards, ignore_errors=True)
-            for step, spent in labelled.seconds.items():
-                seconds[step] = seconds.get(step, 0.0) + spent
-            report(scene, labelled.table)
-    if tasks:
-        seconds["wall"] = time.monotonic() - start
     if not summary.is_file():
         try:
             log_labels(dataset, experiment.tracking, seconds)
         except BaseException:
             summary.unlink(missing_ok=True)
             raise
-    if tasks:
-        say("seconds: " + ", ".join(f"{step} {spent:.1f}" for step, spent in seconds.items())
-            + " (workers' time in each step, added up; then the clock's)")  # fmt: skip
+    if to_label:
+        times = ", ".join(f"{step} {spent:.1f}" for step, spent in seconds.items())
+        say(f"seconds: {times} (workers' time in each step, added up; then the clock's)")
     return dataset
+
+
+def _label(
+    experiment: Experiment, dataset: Dataset, to_label: list[tuple[SceneFolder, str]], say: Say, tick: Tick
+) -> dict[str, float]:
+    """Label scenes and stamp them with their keys. Returns the seconds that each step took."""
+    from wheretolook.labelling.labeller import LabelTask, label_scenes, storing
+    from wheretolook.labelling.shard import SceneJob
+
+    config, keys = experiment.label, {files.name: (files, key) for files, key in to_label}
+    tasks: list[LabelTask] = []
+    for files, _ in to_label:
+        scene = open_scene(experiment, dataset, files)
+        job = SceneJob(
+            files.mesh,
+            files.landmarks,
+            scene.camera,
+            config.localizer,
+            extractor_of(files),
+            scene.device,
+            config.store_matches,
+        )
+        tasks.append(LabelTask(scene.name, job, files.read_table(), _shards(files)))
+    seconds: dict[str, float] = {}
+    start, replacing = time.monotonic(), False
+    with closing(label_scenes(tasks, config)) as results:  # so that Ctrl-C here ends the workers
+        for labelled in results:
+            files, key = keys[labelled.task.name]
+            if not replacing:  # until all are labelled alike, and that is logged, nothing may use the labels
+                replacing = True
+                (dataset.root / "results" / LABELS_MD).unlink(missing_ok=True)
+                for other, _ in to_label:
+                    forget_stamp(other, "label")
+            with storing(files.table):
+                write_table(labelled.table, files.table)
+                write_json(files.label_manifest, labelled.manifest)
+                write_stamp(files, "label", key)
+            shutil.rmtree(labelled.task.shards, ignore_errors=True)
+            for step, spent in labelled.seconds.items():
+                seconds[step] = seconds.get(step, 0.0) + spent
+            _report(files, labelled.table, say)
+            tick(1)
+    return {**seconds, "wall": time.monotonic() - start}
+
+
+def _shards(files: SceneFolder) -> Path:
+    return files.folder / "shards"
+
+
+def _report(files: SceneFolder, table: pd.DataFrame, say: Say) -> None:
+    say(
+        f"{files.name}: {is_good(table).mean():.0%} of {len(table):,} viewpoints localize within 5 cm and 0.4 degrees "
+        f"-> {files.table}"
+    )
+
+
+def _refuse_photographs(files: SceneFolder) -> None:
+    """Raise SceneError if a scene is of photographs: views that nobody photographed cannot be rendered."""
+    if files.is_photographed:
+        raise SceneError(
+            "this scene is known from photographs alone: without a mesh its viewpoints cannot be rendered, and so not "
+            "labelled",
+            path=files.folder,
+            fix="Score its viewpoints with weights trained elsewhere, or use a scene with a mesh.",
+        )
 
 
 def log_labels(

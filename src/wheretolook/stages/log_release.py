@@ -12,8 +12,17 @@ from wheretolook.stages.inputs import Say
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.tracking import ui_command
 
-QUICK = ("top_n", "table_vs_others", "table_input_variants", "training", "calibration", "scores", "regret", "paths",
-         "runtimes")  # fmt: skip
+QUICK = (
+    "top_n",
+    "table_vs_others",
+    "table_input_variants",
+    "training",
+    "calibration",
+    "scores",
+    "regret",
+    "paths",
+    "runtimes",
+)
 """Figures and tables that need no scene, and so only seconds."""
 
 

@@ -1,32 +1,29 @@
-"""Scenes known from photographs alone, as the stages see them: a map, no mesh, and perhaps no scale."""
+"""The map stage of a folder of photographs: a scene with a map, without a mesh, and perhaps without a scale."""
 
 from __future__ import annotations
 
 import re
 import zlib
-from collections.abc import Callable
 from dataclasses import asdict, replace
 
 from wheretolook.config import Experiment
 from wheretolook.dataset.folders import Dataset, SceneFolder
-from wheretolook.dataset.scene import is_photographed
 from wheretolook.dataset.stamps import is_done, read_stamp, stage_key, write_stamp
 from wheretolook.mapping.photograph_config import PhotographsConfig
 from wheretolook.mapping.scale import read_scale
-from wheretolook.utils.errors import ConfigError, SceneError
+from wheretolook.stages.inputs import Say, Tick
+from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import fingerprint
 
 
-def map_photograph_scene(
-    experiment: Experiment, say: Callable[[str], None] = print, tick: Callable[[float], None] = lambda work: None
-) -> Dataset:
-    """The map stage of the folder that `map.photographs.images` names: `<scene>/map/`, and `<scene>/photographs/` with
-    finished steps. The scene joins those of the dataset that are made of photographs too.
+def map_photograph_scene(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> Dataset:
+    """Map the photographs in `map.photographs.images`: `<scene>/map/`, with finished steps in `<scene>/photographs/`.
+
+    The scene joins those of the dataset that are made of photographs too.
 
     Raises:
         MapError, ConfigError: see `map_photographs`; or the dataset holds scenes with meshes.
     """
-    from wheretolook.mapping.photograph_map import map_photographs
     from wheretolook.mapping.photographs import list_photographs
 
     settings, root = experiment.map.photographs, experiment.root
@@ -39,19 +36,21 @@ def map_photograph_scene(
     if missing is not None:
         raise ConfigError("there is no such table", path=missing, fix="Check map.photographs.scale.")
     seed = zlib.crc32(scene.name.encode()) % 2**31  # the scene's own, whichever scenes are beside it
-    key = stage_key("map", [
-        asdict(replace(settings, assume_metric=False)), asdict(experiment.map.extractor), experiment.map.keep_database,
-        seed, [(str(path), path.stat().st_size, path.stat().st_mtime_ns) for path in files],
-        [fingerprint(path) for path in tables],
-    ])  # fmt: skip
+    images = [(str(path), path.stat().st_size, path.stat().st_mtime_ns) for path in files]
+    used = [asdict(replace(settings, assume_metric=False)), asdict(experiment.map.extractor)]
+    made_from = [images, [fingerprint(path) for path in tables]]
+    key = stage_key("map", [*used, experiment.map.keep_database, seed, *made_from])
     if not is_done(scene, "map", key, scene.landmarks, scene.mapping_cameras):
-        report = map_photographs(
-            experiment.map, scene.map, scene.folder / "photographs", seed, experiment.n_workers,
-            experiment.warp_device,
-        )  # fmt: skip
+        from wheretolook.mapping.photograph_map import map_photographs
+
+        device = experiment.warp_device
+        work = scene.folder / "photographs"
+        report = map_photographs(experiment.map, scene.map, work, seed, experiment.n_workers, device)
         write_stamp(scene, "map", key)
-        say(f"{scene.name}: {report.n_landmarks:,} landmarks from {report.n_registered} of {report.n_images} "
-            f"photographs -> {scene.map}")  # fmt: skip
+        say(
+            f"{scene.name}: {report.n_landmarks:,} landmarks from {report.n_registered} of {report.n_images} "
+            f"photographs -> {scene.map}"
+        )
         if report.unregistered:
             say(f"{scene.name}: not placed: {', '.join(report.unregistered)}")
     else:
@@ -64,24 +63,15 @@ def map_photograph_scene(
     return dataset
 
 
-def refuse_labelling(scene: SceneFolder) -> None:
-    """Raise SceneError if a scene is of photographs: views that nobody photographed cannot be rendered."""
-    if is_photographed(scene):
-        raise SceneError(
-            "this scene is known from photographs alone: without a mesh its viewpoints cannot be rendered, and so not "
-            "labelled", path=scene.folder,
-            fix="Score its viewpoints with weights trained elsewhere, or use a scene with a mesh.",
-        )  # fmt: skip
-
-
 def _scene_name(settings: PhotographsConfig) -> str:
     assert settings.images is not None
     name = settings.name or settings.images.resolve().name
     if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9._-]*", name) or name in ("weights", "results", "all"):
         raise ConfigError(
-            "a scene's name becomes a folder's", value=name,
+            "a scene's name becomes a folder's",
+            value=name,
             fix="Set map.photographs.name, of letters, digits, '.', '_' and '-'.",
-        )  # fmt: skip
+        )
     return name
 
 
@@ -92,13 +82,14 @@ def _dataset_with(scene: SceneFolder, experiment: Experiment) -> Dataset:
     if (root / "dataset.json").is_file():
         known = Dataset.load(root)
         others = tuple(other for other in known.scenes if other.name != scene.name)
-        if any(not is_photographed(other) for other in known.scenes):
+        if not all(other.is_photographed for other in known.scenes):
             raise ConfigError(
-                "this dataset holds scenes with meshes, which photographs do not join", path=root,
+                "this dataset holds scenes with meshes, which photographs do not join",
+                path=root,
                 value=[other.name for other in known.scenes],
                 fix="Give the photographs a dataset of their own: --name.",
-            )  # fmt: skip
+            )
         if known.camera != experiment.camera:
             for other in known.scenes:  # what was sampled with another camera is no longer valid
                 write_stamp(other, "map", read_stamp(other, "map") or "")
-    return Dataset(root, experiment.camera, tuple(sorted((*others, scene), key=lambda one: one.name)))
+    return Dataset(root, experiment.camera, tuple(sorted((*others, scene), key=lambda scene: scene.name)))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import shutil
-from dataclasses import replace
+from dataclasses import asdict, replace
+from typing import Any
 
 from wheretolook.config import Experiment
 from wheretolook.dataset.folders import Dataset
@@ -38,7 +40,7 @@ def release(experiment: Experiment, say: Say = print, tick: Tick = lambda work: 
 
     dataset = dataset_after(experiment, "label")
     if not is_release(dataset):
-        copy = copy_dataset(dataset, experiment)
+        copy = copy_dataset(dataset, experiment.data / experiment.release_name, release_settings(experiment))
         for scene, source in zip(copy.scenes, dataset.scenes, strict=True):
             stamp = read_stamp(source, "label")
             assert stamp is not None  # `_dataset` has seen it
@@ -60,6 +62,20 @@ def release(experiment: Experiment, say: Say = print, tick: Tick = lambda work: 
     keep_histories(dataset, experiment.tracking)
     sizes(dataset.root)  # too large? then before the evaluation
     evaluate(on_cpu, say, tick)
-    say(f"the card -> {write_card(dataset)}")
+    say(f"the card -> {write_card(dataset, release_settings(Experiment()))}")
     say(size_text(sizes(dataset.root)))
     return dataset
+
+
+def release_settings(experiment: Experiment) -> dict[str, Any]:
+    """Settings that decide what a dataset holds, as JSON values. Meshes go by name: paths mean nothing elsewhere."""
+    meshes = [{"name": mesh.scene_name, "split": mesh.split, "up": mesh.up} for mesh in experiment.scenes.meshes]
+    settings = {
+        "camera": asdict(experiment.camera),
+        "scenes": {**asdict(experiment.scenes), "meshes": meshes},
+        "map": asdict(experiment.map),
+        "occlusion": asdict(experiment.occlusion),
+        "sample": asdict(experiment.sample),
+        "label": {"localizer": asdict(experiment.label.localizer)},
+    }
+    return dict(json.loads(json.dumps(settings, default=str)))

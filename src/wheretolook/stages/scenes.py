@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from wheretolook.config import Experiment
+from wheretolook.config import Experiment, MeshSource
 from wheretolook.dataset.folders import Dataset, SceneFolder
 from wheretolook.dataset.stamps import is_done, read_stamp, stage_key, write_stamp
 from wheretolook.stages.inputs import Say, Tick, mesh_fingerprint, refuse_release
 from wheretolook.utils.errors import SceneError
-from wheretolook.viewpoints.table import Split
+from wheretolook.viewpoints.config import Split
+
+if TYPE_CHECKING:
+    from wheretolook.geometry.mesh import TexturedMesh
 
 
 def make_scenes(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> Dataset:
@@ -21,30 +24,29 @@ def make_scenes(experiment: Experiment, say: Say = print, tick: Tick = lambda wo
         SceneError: a mesh of one's own cannot be used, or two scenes have the same name.
         ConfigError: the dataset's folder holds a release.
     """
-    from wheretolook.scenes.loading import load_mesh, save_glb
-    from wheretolook.scenes.procedural.generator import generate_apartment
-
     config, root = experiment.scenes, experiment.root
     refuse_release(root)
     numbers: dict[Split, int] = {"train": config.train, "val": config.val, "test": config.test}
     splits = [split for split, number in numbers.items() for _ in range(number)]
-    sources: dict[SceneFolder, Callable[[], Any]] = {}
-    keys: dict[SceneFolder, Any] = {}
+    sources: dict[SceneFolder, Callable[[], TexturedMesh]] = {}
+    keys: dict[SceneFolder, list[Any]] = {}
     for index, split in enumerate(splits):
         seed = config.seed + index
         scene = SceneFolder(root / f"apartment-{seed:03d}", split)
-        sources[scene] = partial(generate_apartment, config.apartment, seed, device=experiment.warp_device)
+        sources[scene] = partial(_generate, experiment, seed)
         keys[scene] = [config.apartment.key(), seed]
     for source in config.meshes:
         scene = SceneFolder(root / source.scene_name, source.split)
         if scene.name in {other.name for other in sources}:
             raise SceneError("two scenes have the same name", path=source.path, value=scene.name, fix="Give it a name.")
-        sources[scene] = partial(load_mesh, source.path, up=source.up)
+        sources[scene] = partial(_load, source)
         keys[scene] = [mesh_fingerprint(source.path), source.up]
 
     for scene, make in sources.items():
         key = stage_key("scenes", keys[scene])
         if not is_done(scene, "scenes", key, scene.mesh):
+            from wheretolook.scenes.loading import save_glb
+
             mesh = make()
             scene.folder.mkdir(parents=True, exist_ok=True)
             save_glb(mesh, scene.mesh)
@@ -59,3 +61,15 @@ def make_scenes(experiment: Experiment, say: Say = print, tick: Tick = lambda wo
             write_stamp(scene, "scenes", read_stamp(scene, "scenes") or "")
     dataset.save()
     return dataset
+
+
+def _generate(experiment: Experiment, seed: int) -> TexturedMesh:
+    from wheretolook.scenes.procedural.generator import generate_apartment
+
+    return generate_apartment(experiment.scenes.apartment, seed, device=experiment.warp_device)
+
+
+def _load(source: MeshSource) -> TexturedMesh:
+    from wheretolook.scenes.loading import load_mesh
+
+    return load_mesh(source.path, up=source.up)

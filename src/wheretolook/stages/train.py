@@ -14,7 +14,8 @@ from wheretolook.methods.method import Method
 from wheretolook.methods.train_config import TrainConfig
 from wheretolook.stages.inputs import Say, Tick, dataset_after
 from wheretolook.utils.files import sha256, write_json
-from wheretolook.utils.tracking import TrackingConfig, log, start_run
+from wheretolook.utils.tracking import log, start_run
+from wheretolook.utils.tracking_config import TrackingConfig
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from wheretolook.config import Experiment
-from wheretolook.stages.inputs import Say, Tick, dataset_after, naming_scene
+from wheretolook.stages.inputs import Say, Tick, dataset_after, naming_scene, open_scene
 
 if TYPE_CHECKING:
     from wheretolook.planning.viewpoint_map import ViewpointMap
@@ -24,7 +24,6 @@ def viewpoint_map(experiment: Experiment, say: Say = print, tick: Tick = lambda 
         ConfigError: no such scene or method, or the method needs weights. WeightsError: the weights cannot be used.
         SceneError: there is no mesh, or no voxel is free. MapFormatError: something else is where the map belongs.
     """
-    from wheretolook.dataset.scene import is_photographed, occlusion_without_mesh, space_and_occlusion
     from wheretolook.planning.scene_map import default_weights, scene_viewpoint_map
 
     dataset, config = dataset_after(experiment, "map"), experiment.viewpoint_map
@@ -32,18 +31,18 @@ def viewpoint_map(experiment: Experiment, say: Say = print, tick: Tick = lambda 
         say(f"scored by {weights}")
         config = replace(config, weights=weights)
     built: dict[str, ViewpointMap] = {}
-    for scene in [dataset.scene(config.scene)] if config.scene else dataset.scenes:
-        name = scene.name
-        photographed = is_photographed(scene)
-        hides = occlusion_without_mesh(experiment.occlusion) if photographed else experiment.occlusion
-        with naming_scene(scene.map if photographed else scene.mesh):
-            space, occlusion = space_and_occlusion(scene, dataset.camera, experiment, hides)
-            found = scene_viewpoint_map(scene, dataset.camera, config, space, occlusion, experiment.warp_device)
-        folder = config.out or scene.folder / "viewpoint-map"
-        found.save(folder)
-        built[name] = found
-        n_rows, n_directions = found.scores.shape
-        say(f"{name}: {n_directions} directions at {n_rows} free voxels of {len(found.grid)}, scored by "
-            f"{found.origin.scorer} -> {folder}")  # fmt: skip
+    for files in [dataset.scene(config.scene)] if config.scene else dataset.scenes:
+        scene = open_scene(experiment, dataset, files)
+        with naming_scene(scene.source):
+            views = scene_viewpoint_map(scene, config, config.method, config.weights)
+        folder = config.out or files.folder / "viewpoint-map"
+        views.save(folder)
+        built[scene.name] = views
+        n_rows, n_directions = views.scores.shape
+        scorer = views.origin.scorer
+        say(
+            f"{scene.name}: {n_directions} directions at {n_rows} free voxels of {len(views.grid)}, scored by {scorer} "
+            f"-> {folder}"
+        )
         tick(1)
     return built

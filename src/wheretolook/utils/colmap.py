@@ -1,4 +1,4 @@
-"""COLMAP's log, kept quiet."""
+"""Quieter logs of COLMAP."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Literal
 
 @contextmanager
 def quiet_colmap(least: Literal["WARNING", "ERROR"] = "WARNING") -> Iterator[None]:
-    """Silence COLMAP's log below a level: it would tear the progress bars."""
+    """Silence COLMAP's log below a level: it would break up the progress bars."""
     import pycolmap
 
     level = pycolmap.logging.minloglevel

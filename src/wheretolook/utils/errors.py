@@ -1,4 +1,4 @@
-"""Errors a user can act on. Each names the offending file and value and says what to do."""
+"""Errors a user can act on: each one names the offending file and value, and what to do."""
 
 from __future__ import annotations
 
@@ -64,4 +64,4 @@ class MissingRunError(WhereToLookError):
 
 
 class PlanningError(WhereToLookError):
-    """A path leaves the viewpoint map, or cannot be looked along within the limits."""
+    """There is no path, or no sequence of views along one that keeps the camera's limits."""

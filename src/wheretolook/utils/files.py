@@ -1,4 +1,4 @@
-"""Files written atomically, and fingerprints of files."""
+"""Atomic writing of files, and their fingerprints."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text atomically; its folder is made when needed."""
+    """Write a text atomically; the folder is created if missing."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".partial")
     partial.write_text(text, encoding="utf-8")
@@ -24,7 +24,8 @@ def write_text(path: Path, text: str) -> None:
 
 def sha256(path: Path) -> str:
     """SHA-256 of a file, in hexadecimal digits."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def fingerprint(path: Path) -> str:

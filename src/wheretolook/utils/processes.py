@@ -1,4 +1,4 @@
-"""Work spread over processes, a few items ahead of the results."""
+"""Spreads work over processes, which read a few items ahead of the results."""
 
 from __future__ import annotations
 
@@ -19,11 +19,7 @@ Result = TypeVar("Result")
 
 
 class Processes:
-    """Processes of one thread each, spawned when first needed and ended with the block.
-
-    Args:
-        workers: how many; 1 works in this process.
-    """
+    """`workers` processes of one thread each, spawned when first needed and ended with the block; 1 is this process."""
 
     def __init__(self, workers: int) -> None:
         self.workers = workers
@@ -40,10 +36,7 @@ class Processes:
             self._pool.shutdown()
 
     def map(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Generator[Result, None, None]:
-        """Apply a function, defined at the top of a module, to items that are read a few ahead of what is returned.
-
-        Yields:
-            Results in the order of the items.
+        """Apply a function, defined at the top level of a module, to items. Yields results in their order.
 
         Raises:
             WorkerError: a process was killed.
@@ -61,10 +54,8 @@ class Processes:
                     return
                 yield pending.popleft().result()
         except BrokenProcessPool as error:
-            raise WorkerError(
-                "a process was killed, probably for lack of memory", value=f"{self.workers} workers",
-                fix="Lower label.workers and run again.",
-            ) from error  # fmt: skip
+            problem, fix = "a process was killed, probably for lack of memory", "Lower label.workers and run again."
+            raise WorkerError(problem, value=f"{self.workers} workers", fix=fix) from error
         finally:
             for future in pending:
                 future.cancel()

@@ -1,7 +1,7 @@
 """Where runs are logged: an MLflow store of one SQLite file and one folder of artifacts, both in one place.
 
-MLflow writes absolute artifact paths into its database (it resolves relative ones against the current folder), so a
-moved store would point at the old place. `client` notices that and rewrites the paths.
+MLflow keeps absolute paths of artifacts. A store that was moved stays readable here, since a run's artifacts lie in a
+folder named by its id; MLflow's UI shows those of earlier runs only at the old place.
 """
 
 from __future__ import annotations
@@ -10,19 +10,18 @@ import logging
 import math
 import os
 import shlex
-import sqlite3
 import subprocess
 import sys
 import time
-import uuid
-from collections.abc import Mapping, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from wheretolook.utils.errors import MissingRunError
+from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.utils.version import VERSION
 
 if TYPE_CHECKING:
@@ -34,51 +33,43 @@ if TYPE_CHECKING:
 STAGE_TAG = "stage"
 """Tag of every run this package logs: "label", "train", "evaluate", "plan", "paths", "learners" or "benchmark"."""
 
+PARENT_TAG = "mlflow.parentRunId"
+"""Tag by which MLflow knows what run another is nested in."""
 
-@dataclass(frozen=True)
-class TrackingConfig:
-    """Where runs are logged.
+AT_ONCE = 800
+"""Metrics logged at a time: MLflow takes 1000 of metrics and parameters together."""
 
-    Args:
-        folder: folder of the MLflow store, holding `mlflow.db` and `artifacts/`. Made when needed.
-        experiment: name of the MLflow experiment that the runs belong to.
-    """
-
-    folder: str = "mlruns"
-    experiment: str = "wheretolook"
-
-    @property
-    def root(self) -> Path:
-        """Absolute path of the store's folder."""
-        return Path(self.folder).expanduser().resolve()
-
-    @property
-    def uri(self) -> str:
-        """Tracking URI of the store."""
-        return f"sqlite:///{self.root / 'mlflow.db'}"
-
-    @property
-    def artifacts(self) -> str:
-        """Artifact location of the experiment."""
-        return str(self.root / "artifacts")
+PAGE = 50
+"""Runs searched at a time."""
 
 
 def client(tracking: TrackingConfig) -> MlflowClient:
-    """A client of the store, which is made if there is none and repaired if it was moved."""
+    """A client of the store, which is made if there is none."""
     tracking.root.mkdir(parents=True, exist_ok=True)
     mlflow_client: MlflowClient = _mlflow().MlflowClient(tracking_uri=tracking.uri)
-    experiment = mlflow_client.get_experiment_by_name(tracking.experiment)
-    if experiment is not None and experiment.artifact_location != tracking.artifacts:
-        _relocate(tracking, experiment.artifact_location)
     return mlflow_client
 
 
+def experiment_ids(mlflow_client: MlflowClient, tracking: TrackingConfig) -> dict[str, str]:
+    """Ids of the experiments that hold the store's runs, by where their artifacts lay when the runs were logged."""
+    return {
+        str(experiment.artifact_location): str(experiment.experiment_id)
+        for experiment in mlflow_client.search_experiments()
+        if experiment.name == tracking.experiment or experiment.name.startswith(f"{tracking.experiment} at ")
+    }
+
+
 def experiment_id(mlflow_client: MlflowClient, tracking: TrackingConfig) -> str:
-    """Id of the experiment, which is created if there is none."""
-    experiment = mlflow_client.get_experiment_by_name(tracking.experiment)
-    if experiment is not None:
-        return str(experiment.experiment_id)
-    return str(mlflow_client.create_experiment(tracking.experiment, artifact_location=tracking.artifacts))
+    """Id of the experiment that new runs go to, which is created if there is none.
+
+    An experiment keeps the absolute path that its artifacts go to. In a store that was moved, new runs therefore go to
+    another experiment, named after the new place.
+    """
+    found = experiment_ids(mlflow_client, tracking)
+    if tracking.artifacts in found:
+        return found[tracking.artifacts]
+    name = f"{tracking.experiment} at {tracking.root}" if found else tracking.experiment
+    return str(mlflow_client.create_experiment(name, artifact_location=tracking.artifacts))
 
 
 @contextmanager
@@ -106,13 +97,18 @@ def start_run(
     mlflow_client = client(tracking)
     all_tags = {STAGE_TAG: stage, **code_version(), **(tags or {})}
     if parent is not None:
-        all_tags["mlflow.parentRunId"] = parent
-    run = mlflow_client.create_run(experiment_id(mlflow_client, tracking), tags=all_tags, run_name=name)
-    run_id = str(run.info.run_id)
+        all_tags[PARENT_TAG] = parent
+    with _open_run(mlflow_client, experiment_id(mlflow_client, tracking), name, all_tags) as run_id:
+        log(mlflow_client, run_id, params)
+        yield mlflow_client, run_id
+
+
+@contextmanager
+def _open_run(mlflow_client: MlflowClient, experiment: str, name: str, tags: Mapping[str, str]) -> Iterator[str]:
+    run_id = str(mlflow_client.create_run(experiment, tags=dict(tags), run_name=name).info.run_id)
     status = "FAILED"
     try:
-        log(mlflow_client, run_id, params=params or {})
-        yield mlflow_client, run_id
+        yield run_id
         status = "FINISHED"
     except KeyboardInterrupt:
         status = "KILLED"
@@ -128,70 +124,49 @@ def log(
     metrics: Mapping[str, float] | None = None,
     step: int = 0,
 ) -> None:
-    """Log parameters and metrics of a run in one transaction. Metrics that are not finite are left out."""
+    """Log parameters and metrics of a run, in few transactions. Metrics that are not finite are left out."""
     from mlflow.entities import Metric, Param
 
     now = int(time.time() * 1000)
-    mlflow_client.log_batch(
-        run_id,
-        metrics=[Metric(key, float(v), now, step) for key, v in (metrics or {}).items() if math.isfinite(v)],
-        params=[Param(key, str(value)) for key, value in (params or {}).items()],
-    )
+    numbers = [Metric(key, float(v), now, step) for key, v in (metrics or {}).items() if math.isfinite(v)]
+    texts = [Param(key, str(value)) for key, value in (params or {}).items()]
+    for begin in range(0, max(len(numbers), 1), AT_ONCE):
+        mlflow_client.log_batch(run_id, numbers[begin : begin + AT_ONCE], texts if begin == 0 else [])
 
 
 @dataclass(frozen=True)
 class NestedRun:
-    """A run within another, before it is logged: its name, parameters and metrics."""
+    """A run within another, before it is logged: its name, parameters, metrics and files."""
 
     name: str
     params: Mapping[str, Any]
     metrics: Mapping[str, float]
+    files: Sequence[Path] = ()
 
 
 def log_nested(
-    tracking: TrackingConfig, parent: str, stage: str, runs: Sequence[NestedRun], tags: Mapping[str, str] | None = None
-) -> list[str]:
-    """Log many finished runs within another one, all but the first in one transaction of the database.
+    tracking: TrackingConfig, parent: str, stage: str, runs: Iterable[NestedRun], tags: Mapping[str, str] | None = None
+) -> None:
+    """Log finished runs within another one.
 
-    One by one through MLflow each takes a tenth of a second, and an evaluation has hundreds.
+    MLflow needs 25 ms for a run and 0.3 ms for a metric (`tests/benchmarks/bench_tracking.py`): hundreds of runs take
+    half a minute.
 
     Args:
         tracking: the store.
         parent: id of the run they are nested under.
         stage: their tag.
-        runs: what to log. Metrics that are not finite are left out.
+        runs: what to log, each when the one before is done. Metrics that are not finite are left out.
         tags: further tags, the same for all.
-
-    Returns:
-        Their ids.
     """
-    if not runs:
-        return []
-    with start_run(tracking, runs[0].name, stage, runs[0].params, parent, tags) as (mlflow_client, first):
-        log(mlflow_client, first, metrics=runs[0].metrics)
-    ids = [first, *(uuid.uuid4().hex for _ in runs[1:])]
-    with closing(sqlite3.connect(tracking.root / "mlflow.db", timeout=60)) as connection, connection:
-        cursor = connection.execute("SELECT * FROM runs WHERE run_uuid = ?", (first,))
-        columns, template = [column[0] for column in cursor.description], cursor.fetchone()
-        all_tags = connection.execute("SELECT key, value FROM tags WHERE run_uuid = ?", (first,)).fetchall()
-        now = template[columns.index("start_time")]
-        for run_id, run in zip(ids[1:], runs[1:], strict=True):
-            row = dict(zip(columns, template, strict=True))
-            row |= {"run_uuid": run_id, "name": run.name, "artifact_uri": row["artifact_uri"].replace(first, run_id)}
-            named = [(key, run.name if key == "mlflow.runName" else value) for key, value in all_tags]
-            metrics = [(key, float(v), now, run_id, 0, 0) for key, v in run.metrics.items() if math.isfinite(v)]
-            marks = ", ".join("?" * len(columns))
-            connection.execute(f"INSERT INTO runs ({', '.join(columns)}) VALUES ({marks})", list(row.values()))
-            for table, pairs in (("tags", named), ("params", [(key, str(v)) for key, v in run.params.items()])):
-                connection.executemany(
-                    f"INSERT INTO {table} (key, value, run_uuid) VALUES (?, ?, ?)", [(*pair, run_id) for pair in pairs]
-                )
-            for table in ("metrics", "latest_metrics"):
-                connection.executemany(
-                    f"INSERT INTO {table} (key, value, timestamp, run_uuid, step, is_nan) VALUES (?, ?, ?, ?, ?, ?)",
-                    metrics,
-                )
-    return ids
+    mlflow_client = client(tracking)
+    experiment = experiment_id(mlflow_client, tracking)
+    all_tags = {STAGE_TAG: stage, **code_version(), **(tags or {}), PARENT_TAG: parent}
+    for run in runs:
+        with _open_run(mlflow_client, experiment, run.name, all_tags) as run_id:
+            log(mlflow_client, run_id, run.params, run.metrics)
+            for file in run.files:
+                mlflow_client.log_artifact(run_id, str(file))
 
 
 def newest_run(
@@ -221,30 +196,21 @@ def finished_runs(
     file: str = "",
 ) -> Iterator[Run]:
     """All finished top-level runs of a stage, the newest first; see `newest_run`."""
-    store = tracking.root / "mlflow.db"
-    if not store.is_file():
+    if not (tracking.root / "mlflow.db").is_file():
         return
     mlflow_client = client(tracking)
-    experiment = mlflow_client.get_experiment_by_name(tracking.experiment)
-    if experiment is None:
-        return
-    # asked of the database: MLflow cannot search for runs without a parent, and an evaluation has hundreds of children
-    one = "EXISTS (SELECT 1 FROM {} t WHERE t.run_uuid = r.run_uuid AND t.key = ? AND t.value = ?)"
-    wanted = [("tags", STAGE_TAG, stage), *(("tags", *pair) for pair in (tags or {}).items())]
-    wanted += [("params", *pair) for pair in (params or {}).items()]
-    query = " AND ".join([
-        "SELECT r.run_uuid FROM runs r WHERE r.experiment_id = ? AND r.status = 'FINISHED'",
-        "r.lifecycle_stage = 'active'",
-        "NOT EXISTS (SELECT 1 FROM tags t WHERE t.run_uuid = r.run_uuid AND t.key = 'mlflow.parentRunId')",
-        *(one.format(table) for table, _, _ in wanted),
-    ]) + " ORDER BY r.start_time DESC, r.rowid DESC"  # fmt: skip
-    values = [experiment.experiment_id, *(text for _, key, value in wanted for text in (key, str(value)))]
-    with closing(sqlite3.connect(store, timeout=60)) as connection:
-        ids = [row[0] for row in connection.execute(query, values)]
-    for run_id in ids:
-        run = mlflow_client.get_run(run_id)
-        if not file or (Path(run.info.artifact_uri) / file).is_file():
-            yield run
+    experiments = list(experiment_ids(mlflow_client, tracking).values())
+    query = f"tags.{STAGE_TAG} = '{stage}' AND tags.`{PARENT_TAG}` IS NULL AND attributes.status = 'FINISHED'"
+    order = ["attributes.start_time DESC"]
+    token: str | None = None
+    while experiments and token != "":
+        page = mlflow_client.search_runs(experiments, query, max_results=PAGE, order_by=order, page_token=token)
+        for run in page:
+            fits = all(run.data.tags.get(key) == str(value) for key, value in (tags or {}).items())
+            fits &= all(run.data.params.get(key) == str(value) for key, value in (params or {}).items())
+            if fits and (not file or artifact(tracking, run.info.run_id, file).is_file()):
+                yield run
+        token = page.token or ""
 
 
 def newest_artifact(tracking: TrackingConfig, stage: str, file: str, dataset: str = "") -> Path:
@@ -263,12 +229,12 @@ def newest_artifact(tracking: TrackingConfig, stage: str, file: str, dataset: st
     if run is None:
         fix = "`wheretolook figures` tells which command makes it, `wheretolook log-release` logs what ships."
         raise MissingRunError(f"there is no run of {stage} with {file}", path=tracking.root, fix=fix)
-    return Path(run.info.artifact_uri) / file
+    return artifact(tracking, run.info.run_id, file)
 
 
 def artifact(tracking: TrackingConfig, run_id: str, path: str) -> Path:
-    """Local path of an artifact of a run."""
-    return Path(client(tracking).get_run(run_id).info.artifact_uri) / path
+    """Local path of an artifact of a run, wherever the store lay when the run was logged."""
+    return Path(tracking.artifacts) / run_id / "artifacts" / path
 
 
 def ui_command(tracking: TrackingConfig) -> str:
@@ -302,16 +268,6 @@ def code_version() -> dict[str, str]:
     except (OSError, subprocess.SubprocessError):
         pass
     return version
-
-
-def _relocate(tracking: TrackingConfig, old: str) -> None:
-    """Point artifact paths under `old` to where the store lies now."""
-    with closing(sqlite3.connect(tracking.root / "mlflow.db")) as connection, connection:
-        for table, column in (("experiments", "artifact_location"), ("runs", "artifact_uri")):
-            connection.execute(
-                f"UPDATE {table} SET {column} = ? || substr({column}, ?) WHERE substr({column}, 1, ?) = ?",
-                (tracking.artifacts, len(old) + 1, len(old), old),
-            )
 
 
 @cache

@@ -1,3 +1,3 @@
-"""The version of this package, where everything below its root can read it."""
+"""The version of this package."""
 
 VERSION = "0.1.0"

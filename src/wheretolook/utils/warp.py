@@ -18,18 +18,12 @@ from wheretolook.utils.errors import ConfigError
 
 @cache  # looking for a driver takes 14 ms
 def start_warp(device: str = "cpu") -> str:
-    """Initialize Warp without its banner and check that a device exists.
+    """Initialize Warp without its banner, and return the full name of a device, such as "cuda:0" for "cuda".
 
     Called when something is built on a device, never on import, so that worker processes start Warp themselves.
 
-    Args:
-        device: "cpu", "cuda" or "cuda:<index>".
-
-    Returns:
-        The device's full name, such as "cuda:0".
-
     Raises:
-        ConfigError: if this machine has no such device.
+        ConfigError: this machine has no such device.
     """
     wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
     with _without_driver_warning():
@@ -43,7 +37,7 @@ def start_warp(device: str = "cpu") -> str:
 
 @contextmanager
 def _without_driver_warning() -> Iterator[None]:
-    """On a machine without a GPU, keep Warp's native library from writing so into every worker's progress bar."""
+    """Hide that Warp's native library warns about a missing GPU, which would break up progress bars."""
     if find_library("cuda") is not None:
         yield
         return

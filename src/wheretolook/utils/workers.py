@@ -1,4 +1,4 @@
-"""Worker processes that leave Ctrl-C to their parent, do not outlive it, and hold on to their memory."""
+"""Worker processes that ignore Ctrl-C, end with their parent, and reuse freed memory."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from multiprocessing.process import BaseProcess
 
 @contextmanager
 def spawning() -> Iterator[None]:
-    """While processes are spawned: they inherit that SIGINT is ignored, from their first moment on.
+    """Processes spawned within this block ignore SIGINT from the start.
 
-    A worker that sets this itself does so only after its imports, which take seconds.
+    If workers set this themselves, a Ctrl-C during their imports, which take seconds, would still reach them.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -29,14 +29,14 @@ def spawning() -> Iterator[None]:
 
 
 def end_with_parent() -> None:
-    """Called in a worker: end it when its parent ends, even if the parent was killed and could not end it."""
+    """Called in a worker: end it when its parent ends, even if the parent is killed."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=_wait_and_exit, args=(parent,), daemon=True).start()
 
 
 def use_one_core() -> None:
-    """Called in a worker that runs SIFT beside others, one for each core: OpenCV keeps to one thread and its memory."""
+    """Called in a worker that runs SIFT, one for each core: OpenCV uses one thread and reuses freed memory."""
     import cv2
 
     cv2.setNumThreads(1)
@@ -44,9 +44,9 @@ def use_one_core() -> None:
 
 
 def _keep_freed_memory() -> None:
-    """Let the C library reuse memory that was freed instead of giving it back to the system.
+    """Let the C library reuse freed memory instead of returning it to the system.
 
-    SIFT takes and frees about 70 MB for each 640 x 480 image; getting it back page by page took a third of its time.
+    SIFT allocates about 70 MB for each 640 x 480 image; getting it from the system each time took a third of its time.
     """
     try:
         library = ctypes.CDLL("libc.so.6")

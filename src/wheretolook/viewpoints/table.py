@@ -1,14 +1,13 @@
 """The table of viewpoints: one Parquet file a scene, one row a viewpoint, joined by ids and never by file order.
 
-A compact table holds the same rows in a third of the space; `read_table` reads both alike. Which landmarks a view
-matched can be stored beside its label, see `MATCH_FIELDS`.
+A compact table holds the same rows in a third of the space; `read_table` reads both. The landmarks that each view
+matched can be stored too, see `MATCH_FIELDS`.
 """
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import pandas as pd
@@ -17,9 +16,6 @@ import pyarrow.parquet as pq
 
 from wheretolook.geometry.poses import Float, camera_centers, quaternion_from_rotation, rotation_from_quaternion
 from wheretolook.utils.errors import TableError
-
-Split = Literal["train", "val", "test"]
-"""What the viewpoints of a scene are for."""
 
 POSE_COLUMNS = ("qw", "qx", "qy", "qz", "tx", "ty", "tz")
 CENTER_COLUMNS = ("x_m", "y_m", "z_m")
@@ -40,35 +36,26 @@ SCHEMA = pa.schema(
 )
 """Columns of `viewpoints.parquet`. The pose is cam_from_world (quaternion wxyz, translation in metres), rank 0 is the
 direction that sees most landmarks at its location. Until a viewpoint is labelled its status is "unlabelled"; afterwards
-it is "localized", "too_few_matches" or "no_pose". Errors are of the pose RANSAC found, if it found one, even if it had
-too few inliers to be believed ("no_pose"); otherwise they are NaN."""
+it is "localized", "too_few_matches" or "no_pose". Errors are those of the pose that RANSAC found, even if it has too
+few inliers to be accepted ("no_pose"); NaN if there is none."""
 
-COMPACT_SCHEMA = pa.schema(
-    [
-        pa.field(CENTER_COLUMNS[POSE_COLUMNS[4:].index(field.name)], field.type)
-        if field.name in POSE_COLUMNS[4:]
-        else field
-        for field in SCHEMA
-    ]
-)
+_COMPACT_NAMES = dict(zip(POSE_COLUMNS[4:], CENTER_COLUMNS, strict=True))
+COMPACT_SCHEMA = pa.schema([field.with_name(_COMPACT_NAMES.get(field.name, field.name)) for field in SCHEMA])
 """Columns of a compact table: in place of the translation, which differs in every row, the camera's centre in the world
 (metres), which the viewpoints of a location share. The translation follows: t = -R c."""
 
 MATCH_FIELDS = pa.schema([("matched_rows", pa.list_(pa.int32())), ("inlier_rows", pa.list_(pa.int32()))])
-"""Two ragged columns that a table may have besides those of `SCHEMA`, if labelling was asked for them: the landmarks
-that were matched in each view, and those of them that agree with the pose found, as rows of the scene's
-`landmarks.npz`, ascending. A view without matches has two empty lists. Compact tables leave them out."""
+"""Two ragged columns that a table may have in addition to `SCHEMA`, if labelling was asked for them: the landmarks that
+were matched in each view, and the inliers among them, as rows of the scene's `landmarks.npz`, ascending. A view without
+matches has two empty lists. Compact tables leave them out."""
 
-CENTER_DECIMALS = 12
-"""Decimals of a metre that are kept of centres; those of a location, each computed from its pose, differ by less."""
+CENTER_DECIMALS = 12  # of a metre; the centres of a location's viewpoints, each computed from its pose, differ by less
 
-_BY_VALUE = ("viewpoint_id", "error_m", "error_deg")  # all other columns repeat few values: they go by dictionary
+_ENCODINGS = {"viewpoint_id": "DELTA_BINARY_PACKED", "error_m": "BYTE_STREAM_SPLIT", "error_deg": "BYTE_STREAM_SPLIT"}
 _COMPACT_FORMAT = {
     "compression_level": 19,
-    "use_dictionary": [name for name in COMPACT_SCHEMA.names if name not in _BY_VALUE],
-    "column_encoding": dict(
-        zip(_BY_VALUE, ("DELTA_BINARY_PACKED", "BYTE_STREAM_SPLIT", "BYTE_STREAM_SPLIT"), strict=True)
-    ),
+    "use_dictionary": [name for name in COMPACT_SCHEMA.names if name not in _ENCODINGS],  # they repeat few values
+    "column_encoding": _ENCODINGS,
 }
 
 UNLABELLED, LOCALIZED, TOO_FEW_MATCHES, NO_POSE = "unlabelled", "localized", "too_few_matches", "no_pose"
@@ -87,10 +74,10 @@ def pose_columns(cam_from_world: Float) -> dict[str, Float]:
 
 
 def is_good(table: pd.DataFrame, max_error_m: float = 0.05, max_error_deg: float = 0.4) -> np.ndarray:
-    """Labels: True where the viewpoint was localized with both errors strictly under their limits. (B,)
+    """Labels (B,): True if a viewpoint was localized with both errors below their limits.
 
     Raises:
-        TableError: some row has no label yet.
+        TableError: a row has no label yet.
     """
     unlabelled = int((table["status"] == UNLABELLED).sum())
     if unlabelled:
@@ -100,7 +87,7 @@ def is_good(table: pd.DataFrame, max_error_m: float = 0.05, max_error_deg: float
 
 
 def outcome_in_words(label: pd.Series) -> str:
-    """What came of localizing a row of a table; empty if it was not tried."""
+    """The result of localizing a row of a table, in words; empty if it was not tried."""
     status = str(label["status"])
     if status == UNLABELLED:
         return ""
@@ -112,7 +99,7 @@ def outcome_in_words(label: pd.Series) -> str:
 
 
 def outcome_in_brief(label: pd.Series) -> str:
-    """The same for narrow pictures: the error of the pose that was found, if one was."""
+    """As `outcome_in_words`, for narrow pictures: only the error of the pose, if one was found."""
     if str(label["status"]) != LOCALIZED:
         return outcome_in_words(label)
     if label["error_m"] < 1:
@@ -124,10 +111,9 @@ def write_table(table: pd.DataFrame, path: Path, compact: bool = False) -> None:
     """Write a table atomically as zstd Parquet with checksums. The same rows give the same bytes.
 
     Args:
-        table: viewpoints, see `SCHEMA`; with both columns of `MATCH_FIELDS`, these are written, too.
+        table: viewpoints, see `SCHEMA`; both columns of `MATCH_FIELDS` are written too if they are there.
         path: file to write; its folder is made when needed.
-        compact: write `COMPACT_SCHEMA`, about 18 bytes a row; read back, poses agree to 1e-12 and all else exactly.
-            `MATCH_FIELDS` are left out.
+        compact: write `COMPACT_SCHEMA`, about 18 bytes a row. Read back, poses agree to 1e-12 and all else exactly.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".partial")
@@ -137,7 +123,7 @@ def write_table(table: pd.DataFrame, path: Path, compact: bool = False) -> None:
     elif set(MATCH_FIELDS.names) <= set(table.columns):
         schema = pa.schema([*SCHEMA, *MATCH_FIELDS])
     content = pa.Table.from_pandas(table, schema=schema, preserve_index=False)
-    content = content.replace_schema_metadata(None)  # it tells of the data frame, not of the rows
+    content = content.replace_schema_metadata(None)  # it describes the data frame, not the rows
     try:
         pq.write_table(content, partial, compression="zstd", write_page_checksum=True, **options)
     except OSError:
@@ -147,41 +133,32 @@ def write_table(table: pd.DataFrame, path: Path, compact: bool = False) -> None:
 
 
 def _shared_centers(table: pd.DataFrame) -> Float:
-    """Camera centres (B, 3) in metres, the very same numbers for all viewpoints of a location."""
+    """Camera centres (B, 3) in metres, exactly equal for all viewpoints of a location."""
     centers = camera_centers(poses(table))
     _, first, rows = np.unique(table["location_id"], return_index=True, return_inverse=True)
     shared = centers[first][rows]
-    apart = np.abs(shared - centers) > 0.5 * 10.0**-CENTER_DECIMALS  # if a location has several, they stay
+    apart = np.abs(shared - centers) > 0.5 * 10.0**-CENTER_DECIMALS  # a location with several centres keeps them
     return np.round(np.where(apart, centers, shared), CENTER_DECIMALS) + 0.0  # no negative zero
 
 
 def read_table(path: Path, matches: bool = False) -> pd.DataFrame:
-    """Read a table of viewpoints, compact or not.
+    """Read the columns of `SCHEMA` of a table of viewpoints, compact or not.
 
-    Args:
-        path: file to read.
-        matches: read `MATCH_FIELDS`, too.
-
-    Returns:
-        The columns of `SCHEMA`. With `matches` also those of `MATCH_FIELDS`: in each row two int32 arrays, (M,) of the
-        landmarks matched and (I,) of the inliers among them.
+    With `matches` also those of `MATCH_FIELDS`: in each row two int32 arrays, (M,) of the landmarks matched and (I,) of
+    the inliers among them.
 
     Raises:
-        TableError: the file is missing, truncated, no Parquet file, or lacks columns; also those of `MATCH_FIELDS`, if
-            they are asked for.
+        TableError: the file is missing, truncated, not a Parquet file, or lacks columns that were asked for.
     """
     if not path.is_file():
         raise TableError("there is no table of viewpoints", path=path, fix="Run the sample stage first.")
     try:
         with pq.ParquetFile(path, page_checksum_verification=True) as file:
-            names = file.schema_arrow.names  # who does not ask for the matches need not wait for them
+            names = file.schema_arrow.names  # matches take long to read, so only if they are asked for
             table = file.read([name for name in names if matches or name not in MATCH_FIELDS.names])
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
-        raise TableError(
-            f"not a readable Parquet file: {error}",
-            path=path,
-            fix="It may be truncated: get it anew, or delete it and run the stage that writes it.",
-        ) from error
+        fix = "It may be truncated: get it anew, or delete it and run the stage that writes it."
+        raise TableError(f"not a readable Parquet file: {error}", path=path, fix=fix) from error
     compact = any(name in names for name in CENTER_COLUMNS)
     schema, columns = (COMPACT_SCHEMA, CENTER_COLUMNS) if compact else (SCHEMA, POSE_COLUMNS[4:])
     missing = [name for name in schema.names if name not in names]
@@ -200,13 +177,9 @@ def read_table(path: Path, matches: bool = False) -> pd.DataFrame:
     position = frame[list(columns)].to_numpy()
     bad = ~(np.abs(length - 1) < 1e-6) | ~np.isfinite(position).all(1)
     if bad.any():
-        row = int(np.argmax(bad))
-        raise TableError(
-            "a pose is no rigid transform",
-            path=path,
-            value=[float(frame[name].iloc[row]) for name in (*POSE_COLUMNS[:4], *columns)],
-            fix="The file is damaged: run the sample stage again.",
-        )
+        first = [float(value) for value in frame[[*POSE_COLUMNS[:4], *columns]].iloc[int(np.argmax(bad))]]
+        fix = "The file is damaged: run the sample stage again."
+        raise TableError("a pose is no rigid transform", path=path, value=first, fix=fix)
     if compact:
         rotation = rotation_from_quaternion(frame[list(POSE_COLUMNS[:4])].to_numpy())
         translation = -(rotation @ position[..., None])[..., 0]

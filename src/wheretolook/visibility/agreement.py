@@ -1,4 +1,4 @@
-"""How well one occlusion model's masks agree with another's, taken as the truth."""
+"""How well the masks of one occlusion model agree with those of another, which are taken as the truth."""
 
 from __future__ import annotations
 
@@ -10,15 +10,10 @@ from numpy.typing import ArrayLike
 
 @dataclass(frozen=True)
 class MaskAgreement:
-    """Agreement of lines of sight found free with those that are free.
+    """Precision and recall of the lines of sight that were found free."""
 
-    Attributes:
-        precision: share of the lines found free that are free; NaN if none was found free.
-        recall: share of the free lines that were found free; NaN if none is free.
-    """
-
-    precision: float
-    recall: float
+    precision: float  # share of the lines found free that are free; NaN if none was found free
+    recall: float  # share of the free lines that were found free; NaN if none is free
 
     @classmethod
     def between(cls, mask: ArrayLike, truth: ArrayLike) -> MaskAgreement:

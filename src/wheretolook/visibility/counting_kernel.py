@@ -7,11 +7,10 @@ from __future__ import annotations
 
 import warp as wp
 
-from wheretolook.visibility.frustum_kernel import in_view, inside_sides, offset_from
+from wheretolook.visibility.frustum_kernel import in_view, inside_sides, least_product, offset_from, rounding_error
 from wheretolook.visibility.sphere_cells_kernel import cell_of
 
-FAR = wp.constant(1.0e15)
-"""Beyond this many metres single precision may overflow."""
+FAR = wp.constant(1.0e15)  # beyond this many metres single precision may overflow
 
 
 @wp.kernel
@@ -25,7 +24,10 @@ def cell_kernel(
     places: wp.array2d[wp.vec2i],
     numbers: wp.array[wp.int32],
 ):
-    """Cell of every landmark around every location, and its place among those of the cell."""
+    """Find the cell of every landmark around every location, and its place among the landmarks of that cell.
+
+    `numbers` counts the landmarks of each cell. A landmark that is occluded or not finite gets the cell -1.
+    """
     location, landmark = wp.tid()
     n_cells = size * size + 1
     cell = wp.int32(-1)
@@ -36,7 +38,7 @@ def cell_kernel(
     if free:
         offset = offset_from(locations[location], points[landmark])
         if wp.isfinite(offset):
-            cell = size * size  # tested whole: close to the camera, where the depth matters, and absurdly far
+            cell = size * size  # the last cell: too near the camera, where depth matters, or too far; always tested
             distance = wp.length(offset)
             if distance > near_radius and distance < FAR:
                 cell = cell_of(offset, size)
@@ -53,7 +55,7 @@ def sort_kernel(
     size: wp.int32,
     offsets: wp.array[wp.vec3],
 ):
-    """Offsets of the landmarks of a location, cell by cell."""
+    """Write the offsets of each location's landmarks, cell by cell."""
     location, landmark = wp.tid()
     place = places[location, landmark]
     if place[0] >= 0:
@@ -65,18 +67,18 @@ def sort_kernel(
 class SortedLandmarks:
     """The landmarks of a block of locations sorted into cells, and the cells of each orientation (`SphereCells`)."""
 
-    size: wp.int32
-    inside_starts: wp.array[wp.int32]
+    size: wp.int32  # cells along a side of the sphere's map
+    inside_starts: wp.array[wp.int32]  # see `CellRuns`
     inside: wp.array[wp.vec2i]
     border_starts: wp.array[wp.int32]
     border: wp.array[wp.vec2i]
-    starts: wp.array[wp.int32]
-    offsets: wp.array[wp.vec3]
+    starts: wp.array[wp.int32]  # first entry of each cell of each location in `offsets`
+    offsets: wp.array[wp.vec3]  # from the location
 
 
 @wp.func
 def inside_runs(s: SortedLandmarks, orientation: wp.int32) -> wp.vec2i:
-    """First run of cells wholly in view, and the one after the last."""
+    """First run of cells that are wholly in view, and the one after the last."""
     return wp.vec2i(s.inside_starts[orientation * s.size], s.inside_starts[(orientation + 1) * s.size])
 
 
@@ -94,7 +96,7 @@ def entries_of(s: SortedLandmarks, location: wp.int32, run: wp.vec2i) -> wp.vec2
 
 @wp.func
 def near_entries(s: SortedLandmarks, location: wp.int32) -> wp.vec2i:
-    """The entries of the last cell, of landmarks that each orientation tests."""
+    """Entries of the last cell, whose landmarks every orientation tests."""
     n_cells = s.size * s.size
     return entries_of(s, location, wp.vec2i(n_cells, n_cells + 1))
 
@@ -103,7 +105,7 @@ def near_entries(s: SortedLandmarks, location: wp.int32) -> wp.vec2i:
 def count_inside(
     s: SortedLandmarks, location: wp.int32, orientation: wp.int32, lane: wp.int32, lanes: wp.int32
 ) -> wp.int32:
-    """Landmarks of every lanes-th run of cells wholly in view."""
+    """Number of landmarks in every lanes-th run of cells that are wholly in view."""
     count = wp.int32(0)
     runs = inside_runs(s, orientation)
     for run in range(runs[0] + lane, runs[1], lanes):
@@ -121,7 +123,7 @@ def count_kernel(
     lanes: wp.int32,
     counts: wp.array2d[wp.int32],
 ):
-    """Several threads (lanes) share a view, which is a location and an orientation."""
+    """Count the landmarks in view. Several threads (lanes) share a view, that is, a location and an orientation."""
     location, orientation, lane = wp.tid()
     count = count_inside(landmarks, location, orientation, lane, lanes)
     left = sides[orientation, 0]
@@ -133,11 +135,9 @@ def count_kernel(
         entries = entries_of(landmarks, location, landmarks.border[run])
         for entry in range(entries[0] + lane, entries[1], lanes):
             offset = landmarks.offsets[entry]
-            # in single precision first; within its rounding error of a side, in double
-            least = wp.min(
-                wp.min(wp.dot(left, offset), wp.dot(right, offset)), wp.min(wp.dot(top, offset), wp.dot(bottom, offset))
-            )
-            error = rounding * (wp.abs(offset[0]) + wp.abs(offset[1]) + wp.abs(offset[2]))
+            # single precision decides unless the landmark is within its rounding error of a side
+            least = least_product(left, right, top, bottom, offset)
+            error = rounding_error(offset, rounding)
             if least > error:
                 count += 1
             elif least >= -error:  # noqa: SIM102 (Warp evaluates both sides of an `and`)
@@ -180,7 +180,7 @@ def count_field_kernel(
     unsure_pairs: wp.array[wp.vec2i],
     unsure_offsets: wp.array[wp.vec3],
 ):
-    """As `count_kernel`, by a table of the field of view; what it cannot decide is listed for the camera itself."""
+    """As `count_kernel`, by a table of the field of view. Landmarks it cannot decide are listed for the camera."""
     row, lane = wp.tid()
     location = (first + row) / counts.shape[1]
     orientation = first + row - location * counts.shape[1]
@@ -204,7 +204,7 @@ def count_field_kernel(
 
 @wp.kernel
 def pack_kernel(mask: wp.array2d[wp.bool], rank: wp.array[wp.int32], packed: wp.array2d[wp.uint8]):
-    """Eight landmarks to the byte, the first in the highest bit."""
+    """Pack the mask eight landmarks to the byte, the first in the highest bit, as `numpy.packbits` does."""
     location, byte = wp.tid()
     bits = wp.int32(0)
     for bit in range(8):

@@ -11,22 +11,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.utils.warp import start_warp, vec3_array
 
-MORTON_BITS = 10
-"""Bits along each axis of the curve that landmarks are ordered by."""
+MORTON_BITS = 10  # bits along each axis of the curve that landmarks are ordered by
 
 
 class DevicePoints:
-    """Landmarks on a device, along a Morton curve: threads side by side then work on landmarks side by side.
-
-    Args:
-        positions: (N, 3) metres, in the map's order.
-        device: "cpu" or a CUDA device.
+    """Landmarks (N, 3) m on a device along a Morton curve, so that threads side by side have landmarks side by side.
 
     Attributes:
-        positions: (N, 3) float64, in the map's order.
+        positions: (N, 3) float64, metres, in the map's order.
+        device: its full name.
         order: (N,) rows of the map in the order of the device's arrays.
         double: (N,) Warp array of vec3d.
-        device: its full name.
     """
 
     def __init__(self, positions: ArrayLike, device: str = "cpu") -> None:
@@ -46,9 +41,7 @@ class DevicePoints:
     @cached_property
     def rank(self) -> Any:
         """(N,) Warp array of int32: where the map's landmarks lie in the device's arrays, the inverse of `order`."""
-        rank = np.empty(len(self.order), dtype=np.int32)
-        rank[self.order] = np.arange(len(rank))
-        return wp.array(rank, dtype=wp.int32, device=self.device)
+        return wp.array(np.argsort(self.order).astype(np.int32), dtype=wp.int32, device=self.device)
 
 
 def morton_codes(positions: NDArray[np.float64]) -> NDArray[np.int64]:

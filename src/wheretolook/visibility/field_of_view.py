@@ -13,39 +13,30 @@ from wheretolook.geometry.colmap_camera import ColmapCamera
 from wheretolook.geometry.poses import Float
 from wheretolook.visibility.octahedral_map import cell_centers, cells_of
 
-TABLE_SIZE = 1024
-"""Cells along a side of the table: 0.06 to 0.19 degrees from a cell's centre to its farthest corner."""
+TABLE_SIZE = 1024  # cells along a side of the table: 0.06 to 0.19 degrees from a cell's centre to its farthest corner
+MAX_DEPTH_RAD = 0.25  # deeper than this is not told apart: cells of the sphere that need more are small in number
 
-MAX_DEPTH_RAD = 0.25
-"""Deeper than this is not told apart: cells of the sphere that need more are small in number."""
-
-EDGE_SAMPLES, GRID_SAMPLES = 2048, 512
-"""Pixels looked at along each edge of the image, and along each side of a grid over it."""
-
-BISECTIONS = 20
-"""Halvings of the gap between neighbouring centres, of which one is seen: the border is found to 1e-8 rad."""
+EDGE_SAMPLES, GRID_SAMPLES = 2048, 512  # pixels sampled along each edge of the image, and each side of a grid over it
+BISECTIONS = 20  # of the gap between neighbouring centres on either side of the border, which is found to 1e-8 rad
 
 
 @dataclass(frozen=True, eq=False)
 class FieldOfView:
-    """How deep inside the field of view every direction of the camera frame lies at least.
+    """How far inside the field of view every direction of the camera frame lies at least.
 
     Where the table says zero the camera itself must be asked. So one table serves every camera model, and the answer
-    stays that of the model. (Missed would be a hole smaller than a cell of the table, or a lobe so narrow
-    that it also falls between a grid of pixels, as only absurd distortion makes them.)
-
-    Attributes:
-        size: cells along a side of the octahedral map.
-        depth_rad: (size * size,) float32. Positive: every direction of the cell is in view and at least this angle from
-            the border of the field of view; negative: likewise out of view; zero: the border may pass through the cell.
+    stays that of the model. (The table would miss a hole in the field of view smaller than one of its cells, or a lobe
+    so narrow that it also falls between a grid of pixels. Only absurd distortion makes such.)
     """
 
-    size: int
+    size: int  # cells along a side of the octahedral map
+    # (size * size,) float32. Positive: every direction of the cell is in view and at least this angle from the border
+    # of the field of view; negative: likewise out of view; zero: the border may pass through the cell.
     depth_rad: NDArray[np.float32]
 
     @classmethod
     def of(cls, camera: ColmapCamera, size: int = TABLE_SIZE) -> FieldOfView:
-        """Tabulate a camera. Takes about a second; the latest cameras are remembered."""
+        """Tabulate a camera, which takes about a second. The four latest tables are kept."""
         return _tabulate(camera, size)
 
 
@@ -76,19 +67,20 @@ def _tabulate(camera: ColmapCamera, size: int) -> FieldOfView:
     reach = 2 * np.sin(MAX_DEPTH_RAD / 2)
     chord, _ = cKDTree(border).query(centers, distance_upper_bound=reach, workers=-1)
     angle = 2 * np.arcsin(np.minimum(chord, reach) / 2)
-    # A cell's points are within its radius of its centre; points on the border are at most a cell (of about this size)
-    # apart, so that the border passes within a radius of one of them. The rest is room to spare.
+    # A cell lies within its radius of its centre. Points found on the border are at most a cell apart, so the border
+    # passes within a radius of one of them. The remaining half radius is a margin.
     certain = np.maximum(angle - 2.5 * radii, 0)
     return FieldOfView(size, (sign * certain).astype(np.float32))
 
 
 def _rays_of_image(camera: ColmapCamera) -> tuple[Float, NDArray[np.bool_]]:
-    """Unit rays (n, 3) of pixels on a grid over the image that the camera does see, and which lie on its edge."""
+    """Unit rays (n, 3) of pixels on a grid over the image and along its edge, and which are on the edge, (n,).
+
+    Only pixels whose rays the camera sees.
+    """
     side = np.linspace(1e-9, 1 - 1e-9, EDGE_SAMPLES)
-    x, y = (
-        part.ravel()
-        for part in np.meshgrid(side[:: EDGE_SAMPLES // GRID_SAMPLES], side[:: EDGE_SAMPLES // GRID_SAMPLES])
-    )
+    coarse = side[:: EDGE_SAMPLES // GRID_SAMPLES]
+    x, y = (part.ravel() for part in np.meshgrid(coarse, coarse))
     ends = np.full(EDGE_SAMPLES, side[0]), np.full(EDGE_SAMPLES, side[-1])
     x = np.concatenate([x, side, side, *ends]) * camera.width
     y = np.concatenate([y, *ends, side, side]) * camera.height

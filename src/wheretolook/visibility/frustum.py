@@ -1,10 +1,10 @@
-"""What is inside a camera's view: the exact test that every kernel and every twin decides by.
+"""What is in a camera's view: the exact test that every kernel and its plain twin decide by.
 
-A landmark is judged by its offset from the camera centre, taken in double precision and rounded to single once. A
-pinhole frustum is four planes through the centre whose normals are rounded to single once too. The sign of
-`normal . offset` is then taken in double precision, where products of single-precision numbers are exact: neither the
-order of threads nor a fused multiply-add can change it, so CUDA, CPU and NumPy agree to the last landmark. Against
-unrounded normals the border moves by less than 1e-4 pixels.
+A landmark is judged by its offset from the camera centre, computed in double precision and rounded to single precision
+once. A pinhole's frustum is four planes through the centre, whose normals are rounded to single precision once too. The
+sign of `normal . offset` is then computed in double precision, in which products of single-precision numbers are exact.
+Neither the order of threads nor a fused multiply-add can change it, so CUDA, CPU and NumPy agree on every landmark.
+Rounding the normals moves the border of the view by less than 1e-4 pixels.
 """
 
 from __future__ import annotations
@@ -21,23 +21,19 @@ from wheretolook.geometry.colmap_camera import Camera, ColmapCamera
 from wheretolook.geometry.poses import Float, split_poses
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.warp import start_warp
-from wheretolook.visibility.frustum_kernel import collect_kernel
+from wheretolook.visibility.frustum_kernel import Views, collect_kernel
 
-MIN_DEPTH_M = 2.0**-10
-"""A pinhole does not see what is nearer to its image plane than this (about a millimetre), or behind it."""
+MIN_DEPTH_M = 2.0**-10  # a pinhole sees nothing nearer to its image plane than this (about a millimetre), or behind it
+
+SINGLE_ROUNDING = 5e-7  # bound on the relative error of a product of two vectors of three float32: 3 * 2^-24, and room
 
 
 @dataclass(frozen=True, eq=False)
-class VisibleSets:
-    """Sets of landmarks, one for each location or view, as rows of a sparse mask.
+class LandmarkSets:
+    """Sets of landmarks, one for each location or view, as rows of a sparse mask."""
 
-    Attributes:
-        starts: (L + 1,) int32; row l is `indices[starts[l]:starts[l + 1]]`.
-        indices: landmark rows, int32, ascending within a row.
-    """
-
-    starts: NDArray[np.int32]
-    indices: NDArray[np.int32]
+    starts: NDArray[np.int32]  # (L + 1,); set l is `indices[starts[l]:starts[l + 1]]`
+    indices: NDArray[np.int32]  # landmark rows, ascending within a set
 
     def __len__(self) -> int:
         return len(self.starts) - 1
@@ -47,7 +43,7 @@ class VisibleSets:
         return self.indices[self.starts[row] : self.starts[row + 1]]
 
     @classmethod
-    def from_mask(cls, mask: NDArray[np.bool_]) -> VisibleSets:
+    def from_mask(cls, mask: NDArray[np.bool_]) -> LandmarkSets:
         """From a dense mask (L, N).
 
         Raises:
@@ -61,16 +57,12 @@ class VisibleSets:
 def _starts(lengths: NDArray[np.integer[Any]]) -> NDArray[np.int32]:
     ends = np.cumsum(lengths, dtype=np.int64)
     if len(ends) and ends[-1] > np.iinfo(np.int32).max:
-        raise ConfigError("too many visible landmarks for one call", value=int(ends[-1]), fix="Ask for fewer at once.")
+        raise ConfigError("too many landmarks for one call", value=int(ends[-1]), fix="Ask for fewer views at once.")
     return np.concatenate([[0], ends]).astype(np.int32)
 
 
 def frustum_sides(camera: PinholeCamera, rotations: ArrayLike) -> NDArray[np.float32]:
-    """Planes through the camera centre that bound the view.
-
-    Args:
-        camera: pinhole intrinsics.
-        rotations: (D, 3, 3) cam_from_world.
+    """Planes through the camera centre that bound the view, for cam_from_world rotations (D, 3, 3).
 
     Returns:
         (D, 5, 3) vectors in the world: inward normals of the left, right, top and bottom side, and the viewing
@@ -79,24 +71,29 @@ def frustum_sides(camera: PinholeCamera, rotations: ArrayLike) -> NDArray[np.flo
     """
     right, down, forward = np.moveaxis(np.asarray(rotations, dtype=np.float64), -2, 0)
     f, cx, cy = camera.focal_px, camera.cx, camera.cy
-    sides = [f * right + cx * forward, (camera.width - cx) * forward - f * right,
-             f * down + cy * forward, (camera.height - cy) * forward - f * down, forward]  # fmt: skip
-    return np.stack(sides, axis=-2).astype(np.float32)
+    horizontal = [f * right + cx * forward, (camera.width - cx) * forward - f * right]
+    vertical = [f * down + cy * forward, (camera.height - cy) * forward - f * down]
+    return np.stack([*horizontal, *vertical, forward], axis=-2).astype(np.float32)
+
+
+def sides_rounding(sides: NDArray[np.float32]) -> float:
+    """Bound on the relative rounding error of single-precision products with the normals of `frustum_sides`."""
+    return float(SINGLE_ROUNDING * np.linalg.norm(sides[:, :4], axis=-1).max(initial=0))
 
 
 def near_radius_m(camera: PinholeCamera) -> float:
-    """Farther from the camera centre than this, whatever lies inside the four sides exceeds `MIN_DEPTH_M` too."""
+    """Distance from the camera centre beyond which whatever lies within the four sides exceeds `MIN_DEPTH_M` too."""
     return float(1.001 * MIN_DEPTH_M * np.sqrt(1 + (camera.cx**2 + camera.cy**2) / camera.focal_px**2))
 
 
 def offsets_from(location: ArrayLike, points: ArrayLike) -> NDArray[np.float32]:
-    """Offsets (N, 3) of points (N, 3) m from a location (3,) m, as they are judged."""
+    """Offsets (N, 3) of points (N, 3) from a location (3,), in metres, rounded to single precision once."""
     with np.errstate(over="ignore"):
         return (np.asarray(points, dtype=np.float64) - np.asarray(location, dtype=np.float64)).astype(np.float32)
 
 
 def in_view(camera: Camera, rotations: ArrayLike, offsets: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """The definition, in NumPy: which offsets each orientation of a camera sees.
+    """Which offsets each orientation of a camera sees: the definition, in NumPy.
 
     Args:
         camera: pinhole, or any COLMAP model.
@@ -108,7 +105,8 @@ def in_view(camera: Camera, rotations: ArrayLike, offsets: NDArray[np.float32]) 
     """
     with np.errstate(invalid="ignore"):
         if isinstance(camera, ColmapCamera):
-            return np.stack([camera.sees(rotate(one, offsets)) for one in np.asarray(rotations, dtype=np.float32)])
+            single = np.asarray(rotations, dtype=np.float32)
+            return np.stack([camera.sees(rotate(rotation, offsets)) for rotation in single])
         seen = np.empty((len(np.asarray(rotations)), len(offsets)), dtype=np.bool_)
         finite, columns = np.isfinite(offsets).all(-1), np.ascontiguousarray(offsets.T)
         for row, sides in enumerate(frustum_sides(camera, rotations)):
@@ -119,35 +117,35 @@ def in_view(camera: Camera, rotations: ArrayLike, offsets: NDArray[np.float32]) 
 
 
 def rotate(rotations: NDArray[np.float32], offsets: NDArray[np.float32]) -> Float:
-    """Offsets (..., 3) turned by rotations (..., 3, 3), the products exact in float64; (..., 3)."""
+    """Offsets (..., 3) rotated by (..., 3, 3), with products exact in float64; (..., 3)."""
     return _dot(np.moveaxis(rotations, -1, 0), np.moveaxis(offsets, -1, 0)[..., None])
 
 
 def _dot(a: NDArray[np.float32], b: NDArray[np.float32]) -> Float:
-    """Products over the first axis in the order of `dot` in the kernels."""
+    """Dot products over the first axis, summed in the order of `dot` in the kernels."""
     x, y, z = (np.asarray(part, dtype=np.float64) for part in a)
     return x * b[0] + y * b[1] + z * b[2]
 
 
 def pixels_of(camera: Camera, points_cam: Float) -> Float:
-    """Pixel coordinates (..., 2) of visible points (..., 3) of the camera frame, rounded as the kernels round them."""
+    """Pixels (..., 2) of points (..., 3) in view, in the camera frame, rounded as the kernels round them."""
     if isinstance(camera, ColmapCamera):
         return camera.project(points_cam)
     return camera.focal_px * (points_cam[..., :2] / points_cam[..., 2:]) + (camera.cx, camera.cy)
 
 
-def visible_landmarks(
+def landmarks_in_view(
     camera: Camera,
     cam_from_world: Float,
     points: Float,
-    unoccluded: VisibleSets,
+    unoccluded: LandmarkSets,
     location_rows: NDArray[np.integer[Any]],
     device: str = "cpu",
-) -> VisibleSets:
+) -> LandmarkSets:
     """The landmarks each view sees (paper, Sec. 3.2).
 
     Args:
-        camera: pinhole, or any COLMAP model.
+        camera: pinhole, or any COLMAP model (in NumPy on the CPU).
         cam_from_world: (B, 3, 4).
         points: (N, 3) landmarks in metres.
         unoccluded: landmarks each of L locations has a free line of sight to.
@@ -161,67 +159,82 @@ def visible_landmarks(
         ConfigError: there are more entries than an int32 counts; ask for fewer views.
     """
     if isinstance(camera, ColmapCamera):
-        return visible_landmarks_plain(camera, cam_from_world, points, unoccluded, location_rows)
+        return landmarks_in_view_plain(camera, cam_from_world, points, unoccluded, location_rows)
     there = points_on_device(points, device)
-    starts, indices = visible_on_device(camera, cam_from_world, there, unoccluded, location_rows, device)
-    return VisibleSets(starts, indices.numpy())
+    starts, indices = in_view_on_device(camera, cam_from_world, there, unoccluded, location_rows, device)
+    return LandmarkSets(starts, indices.numpy())
 
 
 def points_on_device(points: Float, device: str = "cpu") -> Any:
-    """Points (N, 3) m as the Warp array that `visible_on_device` takes, to be used again."""
+    """Points (N, 3) m as a Warp array of vec3d, which several calls of `in_view_on_device` can use."""
     return wp.array(np.asarray(points, dtype=np.float64), dtype=wp.vec3d, device=start_warp(device))
 
 
-def visible_on_device(
+def sets_on_device(sets: LandmarkSets, device: str) -> tuple[Any, Any]:
+    """The starts and indices of sets of landmarks, as Warp arrays of int32."""
+    return wp.array(sets.starts, dtype=wp.int32, device=device), wp.array(sets.indices, dtype=wp.int32, device=device)
+
+
+def views_on_device(
     camera: PinholeCamera,
     cam_from_world: Float,
     points: Any,
-    unoccluded: VisibleSets,
+    unoccluded: tuple[Any, Any],
+    location_rows: NDArray[np.integer[Any]],
+    device: str,
+) -> Any:
+    """`Views` as the kernels take them, of poses (B, 3, 4); points and sets are already on the device."""
+    rotations, centers = split_poses(cam_from_world)
+    views: Any = Views()
+    views.sides = wp.array(frustum_sides(camera, rotations), dtype=wp.vec3, device=device)
+    views.centers = wp.array(centers, dtype=wp.vec3d, device=device)
+    views.location_rows = wp.array(np.asarray(location_rows, dtype=np.int32), dtype=wp.int32, device=device)
+    views.points, views.min_depth = points, MIN_DEPTH_M
+    views.starts, views.unoccluded = unoccluded
+    return views
+
+
+def in_view_on_device(
+    camera: PinholeCamera,
+    cam_from_world: Float,
+    points: Any,
+    unoccluded: LandmarkSets,
     location_rows: NDArray[np.integer[Any]],
     device: str = "cpu",
 ) -> tuple[NDArray[np.int32], Any]:
-    """What `visible_landmarks` gives for a pinhole: the starts (B + 1,), and the indices as a Warp array of int32.
+    """What `landmarks_in_view` gives for a pinhole: the starts (B + 1,), and the indices as a Warp array of int32.
 
     The points are those of `points_on_device`.
     """
     device = start_warp(device)
-    rotations, centers = split_poses(cam_from_world)
-    inputs: list[Any] = [
-        wp.array(frustum_sides(camera, rotations), dtype=wp.vec3, device=device),
-        wp.array(centers, dtype=wp.vec3d, device=device),
-        wp.array(np.asarray(location_rows, dtype=np.int32), dtype=wp.int32, device=device),
-        points,
-        wp.array(unoccluded.starts, dtype=wp.int32, device=device),
-        wp.array(unoccluded.indices, dtype=wp.int32, device=device),
-        wp.float64(MIN_DEPTH_M),
-    ]
-    lengths: Any = wp.empty(len(centers), dtype=wp.int32, device=device)
-    if len(centers) == 1:  # no need to count before there is room
-        starts_there: Any = wp.zeros(1, dtype=wp.int32, device=device)
-        indices: Any = wp.empty(len(unoccluded[int(location_rows[0])]), dtype=wp.int32, device=device)
-        wp.launch(collect_kernel, 1, [*inputs, True, starts_there], [lengths, indices], device=device)
-        starts = _starts(lengths.numpy())
-        return starts, indices[: int(starts[-1])]
-    nothing: Any = wp.empty(0, dtype=wp.int32, device=device)
-    wp.launch(collect_kernel, len(centers), [*inputs, False, nothing], [lengths, nothing], device=device)
+    rows = np.asarray(location_rows)
+    views = views_on_device(camera, cam_from_world, points, sets_on_device(unoccluded, device), rows, device)
+    lengths: Any = wp.empty(len(rows), dtype=wp.int32, device=device)
+    # A single view is collected at once, with room for all its candidates; several are counted first.
+    once = len(rows) == 1
+    first: Any = wp.zeros(1 if once else 0, dtype=wp.int32, device=device)
+    indices: Any = wp.empty(len(unoccluded[int(rows[0])]) if once else 0, dtype=wp.int32, device=device)
+    wp.launch(collect_kernel, len(rows), [views, once, first], [lengths, indices], device=device)
     starts = _starts(lengths.numpy())
+    if once:
+        return starts, indices[: int(starts[-1])]
     indices = wp.empty(int(starts[-1]), dtype=wp.int32, device=device)
-    starts_there = wp.array(starts, dtype=wp.int32, device=device)
-    wp.launch(collect_kernel, len(centers), [*inputs, True, starts_there], [lengths, indices], device=device)
+    first = wp.array(starts, dtype=wp.int32, device=device)
+    wp.launch(collect_kernel, len(rows), [views, True, first], [lengths, indices], device=device)
     return starts, indices
 
 
-def visible_landmarks_plain(
+def landmarks_in_view_plain(
     camera: Camera,
     cam_from_world: Float,
     points: Float,
-    unoccluded: VisibleSets,
+    unoccluded: LandmarkSets,
     location_rows: NDArray[np.integer[Any]],
-) -> VisibleSets:
-    """What `visible_landmarks` computes, in NumPy."""
+) -> LandmarkSets:
+    """What `landmarks_in_view` computes, in NumPy."""
     sets = []
     for rotation, center, row in zip(*split_poses(cam_from_world), location_rows, strict=True):
         candidates = unoccluded[row]
         sets.append(candidates[in_view(camera, rotation[None], offsets_from(center, points[candidates]))[0]])
     lengths = np.array([len(rows) for rows in sets], dtype=np.int64)
-    return VisibleSets(_starts(lengths), np.concatenate([np.empty(0, np.int32), *sets]))
+    return LandmarkSets(_starts(lengths), np.concatenate([np.empty(0, np.int32), *sets]))

@@ -11,6 +11,19 @@ from __future__ import annotations
 import warp as wp
 
 
+@wp.struct
+class Views:
+    """B views of a pinhole camera, and the landmarks that are unoccluded from their locations."""
+
+    sides: wp.array2d[wp.vec3]  # (B, 5), see `frustum_sides`
+    centers: wp.array[wp.vec3d]  # (B,) camera centres
+    location_rows: wp.array[wp.int32]  # (B,) which of the L locations each view is at
+    points: wp.array[wp.vec3d]  # (N,) landmarks
+    starts: wp.array[wp.int32]  # (L + 1,) first entry of each location in `unoccluded`
+    unoccluded: wp.array[wp.int32]  # rows of `points`
+    min_depth: wp.float64  # metres
+
+
 @wp.func
 def dot(a: wp.vec3, b: wp.vec3) -> wp.float64:
     """Products of float32 are exact in float64, so that fusing multiply and add changes nothing."""
@@ -27,31 +40,45 @@ def offset_from(location: wp.vec3d, point: wp.vec3d) -> wp.vec3:
 
 
 @wp.func
+def entry_offset(views: Views, view: wp.int32, entry: wp.int32) -> wp.vec3:
+    """Offset from a view's camera centre to the landmark of an entry of `unoccluded`."""
+    return offset_from(views.centers[view], views.points[views.unoccluded[entry]])
+
+
+@wp.func
 def inside_sides(left: wp.vec3, right: wp.vec3, top: wp.vec3, bottom: wp.vec3, offset: wp.vec3) -> wp.bool:
     zero = wp.float64(0.0)
-    return (
-        dot(left, offset) >= zero
-        and dot(right, offset) > zero
-        and dot(top, offset) >= zero
-        and dot(bottom, offset) > zero
-    )
+    inside_x = dot(left, offset) >= zero and dot(right, offset) > zero
+    return inside_x and dot(top, offset) >= zero and dot(bottom, offset) > zero
 
 
 @wp.func
 def in_view(sides: wp.array2d[wp.vec3], row: wp.int32, offset: wp.vec3, min_depth: wp.float64) -> wp.bool:
     if not wp.isfinite(offset):
         return False
-    return dot(sides[row, 4], offset) > min_depth and inside_sides(
-        sides[row, 0], sides[row, 1], sides[row, 2], sides[row, 3], offset
-    )
+    inside = inside_sides(sides[row, 0], sides[row, 1], sides[row, 2], sides[row, 3], offset)
+    return inside and dot(sides[row, 4], offset) > min_depth
+
+
+@wp.func
+def least_product(left: wp.vec3, right: wp.vec3, top: wp.vec3, bottom: wp.vec3, offset: wp.vec3) -> wp.float32:
+    """Least product of an offset with the normals of the four sides, in single precision."""
+    across = wp.min(wp.dot(left, offset), wp.dot(right, offset))
+    return wp.min(across, wp.min(wp.dot(top, offset), wp.dot(bottom, offset)))
+
+
+@wp.func
+def rounding_error(offset: wp.vec3, rounding: wp.float32) -> wp.float32:
+    """Bound on the rounding error of `least_product`."""
+    return rounding * (wp.abs(offset[0]) + wp.abs(offset[1]) + wp.abs(offset[2]))
 
 
 @wp.func
 def pixel_of(axes: wp.mat33, offset: wp.vec3, focal: wp.float64, cx: wp.float64, cy: wp.float64) -> wp.vec2d:
     """Pixel coordinates; `axes` are the camera's in the world, the rows of cam_from_world.
 
-    Only in modules that do not fuse multiply and add: fused, it rounds once where NumPy rounds twice, which moves a
-    landmark on the edge of a pixel or a bin to the next.
+    Only for modules that do not fuse multiply and add: a fused operation rounds once where NumPy rounds twice, which
+    can move a landmark on the edge of a pixel or a bin to the next one.
     """
     depth = dot(axes[2], offset)
     return wp.vec2d(focal * (dot(axes[0], offset) / depth) + cx, focal * (dot(axes[1], offset) / depth) + cy)
@@ -59,25 +86,19 @@ def pixel_of(axes: wp.mat33, offset: wp.vec3, focal: wp.float64, cx: wp.float64,
 
 @wp.kernel
 def collect_kernel(
-    sides: wp.array2d[wp.vec3],
-    centers: wp.array[wp.vec3d],
-    location_rows: wp.array[wp.int32],
-    points: wp.array[wp.vec3d],
-    starts: wp.array[wp.int32],
-    candidates: wp.array[wp.int32],
-    min_depth: wp.float64,
+    views: Views,
     write: wp.bool,
     out_starts: wp.array[wp.int32],
     lengths: wp.array[wp.int32],
     indices: wp.array[wp.int32],
 ):
+    """Count the landmarks that each view sees and, with `write`, list them from `out_starts` on."""
     view = wp.tid()
-    location = location_rows[view]
+    location = views.location_rows[view]
     count = wp.int32(0)
-    for entry in range(starts[location], starts[location + 1]):
-        landmark = candidates[entry]
-        if in_view(sides, view, offset_from(centers[view], points[landmark]), min_depth):
+    for entry in range(views.starts[location], views.starts[location + 1]):
+        if in_view(views.sides, view, entry_offset(views, view, entry), views.min_depth):
             if write:
-                indices[out_starts[view] + count] = landmark
+                indices[out_starts[view] + count] = views.unoccluded[entry]
             count += 1
     lengths[view] = count

@@ -11,29 +11,27 @@ from scipy.spatial import ConvexHull, cKDTree
 
 from wheretolook.geometry.poses import Float
 from wheretolook.utils.errors import ConfigError, MapError, SceneError
+from wheretolook.visibility.config import DEFAULT_RADIUS
 from wheretolook.visibility.occlusion import OcclusionModel
 
-DEFAULT_RADIUS = 50.0
-"""Greatest mean F1 against the meshes of six mapped scenes (tests/benchmarks/bench_hidden_points.py). It is flat: from
-30 to 100 the mean stays within 0.01. Single scenes are best served by 5 to 100, mostly the larger the more open."""
 TOUCHING_M = 1e-6
 """A landmark this close to a location is in the same place, and has no direction as seen from it."""
 
-_FLAT = 1e-12  # mean square of the directions' components along an axis below which they lie across it
+_FLAT = 1e-12  # least mean square of the directions along an axis; below it, all lie in the plane across that axis
 _NO_LENGTH = 1e-12  # keeps facets through the origin, which no direction leaves by, from dividing by zero
 
 
 class HiddenPointRemoval(OcclusionModel):
     """Occlusion by hidden-point removal (Katz, Tal and Basri, "Direct Visibility of Point Sets", SIGGRAPH 2007).
 
-    Seen from a location, each landmark at distance r is flipped along its line of sight to the distance 2 R - r, so
-    that the near ones come to lie outside. The landmarks on the convex hull of the flipped ones and the location are
-    those with a free line of sight. One hull serves all directions at the location.
+    A landmark at distance r from a location is moved along its line of sight to the distance 2 R - r, which puts near
+    landmarks outside of far ones. The landmarks on the convex hull of the moved ones and the location are those with a
+    free line of sight. One hull serves all directions at the location.
 
-    The larger R, the nearer to a sphere the flipped landmarks lie and the more of them are found free: a small R loses
-    landmarks on surfaces seen at a slant, a large one sees through surfaces with few landmarks on them. Turning map and
-    locations changes nothing, nor does scaling them with the margin, nor the order of the landmarks. But R, and so the
-    answer, depends on the farthest landmark, also if that is a wrong one far outside the scene.
+    The larger R, the nearer to a sphere the moved landmarks lie and the more of them are found free: a small R loses
+    landmarks on surfaces seen at a slant, a large one sees through surfaces with few landmarks on them. The result does
+    not depend on the map's orientation, scale (if the margin is scaled with it) or order of landmarks. But R, and so
+    the result, depends on the farthest landmark, even if that is an outlier far outside the scene.
 
     Args:
         radius: R as a multiple of the distance from the location to the farthest landmark, at least 1.
@@ -44,8 +42,7 @@ class HiddenPointRemoval(OcclusionModel):
             process may use. A hull takes about 0.4 KB a landmark while it is made.
 
     Raises:
-        ConfigError: the radius is below 1 or not finite, the margin negative or not finite, or the number of threads
-            negative.
+        ConfigError: a value is out of range.
     """
 
     name = "hidden-points"
@@ -54,11 +51,8 @@ class HiddenPointRemoval(OcclusionModel):
 
     def __init__(self, radius: float = DEFAULT_RADIUS, margin_m: float = 0.05, threads: int = 0) -> None:
         if not 1 <= radius < np.inf:
-            raise ConfigError(
-                "the radius of hidden-point removal must be at least 1, in distances of the farthest landmark",
-                value=radius,
-                fix=f"The default is {DEFAULT_RADIUS:g}.",
-            )
+            problem = "the radius of hidden-point removal must be at least 1, in distances of the farthest landmark"
+            raise ConfigError(problem, value=radius, fix=f"The default is {DEFAULT_RADIUS:g}.")
         if not 0 <= margin_m < np.inf:
             raise ConfigError("the margin must be a distance of at least 0 m", value=margin_m)
         if threads < 0:
@@ -68,12 +62,7 @@ class HiddenPointRemoval(OcclusionModel):
     def unoccluded(self, locations: Float, points: Float) -> NDArray[np.bool_]:
         """(L, N), True where no surface that the landmarks suggest stands between location and landmark.
 
-        Landmarks in exactly the same place get the same answer.
-
-        Raises:
-            MapError: there are no landmarks, or one is not finite.
-            SceneError: a location is not finite, or a landmark lies at it, so that a camera there would be inside
-                geometry. Other locations inside geometry cannot be told from free ones without a mesh.
+        Landmarks in exactly the same place get the same answer. Raises what `check` raises.
         """
         at, landmarks = np.asarray(locations, dtype=np.float64), np.asarray(points, dtype=np.float64)
         self.check(at, landmarks)
@@ -93,18 +82,20 @@ class HiddenPointRemoval(OcclusionModel):
 
         Raises:
             MapError: there are no landmarks, or one is not finite.
-            SceneError: a location is not finite, or a landmark lies at it.
+            SceneError: a location is not finite, or a landmark lies at it, so that a camera there would be inside
+                geometry. Other locations inside geometry cannot be told from free ones without a mesh.
         """
         super().check(locations, points)
-        _check_landmarks(points)
+        bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+        if len(bad):
+            problem = f"{len(bad)} of {len(points)} landmarks are not finite, the first in row {bad[0]}"
+            raise MapError(problem, value=tuple(points[bad[0]].tolist()), fix="Triangulate the model again.")
         distance, _ = cKDTree(points).query(locations, distance_upper_bound=2 * TOUCHING_M)
         touching = distance <= TOUCHING_M
         if touching.any():
-            raise SceneError(
-                "a landmark lies at the location: it is on a surface, or inside geometry",
-                value=tuple(np.asarray(locations)[touching][0].tolist()),
-                fix="Choose locations in free space.",
-            )
+            problem = "a landmark lies at the location: it is on a surface, or inside geometry"
+            at = tuple(np.asarray(locations)[touching][0].tolist())
+            raise SceneError(problem, value=at, fix="Choose locations in free space.")
 
     def _free_from(self, location: Float, places: Float) -> NDArray[np.bool_]:
         """Which of the distinct places (N, 3) are free from a location (3,); (N,)."""
@@ -112,10 +103,10 @@ class HiddenPointRemoval(OcclusionModel):
         distance = np.linalg.norm(lines, axis=1)
         # in units of 2 R, so that the numbers are near 1 whatever the scale of the scene
         unit_m = 2 * self.radius * distance.max()
-        return seen_by_hull(lines / distance[:, None], 1 - distance / unit_m, self.margin_m / unit_m)
+        return on_hull(lines / distance[:, None], 1 - distance / unit_m, self.margin_m / unit_m)
 
 
-def seen_by_hull(directions: Float, lengths: Float, margin: float = 0.0) -> NDArray[np.bool_]:
+def on_hull(directions: Float, lengths: Float, margin: float = 0.0) -> NDArray[np.bool_]:
     """Which points lie on the convex hull of all of them and the origin, or less than a margin inside.
 
     Args:
@@ -128,21 +119,19 @@ def seen_by_hull(directions: Float, lengths: Float, margin: float = 0.0) -> NDAr
     """
     points = directions * lengths[:, None]
     hull = ConvexHull(np.concatenate([points, np.zeros((1, 3)), _missing_axes(directions)]))
-    seen = np.zeros(len(hull.points), dtype=bool)
-    seen[hull.vertices] = True
-    seen = seen[: len(points)]
+    on = np.isin(np.arange(len(points)), hull.vertices)
     if margin > 0:
-        below = np.flatnonzero(~seen)
-        seen[below] = hull_length(hull, directions[below]) - lengths[below] <= margin
-    return seen
+        inner = np.flatnonzero(~on)
+        on[inner] = hull_length(hull, directions[inner]) - lengths[inner] <= margin
+    return on
 
 
 def hull_length(hull: ConvexHull, directions: Float) -> Float:
     """Distance from the origin to where each direction leaves a convex hull that holds the origin.
 
-    A facet's plane n x = d is met along u at d / (n u), and the hull's boundary where that is least, that is, at the
-    facet with the greatest u (n / d). Climbing from facet to better neighbouring facet ends there, as it does in the
-    simplex method, since the n / d are the corners of a convex polyhedron, the hull's dual.
+    Along u, a facet's plane n x = d is met at d / (n u), and the hull's boundary at the least of these, that is, at the
+    facet with the greatest u (n / d). The n / d are the corners of a convex polyhedron, the hull's dual. So moving from
+    facet to better neighbouring facet ends at the best one, as in the simplex method.
 
     Args:
         hull: in three dimensions.
@@ -169,20 +158,10 @@ def hull_length(hull: ConvexHull, directions: Float) -> Float:
 
 
 def _missing_axes(directions: Float) -> Float:
-    """Unit vectors, each with its opposite, across the plane or the line that all directions (N, 3) lie in.
+    """Unit vectors, each with its opposite, across the plane or the line that all directions (N, 3) lie in, if any.
 
-    Added to the points they make a hull of full dimension that cuts this plane or line in the hull asked for.
+    With them the hull has three dimensions, as Qhull needs; its section with the plane or line stays the same.
     """
     spread, axes = np.linalg.eigh(directions.T @ directions)
     across = axes[:, spread <= _FLAT * len(directions)].T
     return np.concatenate([across, -across])
-
-
-def _check_landmarks(points: Float) -> None:
-    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
-    if len(bad):
-        raise MapError(
-            f"{len(bad)} of {len(points)} landmarks are not finite, the first in row {bad[0]}",
-            value=tuple(points[bad[0]].tolist()),
-            fix="Triangulate the model again.",
-        )

@@ -1,11 +1,10 @@
-"""Occlusion models: which landmarks have a free line of sight from a location (paper, Sec. 3.2).
+"""Occlusion models: which landmarks are unoccluded, that is, have a free line of sight, from a location (paper, 3.2).
 
 Occlusion depends on the location only, so one answer serves every direction a camera may look in from there.
 """
 
 from __future__ import annotations
 
-import os
 from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,16 +17,14 @@ from scipy.spatial import cKDTree
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import Float
 from wheretolook.utils.errors import ConfigError, MapError, SceneError, TableError
+from wheretolook.utils.npz_files import load_npz, save_npz
 from wheretolook.visibility.device_points import DevicePoints
 
 if TYPE_CHECKING:
     from wheretolook.rendering.raycasting import MeshRaycaster
 
-MATCH_M = 1e-4
-"""Locations closer than this are taken for the same stored location."""
-
-ON_SURFACE_M = 1e-3
-"""A location this close to a triangle is on it."""
+MATCH_M = 1e-4  # locations closer than this are taken for the same stored location
+ON_SURFACE_M = 1e-3  # a location this close to a triangle is on it
 
 
 class OcclusionModel(ABC):
@@ -38,7 +35,7 @@ class OcclusionModel(ABC):
     Attributes:
         name: of the model, as in `OcclusionConfig`.
         uses_all_cores: whether `unoccluded` occupies all cores of a CPU by itself.
-        landmarks_hide: whether landmarks hide one another, so that those added change what is seen of the others.
+        landmarks_hide: whether landmarks occlude one another, so that added landmarks change the mask of the others.
     """
 
     name: str = "custom"
@@ -50,9 +47,9 @@ class OcclusionModel(ABC):
         """Lines of sight from locations (L, 3) m to points (N, 3) m; (L, N), True where free."""
 
     def unoccluded_on_device(self, locations: Float, points: DevicePoints) -> Any | None:
-        """The same, (L, N) of bool, as a Warp array on the device of the points and in their order.
+        """`unoccluded` as a Warp array (L, N) of bool on the device of the points, in their order there.
 
-        Models that work on a device answer there; None stands for a mask that is True everywhere.
+        None stands for a mask that is True everywhere. By default computed on the host and uploaded.
         """
         mask = self.unoccluded(locations, points.positions)
         return wp.array(np.ascontiguousarray(mask[:, points.order]), dtype=wp.bool, device=points.device)
@@ -73,14 +70,13 @@ class OcclusionModel(ABC):
         at = np.asarray(locations, dtype=np.float64).reshape(-1, 3)
         finite = np.isfinite(at).all(axis=-1)
         if not finite.all():
-            value = tuple(at[~finite][0].tolist())
-            raise SceneError("a location is not finite", value=value, fix="Give locations in metres.")
+            first = tuple(at[~finite][0].tolist())
+            raise SceneError("a location is not finite", value=first, fix="Give locations in metres.")
         inside = self.inside_geometry(at)
         if inside.any():
-            raise SceneError(
-                "this location lies inside geometry", value=tuple(np.round(at[inside][0], 3).tolist()),
-                fix="Give locations in free space, as `FreeSpace.is_free` finds them.",
-            )  # fmt: skip
+            first = tuple(np.round(at[inside][0], 3).tolist())
+            fix = "Give locations in free space, as `FreeSpace.is_free` finds them."
+            raise SceneError("this location lies inside geometry", value=first, fix=fix)
 
 
 class NoOcclusion(OcclusionModel):
@@ -93,7 +89,7 @@ class NoOcclusion(OcclusionModel):
         return np.ones((len(locations), len(points)), dtype=bool)
 
     def unoccluded_on_device(self, locations: Float, points: DevicePoints) -> None:
-        """None: nothing is hidden."""
+        """None: every line of sight is free."""
 
 
 class MeshOcclusion(OcclusionModel):
@@ -102,8 +98,8 @@ class MeshOcclusion(OcclusionModel):
     Args:
         raycaster: the mesh.
         margin_m: a surface this close in front of a landmark is the landmark's own.
-        two_sided: whether the backs of triangles are surfaces too. If not, a location that sees mostly backs lies
-            inside geometry (`FreeSpace` finds out which it is).
+        two_sided: whether the backs of triangles are surfaces too, which `FreeSpace.two_sided` finds out. If not, a
+            location from which mostly backs are seen lies inside geometry.
 
     Raises:
         ConfigError: the margin is negative or not finite.
@@ -121,13 +117,13 @@ class MeshOcclusion(OcclusionModel):
         return ~self.raycaster.occluded(locations, points, margin_m=self.margin_m)
 
     def unoccluded_on_device(self, locations: Float, points: DevicePoints) -> Any | None:
-        """The same on the raycaster's device."""
+        """As `unoccluded`, on the raycaster's device."""
         if points.device != self.raycaster.device:
             return super().unoccluded_on_device(locations, points)
         return self.raycaster.unoccluded_on_device(locations, points.single, self.margin_m)
 
     def inside_geometry(self, locations: Float) -> NDArray[np.bool_]:
-        """Whether locations (L, 3) m lie on a surface or, in a one-sided mesh, see mostly backs of triangles; (L,)."""
+        """Whether locations (L, 3) m are on a surface or, in a one-sided mesh, surrounded mostly by backs; (L,)."""
         at = np.asarray(locations, dtype=np.float64).reshape(-1, 3)
         inside = self.raycaster.distance_to_surface(at, ON_SURFACE_M) <= ON_SURFACE_M
         if not self.two_sided:
@@ -144,12 +140,12 @@ class MeshOcclusion(OcclusionModel):
 
 
 class StoredOcclusion(OcclusionModel):
-    """Occlusion computed once for the locations of a dataset and read back, so that no mesh is needed any more.
+    """Occlusion computed once for the locations of a dataset and stored, so that the mesh is no longer needed.
 
     Args:
         locations: (L, 3) metres.
-        packed: (L, ceil(N / 8)) uint8, bits as `numpy.packbits` packs them: set where the line of sight is free.
-            Columns follow the map's landmarks.
+        packed: (L, ceil(N / 8)) uint8, the mask as `numpy.packbits` packs it: a bit is set where the line of sight is
+            free. Columns are in the order of the map's landmarks.
         n_landmarks: N.
         model: name of the occlusion model it was computed with.
     """
@@ -178,18 +174,13 @@ class StoredOcclusion(OcclusionModel):
             TableError: a location was not stored, or the mask belongs to a map with another number of landmarks.
         """
         if len(points) != self.n_landmarks:
-            raise TableError(
-                f"stored occlusion is of {self.n_landmarks} landmarks, the map has {len(points)}",
-                fix="Run the sample stage again: the map has changed since.",
-            )
+            problem = f"stored occlusion is of {self.n_landmarks} landmarks, the map has {len(points)}"
+            raise TableError(problem, fix="Run the sample stage again: the map has changed since.")
         distance, row = self._tree.query(np.asarray(locations), distance_upper_bound=MATCH_M)
         if not np.all(np.isfinite(distance)):
-            unknown = np.asarray(locations)[~np.isfinite(distance)][0]
-            raise TableError(
-                "no stored occlusion for this location",
-                value=tuple(np.round(unknown, 3).tolist()),
-                fix="Use a mesh for free locations, or sample this location first.",
-            )
+            unknown = tuple(np.round(np.asarray(locations)[~np.isfinite(distance)][0], 3).tolist())
+            fix = "Use a mesh for free locations, or sample this location first."
+            raise TableError("no stored occlusion for this location", value=unknown, fix=fix)
         return self._unpack(row)
 
     def _unpack(self, rows: NDArray[np.integer[Any]] | slice) -> NDArray[np.bool_]:
@@ -197,12 +188,8 @@ class StoredOcclusion(OcclusionModel):
 
     def save(self, path: Path) -> None:
         """Write locations and the bit-packed mask as a compressed NPZ, atomically."""
-        partial = path.with_name(path.name + ".partial")
-        with open(partial, "wb") as file:
-            np.savez_compressed(
-                file, locations=self.locations, mask=self.packed, n_landmarks=self.n_landmarks, model=self.name
-            )
-        os.replace(partial, path)
+        about = {"n_landmarks": np.array(self.n_landmarks), "model": np.array(self.name)}
+        save_npz(path, {"locations": self.locations, "mask": self.packed, **about}, compress=True)
 
     @classmethod
     def load(cls, path: Path) -> StoredOcclusion:
@@ -212,10 +199,8 @@ class StoredOcclusion(OcclusionModel):
             TableError: the file is missing or damaged.
         """
         try:
-            with np.load(path) as data:
-                model = str(data["model"]) if "model" in data else "mesh"
-                return cls(data["locations"], data["mask"], int(data["n_landmarks"]), model)
-        except Exception as error:  # a damaged zip raises many kinds of errors
-            raise TableError(
-                f"cannot read stored occlusion: {error}", path=path, fix="Run the sample stage again."
-            ) from error
+            data = load_npz(path)
+            return cls(data["locations"], data["mask"], int(data["n_landmarks"]), str(data.get("model", "mesh")))
+        except (ValueError, KeyError, TypeError) as error:
+            fix = "Run the sample stage again."
+            raise TableError(f"cannot read stored occlusion: {error}", path=path, fix=fix) from error

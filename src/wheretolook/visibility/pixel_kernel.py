@@ -31,7 +31,7 @@ def pixel_number(
 
 @wp.func
 def mark(bits: wp.array2d[wp.uint32], view: wp.int32, pixel: wp.int32) -> wp.int32:
-    """1 if nothing was at this pixel yet."""
+    """Mark a pixel of a view as taken. Returns 1 if it was not yet, else 0."""
     word = pixel >> 5
     bit = wp.uint32(1) << wp.uint32(pixel & 31)
     before = wp.atomic_or(bits, view, word, bit)
@@ -54,7 +54,7 @@ def count_pixels_kernel(
     bits: wp.array2d[wp.uint32],
     counts: wp.array2d[wp.int32],
 ):
-    """As `count_kernel`, but a landmark counts only if it is the first to reach its pixel."""
+    """As `count_kernel`, but a landmark counts only if no other was counted at its pixel."""
     view, lane = wp.tid()
     location = (first + view) / axes.shape[0]
     orientation = first + view - location * axes.shape[0]

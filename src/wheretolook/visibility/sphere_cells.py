@@ -1,11 +1,11 @@
 """Cells of the sphere of directions, and which of them lie inside, outside or on the border of each view.
 
-Whether a direction is in view does not depend on the location. So the sphere is cut into cells once, and every
-orientation's cells are sorted into those wholly in view, whose landmarks count without a test, those wholly out of
+Whether a direction is in view does not depend on the location. So the sphere is cut into cells once, and for every
+orientation the cells are sorted into those wholly in view, whose landmarks count without a test, those wholly out of
 view, and those on the border, whose landmarks are tested one by one: a few per cent of all.
 
 The cells are the squares of an octahedral map. Within a face of the octahedron a cell is the cone over a planar
-quadrilateral, so that a plane through the centre has it on one side if it has its corners there.
+quadrilateral. So it lies on one side of a plane through the centre if its corners do.
 """
 
 from __future__ import annotations
@@ -26,68 +26,54 @@ from wheretolook.visibility.sphere_cells_kernel import (
     INSIDE,
     classify_field_kernel,
     classify_pinhole_kernel,
-    count_runs_kernel,
-    write_runs_kernel,
+    runs_kernel,
 )
 
-ROUNDING = 1e-5
-"""A cell's corners must be this far (relative) from a plane: a landmark on its edge may be rounded out of the cell."""
+ROUNDING = 1e-5  # least relative distance of a cell's corners from a plane, since rounding may move landmarks into it
 
 
 def choose_size(n_points: int) -> int:
-    """Cells along a side of the map, a multiple of two, for about six landmarks a cell, found best on CPU and GPU."""
+    """Cells along a side of the map, an even number. About six landmarks a cell were fastest on CPU and GPU."""
     return int(np.clip(2 * round(np.sqrt(n_points / 6) / 2), 8, 256))
 
 
 @dataclass(frozen=True, eq=False)
 class CellRuns:
-    """Runs of neighbouring cells for each of D orientations, on a device.
+    """Runs of neighbouring cells for each of D orientations, on a device."""
 
-    Attributes:
-        starts: (D * size + 1,) int32; orientation d has the runs from `starts[d * size]` to `starts[(d + 1) * size]`.
-        cells: (n,) pairs of int32: the first cell of a run, and the one after its last.
-    """
-
-    starts: Any
-    cells: Any
+    starts: Any  # (D * size + 1,) int32; orientation d has the runs from `starts[d * size]` to `starts[(d + 1) * size]`
+    cells: Any  # (n,) pairs of int32: the first cell of a run, and the one after its last
 
 
 @dataclass(frozen=True, eq=False)
 class SphereCells:
-    """The cells of D orientations, on a device.
+    """The cells of D orientations, on a device."""
 
-    Attributes:
-        size: cells along a side of the map; there are size * size.
-        inside: runs of cells wholly in view.
-        border: runs of cells that are partly in view, or may be.
-    """
-
-    size: int
-    inside: CellRuns
-    border: CellRuns
+    size: int  # cells along a side of the map; there are size * size
+    inside: CellRuns  # runs of cells wholly in view
+    border: CellRuns  # runs of cells that are partly in view, or may be
 
     @classmethod
     def of(cls, camera: Camera, rotations: Float, size: int, device: str) -> SphereCells:
-        """Sort the cells, size along a side of the map, of orientations (D, 3, 3) cam_from_world on a Warp device."""
+        """Classify the cells, `size` along a side, for rotations (D, 3, 3) cam_from_world, on a Warp device."""
         shape = (len(rotations), size * size)
         classes: Any = wp.empty(shape, dtype=wp.uint8, device=device)
+
+        def upload(values: Float, dtype: Any) -> Any:
+            return wp.array(np.asarray(values, dtype=np.float32), dtype=dtype, device=device)
+
         if isinstance(camera, ColmapCamera):
             field = FieldOfView.of(camera)
             centers, radii = cell_centers(size)
-            inputs: list[Any] = [
-                wp.array(np.asarray(rotations, dtype=np.float32), dtype=wp.mat33, device=device),
-                wp.array(centers.astype(np.float32), dtype=wp.vec3, device=device),
-                wp.array(field.depth_rad, dtype=wp.float32, device=device), field.size, float(radii.max()) + ROUNDING,
-            ]  # fmt: skip
+            arrays = [upload(rotations, wp.mat33), upload(centers, wp.vec3), upload(field.depth_rad, wp.float32)]
+            inputs = [*arrays, field.size, float(radii.max()) + ROUNDING]
             wp.launch(classify_field_kernel, shape, inputs, [classes], device=device)
         else:
             edge = np.arange(size + 1) / size * 2 - 1
-            corners = octahedral_directions(edge[None, :], edge[:, None]).reshape(-1, 3).astype(np.float32)
+            corners = octahedral_directions(edge[None, :], edge[:, None]).reshape(-1, 3)
             sides = frustum_sides(camera, rotations)
-            inputs = [
-                wp.array(sides, dtype=wp.vec3, device=device), wp.array(corners, dtype=wp.vec3, device=device), size,
-                float(ROUNDING * np.linalg.norm(sides, axis=-1).max(initial=0)),
-            ]  # fmt: skip
+            margin = float(ROUNDING * np.linalg.norm(sides, axis=-1).max(initial=0))
+            inputs = [upload(sides, wp.vec3), upload(corners, wp.vec3), size, margin]
             wp.launch(classify_pinhole_kernel, shape, inputs, [classes], device=device)
         return cls(size, _runs(classes, size, INSIDE), _runs(classes, size, BORDER))
 
@@ -96,9 +82,10 @@ def _runs(classes: Any, size: int, wanted: int) -> CellRuns:
     device, rows = classes.device, (classes.shape[0], size)
     n_rows = rows[0] * rows[1]
     numbers: Any = wp.zeros(n_rows + 1, dtype=wp.int32, device=device)
-    wp.launch(count_runs_kernel, rows, [classes, size, wanted], [numbers], device=device)
+    none: list[Any] = [wp.empty(0, dtype=dtype, device=device) for dtype in (wp.int32, wp.vec2i)]
+    wp.launch(runs_kernel, rows, [classes, size, wanted, False, none[0]], [numbers, none[1]], device=device)
     starts: Any = wp.empty(n_rows + 1, dtype=wp.int32, device=device)
     wp.utils.array_scan(numbers, starts, inclusive=False)
     cells: Any = wp.empty(int(starts[n_rows:].numpy()[0]), dtype=wp.vec2i, device=device)
-    wp.launch(write_runs_kernel, rows, [classes, size, wanted, starts], [cells], device=device)
+    wp.launch(runs_kernel, rows, [classes, size, wanted, True, starts], [numbers, cells], device=device)
     return CellRuns(starts, cells)

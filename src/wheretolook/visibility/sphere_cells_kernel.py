@@ -1,4 +1,4 @@
-"""Warp functions and kernels of the cells of the sphere."""
+"""Warp functions and kernels that find the cell of a direction, and the cells inside and on the border of a view."""
 
 # mypy: ignore-errors
 # Warp's kernel language is not Python's type system.
@@ -83,28 +83,19 @@ def classify_field_kernel(
 
 
 @wp.kernel
-def count_runs_kernel(classes: wp.array2d[wp.uint8], size: wp.int32, wanted: wp.int32, numbers: wp.array[wp.int32]):
-    orientation, row = wp.tid()
-    before = wp.int32(0)
-    number = wp.int32(0)
-    for column in range(size):
-        kind = wp.int32(classes[orientation, row * size + column])
-        if kind == wanted and before != wanted:
-            number += 1
-        before = kind
-    numbers[orientation * size + row] = number
-
-
-@wp.kernel
-def write_runs_kernel(
+def runs_kernel(
     classes: wp.array2d[wp.uint8],
     size: wp.int32,
     wanted: wp.int32,
+    write: wp.bool,
     starts: wp.array[wp.int32],
+    numbers: wp.array[wp.int32],
     cells: wp.array[wp.vec2i],
 ):
+    """Count the runs of cells of a class in each row of the map and, with `write`, list them from `starts` on."""
     orientation, row = wp.tid()
-    run = starts[orientation * size + row]
+    index = orientation * size + row
+    number = wp.int32(0)
     first = wp.int32(-1)
     for column in range(size + 1):
         wanted_here = wp.bool(False)
@@ -113,6 +104,8 @@ def write_runs_kernel(
         if wanted_here and first < 0:
             first = column
         if not wanted_here and first >= 0:
-            cells[run] = wp.vec2i(row * size + first, row * size + column)
-            run += 1
+            if write:
+                cells[starts[index] + number] = wp.vec2i(row * size + first, row * size + column)
+            number += 1
             first = wp.int32(-1)
+    numbers[index] = number

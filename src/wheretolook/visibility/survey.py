@@ -1,4 +1,4 @@
-"""From a map and an occlusion model to what every location sees in every direction, in bounded memory."""
+"""Count what every location sees in every direction, from a map and an occlusion model, in bounded memory."""
 
 from __future__ import annotations
 
@@ -20,22 +20,16 @@ from wheretolook.visibility.counting_kernel import pack_kernel
 from wheretolook.visibility.device_points import DevicePoints
 from wheretolook.visibility.occlusion import OcclusionModel, StoredOcclusion
 
-CPU_BLOCK_BYTES = 1 << 24
-"""On a CPU a block of locations should fit into the cache."""
+CPU_BLOCK_BYTES = 1 << 24  # on a CPU a block of locations should fit into the cache
 
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """What L locations see in D directions.
+    """What L locations see in D directions."""
 
-    Attributes:
-        counts: (L, D) int32, landmarks in view (or distinct pixels, if so asked).
-        best: (L, K) int32, the K directions that see most: by falling count, then by rising direction.
-        occlusion: which landmarks each location has a free line of sight to; None if it was not to be kept.
-    """
-
-    counts: NDArray[np.int32]
-    best: NDArray[np.int32]
+    counts: NDArray[np.int32]  # (L, D) landmarks in view (or distinct pixels, if so asked)
+    best: NDArray[np.int32]  # (L, K) the K directions that see most: by falling count, then by rising direction
+    # which landmarks each location has a free line of sight to; None if it was not to be kept.
     occlusion: StoredOcclusion | None
 
 
@@ -55,10 +49,10 @@ def survey(
     counter: FrustumCounter | None = None,
     progress: str | None = None,
 ) -> Survey:
-    """Find the landmarks every location has a free line of sight to and count those in view (paper, Sec. 3.2).
+    """Find the landmarks that are unoccluded from every location, and count those in view (paper, Sec. 3.2).
 
-    Works through the locations in blocks, so that memory does not grow with their number (but for the result: a bit for
-    each location and landmark, if occlusion is kept).
+    Works through the locations in blocks, so that memory does not grow with their number (except for the result: a bit
+    for each location and landmark, if occlusion is kept).
 
     Args:
         camera: pinhole, or any COLMAP model.
@@ -71,15 +65,14 @@ def survey(
         keep_occlusion: whether to return the masks.
         device: "cpu" or a CUDA device.
         threads: threads on a CPU, 0 for all cores.
-        memory_bytes: bound on what the blocks in work take on the device.
-        counter: of the same camera, rotations and rule, to use again.
+        memory_bytes: bound on the memory of all blocks that are worked on at a time, on the device.
+        counter: a counter of the same camera, rotations and rule, to be used again.
         progress: text of a progress bar; None shows none.
 
     Raises:
         MapError: there are no landmarks.
-        SceneError: there are no locations, one is not finite, or lies inside geometry as far as the occlusion model can
-            tell.
-        ConfigError: a single location takes more memory than allowed, or the counter is another's.
+        SceneError: there are no locations, or what `OcclusionModel.check` refuses.
+        ConfigError: a single location takes more memory than allowed, or the counter was made for something else.
     """
     at = np.asarray(locations, dtype=np.float64).reshape(-1, 3)
     if len(at) == 0:
@@ -94,9 +87,8 @@ def survey(
     workers = 1 if on_gpu or occlusion.uses_all_cores else (threads or len(os.sched_getaffinity(0)))
     if counter is None:
         scratch = max(1, memory_bytes // (4 * workers))
-        counter = FrustumCounter(
-            camera, np.asarray(rotations), n_points, landmarks.device, distinct_pixels, scratch_bytes=scratch
-        )
+        where = landmarks.device
+        counter = FrustumCounter(camera, np.asarray(rotations), n_points, where, distinct_pixels, scratch_bytes=scratch)
     elif not counter.serves(camera, np.asarray(rotations), distinct_pixels, landmarks.device):
         raise ConfigError("the counter is of another camera, other rotations, another rule or another device")
     n_directions = len(counter.rotations)
@@ -104,10 +96,8 @@ def survey(
     per_location = counter.bytes_per_location(n_points) + n_points  # and its mask
     least = per_location + counter.fixed_bytes
     if least > memory_bytes:
-        raise ConfigError(
-            f"one location with {n_points:,} landmarks takes {least:,} bytes", value=memory_bytes,
-            fix=f"Allow at least {least} bytes.",
-        )  # fmt: skip
+        problem = f"one location with {n_points:,} landmarks takes {least:,} bytes"
+        raise ConfigError(problem, value=memory_bytes, fix=f"Allow at least {least} bytes.")
     workers = min(workers, memory_bytes // least)
     share = memory_bytes // workers - counter.fixed_bytes
     if not on_gpu and not occlusion.uses_all_cores:
@@ -138,7 +128,7 @@ def survey(
 
 
 def _each(work: Callable[[slice], int], blocks: list[slice], workers: int) -> Iterator[int]:
-    """Results of all blocks. Warp lets go of Python's lock while a kernel runs, so that threads use several cores."""
+    """Results of all blocks. Warp releases Python's lock while a kernel runs, so that threads use several cores."""
     if workers == 1:
         yield from map(work, blocks)
         return

@@ -1,9 +1,10 @@
 """Occlusion from depth images alone: fused into a truncated signed distance field (TSDF), whose surface is ray-cast.
 
 Curless and Levoy, "A Volumetric Method for Building Complex Models from Range Images", SIGGRAPH 1996, in the hashed
-blocks of voxels of Dong, Park, Yang and Kaess, "ASH", T-PAMI 2022 (Open3D's `VoxelBlockGrid`). Lines of sight are rays
-against the triangles of the zero crossing, extracted once. Casting them through the voxels instead, as six z-buffers
-around each location (`VoxelBlockGrid.ray_cast`), took 20 to 30 times as long on a CPU, and missed thin things.
+blocks of voxels of Dong, Park, Yang and Kaess, "ASH", T-PAMI 2022 (Open3D's `VoxelBlockGrid`). The triangles of the
+zero crossing are extracted once, and lines of sight are rays against them. Casting rays through the voxels instead, as
+six depth images around each location (`VoxelBlockGrid.ray_cast`), took 20 to 30 times as long on a CPU and missed thin
+things.
 """
 
 from __future__ import annotations
@@ -25,16 +26,13 @@ from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.visibility.occlusion import MeshOcclusion
 
-BLOCK_VOXELS = 8
-"""Voxels along the side of a block."""
-BYTES_PER_BLOCK = 24 * 1024
-"""Greatest memory in use for each block, from fusion to ray casting: measured on three scenes, 19 to 23 KiB."""
-MAX_BLOCKS = 1 << 20
-"""Open3D's extraction of triangles numbers four entries of each voxel by 32 bits: more blocks are refused."""
+BLOCK_VOXELS = 8  # voxels along the side of a block
+BYTES_PER_BLOCK = 24 * 1024  # peak memory for each block, from fusion to ray casting: 19 to 23 KiB on three scenes
+MAX_BLOCKS = 1 << 20  # more are refused: Open3D's extraction of triangles numbers four entries of each voxel by 32 bits
 
 _TOUCH_STRIDE = 4  # Open3D looks for blocks at every fourth pixel
-_SURVEY_IMAGES, _SURVEY_PIXELS = 100, 5000  # looked at to estimate the memory
-_SURVEY_CELL_M = 0.16  # the pixels of a survey are too far apart to count smaller blocks
+_SURVEY_IMAGES, _SURVEY_PIXELS = 100, 5000  # images, and pixels of each, from which the memory is estimated
+_SURVEY_CELL_M = 0.16  # those pixels are too far apart to count smaller blocks
 _BLOCKS_PER_CELL = 1.7  # a block is also touched by a surface that passes beside it: measured, 1.3 to 1.7
 _OUTWARD_VOXELS = 0.1  # averaging views at a slant rounds edges off by about this much
 
@@ -50,9 +48,6 @@ class TsdfConfig:
             thinner than twice this blur each other, so it should be small; below about 1.5, gaps open.
         max_depth_m: farther readings are left out, as those of most depth cameras are too noisy there.
         memory_limit_bytes: memory the fusion and its result may take; None takes 80 % of what is available.
-
-    Raises:
-        ConfigError: a value out of range.
     """
 
     voxel_size_m: float = 0.02
@@ -65,9 +60,8 @@ class TsdfConfig:
             if not 0 < getattr(self, name) < np.inf:
                 raise ConfigError(f"tsdf.{name} must be a positive length in metres", value=getattr(self, name))
         if not 1 <= self.truncation_voxels < np.inf:
-            raise ConfigError(
-                "tsdf.truncation_voxels must be at least 1", value=self.truncation_voxels, fix="The default is 2."
-            )
+            value = self.truncation_voxels
+            raise ConfigError("tsdf.truncation_voxels must be at least 1", value=value, fix="The default is 2.")
         if self.memory_limit_bytes is not None and self.memory_limit_bytes <= 0:
             raise ConfigError("tsdf.memory_limit_bytes must be positive", value=self.memory_limit_bytes)
 
@@ -79,48 +73,34 @@ class TsdfConfig:
 
 @dataclass(frozen=True, eq=False)
 class DepthImage:
-    """A dense depth image with its camera and pose, checked.
-
-    Attributes:
-        depth_m: (H, W) floats, metres along the optical axis; 0, negative, NaN and infinite mean no reading.
-        camera: intrinsics: a pinhole, or a COLMAP camera of the model SIMPLE_PINHOLE or PINHOLE.
-        cam_from_world: (3, 4).
+    """A depth image with its camera and pose.
 
     Raises:
         ConfigError: the image has another size than the camera or holds integers, the camera has distortion, or the
             pose is no rigid transform.
     """
 
-    depth_m: NDArray[Any]
-    camera: Camera
-    cam_from_world: Float
+    depth_m: NDArray[Any]  # (H, W) floats, metres along the optical axis; 0, negative, NaN and infinite mean no reading
+    camera: Camera  # intrinsics: a pinhole, or a COLMAP camera of the model SIMPLE_PINHOLE or PINHOLE
+    cam_from_world: Float  # (3, 4)
 
     def __post_init__(self) -> None:
-        _ = self.camera.matrix  # a camera with distortion has none
-        expected = (self.camera.height, self.camera.width)
-        if np.shape(self.depth_m) != expected:
-            raise ConfigError(
-                f"the camera has {expected[0]} x {expected[1]} pixels (height x width), the depth image another size",
-                value=np.shape(self.depth_m),
-                fix="Give the camera of the depth image, or scale one of them.",
-            )
-        if not np.issubdtype(np.asarray(self.depth_m).dtype, np.floating):
-            raise ConfigError(
-                "a depth image must hold floats, in metres",
-                value=str(np.asarray(self.depth_m).dtype),
-                fix="Divide a 16-bit image by its depth scale, mostly 1000 a metre.",
-            )
+        _ = self.camera.matrix  # raises if the camera has distortion
+        height, width = self.camera.height, self.camera.width
+        if np.shape(self.depth_m) != (height, width):
+            problem = f"the camera has {height} x {width} pixels (height x width), the depth image another size"
+            fix = "Give the camera of the depth image, or scale one of them."
+            raise ConfigError(problem, value=np.shape(self.depth_m), fix=fix)
+        dtype = np.asarray(self.depth_m).dtype
+        if not np.issubdtype(dtype, np.floating):
+            fix = "Divide a 16-bit image by its depth scale, mostly 1000 a metre."
+            raise ConfigError("a depth image must hold floats, in metres", value=str(dtype), fix=fix)
         pose = np.asarray(self.cam_from_world, dtype=np.float64)
-        rigid = pose.shape == (3, 4) and bool(np.isfinite(pose).all())
-        rigid = (
-            rigid and np.allclose(pose[:, :3] @ pose[:, :3].T, np.eye(3), atol=1e-3) and np.linalg.det(pose[:, :3]) > 0
-        )
-        if not rigid:
-            raise ConfigError(
-                "cam_from_world of a depth image must be a rigid transform (3, 4)",
-                value=pose.tolist(),
-                fix="Give finite poses with a rotation in the first three columns.",
-            )
+        rigid = pose.shape == (3, 4) and bool(np.isfinite(pose).all()) and np.linalg.det(pose[:, :3]) > 0
+        if not rigid or not np.allclose(pose[:, :3] @ pose[:, :3].T, np.eye(3), atol=1e-3):
+            problem = "cam_from_world of a depth image must be a rigid transform (3, 4)"
+            fix = "Give finite poses with a rotation in the first three columns."
+            raise ConfigError(problem, value=pose.tolist(), fix=fix)
 
     def readings(self, max_depth_m: float, stride: int = 1) -> NDArray[np.float32]:
         """Every stride-th pixel in both directions, float32, 0 where there is no reading up to `max_depth_m`."""
@@ -146,7 +126,7 @@ class TsdfVolume:
 
     Args:
         config: voxel size, truncation and limits.
-        expected_blocks: room made at the start; more is made when it is used up, which copies all.
+        expected_blocks: number of blocks to allocate at the start; when they are used up, all are copied to more.
     """
 
     def __init__(self, config: TsdfConfig | None = None, expected_blocks: int = 1 << 13) -> None:
@@ -154,26 +134,15 @@ class TsdfVolume:
 
         self.config = config or TsdfConfig()
         self._limit = self.config.memory_limit_bytes or _available_bytes() * 4 // 5
-        float32, channels = o3d.core.float32, o3d.core.SizeVector([1])
-        self._grid: Any = o3d.t.geometry.VoxelBlockGrid(
-            ("tsdf", "weight"),
-            (float32, float32),
-            (channels, channels),
-            self.config.voxel_size_m,
-            BLOCK_VOXELS,
-            expected_blocks,
-        )
+        layout = ("tsdf", "weight"), (o3d.core.float32,) * 2, (o3d.core.SizeVector([1]),) * 2
+        size_m = self.config.voxel_size_m
+        self._grid: Any = o3d.t.geometry.VoxelBlockGrid(*layout, size_m, BLOCK_VOXELS, expected_blocks)
 
     @classmethod
     def from_images(
         cls, images: Sequence[DepthImage], config: TsdfConfig | None = None, progress: bool = True
     ) -> TsdfVolume:
-        """Fuse depth images.
-
-        Args:
-            images: in any order. A sequence that reads each from disk when asked for it keeps memory low.
-            config: voxel size, truncation and limits.
-            progress: whether to show a progress bar.
+        """Fuse depth images, in any order. A sequence that reads each from disk when asked for it keeps memory low.
 
         Raises:
             ConfigError: the voxels would not fit the memory (found before the fusion, from a sample of the images).
@@ -220,16 +189,13 @@ class TsdfVolume:
     def surface(self) -> TexturedMesh:
         """The zero crossing as triangles without colours, whose fronts face the cameras that saw them.
 
-        The triangles do not depend on the machine, their order does: they are found by several threads.
+        Several threads find the triangles, so their order may differ from run to run; the triangles do not.
 
         Raises:
             SceneError: there is none.
         """
-        nothing = SceneError(
-            "the depth images show no surface",
-            value=f"{len(self)} blocks of voxels",
-            fix="Check the poses, that depths are in metres, and that voxel_size_m is below the scene's size.",
-        )
+        fix = "Check the poses, that depths are in metres, and that voxel_size_m is below the scene's size."
+        nothing = SceneError("the depth images show no surface", value=f"{len(self)} blocks of voxels", fix=fix)
         if len(self) == 0:
             raise nothing
         # Shifting the field moves the crossing outwards, towards the cameras.
@@ -260,7 +226,7 @@ class TsdfOcclusion(MeshOcclusion):
     What no depth image has seen hides nothing.
 
     Args:
-        volume: the fused depth images; not needed any more afterwards.
+        volume: the fused depth images; no longer needed afterwards.
         margin_m: a surface this close in front of a landmark is the landmark's own. Keep it above two voxels.
         device: "cpu" or a CUDA device; casts the rays.
 
@@ -279,7 +245,7 @@ class TsdfOcclusion(MeshOcclusion):
         """Whether locations (L, 3) m lie within half a voxel of a surface, or behind surfaces; (L,).
 
         A location is behind surfaces if more of the 32 rays around it meet a back than a front: it lies in furniture
-        or a wall, or outside of what the depth images saw. Where nothing was seen around it, nothing can be told.
+        or a wall, or outside of what the depth images saw. Where no ray meets anything, the location counts as free.
         """
         at = np.asarray(locations, dtype=np.float64).reshape(-1, 3)
         fronts, backs = self._sides_around(at)
@@ -303,17 +269,15 @@ def estimate_blocks(images: Sequence[DepthImage], config: TsdfConfig) -> int:
         points = image.points(config.max_depth_m, stride)
         cells = np.union1d(cells, np.floor(points / cell_m).astype(np.int64) @ number)
     if len(cells) == 0:
-        raise SceneError(
-            f"no depth image has a reading up to {config.max_depth_m:g} m",
-            value=f"{len(images)} images",
-            fix="Check that depths are in metres and that max_depth_m is large enough.",
-        )
-    # A surface touches blocks by its area.
+        problem = f"no depth image has a reading up to {config.max_depth_m:g} m"
+        fix = "Check that depths are in metres and that max_depth_m is large enough."
+        raise SceneError(problem, value=f"{len(images)} images", fix=fix)
+    # The number of blocks that a surface touches grows with its area.
     return int(np.ceil(_BLOCKS_PER_CELL * len(cells) * (cell_m / config.block_m) ** 2))
 
 
 def _check_memory(n_blocks: int, config: TsdfConfig, limit_bytes: int) -> None:
-    """Raise ConfigError where so many blocks would not fit."""
+    """Raise ConfigError if so many blocks do not fit into the memory."""
     fits = min(limit_bytes // BYTES_PER_BLOCK, MAX_BLOCKS)
     if n_blocks <= fits:
         return

@@ -24,7 +24,7 @@ from wheretolook.geometry.poses import Float, check_poses, split_poses
 from wheretolook.inputs.localization_map import LocalizationMap, shared_locations
 from wheretolook.methods.base import Scorer
 from wheretolook.methods.fisher import Approximation
-from wheretolook.visibility.frustum import VisibleSets
+from wheretolook.visibility.frustum import LandmarkSets
 
 PROBE_AXES = 2000
 """Axes among which the worst view is sought."""
@@ -101,7 +101,7 @@ class PoseInformation:
     def _numbers(self, approximation: Approximation) -> Float:
         _, rows, mask = self._locations()
         if approximation == "exact":
-            seen = VisibleSets.from_mask(mask)
+            seen = LandmarkSets.from_mask(mask)
             return exact_information(self.camera, self._poses, self.points, seen, rows, self.device)
         field, _ = self.field(self._poses, approximation)
         return field.information_of_views(rows, self._poses[:, 2, :3])

@@ -6,14 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from wheretolook.inputs.channels import Layout
-from wheretolook.learning.config import (
-    FittingConfig,
-    Keep,
-    Schedule,
-    check_at_least,
-    check_choice,
-    check_share,
-)
+from wheretolook.learning.config import FittingConfig, Keep, Schedule, check_at_least, check_choice, check_share
 from wheretolook.utils.errors import ConfigError
 
 RELEASED_SETTINGS: dict[str, Any] = {

@@ -9,7 +9,7 @@ from wheretolook.utils.errors import ConfigError
 
 @dataclass(frozen=True)
 class TreesConfig:
-    """Options of boosted trees (scikit-learn's HistGradientBoostingClassifier).
+    """Options of boosted trees (LightGBM's, Ke et al. 2017).
 
     Args:
         max_trees: rounds of boosting; those up to the best validation average precision are kept.

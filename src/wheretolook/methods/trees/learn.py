@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -25,6 +25,9 @@ from wheretolook.methods.trees.config import TreesConfig
 from wheretolook.utils.errors import ConfigError, WeightsError
 from wheretolook.viewpoints.table import is_good, poses
 
+if TYPE_CHECKING:
+    from lightgbm import Booster
+
 BLOCK = 4096
 """Views described at a time: some million landmarks."""
 
@@ -42,7 +45,7 @@ class BoostedTrees:
         left, right: (M,) int64, next nodes; a leaf's are itself.
         value: (M,) float64, of leaves, zero elsewhere.
         depth: steps from a root to the deepest leaf.
-        baseline: log-odds without trees.
+        baseline: log-odds to add to the sum of the trees: 0 of LightGBM's, whose first tree has it in its leaves.
         scale, offset: what turns the sum into calibrated log-odds: scale * sum + offset.
     """
 
@@ -60,23 +63,31 @@ class BoostedTrees:
     offset: float = 0.0
 
     @classmethod
-    def of_sklearn(cls, model: Any, camera: PinholeCamera, n_trees: int) -> BoostedTrees:
-        """The first trees of a fitted HistGradientBoostingClassifier of two classes."""
-        parts: dict[str, list[NDArray[Any]]] = {name: [] for name in _ARRAYS}
-        start, depth = 0, 0
-        for (predictor,) in model._predictors[:n_trees]:
-            nodes = predictor.nodes
-            own, leaf = np.arange(len(nodes)) + start, nodes["is_leaf"].astype(bool)
-            parts["roots"].append(np.array([start]))
-            parts["feature"].append(np.where(leaf, 0, nodes["feature_idx"]).astype(np.int64))
-            parts["threshold"].append(np.where(leaf, 0.0, nodes["num_threshold"]))
-            parts["missing_left"].append(nodes["missing_go_to_left"].astype(bool))
-            for side in ("left", "right"):
-                parts[side].append(np.where(leaf, own, nodes[side].astype(np.int64) + start))
-            parts["value"].append(np.where(leaf, nodes["value"], 0.0))
-            start, depth = start + len(nodes), max(depth, int(nodes["depth"].max()))
-        arrays: dict[str, Any] = {name: torch.from_numpy(np.concatenate(part)) for name, part in parts.items()}
-        return cls(camera, **arrays, depth=depth, baseline=float(np.ravel(model._baseline_prediction)[0]))
+    def of_lightgbm(cls, booster: Booster, camera: PinholeCamera, n_trees: int) -> BoostedTrees:
+        """The first trees of a model of two classes that LightGBM has fitted."""
+        nodes = [tree["tree_structure"] for tree in booster.dump_model(num_iteration=n_trees)["tree_info"]]
+        parts: dict[str, list[Any]] = {name: [] for name in _ARRAYS} | {"roots": list(range(len(nodes)))}
+        depths = [0] * len(nodes)
+        for number, node in enumerate(nodes):  # which grows while it is gone through: all roots, their children, ...
+            is_leaf = "split_feature" not in node
+            threshold = 0.0 if is_leaf else node["threshold"]
+            parts["feature"].append(0 if is_leaf else node["split_feature"])
+            parts["threshold"].append(threshold)
+            # where all values were known in training, LightGBM takes one that is not for zero
+            as_zero = is_leaf or node["missing_type"] != "NaN"
+            parts["missing_left"].append(threshold >= 0 if as_zero else node["default_left"])
+            parts["left"].append(number if is_leaf else len(nodes))
+            parts["right"].append(number if is_leaf else len(nodes) + 1)
+            parts["value"].append(node["leaf_value"] if is_leaf else 0.0)
+            if not is_leaf:
+                nodes += [node["left_child"], node["right_child"]]
+                depths += [depths[number] + 1] * 2
+        reals, flags = ("threshold", "value"), ("missing_left",)
+        kinds = {**dict.fromkeys(reals, torch.float64), **dict.fromkeys(flags, torch.bool)}
+        arrays: dict[str, Any] = {
+            name: torch.tensor(part, dtype=kinds.get(name, torch.int64)) for name, part in parts.items()
+        }
+        return cls(camera, **arrays, depth=max(depths), baseline=0.0)
 
     def to(self, device: str) -> BoostedTrees:
         """The same trees on a device."""
@@ -238,29 +249,28 @@ def fit_trees(
         val: of other scenes.
         camera: of both.
         config: options.
-        seed: of scikit-learn's choice of bins.
+        seed: of LightGBM, which samples views to choose bins.
 
     Returns:
         The trees, and their metrics on the validation views.
     """
-    from sklearn.ensemble import HistGradientBoostingClassifier
+    import lightgbm
     from sklearn.metrics import average_precision_score, log_loss, roc_auc_score
 
-    values = train.values.astype(np.float64)
-    values[:, np.isnan(values).all(0)] = 0  # scikit-learn takes no column of which nothing is known
-    model = HistGradientBoostingClassifier(
-        max_iter=config.max_trees, learning_rate=config.learning_rate, max_leaf_nodes=config.max_leaves,
-        min_samples_leaf=config.min_leaf, l2_regularization=config.l2, early_stopping=False, random_state=seed,
-    ).fit(values, train.labels)  # fmt: skip
-    every = max(1, config.max_trees // 40)
-    stages = model.staged_decision_function(val.values.astype(np.float64))
-    precision = {
-        number: float(average_precision_score(val.labels, logits.reshape(-1)))
-        for number, logits in enumerate(stages, start=1)
-        if number % every == 0 or number == config.max_trees
-    }
+    options = {
+        "objective": "binary", "learning_rate": config.learning_rate, "num_leaves": config.max_leaves,
+        "min_data_in_leaf": config.min_leaf, "lambda_l2": config.l2, "seed": seed, "verbosity": -1,
+        "deterministic": True, "force_col_wise": True,  # the same trees for any number of threads
+    }  # fmt: skip
+    views = lightgbm.Dataset(train.values.astype(np.float64), train.labels.astype(np.float64))
+    booster = lightgbm.train(options, views, config.max_trees)
+    every, values, raw = max(1, config.max_trees // 40), val.values.astype(np.float64), np.zeros(len(val.labels))
+    precision: dict[int, float] = {}
+    for first in range(0, booster.num_trees(), every):
+        raw += np.asarray(booster.predict(values, start_iteration=first, num_iteration=every, raw_score=True))
+        precision[min(first + every, booster.num_trees())] = float(average_precision_score(val.labels, raw))
     kept = max(precision, key=lambda number: precision[number])
-    trees = BoostedTrees.of_sklearn(model, camera, kept)
+    trees = BoostedTrees.of_lightgbm(booster, camera, kept)
     raw = trees.raw_logits(torch.from_numpy(val.values)).numpy()
     scale, offset = fit_platt(raw, val.labels)
     trees = replace(trees, scale=scale, offset=offset)

@@ -1,11 +1,11 @@
-"""Things painted once for one surface: pictures, posters, rugs, book spines, packages, views from a window."""
+"""Materials painted for one surface each: pictures, posters, rugs, book spines, packages, views from a window."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from wheretolook.scenes.procedural.materials import Colour, Material, mix, vary
+from wheretolook.scenes.procedural.materials import Colour, Material, fill, mix, vary
 from wheretolook.scenes.procedural.noise import SIZE, Canvas, Image
 
 PALETTES: tuple[tuple[Colour, ...], ...] = (
@@ -69,7 +69,7 @@ def _text(
 
 def _landscape(canvas: Canvas, rng: np.random.Generator, colours: list[Colour]) -> Image:
     sky, low = vary(rng, (0.55, 0.70, 0.85), 0.08), vary(rng, (0.93, 0.82, 0.68), 0.06)
-    image = mix(sky, low, np.broadcast_to(canvas.unit_y**0.8, (canvas.height, canvas.width)))
+    image = mix(sky, low, np.broadcast_to(canvas.unit_y**0.8, canvas.shape))
     shift = (int(rng.integers(SIZE)), int(rng.integers(SIZE)))
     cloud = np.clip(0.3 * canvas.crop(canvas.noise.cloud, shift, step=3), 0, 0.6)
     image = mix(image, 0.96, cloud)
@@ -98,14 +98,12 @@ def _abstract(canvas: Canvas, rng: np.random.Generator, colours: list[Colour]) -
 
 
 def _geometric(canvas: Canvas, rng: np.random.Generator, colours: list[Colour]) -> Image:
-    image = np.broadcast_to(np.asarray(colours[0], np.float32), (canvas.height, canvas.width, 3)).copy()
-    image = _rectangles(image, rng, colours, int(rng.integers(15, 60)))
+    image = _rectangles(fill(canvas, colours[0]), rng, colours, int(rng.integers(15, 60)))
     return _ellipses(canvas, image, rng, colours, int(rng.integers(4, 24)), (0.015, 0.12))
 
 
 def _poster(canvas: Canvas, rng: np.random.Generator, colours: list[Colour]) -> Image:
-    image = np.broadcast_to(np.asarray(colours[0], np.float32), (canvas.height, canvas.width, 3)).copy()
-    image = _ellipses(canvas, image, rng, colours[1:], int(rng.integers(6, 20)), (0.02, 0.22))
+    image = _ellipses(canvas, fill(canvas, colours[0]), rng, colours[1:], int(rng.integers(6, 20)), (0.02, 0.22))
     bar = int(canvas.height * rng.uniform(0.62, 0.8))
     image[bar:] = colours[int(rng.integers(5))]
     ink = (0.06, 0.06, 0.08) if image[bar:].mean() > 0.45 else (0.95, 0.94, 0.9)
@@ -131,16 +129,15 @@ def picture(rng: np.random.Generator, mat: float = 0.0) -> Material:
 
 
 def rug(rng: np.random.Generator, richness: float = 1.0) -> Material:
-    """A rug: ornament mirrored about both axes inside borders, stripes, or all but plain."""
+    """A rug: ornament mirrored about both axes inside borders, stripes, or nearly plain."""
     seed, colours = int(rng.integers(2**31)), palette(rng)
     kind = "ornament" if rng.random() < 0.25 + 0.4 * richness else ("stripes" if rng.random() < 0.5 else "plain")
     shift = (int(rng.integers(SIZE)), int(rng.integers(SIZE)))
 
     def paint(canvas: Canvas) -> Image:
         local = np.random.default_rng(seed)
-        shape = (canvas.height, canvas.width)
-        x = np.broadcast_to(np.abs(canvas.unit_x - 0.5), shape) * canvas.width / canvas.texels_per_m
-        y = np.broadcast_to(np.abs(canvas.unit_y - 0.5), shape) * canvas.height / canvas.texels_per_m
+        x = np.broadcast_to(np.abs(canvas.unit_x - 0.5), canvas.shape) * canvas.width / canvas.texels_per_m
+        y = np.broadcast_to(np.abs(canvas.unit_y - 0.5), canvas.shape) * canvas.height / canvas.texels_per_m
         edge = np.minimum(x.max() - x, y.max() - y)
         if kind == "ornament":
             rows, columns = (y * canvas.texels_per_m).astype(int), (x * canvas.texels_per_m).astype(int)
@@ -160,7 +157,7 @@ def rug(rng: np.random.Generator, richness: float = 1.0) -> Material:
             steps = np.sort(local.uniform(0, max(float(y.max()), 0.1), 7))
             image = np.asarray(colours, np.float32)[np.digitize(y, steps) % 5]
         else:
-            image = np.broadcast_to(np.asarray(colours[0], np.float32), (*shape, 3)).copy()
+            image = fill(canvas, colours[0])
             image[(edge > 0.05) & (edge < 0.08)] = colours[1]
         return image * (1 + 0.05 * canvas.crop(canvas.noise.fine, shift))[..., None]
 
@@ -176,7 +173,7 @@ def book_spine(rng: np.random.Generator, colour: ArrayLike) -> Material:
 
     def paint(canvas: Canvas) -> Image:
         local = np.random.default_rng(seed)
-        image = np.broadcast_to(base, (canvas.height, canvas.width, 3)).copy()
+        image = fill(canvas, base)
         for _ in range(int(local.integers(0, 3))):
             top = local.uniform(0, 0.9)
             rows = slice(int(top * canvas.height), int((top + local.uniform(0.02, 0.14)) * canvas.height) + 1)
@@ -185,14 +182,8 @@ def book_spine(rng: np.random.Generator, colour: ArrayLike) -> Material:
             title = np.swapaxes(image, 0, 1)  # titles run down the spine
             size = max(2, int(canvas.width * local.uniform(0.3, 0.6)))
             top = (canvas.width - size) // 2
-            start = local.uniform(0.06, 0.25)
-            _text(
-                title,
-                local,
-                ink,
-                (start, top / canvas.width, local.uniform(0.6, 0.95), (top + size + 1) / canvas.width),
-                size,
-            )
+            start, end = local.uniform(0.06, 0.25), local.uniform(0.6, 0.95)
+            _text(title, local, ink, (start, top / canvas.width, end, (top + size + 1) / canvas.width), size)
         return image
 
     return Material(paint)
@@ -204,9 +195,8 @@ def package(rng: np.random.Generator) -> Material:
 
     def paint(canvas: Canvas) -> Image:
         local = np.random.default_rng(seed)
-        ground = colours[int(local.integers(5))]
-        image = np.broadcast_to(np.asarray(ground, np.float32), (canvas.height, canvas.width, 3)).copy()
-        image = _rectangles(image, local, colours, int(local.integers(1, 5)))
+        ground = fill(canvas, colours[int(local.integers(5))])
+        image = _rectangles(ground, local, colours, int(local.integers(1, 5)))
         image = _ellipses(canvas, image, local, colours, int(local.integers(1, 4)), (0.08, 0.3))
         ink = (0.95, 0.95, 0.92) if image.mean() < 0.5 else (0.1, 0.1, 0.12)
         image = _text(image, local, ink, (0.1, 0.12, 0.95, 0.4), max(3, canvas.height // 8))
@@ -216,17 +206,15 @@ def package(rng: np.random.Generator) -> Material:
 
 
 def view(rng: np.random.Generator) -> Material:
-    """What a window shows: a bright sky, hazy hills and perhaps houses. It is also the light that comes in."""
+    """The view from a window: a bright sky, hazy hills and perhaps houses. It emits the daylight."""
     shift = (int(rng.integers(SIZE)), int(rng.integers(SIZE)))
     seed, horizon = int(rng.integers(2**31)), float(rng.uniform(0.5, 0.7))
     houses = bool(rng.random() < 0.5)
 
     def paint(canvas: Canvas) -> Image:
-        local = np.random.default_rng(seed)
-        shape = (canvas.height, canvas.width)
+        local, shape = np.random.default_rng(seed), canvas.shape
         image = mix((0.78, 0.88, 0.97), (0.96, 0.97, 0.97), np.broadcast_to(canvas.unit_y / horizon, shape).clip(0, 1))
-        cloud = np.clip(0.25 * canvas.crop(canvas.noise.cloud, shift), 0, 0.5)
-        image = mix(image, 0.98, cloud)
+        image = mix(image, 0.98, np.clip(0.25 * canvas.crop(canvas.noise.cloud, shift), 0, 0.5))
         for i, colour in enumerate(((0.70, 0.78, 0.82), (0.58, 0.68, 0.62), (0.47, 0.58, 0.42))):
             ridge = canvas.noise.cloud[int(local.integers(SIZE)), (np.arange(canvas.width) + shift[1]) % SIZE]
             level = horizon + 0.11 * i + 0.03 * ridge
@@ -235,10 +223,8 @@ def view(rng: np.random.Generator) -> Material:
             image = mix(image, (np.asarray(colour) * detail[..., None]).astype(np.float32), inside)
         if houses:
             for _ in range(int(local.integers(2, 6))):
-                width, top = (
-                    int(local.uniform(0.06, 0.2) * shape[1]) + 2,
-                    int((horizon + local.uniform(-0.1, 0.1)) * shape[0]),
-                )
+                width = int(local.uniform(0.06, 0.2) * shape[1]) + 2
+                top = int((horizon + local.uniform(-0.1, 0.1)) * shape[0])
                 left, bottom = int(local.uniform(0, 1) * shape[1]), top + int(0.3 * shape[0])
                 image[top:bottom, left : left + width] = vary(local, (0.80, 0.76, 0.70), 0.05)
                 image[max(top - 4, 0) : top, left : left + width] = vary(local, (0.62, 0.42, 0.36), 0.04)

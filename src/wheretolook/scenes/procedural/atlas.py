@@ -1,4 +1,4 @@
-"""One texture for everything: a place for every patch, painted albedo, light, and padding against bleeding."""
+"""The texture atlas: a rectangle for every patch, painted albedo times light, padded against bleeding."""
 
 from __future__ import annotations
 
@@ -26,8 +26,7 @@ class Chart:
 
     Attributes:
         material: what is painted.
-        width: texels, without padding.
-        height: texels, without padding.
+        width, height: texels, without padding.
         pad: texels of replicated border on each side.
         texels_per_m: scale of the pattern.
         offset_m: where the pattern starts.
@@ -43,7 +42,7 @@ class Chart:
 
 @dataclass(frozen=True, eq=False)
 class AtlasPlan:
-    """Charts, their corners and who uses which.
+    """Charts, their corners and the chart of each patch.
 
     Attributes:
         charts: all charts.
@@ -59,6 +58,7 @@ class AtlasPlan:
 
 
 def _charts(patches: Sequence[Patch], texels_per_m: float) -> tuple[list[Chart], NDArray[np.int64]]:
+    """Charts of all patches, and the chart of each (P,)."""
     charts: list[Chart] = []
     index = np.empty(len(patches), np.int64)
     shared: dict[int, int] = {}
@@ -112,24 +112,18 @@ def plan_atlas(patches: Sequence[Patch], texels_per_m: float, size: int) -> Atla
             rows = min(size, -(-packed[1] // 256) * 256)
             return AtlasPlan(charts, packed[0], index, (size, rows))
         density *= 0.95
-    raise SceneError(
-        "texture is too small for the apartment", value=size, fix="Raise texture_size or lower texels_per_m"
-    )
+    fix = "Raise texture_size or lower texels_per_m"
+    raise SceneError("texture is too small for the apartment", value=size, fix=fix)
 
 
 def paint_charts(plan: AtlasPlan, noise: NoiseBank) -> list[Image]:
     """Albedo of every chart, (height, width, 3) float32 in display space."""
-    painted: list[Image] = []
-    previous: tuple[Chart, Image] | None = None
+    painted: dict[int, Image] = {}
     for chart in plan.charts:
-        if previous is not None and previous[0] is chart:  # the levels of a shared material
-            painted.append(previous[1])
-            continue
-        canvas = Canvas(chart.height, chart.width, chart.texels_per_m, *chart.offset_m, noise)
-        image = np.asarray(chart.material.paint(canvas), np.float32)
-        painted.append(image)
-        previous = (chart, image)
-    return painted
+        if id(chart) not in painted:  # the levels of a shared material are one chart
+            canvas = Canvas(chart.height, chart.width, chart.texels_per_m, *chart.offset_m, noise)
+            painted[id(chart)] = np.asarray(chart.material.paint(canvas), np.float32)
+    return [painted[id(chart)] for chart in plan.charts]
 
 
 def compose(
@@ -140,19 +134,14 @@ def compose(
     Args:
         plan: from `plan_atlas`.
         painted: from `paint_charts`.
-        light: per chart the factor on the albedo, (h, w, 3) on any coarser grid, or None for surfaces that glow.
+        light: for each chart the factor on the albedo, (h, w, 3) on any coarser grid, or None for surfaces that glow.
     """
     width, height = plan.size
     atlas = np.zeros((height, width, 3), np.uint8)
     for chart, (x, y), albedo, factor in zip(plan.charts, plan.corners, painted, light, strict=True):
         if factor is not None:
-            fine = cv2.resize(
-                np.asarray(factor, np.float32), (chart.width, chart.height), interpolation=cv2.INTER_LINEAR
-            )
-            albedo = albedo * fine
-        texels = np.clip(albedo * 255 + 0.5, 0, 255).astype(np.uint8)
-        p = chart.pad
-        atlas[y - p : y + chart.height + p, x - p : x + chart.width + p] = cv2.copyMakeBorder(
-            texels, p, p, p, p, cv2.BORDER_REPLICATE
-        )
+            albedo = albedo * cv2.resize(np.asarray(factor, np.float32), (chart.width, chart.height))
+        p, texels = chart.pad, np.clip(albedo * 255 + 0.5, 0, 255).astype(np.uint8)
+        padded = cv2.copyMakeBorder(texels, p, p, p, p, cv2.BORDER_REPLICATE)
+        atlas[y - p : y + chart.height + p, x - p : x + chart.width + p] = padded
     return atlas

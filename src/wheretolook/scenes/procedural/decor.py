@@ -1,4 +1,4 @@
-"""Small things: books, plants, bottles, bowls, lamps, pictures, clothes. Each stands on z = 0 around the origin."""
+"""Small things: books, plants, bottles, bowls, lamps, pictures, clothes. Most stand on z = 0 around the origin."""
 
 from __future__ import annotations
 
@@ -25,11 +25,8 @@ def books_in_row(style: Style, length: float, height: float, depth: float) -> li
             x += width  # a gap
             continue
         colour = materials.vary(rng, style.pick(style.cover_colours), 0.06)
-        spine = (
-            artwork.book_spine(rng, colour)
-            if style.chance(0.35 + 0.6 * style.richness)
-            else materials.plain(rng, colour)
-        )
+        printed = style.chance(0.35 + 0.6 * style.richness)
+        spine = artwork.book_spine(rng, colour) if printed else materials.plain(rng, colour)
         cover = style.pick(style.covers)
         book = box((x, 0, 0), (x + width - 0.001, deep, tall), cover, faces={"front": spine, "top": style.paper})
         book[0] = replace(book[0], density=1.9)
@@ -43,9 +40,8 @@ def book_stack(style: Style, count: int) -> list[Patch]:
     patches: list[Patch] = []
     for _ in range(count):
         w, d, h = rng.uniform(0.19, 0.3), rng.uniform(0.14, 0.21), rng.uniform(0.01, 0.035)
-        book = box(
-            (-w / 2, -d / 2, 0), (w / 2, d / 2, h), style.paper, faces={"top": artwork.package(rng)}, density=1.6
-        )
+        faces = {"top": artwork.package(rng)}
+        book = box((-w / 2, -d / 2, 0), (w / 2, d / 2, h), style.paper, faces=faces, density=1.6)
         patches += move(book, angle_rad=float(rng.normal(0, 0.25)), shift=(0, 0, z))
         z += h + 0.0005
     return patches
@@ -53,69 +49,47 @@ def book_stack(style: Style, count: int) -> list[Patch]:
 
 def bottle(style: Style, height: float) -> list[Patch]:
     """Bottle or jar with a label."""
-    rng = style.rng
-    r, neck = height * rng.uniform(0.13, 0.2), rng.uniform(0.3, 0.8)
-    colour = materials.vary(
-        rng, style.pick([(0.22, 0.36, 0.24), (0.75, 0.75, 0.72), (0.45, 0.28, 0.15), (0.85, 0.82, 0.7)]), 0.05
-    )
-    body = materials.plain(rng, colour, shared=True)
-    h = height
-    out = lathe([(0, h), (r * neck, h), (r * neck, 0.8 * h), (r, 0.62 * h), (r, 0.02 * h), (0, 0)], body, sides=14)
-    label = lathe(
-        [(r * 0.98, 0.5 * h), (r * 1.03, 0.5 * h), (r * 1.03, 0.18 * h), (r * 0.98, 0.18 * h), (r * 0.98, 0.5 * h)],
-        artwork.package(rng),
-        sides=14,
-        density=2.0,
-    )
-    return out + label
+    rng, h = style.rng, height
+    r, neck = h * rng.uniform(0.13, 0.2), rng.uniform(0.3, 0.8)
+    colour = style.pick([(0.22, 0.36, 0.24), (0.75, 0.75, 0.72), (0.45, 0.28, 0.15), (0.85, 0.82, 0.7)])
+    glass = materials.plain(rng, materials.vary(rng, colour, 0.05), shared=True)
+    profile = [(0, h), (r * neck, h), (r * neck, 0.8 * h), (r, 0.62 * h), (r, 0.02 * h), (0, 0)]
+    inner, outer = r * 0.98, r * 1.03
+    label = [(inner, 0.5 * h), (outer, 0.5 * h), (outer, 0.18 * h), (inner, 0.18 * h), (inner, 0.5 * h)]
+    return lathe(profile, glass, sides=14) + lathe(label, artwork.package(rng), sides=14, density=2.0)
 
 
-def package(style: Style, low: float = 0.1, high: float = 0.26) -> list[Patch]:
+def package(style: Style) -> list[Patch]:
     """Cardboard box with a printed front."""
     rng = style.rng
-    w, d, h = rng.uniform(0.07, 0.18), rng.uniform(0.04, 0.09), rng.uniform(low, high)
-    return box(
-        (-w / 2, -d / 2, 0),
-        (w / 2, d / 2, h),
-        style.pick(style.covers),
-        faces={"front": artwork.package(rng)},
-        density=1.8,
-    )
+    w, d, h = rng.uniform(0.07, 0.18), rng.uniform(0.04, 0.09), rng.uniform(0.1, 0.26)
+    cover, faces = style.pick(style.covers), {"front": artwork.package(rng)}
+    return box((-w / 2, -d / 2, 0), (w / 2, d / 2, h), cover, faces=faces, density=1.8)
 
 
 def bowl(style: Style, radius: float, fruit: bool) -> list[Patch]:
     """Open bowl, with oranges or apples if asked for."""
-    rng, h = style.rng, radius * 0.5
+    rng, r, h = style.rng, radius, radius * 0.5
     material = materials.plain(rng, materials.vary(rng, style.pick(style.cover_colours), 0.05), shared=True)
-    profile = [
-        (0, 0.02),
-        (0.6 * radius, 0.1 * h),
-        (radius * 0.96, h),
-        (radius, h),
-        (0.7 * radius, 0.06 * h),
-        (0.4 * radius, 0),
-        (0, 0),
-    ]
-    patches = lathe(profile, material, sides=24)
+    inside, outside = (
+        [(0, 0.02), (0.6 * r, 0.1 * h), (r * 0.96, h)],
+        [(r, h), (0.7 * r, 0.06 * h), (0.4 * r, 0), (0, 0)],
+    )
+    patches = lathe(inside + outside, material, sides=24)
     if fruit:
         skin = materials.plain(rng, style.pick([(0.86, 0.5, 0.14), (0.72, 0.2, 0.14), (0.6, 0.7, 0.25)]), shared=True)
-        for k in range(6):
-            a, r = 2 * np.pi * k / 5, 0.45 * radius if k < 5 else 0.0
-            patches += sphere(
-                (r * np.cos(a), r * np.sin(a), 0.6 * h + (0.25 * h if k == 5 else 0)), 0.24 * radius, skin
-            )
+        for k in range(6):  # five around one on top
+            angle, off = 2 * np.pi * k / 5, 0.45 * r if k < 5 else 0.0
+            centre = (off * np.cos(angle), off * np.sin(angle), 0.6 * h + (0.25 * h if k == 5 else 0))
+            patches += sphere(centre, 0.24 * r, skin)
     return patches
 
 
-def sphere(centre: tuple[float, float, float], radius: float, material: Material, sides: int = 14) -> list[Patch]:
+def sphere(centre: tuple[float, float, float], radius: float, material: Material) -> list[Patch]:
     """Closed sphere."""
-    angle = np.linspace(0, np.pi, sides // 2 + 1)
-    return lathe(
-        [(radius * np.sin(a) if 0 < a < np.pi else 0.0, radius * np.cos(a)) for a in angle],
-        material,
-        sides=sides,
-        centre=centre,
-    )
+    angles = np.linspace(0, np.pi, 8)
+    profile = [(radius * np.sin(a) if 0 < a < np.pi else 0.0, radius * np.cos(a)) for a in angles]
+    return lathe(profile, material, sides=14, centre=centre)
 
 
 def vase(style: Style, height: float) -> list[Patch]:
@@ -123,53 +97,32 @@ def vase(style: Style, height: float) -> list[Patch]:
     rng = style.rng
     z = np.linspace(1, 0, 12)
     r = height * (0.16 + 0.13 * np.sin(np.pi * (1 - z) ** rng.uniform(0.7, 1.6)))
-    kind = style.pick(["plain", "stripes", "zigzag"])
-    body = materials.fabric(
-        rng,
-        materials.vary(rng, style.pick(style.cover_colours)),
-        second=style.pick(style.cover_colours),
-        pattern=kind,
-        weave=0.01,
-        period_m=0.06,
-    )
-    return lathe(
-        [(0, 0.97 * height), *[(float(a), float(b) * height) for a, b in zip(r, z, strict=True)], (0, 0)],
-        body,
-        sides=20,
-        density=1.4,
-    )
+    pattern = style.pick(["plain", "stripes", "zigzag"])
+    colour, second = materials.vary(rng, style.pick(style.cover_colours)), style.pick(style.cover_colours)
+    glaze = materials.fabric(rng, colour, second=second, pattern=pattern, weave=0.01, period_m=0.06)
+    profile = [(0, 0.97 * height), *[(float(a), float(b) * height) for a, b in zip(r, z, strict=True)], (0, 0)]
+    return lathe(profile, glaze, sides=20, density=1.4)
 
 
 def plant(style: Style, height: float, leaves: int, reach_m: float) -> list[Patch]:
     """Potted plant: stems with curved, two-sided leaves, none of which reaches further than `reach_m` to the side."""
-    rng, pot_h = style.rng, 0.3 * height
-    pot_r = 0.55 * pot_h
-    pot = materials.plain(
-        rng, materials.vary(rng, style.pick([(0.72, 0.42, 0.28), (0.85, 0.84, 0.8), (0.3, 0.32, 0.34)]), 0.03)
-    )
+    rng, h = style.rng, 0.3 * height
+    r = 0.55 * h
+    colour = materials.vary(rng, style.pick([(0.72, 0.42, 0.28), (0.85, 0.84, 0.8), (0.3, 0.32, 0.34)]), 0.03)
+    pot = materials.plain(rng, colour)
     earth = materials.plain(rng, (0.22, 0.16, 0.11), speckle=0.15)
-    patches = lathe(
-        [
-            (0, 0.88 * pot_h),
-            (pot_r * 0.9, 0.88 * pot_h),
-            (pot_r * 0.92, pot_h),
-            (pot_r, pot_h),
-            (0.75 * pot_r, 0),
-            (0, 0),
-        ],
-        pot,
-        sides=20,
-    )
-    patches += lathe([(0, 0.92 * pot_h), (pot_r * 0.91, 0.92 * pot_h), (0, 0.9 * pot_h)], earth, sides=20)
+    profile = [(0, 0.88 * h), (r * 0.9, 0.88 * h), (r * 0.92, h), (r, h), (0.75 * r, 0), (0, 0)]
+    patches = lathe(profile, pot, sides=20)
+    patches += lathe([(0, 0.92 * h), (r * 0.91, 0.92 * h), (0, 0.9 * h)], earth, sides=20)
     stem = materials.plain(rng, (0.3, 0.36, 0.18), shared=True)
     wide = style.chance(0.5)
     for _ in range(leaves):
         turn, lean = rng.uniform(0, 2 * np.pi), rng.uniform(0.1, 0.75)
         length = height * rng.uniform(0.18, 0.3)
         width = length * (0.55 if wide else 0.22) * rng.uniform(0.8, 1.1)
-        rise = (height - pot_h) * rng.uniform(0.35, 0.8)
+        rise = (height - h) * rng.uniform(0.35, 0.8)
         u = np.linspace(0, 1, 6)
-        path = np.stack([0.35 * rise * lean * u**1.6, 0 * u, 0.9 * pot_h + rise * u * (1 - 0.25 * lean * u)], -1)
+        path = np.stack([0.35 * rise * lean * u**1.6, 0 * u, 0.9 * h + rise * u * (1 - 0.25 * lean * u)], -1)
         shrink = min(1.0, (reach_m - 0.01) / (path[-1, 0] + length * (np.sin(0.9 * lean) + 0.25 * lean)))
         path[:, 0] *= shrink
         grow = move(tube(path, np.linspace(0.006, 0.003, 6) * (0.4 + height), stem, sides=5), angle_rad=turn)
@@ -178,15 +131,8 @@ def plant(style: Style, height: float, leaves: int, reach_m: float) -> list[Patc
         along = lean * 0.9
         x = path[-1, 0] + shrink * length * (v * np.sin(along) + 0.25 * v**2 * lean)
         z = path[-1, 2] + length * (v * np.cos(along) - 0.45 * v**2 * lean)
-        across = np.linspace(1, -1, 5)
-        grid = np.stack(
-            [
-                np.repeat(x[:, None], 5, 1),
-                half[:, None] * across[None],
-                z[:, None] + 0.35 * half[:, None] * across[None] ** 2,
-            ],
-            -1,
-        )
+        across, half = np.linspace(1, -1, 5)[None], half[:, None]
+        grid = np.stack([np.repeat(x[:, None], 5, 1), half * across, z[:, None] + 0.35 * half * across**2], -1)
         under = along + 0.45 * lean
         thickness = 0.003 * np.array([-np.cos(under), 0, np.sin(under)])
         blade = slab_between(grid, grid - thickness, style.pick(style.leaves), (width, length))
@@ -194,7 +140,7 @@ def plant(style: Style, height: float, leaves: int, reach_m: float) -> list[Patc
     return patches
 
 
-def picture_frame(style: Style, width: float, height: float, material: Material | None = None) -> list[Patch]:
+def picture_frame(style: Style, width: float, height: float) -> list[Patch]:
     """Framed picture: back at y = 0, centred on the origin in x and z."""
     depth, border = 0.025, float(style.rng.uniform(0.015, 0.035))
     frame = style.pick([style.black, style.small_wood, style.small_white])
@@ -202,34 +148,16 @@ def picture_frame(style: Style, width: float, height: float, material: Material 
     patches = box((-w, 0, h - border), (w, depth, h), frame) + box((-w, 0, -h), (w, depth, border - h), frame)
     patches += box((-w, 0, border - h), (border - w, depth, h - border), frame)
     patches += box((w - border, 0, border - h), (w, depth, h - border), frame)
-    art = material if material is not None else style.print()
-    patches.append(
-        plane(
-            (w - border, 0.6 * depth, h - border),
-            (2 * border - width, 0, 0),
-            (0, 0, 2 * border - height),
-            art,
-            density=1.7,
-        )
-    )
-    return patches
+    right, down = (2 * border - width, 0, 0), (0, 0, 2 * border - height)
+    return [*patches, plane((w - border, 0.6 * depth, h - border), right, down, style.print(), density=1.7)]
 
 
 def shade(style: Style, radius: float, height: float, z: float, lit: bool) -> list[Patch]:
     """Cloth lamp shade, open below and above, glowing if lit."""
     colour = (1.0, 0.93, 0.80) if lit else (0.80, 0.77, 0.70)
     material = materials.glow(colour) if lit else materials.plain(style.rng, colour)
-    return lathe(
-        [
-            (0.68 * radius, z + height),
-            (0.7 * radius, z + height),
-            (radius, z),
-            (0.98 * radius, z),
-            (0.68 * radius, z + height),
-        ],
-        material,
-        sides=24,
-    )
+    r, top = radius, z + height
+    return lathe([(0.68 * r, top), (0.7 * r, top), (r, z), (0.98 * r, z), (0.68 * r, top)], material, sides=24)
 
 
 def table_lamp(style: Style, lit: bool) -> list[Patch]:
@@ -241,19 +169,14 @@ def table_lamp(style: Style, lit: bool) -> list[Patch]:
 
 def floor_lamp(style: Style, lit: bool) -> list[Patch]:
     """Standard lamp; its bulb is at z = 1.5."""
-    return (
-        cylinder(0.14, 0, 0.025, style.metal, sides=20)
-        + cylinder(0.012, 0.025, 1.45, style.metal, sides=8)
-        + shade(style, 0.22, 0.28, 1.38, lit)
-    )
+    stand = cylinder(0.14, 0, 0.025, style.metal, sides=20) + cylinder(0.012, 0.025, 1.45, style.metal, sides=8)
+    return stand + shade(style, 0.22, 0.28, 1.38, lit)
 
 
-def pillow(style: Style, material: Material, size: float = 0.44, thick: float = 0.14) -> list[Patch]:
+def pillow(style: Style, material: Material, size: float) -> list[Patch]:
     """Square pillow standing on its edge, front to +y."""
-    half = size / 2
-    return cushion(
-        (-half, 0, 0), (half, thick * 0.45, size), material, radius_m=0.03, puff=(0, 0.3 * thick, 0), span=6, hidden=()
-    )
+    half, thick, puff = size / 2, 0.14 * 0.45, (0, 0.3 * 0.14, 0)
+    return cushion((-half, 0, 0), (half, thick, size), material, radius_m=0.03, puff=puff, span=6, hidden=())
 
 
 def coat(style: Style) -> list[Patch]:

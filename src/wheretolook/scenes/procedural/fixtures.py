@@ -1,4 +1,4 @@
-"""What is built in: kitchen units, bathroom, radiators, curtains, doors. Frame as in `furniture`."""
+"""Kitchen units, appliances, sanitary ware, radiators, curtains, doors. Frame as in `furniture`."""
 
 from __future__ import annotations
 
@@ -10,19 +10,13 @@ from wheretolook.scenes.procedural.materials import Material
 from wheretolook.scenes.procedural.patches import Patch, box, cushion, cylinder, lathe, move, slab_between, tube
 from wheretolook.scenes.procedural.style import Style
 
+Corner = tuple[float, float, float]
 
-def trough(
-    low: tuple[float, float, float],
-    high: tuple[float, float, float],
-    rim: float,
-    floor: float,
-    material: Material,
-    *,
-    hidden: tuple[str, ...] = WALL_SIDE,
-) -> list[Patch]:
+
+def trough(low: Corner, high: Corner, rim: float, floor: float, material: Material) -> list[Patch]:
     """Basin: four walls of thickness `rim` around a bottom of thickness `floor`."""
     (x0, y0, z0), (x1, y1, z1) = low, high
-    patches = box((x0, y0, z0), (x1, y0 + rim, z1), material, hidden=hidden)
+    patches = box((x0, y0, z0), (x1, y0 + rim, z1), material, hidden=WALL_SIDE)
     patches += box((x0, y1 - rim, z0), (x1, y1, z1), material)
     patches += box((x0, y0 + rim, z0), (x0 + rim, y1 - rim, z1), material)
     patches += box((x1 - rim, y0 + rim, z0), (x1, y1 - rim, z1), material)
@@ -41,28 +35,13 @@ def kitchen_run(style: Style, width: float, height: float, window: bool) -> list
     """Base units with worktop, sink, hob and oven; wall units above unless a window is there; things on the worktop."""
     rng, depth, top, w = style.rng, 0.6, 0.9, width / 2
     columns = max(2, round(width / 0.6))
-    stone = materials.marble(
-        rng,
-        materials.vary(rng, style.pick([(0.32, 0.32, 0.33), (0.78, 0.75, 0.70), (0.60, 0.46, 0.34)]), 0.03),
-        (0.9, 0.88, 0.84),
-        0.25 + 0.5 * style.richness,
-    )
-    hob, sink = int(rng.integers(columns)), 0
+    colour = materials.vary(rng, style.pick([(0.32, 0.32, 0.33), (0.78, 0.75, 0.70), (0.60, 0.46, 0.34)]), 0.03)
+    stone = materials.marble(rng, colour, (0.9, 0.88, 0.84), 0.25 + 0.5 * style.richness)
+    hob = int(rng.integers(columns))
     sink = (hob + max(1, columns // 2)) % columns
     cell = width / columns
-    oven_face = artwork.screen(rng)
-    patches = cabinet(
-        style,
-        width,
-        depth,
-        top - 0.04,
-        columns=columns,
-        rows=1,
-        carcass=style.front,
-        front=style.front,
-        plinth=0.1,
-        faces={(hob, 0): oven_face},
-    )
+    size, oven = (width, depth, top - 0.04), {(hob, 0): artwork.screen(rng)}
+    patches = cabinet(style, size, columns=columns, carcass=style.front, plinth=0.1, faces=oven)
     sx = -w + (sink + 0.5) * cell
     basin_w, y0, y1 = min(0.5, cell - 0.06), 0.12, 0.5
     for low, high in (
@@ -79,28 +58,16 @@ def kitchen_run(style: Style, width: float, height: float, window: bool) -> list
     for dx, dy, r in ((-0.13, 0.18, 0.09), (0.13, 0.18, 0.07), (-0.13, 0.42, 0.07), (0.13, 0.42, 0.09)):
         patches += move(cylinder(r, 0.008, 0.011, style.metal, sides=20), shift=(hx + dx, dy, top))
     if style.chance(0.6):
-        pot = materials.plain(rng, style.pick([(0.7, 0.7, 0.72), (0.6, 0.16, 0.14), (0.2, 0.28, 0.36)]), shared=True)
-        patches += move(
-            lathe([(0, 0.135), (0.02, 0.135), (0.02, 0.12), (0.1, 0.11), (0.1, 0), (0, 0)], pot, sides=24),
-            shift=(hx + 0.13, 0.42, top + 0.0115),
-        )
+        enamel = materials.plain(rng, style.pick([(0.7, 0.7, 0.72), (0.6, 0.16, 0.14), (0.2, 0.28, 0.36)]), shared=True)
+        pot = lathe([(0, 0.135), (0.02, 0.135), (0.02, 0.12), (0.1, 0.11), (0.1, 0), (0, 0)], enamel, sides=24)
+        patches += move(pot, shift=(hx + 0.13, 0.42, top + 0.0115))
     if not window:
-        z0 = 1.45
-        above = cabinet(
-            style,
-            width,
-            0.34,
-            min(height - 0.15, 2.2) - z0,
-            columns=columns,
-            rows=1,
-            carcass=style.front,
-            front=style.front,
-            plinth=0.0,
-        )
-        patches += move(above, shift=(0, 0, z0))
-    spots = [c for c in np.arange(-w + 0.12, w - 0.1, 0.2) if abs(c - sx) > basin_w / 2 + 0.1 and abs(c - hx) > 0.4]
-    for x in spots:
-        if not style.chance(0.25 + 0.6 * style.clutter):
+        size = (width, 0.34, min(height - 0.15, 2.2) - 1.45)
+        above = cabinet(style, size, columns=columns, carcass=style.front, plinth=0.0)
+        patches += move(above, shift=(0, 0, 1.45))
+    for x in np.arange(-w + 0.12, w - 0.1, 0.2):
+        free = abs(x - sx) > basin_w / 2 + 0.1 and abs(x - hx) > 0.4
+        if not free or not style.chance(0.25 + 0.6 * style.clutter):
             continue
         kind = rng.integers(5 if abs(x) < w - 0.3 else 4)  # leaves must not reach past the end
         item = [
@@ -116,21 +83,16 @@ def kitchen_run(style: Style, width: float, height: float, window: bool) -> list
 
 def fridge(style: Style) -> list[Patch]:
     """Fridge with a few notes on its door."""
-    metal = materials.plain(style.rng, style.pick([(0.72, 0.73, 0.74), (0.9, 0.9, 0.89)]))
-    patches = box((-0.3, 0.02, 0), (0.3, 0.6, 1.85), metal, hidden=WALL_SIDE)
+    shell = materials.plain(style.rng, style.pick([(0.72, 0.73, 0.74), (0.9, 0.9, 0.89)]))
+    patches = box((-0.3, 0.02, 0), (0.3, 0.6, 1.85), shell, hidden=WALL_SIDE)
     for low, high in ((0.03, 0.68), (0.69, 1.84)):
-        patches += box((-0.3, 0.6, low), (0.3, 0.64, high), metal, hidden=("back",))
+        patches += box((-0.3, 0.6, low), (0.3, 0.64, high), shell, hidden=("back",))
     patches += tube([(0.25, 0.67, 1.3), (0.25, 0.67, 0.8)], 0.009, style.metal, sides=8)
     for _ in range(round(5 * style.clutter)):
         x, z = style.rng.uniform(-0.2, 0.12), style.rng.uniform(0.85, 1.65)
-        size = style.rng.uniform(0.05, 0.12, 2)
-        patches += box(
-            (x, 0.64, z),
-            (x + size[0], 0.642, z + size[1]),
-            style.paper,
-            faces={"front": artwork.package(style.rng)},
-            density=1.6,
-        )
+        w, h = style.rng.uniform(0.05, 0.12, 2)
+        faces = {"front": artwork.package(style.rng)}
+        patches += box((x, 0.64, z), (x + w, 0.642, z + h), style.paper, faces=faces, density=1.6)
     return patches
 
 
@@ -148,17 +110,15 @@ def toilet(style: Style) -> list[Patch]:
     """Toilet with cistern."""
     white = style.ceramic
     patches = cushion((-0.19, 0.02, 0.38), (0.19, 0.2, 0.8), white, radius_m=0.025, hidden=("back",))
-    bowl = lathe(
-        [(0, 0.44), (0.19, 0.44), (0.2, 0.41), (0.19, 0.34), (0.12, 0.14), (0.13, 0.0), (0, 0.0)], white, sides=28
-    )
-    stretch = np.diag([1.0, 1.25, 1.0])
-    patches += move(move(bowl, rotation=stretch), shift=(0, 0.42, 0))
+    profile = [(0, 0.44), (0.19, 0.44), (0.2, 0.41), (0.19, 0.34), (0.12, 0.14), (0.13, 0.0), (0, 0.0)]
+    bowl = move(lathe(profile, white, sides=28), rotation=np.diag([1.0, 1.25, 1.0]))
+    patches += move(bowl, shift=(0, 0.42, 0))
     return patches + box((-0.11, 0.02, 0), (0.11, 0.3, 0.379), white, hidden=WALL_SIDE)
 
 
 def basin(style: Style) -> list[Patch]:
     """Washbasin on a cabinet with a mirror above; bottles beside the tap."""
-    patches = cabinet(style, 0.62, 0.42, 0.72, columns=2, rows=1, carcass=style.front, front=style.front)
+    patches = cabinet(style, (0.62, 0.42, 0.72), columns=2, carcass=style.front)
     patches += trough((-0.34, 0.0, 0.72), (0.34, 0.47, 0.86), 0.04, 0.03, style.ceramic)
     patches += move(tap(style, 0.16), shift=(0, 0.02, 0.86))
     glass = materials.plain(style.rng, (0.70, 0.75, 0.77))
@@ -172,19 +132,10 @@ def basin(style: Style) -> list[Patch]:
 def washing_machine(style: Style) -> list[Patch]:
     """Washing machine with its door."""
     patches = box((-0.3, 0.02, 0), (0.3, 0.58, 0.85), style.white, hidden=WALL_SIDE)
-    ring = move(
-        cylinder(0.19, 0, 0.03, style.metal, sides=32) + cylinder(0.14, 0.03, 0.04, style.black, sides=32),
-        rotation=[[1, 0, 0], [0, 0, 1], [0, -1, 0]],
-        shift=(0, 0.58, 0.42),
-    )
-    panel = box(
-        (-0.29, 0.58, 0.73),
-        (0.29, 0.585, 0.83),
-        style.white,
-        faces={"front": artwork.package(style.rng)},
-        hidden=("back",),
-    )
-    return patches + ring + panel
+    door = cylinder(0.19, 0, 0.03, style.metal, sides=32) + cylinder(0.14, 0.03, 0.04, style.black, sides=32)
+    patches += move(door, rotation=[[1, 0, 0], [0, 0, 1], [0, -1, 0]], shift=(0, 0.58, 0.42))
+    panel = {"front": artwork.package(style.rng)}
+    return patches + box((-0.29, 0.58, 0.73), (0.29, 0.585, 0.83), style.white, faces=panel, hidden=("back",))
 
 
 def towel(style: Style) -> list[Patch]:
@@ -202,27 +153,21 @@ def towel(style: Style) -> list[Patch]:
 
 
 def radiator(style: Style, width: float, height: float) -> list[Patch]:
-    """Column radiator: the same slender element again and again."""
-    count = max(4, round(width / 0.06))
+    """Column radiator: a row of equal slender elements."""
+    count, white = max(4, round(width / 0.06)), style.small_white
     patches: list[Patch] = []
     for x in (np.arange(count) - (count - 1) / 2) * 0.06:
-        patches += cushion(
-            (x - 0.022, 0.04, 0.12),
-            (x + 0.022, 0.14, 0.12 + height),
-            style.small_white,
-            radius_m=0.02,
-            rounding=2,
-            span=1,
-        )
+        low, high = (x - 0.022, 0.04, 0.12), (x + 0.022, 0.14, 0.12 + height)
+        patches += cushion(low, high, white, radius_m=0.02, rounding=2, span=1)
     half = count * 0.03
     for z in (0.18, 0.06 + height):
-        patches += tube([(-half, 0.09, z), (half, 0.09, z)], 0.016, style.small_white, sides=8)
+        patches += tube([(-half, 0.09, z), (half, 0.09, z)], 0.016, white, sides=8)
     for x in (-half + 0.1, half - 0.1):
-        patches += tube([(x, 0.09, 0.15), (x, 0.09, 0)], 0.01, style.small_white, sides=6)
+        patches += tube([(x, 0.09, 0.15), (x, 0.09, 0)], 0.01, white, sides=6)
     return patches
 
 
-def curtain(style: Style, width: float, height: float, material: Material) -> list[Patch]:
+def curtain(width: float, height: float, material: Material) -> list[Patch]:
     """Wavy curtain from z = 0 (top) down; y = 0 is its middle."""
     folds = max(3, round(width / 0.11))
     n, m = 8 * folds, 6
@@ -242,9 +187,8 @@ def front_door(style: Style, width: float, height: float) -> list[Patch]:
     for x0, x1 in ((-w - 0.08, -w), (w, w + 0.08)):
         patches += box((x0, 0, 0), (x1, 0.045, height + 0.08), style.trim, hidden=WALL_SIDE)
     patches += box((-w, 0, height), (w, 0.045, height + 0.08), style.trim, hidden=("back",))
-    return patches + tube(
-        [(w - 0.06, 0.04, 1.02), (w - 0.06, 0.08, 1.02), (w - 0.17, 0.08, 1.02)], 0.01, style.metal, sides=8
-    )
+    handle = [(w - 0.06, 0.04, 1.02), (w - 0.06, 0.08, 1.02), (w - 0.17, 0.08, 1.02)]
+    return patches + tube(handle, 0.01, style.metal, sides=8)
 
 
 def coat_rack(style: Style, count: int) -> list[Patch]:

@@ -1,8 +1,9 @@
-"""What goes into a room of each kind, and where."""
+"""Puts furniture into rooms according to their kind."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 
@@ -11,12 +12,11 @@ from wheretolook.scenes.procedural.dressing import dress
 from wheretolook.scenes.procedural.layout import Lamp, Layout, Spot, overlap
 from wheretolook.scenes.procedural.patches import Patch, box, move
 from wheretolook.scenes.procedural.plan import Plan, outside_spans
-from wheretolook.scenes.procedural.shell import wall_items
 from wheretolook.scenes.procedural.style import Style
 
 
 def furnish(style: Style, plan: Plan) -> tuple[list[Patch], list[Lamp]]:
-    """Everything in the rooms of a plan, and the lamps that are lit."""
+    """Everything in the rooms of a plan, and the lamps that are lit. The front door is in the hall if there is one."""
     furnisher = Furnisher(style, plan)
     entrance = min(plan.rooms, key=lambda room: {"hall": 0, "living": 1}.get(room.kind, 2))
     patches: list[Patch] = []
@@ -35,7 +35,7 @@ def furnish(style: Style, plan: Plan) -> tuple[list[Patch], list[Lamp]]:
 
 
 class Furnisher:
-    """Knows what belongs into a room of each kind."""
+    """Furnishes the rooms of one apartment, each according to its kind."""
 
     def __init__(self, style: Style, plan: Plan) -> None:
         self.style, self.plan = style, plan
@@ -61,14 +61,18 @@ class Furnisher:
         front: float = 0.5,
         sides: list[int] | None = None,
     ) -> Spot | None:
-        width, depth, height = size
-        spot = layout.find_by_wall(width, depth, height, place=place, front=front, sides=sides)
+        """Stand a piece of furniture at a wall, if there is a place; see `Layout.find_by_wall`."""
+        spot = layout.find_by_wall(size, place, front, sides)
         if spot is not None:
-            layout.put_by_wall(patches, spot, width, height, depth, front)
+            layout.put_by_wall(patches, spot)
         return spot
 
-    def _rug(self, layout: Layout, x: float, y: float, width: float, depth: float) -> None:
-        room = layout.room
+    def _bookshelf(self, layout: Layout, width: float, height: float, place: str = "any") -> None:
+        self._stand(layout, furniture.bookshelf(self.style, width, height), (width, 0.3, height), place)
+
+    def _rug(self, layout: Layout, centre: tuple[float, float], size: tuple[float, float], turned: bool) -> None:
+        """Lay a rug of a size in x and y, or the other way round if turned, cut off near the walls."""
+        room, (x, y), (width, depth) = layout.room, centre, size[::-1] if turned else size
         x0, x1 = max(x - width / 2, room.x0 + 0.15), min(x + width / 2, room.x1 - 0.15)
         y0, y1 = max(y - depth / 2, room.y0 + 0.15), min(y + depth / 2, room.y1 - 0.15)
         if min(x1 - x0, y1 - y0) > 0.4:
@@ -76,45 +80,37 @@ class Furnisher:
 
     def front_door(self, layout: Layout) -> None:
         """Closed door to the outside; without a free outer wall there is none."""
-        room, width = layout.room, 0.95
-        for side in self.style.rng.permutation(4):
-            for low, high in outside_spans(room, self.plan.rooms, int(side)):
-                at = (
-                    float(self.style.rng.uniform(low + width / 2 + 0.15, high - width / 2 - 0.15))
-                    if high - low > width + 0.4
-                    else None
-                )
-                if at is not None and layout.wall_is_clear(
-                    int(side), at - width / 2 - 0.1, at + width / 2 + 0.1, 0, 2.2
-                ):
-                    layout.patches += wall_items(room, int(side), at, fixtures.front_door(self.style, width, 2.05))
-                    layout.add_door(int(side), at - width / 2, at + width / 2, 2.1)
+        width, half = 0.95, 0.95 / 2
+        for side in map(int, self.style.rng.permutation(4)):
+            for low, high in outside_spans(layout.room, self.plan.rooms, side):
+                if high - low <= width + 0.4:
+                    continue
+                at = float(self.style.rng.uniform(low + half + 0.15, high - half - 0.15))
+                if layout.wall_is_clear(side, at - half - 0.1, at + half + 0.1, 0, 2.2):
+                    layout.put_on_wall(side, at, fixtures.front_door(self.style, width, 2.05))
+                    layout.add_door(side, at - half, at + half, 2.1)
                     return
 
-    def _dining(self, layout: Layout, seats: int) -> bool:
+    def _dining(self, layout: Layout, seats: int) -> None:
+        """Table with chairs on the floor, with fewer seats where it does not fit."""
         style = self.style
         for count in range(seats, 1, -2):
             length, depth = {2: 0.75, 4: 1.2, 6: 1.7}[count], 0.8
             turned = style.chance(0.5)
-            full = (length + 0.1, depth + 1.0)
-            w, d = full[::-1] if turned else full
+            w, d = (depth + 1.0, length + 0.1) if turned else (length + 0.1, depth + 1.0)
             spot = layout.find_on_floor(w, d, 0.25)
             if spot is None:
                 continue
             patches = move(furniture.table(style, length, depth, 0.75, style.second_wood), shift=(0, -depth / 2, 0))
             for k in range(count // 2):
                 x = (k - (count / 2 - 1) / 2) * length / (count / 2)
-                for sign in (-1, 1):
-                    pulled = float(style.rng.uniform(0.0, 0.12))
-                    seat = furniture.chair(style, *self.dining_chair)
-                    patches += move(
-                        seat, angle_rad=0.0 if sign < 0 else np.pi, shift=(x, sign * (depth / 2 + 0.08 + pulled), 0)
-                    )
+                for sign, angle in ((-1, 0.0), (1, np.pi)):
+                    y = sign * (depth / 2 + 0.08 + float(style.rng.uniform(0.0, 0.12)))
+                    patches += move(furniture.chair(style, *self.dining_chair), angle_rad=angle, shift=(x, y, 0))
             patches += self._on_table(length, depth, 0.75)
             layout.patches += move(patches, angle_rad=np.pi / 2 if turned else 0.0, shift=(*spot, 0))
             layout.footprints.append((spot[0] - w / 2, spot[1] - d / 2, spot[0] + w / 2, spot[1] + d / 2))
-            return True
-        return False
+            return
 
     def _on_table(self, length: float, depth: float, height: float) -> list[Patch]:
         style = self.style
@@ -137,89 +133,70 @@ class Furnisher:
             self._kitchen(layout)
         spot = None
         for seats in (3, 2) if max(room.width, room.depth) > 4.2 else (2,):
-            spot = spot or self._stand(
-                layout, furniture.sofa(style, seats), (0.62 * seats + 0.36, 0.92, 0.85), "middle", front=0.42
-            )
+            size = (0.62 * seats + 0.36, 0.92, 0.85)
+            spot = spot or self._stand(layout, furniture.sofa(style, seats), size, "middle", front=0.42)
         tv = float(style.rng.uniform(1.4, 1.8))
         opposite = None if spot is None else [(spot.side + 2) % 4, (spot.side + 1) % 4, (spot.side + 3) % 4]
         self._stand(layout, furniture.media_unit(style, tv), (tv, 0.45, 1.3), "middle", 0.7, opposite)
         if spot is not None:
             self._before_sofa(layout, spot)
         for _ in range(1 + round(1.5 * style.clutter)):
-            w = float(style.rng.choice([0.8, 1.0, 1.4]))
-            height = float(style.rng.uniform(1.7, 2.15))
-            place = "corner" if style.chance(0.5) else "any"
-            self._stand(layout, furniture.bookshelf(style, w, height), (w, 0.3, height), place)
+            width, height = float(style.rng.choice([0.8, 1.0, 1.4])), float(style.rng.uniform(1.7, 2.15))
+            self._bookshelf(layout, width, height, "corner" if style.chance(0.5) else "any")
         if room.area > 15:
             self._dining(layout, 6)
         self._stand(layout, furniture.sofa(style, 1), (0.98, 0.92, 0.85), "any")
         self._floor_lamp(layout)
 
     def _before_sofa(self, layout: Layout, sofa: Spot) -> None:
-        style = self.style
-        corner, right, normal = layout.room.wall_frame(sofa.side)
-        x, y, _ = corner + sofa.at * right + 1.65 * normal
-        self._rug(layout, x, y, *((1.6, 2.3) if sofa.side % 2 else (2.3, 1.6)))
+        """Rug and coffee table."""
+        self._rug(layout, layout.point(sofa.side, sofa.at, 1.65), (2.3, 1.6), bool(sofa.side % 2))
         footprint = layout.rectangle(sofa.side, sofa.at - 0.52, sofa.at + 0.52, 1.36, 1.93)
-        # it may stand where the sofa and the television keep the floor free, but not before a door
-        kept = layout.footprints + layout.keep_free[: len(layout.doors)]
-        if layout.contains(footprint) and not any(overlap(footprint, f) for f in kept) and layout.passable(footprint):
-            table = furniture.table(style, 1.0, 0.55, 0.42, style.second_wood)
+        # The table may stand where the sofa and the television keep the floor free, but not before a door.
+        taken = layout.footprints + layout.keep_free[: len(layout.doors)]
+        if layout.contains(footprint) and not any(overlap(footprint, f) for f in taken) and layout.passable(footprint):
+            table = furniture.table(self.style, 1.0, 0.55, 0.42, self.style.second_wood)
             table += move(self._on_table(1.0, 0.55, 0.42), shift=(0, 0.275, 0))
-            layout.patches += wall_items(layout.room, sofa.side, sofa.at, move(table, shift=(0, 1.37, 0)))
+            layout.put_on_wall(sofa.side, sofa.at, move(table, shift=(0, 1.37, 0)))
             layout.footprints.append(footprint)
 
     def _floor_lamp(self, layout: Layout) -> None:
         lit = layout.room.lamp_on and self.style.chance(0.7)
-        spot = layout.find_by_wall(0.46, 0.46, 1.7, place="corner", front=0.0)
+        spot = layout.find_by_wall((0.46, 0.46, 1.7), "corner", front=0.0)
         if spot is not None:
-            layout.put_by_wall(move(decor.floor_lamp(self.style, lit), shift=(0, 0.23, 0)), spot, 0.46, 1.7, 0.46, 0)
+            layout.put_by_wall(move(decor.floor_lamp(self.style, lit), shift=(0, 0.23, 0)), spot)
             if lit:
-                layout.add_lamp(spot, 0.23, 1.52, 0.5)
+                layout.add_lamp(*layout.point(spot.side, spot.at, 0.23), 1.52, 0.5)
 
     def _kitchen(self, layout: Layout) -> None:
-        style, room = self.style, layout.room
-        for width in (3.6, 3.0, 2.4, 1.8):
-            spot = None
-            for height, window in ((2.2, False), (0.92, True)):
-                spot = layout.find_by_wall(width, 0.64, height, place="corner", front=0.8)
-                if spot is not None:
-                    run = fixtures.kitchen_run(style, width, self.plan.height, window)
-                    layout.put_by_wall(run, spot, width, height, 0.64, 0.8)
-                    self._splashback(layout, spot, width, window)
-                    break
+        style = self.style
+        for width, height in product((3.6, 3.0, 2.4, 1.8), (2.2, 0.92)):
+            spot = layout.find_by_wall((width, 0.64, height), "corner", front=0.8)
             if spot is not None:
+                below_window = height < 1
+                layout.put_by_wall(fixtures.kitchen_run(style, width, self.plan.height, below_window), spot)
+                self._splashback(layout, spot, width, below_window)
                 break
         self._stand(layout, fixtures.fridge(style), (0.64, 0.66, 1.9), "corner", 0.6)
-        if room.kind == "kitchen":
+        if layout.room.kind == "kitchen":
             if style.chance(0.5):
                 self._stand(layout, fixtures.washing_machine(style), (0.62, 0.6, 0.88), "corner")
             self._dining(layout, 4)
-            self._stand(layout, furniture.bookshelf(style, 0.8, 1.6), (0.8, 0.3, 1.6))
+            self._bookshelf(layout, 0.8, 1.6)
 
-    def _splashback(self, layout: Layout, spot: Spot, width: float, window: bool) -> None:
-
-        style = self.style
+    def _splashback(self, layout: Layout, spot: Spot, width: float, below_window: bool) -> None:
+        """Tiles between the worktop and the wall units or the window."""
+        rng, style = self.style.rng, self.style
         size = style.pick([(0.1, 0.1), (0.2, 0.1), (0.15, 0.15)])
-        colour = materials.vary(style.rng, style.pick([(0.92, 0.92, 0.9), (0.55, 0.66, 0.66), (0.8, 0.74, 0.6)]), 0.03)
-        tile = materials.tiles(
-            style.rng,
-            colour,
-            (0.6, 0.6, 0.58),
-            size_m=size,
-            brick=size[0] != size[1],
-            variation=0.02 + 0.05 * style.richness,
-        )
+        colour = materials.vary(rng, style.pick([(0.92, 0.92, 0.9), (0.55, 0.66, 0.66), (0.8, 0.74, 0.6)]), 0.03)
+        brick, variation = size[0] != size[1], 0.02 + 0.05 * style.richness
+        tile = materials.tiles(rng, colour, (0.6, 0.6, 0.58), size_m=size, brick=brick, variation=variation)
         top = 1.45
-        if window:
+        if below_window:
             low = min((o.z0 for o in layout.room.openings[spot.side] if o.kind == "window"), default=1.2)
             top = min(1.2, low - 0.035)
-        layout.patches += wall_items(
-            layout.room,
-            spot.side,
-            spot.at,
-            box((-width / 2, 0, 0.9), (width / 2, 0.006, top), tile, hidden=("back", "bottom")),
-        )
+        tiled = box((-width / 2, 0, 0.9), (width / 2, 0.006, top), tile, hidden=("back", "bottom"))
+        layout.put_on_wall(spot.side, spot.at, tiled)
 
     def _bedroom(self, layout: Layout) -> None:
         style = self.style
@@ -229,68 +206,50 @@ class Furnisher:
                 break
         if spot is not None:
             for sign in (-1, 1):
-                at = spot.at + sign * (width / 2 + 0.05 + 0.24)
-                beside = layout.rectangle(spot.side, at - 0.22, at + 0.22, 0, 0.4)
-                if layout.wall_is_clear(spot.side, at - 0.22, at + 0.22, 0, 0.9, gap=0.0) and layout.is_clear(
-                    beside, 0.0
-                ):
-                    lit = layout.room.lamp_on and style.chance(0.6)
-                    stand = Spot(spot.side, at, beside)
-                    layout.put_by_wall(furniture.nightstand(style, lit), stand, 0.44, 0.95, 0.4, 0.0)
-                    if lit:
-                        layout.add_lamp(stand, 0.16, 0.87, 0.25, along=0.06)
+                self._nightstand(layout, spot.side, spot.at + sign * (width / 2 + 0.05 + 0.24))
             if style.chance(0.7):
-                corner, right, normal = layout.room.wall_frame(spot.side)
-                x, y, _ = corner + spot.at * right + 1.7 * normal
-                size = (width + 1.0, 1.5)
-                self._rug(layout, x, y, *(size[::-1] if spot.side % 2 else size))
-        w = float(style.rng.choice([1.2, 1.6, 2.0]))
-        for width in (w, 1.0):
-            robe = furniture.cabinet(
-                style,
-                width,
-                0.6,
-                2.1,
-                columns=round(width / 0.5),
-                rows=1,
-                carcass=style.wood,
-                front=style.wood if style.chance(0.5) else style.front,
-            )
-            if self._stand(layout, robe, (width, 0.62, 2.12), "corner", 0.6) is not None:
+                self._rug(layout, layout.point(spot.side, spot.at, 1.7), (width + 1.0, 1.5), bool(spot.side % 2))
+        for width in (float(style.rng.choice([1.2, 1.6, 2.0])), 1.0):
+            front = style.wood if style.chance(0.5) else style.front
+            wardrobe = furniture.cabinet(style, (width, 0.6, 2.1), columns=round(width / 0.5), front=front)
+            if self._stand(layout, wardrobe, (width, 0.62, 2.12), "corner", 0.6) is not None:
                 break
         if style.chance(0.6):
             self._desk(layout)
         if style.chance(0.7):
-            chest = furniture.cabinet(style, 0.9, 0.42, 0.85, columns=2, rows=3, carcass=style.wood, front=style.front)
-            chest += move(decor.vase(style, 0.25), shift=(-0.25, 0.2, 0.85)) + move(
-                decor.book_stack(style, 2), shift=(0.2, 0.2, 0.85)
-            )
+            chest = furniture.cabinet(style, (0.9, 0.42, 0.85), columns=2, rows=3)
+            chest += move(decor.vase(style, 0.25), shift=(-0.25, 0.2, 0.85))
+            chest += move(decor.book_stack(style, 2), shift=(0.2, 0.2, 0.85))
             self._stand(layout, chest, (0.9, 0.46, 1.1))
-        self._stand(layout, furniture.bookshelf(style, 0.8, 1.8), (0.8, 0.3, 1.8)) if style.chance(
-            0.2 + 0.6 * style.clutter
-        ) else None
+        if style.chance(0.2 + 0.6 * style.clutter):
+            self._bookshelf(layout, 0.8, 1.8)
+
+    def _nightstand(self, layout: Layout, side: int, at: float) -> None:
+        a0, a1 = at - 0.22, at + 0.22
+        spot = Spot(side, at, (0.44, 0.4, 0.95), 0.0, layout.rectangle(side, a0, a1, 0, 0.4))
+        if layout.wall_is_clear(side, a0, a1, 0, 0.9, gap=0.0) and layout.is_clear(spot.footprint, 0.0):
+            lit = layout.room.lamp_on and self.style.chance(0.6)
+            layout.put_by_wall(furniture.nightstand(self.style, lit), spot)
+            if lit:
+                layout.add_lamp(*layout.point(side, at - 0.06, 0.16), 0.87, 0.25)
 
     def _desk(self, layout: Layout) -> None:
-        style = self.style
-        patches = furniture.desk(style, 1.3) + move(
-            furniture.chair(style, *self.dining_chair),
-            angle_rad=np.pi + style.rng.normal(0, 0.1),
-            shift=(0.05, 0.85, 0),
-        )
+        patches = furniture.desk(self.style, 1.3)
+        chair = furniture.chair(self.style, *self.dining_chair)
+        patches += move(chair, angle_rad=np.pi + self.style.rng.normal(0, 0.1), shift=(0.05, 0.85, 0))
         self._stand(layout, patches, (1.34, 1.12, 1.3), "any", 0.1)
 
     def _study(self, layout: Layout) -> None:
         style = self.style
         self._desk(layout)
         for _ in range(2 + round(2 * style.clutter)):
-            w = float(style.rng.choice([0.8, 1.2]))
-            self._stand(layout, furniture.bookshelf(style, w, 2.0), (w, 0.3, 2.0))
+            self._bookshelf(layout, float(style.rng.choice([0.8, 1.2])), 2.0)
         self._stand(layout, furniture.sofa(style, 1), (0.98, 0.92, 0.85))
-        self._rug(layout, (layout.room.x0 + layout.room.x1) / 2, (layout.room.y0 + layout.room.y1) / 2, 1.8, 1.3)
+        self._rug(layout, layout.room.centre, (1.8, 1.3), turned=False)
         self._floor_lamp(layout)
 
     def _bathroom(self, layout: Layout) -> None:
-        style, room = self.style, layout.room
+        style = self.style
         for width in (1.7, 1.5):
             if self._stand(layout, fixtures.bathtub(style, width), (width, 0.77, 0.6), "corner", 0.3) is not None:
                 break
@@ -298,36 +257,29 @@ class Furnisher:
         self._stand(layout, fixtures.toilet(style), (0.5, 0.68, 1.0), "any", 0.45)
         if style.chance(0.6):
             self._stand(layout, fixtures.washing_machine(style), (0.62, 0.6, 0.88), "corner", 0.5)
-
-        for side in style.rng.permutation(4)[:3]:
-            at = layout.hang(0.66, 0.7, 1.5, int(side), depth=0.1)
+        for side in map(int, style.rng.permutation(4)[:3]):
+            at = layout.hang(0.66, 0.7, 1.5, side, depth=0.1)
             if at is not None:
-                layout.patches += wall_items(room, int(side), at, move(fixtures.towel(style), shift=(0, 0, 1.4)))
+                layout.put_on_wall(side, at, move(fixtures.towel(style), shift=(0, 0, 1.4)))
         spot = layout.find_on_floor(0.8, 0.5, 0.1)
         if spot is not None:
-            layout.patches += box(
-                (spot[0] - 0.4, spot[1] - 0.25, 0), (spot[0] + 0.4, spot[1] + 0.25, 0.012), style.patterned()
-            )
+            x, y = spot
+            layout.patches += box((x - 0.4, y - 0.25, 0), (x + 0.4, y + 0.25, 0.012), style.patterned())
 
     def _hall(self, layout: Layout) -> None:
         style, room = self.style, layout.room
         narrow = min(room.width, room.depth) < 1.7
         depth = 0.26 if narrow else 0.38
-        shoes = furniture.cabinet(style, 0.9, depth, 0.85, columns=2, rows=2, carcass=style.wood, front=style.front)
-        shoes += move(decor.bowl(style, 0.1, False), shift=(-0.2, depth / 2, 0.85)) + move(
-            decor.vase(style, 0.28), shift=(0.25, depth / 2, 0.85)
-        )
+        shoes = furniture.cabinet(style, (0.9, depth, 0.85), columns=2, rows=2)
+        shoes += move(decor.bowl(style, 0.1, False), shift=(-0.2, depth / 2, 0.85))
+        shoes += move(decor.vase(style, 0.28), shift=(0.25, depth / 2, 0.85))
         self._stand(layout, shoes, (0.9, depth + 0.04, 1.15), "any", 0.3)
-
-        for side in style.rng.permutation(4):
-            at = layout.hang(1.0, 0.65, 1.85, int(side), depth=0.16)
+        for side in map(int, style.rng.permutation(4)):
+            at = layout.hang(1.0, 0.65, 1.85, side, depth=0.16)
             if at is not None:
-                layout.patches += wall_items(room, int(side), at, fixtures.coat_rack(style, 3))
+                layout.put_on_wall(side, at, fixtures.coat_rack(style, 3))
                 break
         if not narrow:
-            self._stand(layout, furniture.bookshelf(style, 0.8, 2.0), (0.8, 0.3, 2.0))
-        long = max(room.width, room.depth)
-        size = (min(long - 1.2, 2.6), 0.75)
-        self._rug(
-            layout, (room.x0 + room.x1) / 2, (room.y0 + room.y1) / 2, *(size if room.width > room.depth else size[::-1])
-        )
+            self._bookshelf(layout, 0.8, 2.0)
+        length = min(max(room.width, room.depth) - 1.2, 2.6)
+        self._rug(layout, room.centre, (length, 0.75), turned=room.width <= room.depth)

@@ -14,73 +14,51 @@ from wheretolook.scenes.procedural.style import Style
 WALL_SIDE = ("back", "bottom")
 
 
-def leg(
-    x: float, y: float, top: float, material: Material, *, radius: float = 0.022, splay: tuple[float, float] = (0, 0)
-) -> list[Patch]:
-    """Tapered round leg."""
-    return tube(
-        [(x, y, top), (x + splay[0] / 2, y + splay[1] / 2, top / 2), (x + splay[0], y + splay[1], 0.001)],
-        [radius, 0.85 * radius, 0.65 * radius],
-        material,
-        sides=10,
-    )
-
-
 def legs(
     width: float, y0: float, y1: float, top: float, material: Material, *, radius: float = 0.022, splay: float = 0.0
 ) -> list[Patch]:
-    """Four legs under a rectangle of the given width, centred in x."""
-    return [
-        p
-        for sx in (-1, 1)
-        for y, sy in ((y0, -1), (y1, 1))
-        for p in leg(sx * width / 2, y, top, material, radius=radius, splay=(sx * splay, sy * splay))
-    ]
+    """Four tapered round legs under a rectangle of the given width, centred in x."""
+    radii = [radius, 0.85 * radius, 0.65 * radius]
+    patches: list[Patch] = []
+    for side in (-1, 1):
+        for y, dy in ((y0, -splay), (y1, splay)):
+            x, dx = side * width / 2, side * splay
+            path = [(x, y, top), (x + dx / 2, y + dy / 2, top / 2), (x + dx, y + dy, 0.001)]
+            patches += tube(path, radii, material, sides=10)
+    return patches
 
 
 def sofa(style: Style, seats: int) -> list[Patch]:
     """Sofa or armchair: frame, arms, swelling seat and back cushions, a few pillows; 0.9 m deep."""
-    cloth, arm, depth = style.upholstery, 0.17, 0.88
+    rng, cloth, arm, depth = style.rng, style.upholstery, 0.17, 0.88
     seat = 0.62 if seats > 1 else 0.6
     width = seats * seat + 2 * arm
     w = width / 2
-    patches = legs(width - 0.14, 0.1, depth - 0.1, 0.13, style.leg(), radius=0.025)
+    inner = w - arm * 0.9
+    patches = legs(width - 0.14, 0.1, depth - 0.1, 0.13, style.leg, radius=0.025)
     patches += cushion((-w, 0.02, 0.12), (w, depth, 0.3), cloth, radius_m=0.03, hidden=WALL_SIDE)
-    patches += cushion(
-        (-w + arm * 0.9, 0.02, 0.29), (w - arm * 0.9, 0.24, 0.72), cloth, radius_m=0.06, hidden=WALL_SIDE
-    )
+    patches += cushion((-inner, 0.02, 0.29), (inner, 0.24, 0.72), cloth, radius_m=0.06, hidden=WALL_SIDE)
     for x in (-w, w - arm):
         patches += cushion((x, 0.02, 0.29), (x + arm, depth, 0.6), cloth, radius_m=0.07, hidden=WALL_SIDE)
     for k in range(seats):
         x = -w + arm + k * seat
-        patches += cushion(
-            (x + 0.004, 0.23, 0.295),
-            (x + seat - 0.004, depth + 0.01, 0.43),
-            cloth,
-            radius_m=0.045,
-            puff=(0, 0.01, 0.025),
-            span=7,
-        )
-        patches += cushion(
-            (x + 0.01, 0.2, 0.43), (x + seat - 0.01, 0.36, 0.82), cloth, radius_m=0.07, puff=(0, 0.03, 0.015), span=7
-        )
-    for x in style.rng.permutation(np.linspace(-w + arm + 0.25, w - arm - 0.25, 2 * seats))[
-        : int(style.rng.integers(1, seats + 1))
-    ]:
-        tilt = float(style.rng.uniform(0.2, 0.35))
+        low, high = (x + 0.004, 0.23, 0.295), (x + seat - 0.004, depth + 0.01, 0.43)
+        patches += cushion(low, high, cloth, radius_m=0.045, puff=(0, 0.01, 0.025), span=7)
+        low, high = (x + 0.01, 0.2, 0.43), (x + seat - 0.01, 0.36, 0.82)
+        patches += cushion(low, high, cloth, radius_m=0.07, puff=(0, 0.03, 0.015), span=7)
+    places = rng.permutation(np.linspace(-w + arm + 0.25, w - arm - 0.25, 2 * seats))
+    for x in places[: int(rng.integers(1, seats + 1))]:
+        tilt = float(rng.uniform(0.2, 0.35))
         patches += move(tilted_back(decor.pillow(style, style.patterned(), 0.4), tilt), shift=(x, 0.46, 0.475))
     return patches
 
 
-def table(
-    style: Style, width: float, depth: float, height: float, material: Material, *, thick: float = 0.035
-) -> list[Patch]:
-    """Table with four legs and an apron."""
-    w = width / 2
-    patches = box((-w, 0, height - thick), (w, depth, height), material)
-    patches += legs(width - 0.12, 0.06, depth - 0.06, height - thick, style.leg(), radius=0.028)
+def table(style: Style, width: float, depth: float, height: float, material: Material) -> list[Patch]:
+    """Table with four legs; with an apron if it is high."""
+    w, z = width / 2, height - 0.035
+    patches = box((-w, 0, z), (w, depth, height), material)
+    patches += legs(width - 0.12, 0.06, depth - 0.06, z, style.leg, radius=0.028)
     if height > 0.6:
-        z = height - thick
         patches += box((-w + 0.07, 0.05, z - 0.07), (w - 0.07, 0.07, z), style.small_wood)
         patches += box((-w + 0.07, depth - 0.07, z - 0.07), (w - 0.07, depth - 0.05, z), style.small_wood)
     return patches
@@ -88,10 +66,10 @@ def table(
 
 def chair(style: Style, wooden: Material, cloth: Material) -> list[Patch]:
     """Dining chair, centred on the origin, its back towards -y."""
-    patches = legs(0.36, -0.18, 0.18, 0.43, style.leg(), radius=0.018, splay=0.02)
+    patches = legs(0.36, -0.18, 0.18, 0.43, style.leg, radius=0.018, splay=0.02)
     patches += cushion((-0.22, -0.21, 0.43), (0.22, 0.22, 0.48), cloth, radius_m=0.022, puff=(0, 0, 0.012), span=5)
     for x in (-0.19, 0.19):
-        patches += tube([(x, -0.19, 0.44), (x, -0.22, 0.65), (x, -0.26, 0.9)], 0.016, style.leg(), sides=8)
+        patches += tube([(x, -0.19, 0.44), (x, -0.22, 0.65), (x, -0.26, 0.9)], 0.016, style.leg, sides=8)
     for z in (0.62, 0.74, 0.86):
         y = -0.2 - 0.07 * (z - 0.44) / 0.46
         patches += cushion((-0.2, y - 0.02, z - 0.035), (0.2, y + 0.005, z + 0.035), wooden, radius_m=0.011, hidden=())
@@ -104,55 +82,56 @@ def bed(style: Style, width: float) -> list[Patch]:
     frame = style.wood if style.chance(0.6) else style.upholstery
     sheet = materials.fabric(rng, (0.90, 0.89, 0.86), weave=0.01)
     cover = style.patterned()
-    patches = cushion(
-        (-w - 0.04, 0.02, 0), (w + 0.04, 0.1, float(rng.uniform(0.9, 1.15))), frame, radius_m=0.02, hidden=WALL_SIDE
-    )
-    patches += box((-w - 0.03, 0.1, 0.12), (w + 0.03, length, 0.3), frame) + legs(
-        width - 0.15, 0.2, length - 0.08, 0.12, style.leg(), radius=0.03
-    )
+    head = float(rng.uniform(0.9, 1.15))
+    patches = cushion((-w - 0.04, 0.02, 0), (w + 0.04, 0.1, head), frame, radius_m=0.02, hidden=WALL_SIDE)
+    patches += box((-w - 0.03, 0.1, 0.12), (w + 0.03, length, 0.3), frame)
+    patches += legs(width - 0.15, 0.2, length - 0.08, 0.12, style.leg, radius=0.03)
     patches += cushion((-w, 0.1, 0.3), (w, length - 0.02, 0.48), sheet, radius_m=0.05)
-    n, m = 36, 28
-    s, t = np.linspace(-1, 1, n + 1), np.linspace(0, 1, m + 1)
-    x = np.broadcast_to((w + 0.03) * s, (m + 1, n + 1))
-    y = np.broadcast_to((0.72 + (length + 0.01 - 0.72) * t)[:, None], x.shape)
+    patches += _duvet(rng, w + 0.03, length + 0.01, cover, (2 * w, length - 0.72))
+    count = 2 if width > 1.2 else 1
+    for k in range(count):
+        x = (k - (count - 1) / 2) * width / count
+        low, high = (x - 0.32, 0.14, 0.46), (x + 0.32, 0.56, 0.56)
+        patches += cushion(low, high, sheet, radius_m=0.04, puff=(0, 0, 0.05), span=7)
+        if style.chance(0.6):
+            patches += move(tilted_back(decor.pillow(style, cover, 0.38), 0.5), shift=(x, 0.62, 0.55))
+    return patches
+
+
+def _duvet(
+    rng: np.random.Generator, half_width: float, end: float, cover: Material, size_m: tuple[float, float]
+) -> list[Patch]:
+    """Rippled cover from y = 0.72 to `end`, whose edges hang over the mattress."""
+    x = np.broadcast_to(half_width * np.linspace(-1, 1, 37), (29, 37))
+    y = np.broadcast_to((0.72 + (end - 0.72) * np.linspace(0, 1, 29))[:, None], x.shape)
     ripple = 0.012 * np.sin(7 * x + 3 * y + rng.uniform(0, 6)) + 0.01 * np.sin(4 * x - 9 * y + rng.uniform(0, 6))
-    edge = (
-        np.clip((w + 0.03 - np.abs(x)) / 0.06, 0, 1)
-        * np.clip((length + 0.01 - y) / 0.06, 0, 1)
-        * np.clip((y - 0.72) / 0.08, 0, 1)
-    )
+    across, to_foot, to_head = (half_width - np.abs(x)) / 0.06, (end - y) / 0.06, (y - 0.72) / 0.08
+    edge = np.clip(across, 0, 1) * np.clip(to_foot, 0, 1) * np.clip(to_head, 0, 1)
     fall = 0.48 - 0.16 * (1 - np.sqrt(edge * (2 - edge)))
     top = np.stack([x, y, np.maximum(fall + 0.045 * edge + ripple * edge, 0.33)], -1)[::-1]
     under = top.copy()
     under[..., 2] = 0.325
-    patches += slab_between(top, under, cover, (2 * w, length - 0.72))
-    count = 2 if width > 1.2 else 1
-    for k in range(count):
-        x0 = (k - (count - 1) / 2) * width / count
-        pillow = cushion(
-            (x0 - 0.32, 0.14, 0.46), (x0 + 0.32, 0.56, 0.56), sheet, radius_m=0.04, puff=(0, 0, 0.05), span=7
-        )
-        patches += pillow
-        if style.chance(0.6):
-            patches += move(tilted_back(decor.pillow(style, cover, 0.38), 0.5), shift=(x0, 0.62, 0.55))
-    return patches
+    return slab_between(top, under, cover, size_m)
 
 
 def cabinet(
     style: Style,
-    width: float,
-    depth: float,
-    height: float,
+    size: tuple[float, float, float],
     *,
     columns: int,
-    rows: int,
-    carcass: Material,
-    front: Material,
+    rows: int = 1,
+    carcass: Material | None = None,
+    front: Material | None = None,
     plinth: float = 0.08,
     faces: dict[tuple[int, int], Material] | None = None,
 ) -> list[Patch]:
-    """Carcass with a grid of doors or drawers and their handles."""
-    w = width / 2
+    """Carcass with a grid of doors or drawers and their handles.
+
+    `size` is width, depth and height, `plinth` the height of the recessed foot, in metres. `faces` are the materials of
+    single doors by column and row. Without materials, the carcass is of the style's wood, the doors are its fronts.
+    """
+    (width, depth, height), w = size, size[0] / 2
+    carcass, front = carcass or style.wood, front or style.front
     patches = box((-w, 0, plinth), (w, depth - 0.02, height), carcass, hidden=WALL_SIDE)
     if plinth > 0:
         patches += box((-w + 0.02, 0, 0), (w - 0.02, depth - 0.06, plinth), style.black, hidden=WALL_SIDE)
@@ -161,50 +140,42 @@ def cabinet(
         for j in range(rows):
             x0, z0 = -w + i * cell_w + 0.003, plinth + j * cell_h + 0.003
             x1, z1 = x0 + cell_w - 0.006, z0 + cell_h - 0.006
-            face = (faces or {}).get((i, j), front)
-            patches += box((x0, depth - 0.02, z0), (x1, depth, z1), front, faces={"front": face}, hidden=WALL_SIDE)
+            face = {"front": (faces or {}).get((i, j), front)}
+            patches += box((x0, depth - 0.02, z0), (x1, depth, z1), front, faces=face, hidden=WALL_SIDE)
             if cell_h < 0.9 * cell_w:
-                c, half = (x0 + x1) / 2, min(0.08, cell_w / 4)
-                patches += tube(
-                    [(c - half, depth + 0.02, z1 - 0.05), (c + half, depth + 0.02, z1 - 0.05)],
-                    0.006,
-                    style.metal,
-                    sides=6,
-                )
+                middle, half, z = (x0 + x1) / 2, min(0.08, cell_w / 4), z1 - 0.05
+                ends = ((middle - half, z), (middle + half, z))
             else:
                 x = x1 - 0.04 if i % 2 == 0 else x0 + 0.04
-                middle = min(max(1.0, z0 + 0.2), z1 - 0.12)
-                patches += tube(
-                    [(x, depth + 0.02, middle + 0.07), (x, depth + 0.02, middle - 0.07)], 0.006, style.metal, sides=6
-                )
+                z = min(max(1.0, z0 + 0.2), z1 - 0.12)
+                ends = ((x, z + 0.07), (x, z - 0.07))
+            patches += tube([(x, depth + 0.02, z) for x, z in ends], 0.006, style.metal, sides=6)
     return patches
 
 
 def bookshelf(style: Style, width: float, height: float, depth: float = 0.28) -> list[Patch]:
     """Open shelves full of books, with vases and boxes between."""
-    rng, w, board = style.rng, width / 2, 0.022
-    wooden = style.wood
-    patches = box((-w, 0, 0), (-w + board, depth, height), wooden) + box((w - board, 0, 0), (w, depth, height), wooden)
-    patches += box((-w + board, 0, 0.04), (w - board, 0.008, height), wooden, hidden=WALL_SIDE)
-    count = max(2, round(height / 0.36))
-    levels = np.linspace(0.05, height - board, count + 1)
+    rng, wooden, board = style.rng, style.wood, 0.022
+    w = width / 2
+    inner = w - board
+    patches = box((-w, 0, 0), (-inner, depth, height), wooden) + box((inner, 0, 0), (w, depth, height), wooden)
+    patches += box((-inner, 0, 0.04), (inner, 0.008, height), wooden, hidden=WALL_SIDE)
+    levels = np.linspace(0.05, height - board, max(2, round(height / 0.36)) + 1)
     for z in levels:
-        patches += box((-w + board, 0.008, z), (w - board, depth - 0.005, z + board), wooden, hidden=())
+        patches += box((-inner, 0.008, z), (inner, depth - 0.005, z + board), wooden, hidden=())
     for low, high in pairwise(levels):
-        gap, x = high - low - board - 0.015, -w + board + 0.01
-        inner_end = w - board - 0.01
-        while inner_end - x > 0.12:
-            run = float(min(rng.uniform(0.25, 0.8), inner_end - x))
+        gap, x, end = high - low - board - 0.015, -w + board + 0.01, w - board - 0.01
+        while end - x > 0.12:
+            run = float(min(rng.uniform(0.25, 0.8), end - x))
             draw = rng.random()
             if draw < 0.35 + 0.55 * style.clutter:
-                item = decor.books_in_row(style, run, gap, depth - 0.03)
-                patches += move(item, shift=(x, 0.03, low + board))
+                books = decor.books_in_row(style, run, gap, depth - 0.03)
+                patches += move(books, shift=(x, 0.03, low + board))
             elif draw < 0.92 and run > 0.2:
-                item = (
-                    decor.vase(style, min(gap * 0.85, 0.26))
-                    if style.chance(0.5)
-                    else decor.book_stack(style, int(rng.integers(1, 4)))
-                )
+                if style.chance(0.5):
+                    item = decor.vase(style, min(gap * 0.85, 0.26))
+                else:
+                    item = decor.book_stack(style, int(rng.integers(1, 4)))
                 patches += move(item, shift=(x + run / 2, depth / 2, low + board))
             x += run + 0.005
     return patches
@@ -230,19 +201,12 @@ def wall_shelf(style: Style, width: float) -> list[Patch]:
 
 def media_unit(style: Style, width: float) -> list[Patch]:
     """Low cabinet with a television on it."""
-    patches = cabinet(style, width, 0.42, 0.48, columns=3, rows=1, carcass=style.wood, front=style.front)
+    patches = cabinet(style, (width, 0.42, 0.48), columns=3)
     tv = min(1.25, width - 0.1)
-    bezel = box(
-        (-tv / 2, 0.14, 0.56),
-        (tv / 2, 0.18, 0.56 + 0.57 * tv),
-        style.black,
-        faces={"front": style.screen},
-        hidden=("back",),
-    )
-    stand = box((-0.2, 0.08, 0.48), (0.2, 0.26, 0.495), style.black) + box(
-        (-0.04, 0.14, 0.495), (0.04, 0.17, 0.57), style.black
-    )
-    patches += bezel + stand
+    low, high = (-tv / 2, 0.14, 0.56), (tv / 2, 0.18, 0.56 + 0.57 * tv)
+    patches += box(low, high, style.black, faces={"front": style.screen}, hidden=("back",))
+    patches += box((-0.2, 0.08, 0.48), (0.2, 0.26, 0.495), style.black)
+    patches += box((-0.04, 0.14, 0.495), (0.04, 0.17, 0.57), style.black)
     if width - tv > 0.5 and style.chance(0.7):
         patches += move(decor.vase(style, 0.24), shift=(width / 2 - 0.12, 0.2, 0.48))
     return patches
@@ -250,25 +214,21 @@ def media_unit(style: Style, width: float) -> list[Patch]:
 
 def nightstand(style: Style, lit: bool) -> list[Patch]:
     """Bedside table with a lamp and books."""
-    patches = cabinet(style, 0.42, 0.38, 0.5, columns=1, rows=2, carcass=style.wood, front=style.front, plinth=0.06)
+    patches = cabinet(style, (0.42, 0.38, 0.5), columns=1, rows=2, plinth=0.06)
     patches += move(decor.table_lamp(style, lit), shift=(0.06, 0.16, 0.5))
     return patches + move(decor.book_stack(style, 1), shift=(-0.09, 0.28, 0.5))
 
 
 def desk(style: Style, width: float) -> list[Patch]:
     """Desk with a monitor, keyboard, lamp and papers."""
-    top = 0.74
+    top, black = 0.74, style.black
     patches = table(style, width, 0.65, top, style.second_wood)
-    patches += box(
-        (-0.3, 0.16, top + 0.12), (0.3, 0.19, top + 0.47), style.black, faces={"front": style.screen}, hidden=()
-    )
-    patches += box((-0.1, 0.1, top), (0.1, 0.26, top + 0.012), style.black) + box(
-        (-0.025, 0.15, top + 0.012), (0.025, 0.17, top + 0.14), style.black
-    )
-    patches += box((-0.21, 0.4, top), (0.21, 0.53, top + 0.02), style.black)
+    low, high = (-0.3, 0.16, top + 0.12), (0.3, 0.19, top + 0.47)
+    patches += box(low, high, black, faces={"front": style.screen}, hidden=())
+    patches += box((-0.1, 0.1, top), (0.1, 0.26, top + 0.012), black)
+    patches += box((-0.025, 0.15, top + 0.012), (0.025, 0.17, top + 0.14), black)
+    patches += box((-0.21, 0.4, top), (0.21, 0.53, top + 0.02), black)
     patches += move(decor.book_stack(style, 3), shift=(width / 2 - 0.2, 0.25, top))
-    paper = box(
-        (-0.105, -0.15, 0), (0.105, 0.15, 0.004), style.paper, faces={"top": artwork.package(style.rng)}, density=1.5
-    )
-    patches += move(paper, shift=(-width / 2 + 0.2, 0.42, top), angle_rad=0.2)
-    return patches
+    faces = {"top": artwork.package(style.rng)}
+    paper = box((-0.105, -0.15, 0), (0.105, 0.15, 0.004), style.paper, faces=faces, density=1.5)
+    return patches + move(paper, shift=(-width / 2 + 0.2, 0.42, top), angle_rad=0.2)

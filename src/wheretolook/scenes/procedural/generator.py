@@ -1,15 +1,14 @@
-"""The embedded default scene: a furnished apartment, drawn from a seed."""
+"""The default scene, which needs no download: a furnished apartment, generated from a seed."""
 
 from __future__ import annotations
 
-import math
-from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wheretolook.geometry.mesh import TexturedMesh
+from wheretolook.scenes.config import ApartmentConfig
 from wheretolook.scenes.procedural import atlas, lighting
 from wheretolook.scenes.procedural.furnishing import furnish
 from wheretolook.scenes.procedural.layout import Lamp
@@ -19,83 +18,13 @@ from wheretolook.scenes.procedural.plan import Plan, draw_plan
 from wheretolook.scenes.procedural.repetition import repeat_patterns
 from wheretolook.scenes.procedural.shell import build_shell
 from wheretolook.scenes.procedural.style import Style
-from wheretolook.utils.errors import ConfigError
 
-
-@dataclass(frozen=True)
-class ApartmentConfig:
-    """Options of the procedural apartment.
-
-    Args:
-        n_rooms: number of rooms, 3 to 6; None draws it from the seed.
-        area_m2: floor area aimed at, in square metres; None takes about 13 per room.
-        texture_richness: 0 to 1; contrast of wood, stone and cloth, and how many pictures hang. Lower is harder to
-            localize in.
-        clutter: 0 to 1; books, plants, bottles and other small things. Lower is harder.
-        repetition: 0 to 1; share of large surfaces that repeat a strong pattern every 0.6 to 2 m, as in games. Such
-            views are full of features and yet hard to localize.
-        dark_rooms: share of rooms whose lamp is off, some with their curtains closed. Higher is harder.
-        enlarged: how many times as large everything is, furniture and patterns too: halls with few, far landmarks.
-        vary: every apartment draws its area and the five numbers above from its seed, whatever they are set to: rooms
-            unlike each other, to learn from.
-        texels_per_m: texture resolution of large surfaces; lowered if the atlas would not fit.
-        texture_size: greatest width and height of the texture in texels.
-        light_spacing_m: distance between light samples in metres.
-        light_rays: rays per light sample over the hemisphere.
-    """
-
-    n_rooms: int | None = None
-    area_m2: float | None = None
-    texture_richness: float = 0.85
-    clutter: float = 0.85
-    repetition: float = 0.0
-    dark_rooms: float = 0.2
-    enlarged: float = 1.0
-    vary: bool = False
-    texels_per_m: float = 125.0
-    texture_size: int = 4096
-    light_spacing_m: float = 0.1
-    light_rays: int = 24
-
-    def __post_init__(self) -> None:
-        if self.n_rooms is not None and not 3 <= self.n_rooms <= 6:
-            raise ConfigError("n_rooms must be 3 to 6", value=self.n_rooms)
-        if self.area_m2 is not None and not 25 <= self.area_m2 <= 200:
-            raise ConfigError("area_m2 must be 25 to 200", value=self.area_m2)
-        for name in ("texture_richness", "clutter", "repetition", "dark_rooms"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ConfigError(f"{name} must be between 0 and 1", value=getattr(self, name))
-        for name in ("enlarged", "texels_per_m", "texture_size", "light_spacing_m", "light_rays"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ConfigError(f"{name} must be a positive number", value=getattr(self, name))
-
-    def key(self) -> dict[str, Any]:
-        """What decides an apartment, but for its seed; options that came later only where they are not the default."""
-        later = ("repetition", "enlarged", "vary")
-        default = ApartmentConfig()
-        return {
-            name: value for name, value in asdict(self).items() if name not in later or value != getattr(default, name)
-        }
-
-    def of_seed(self, seed: int) -> ApartmentConfig:
-        """What the apartment of a seed is like: this, unless it is to `vary`."""
-        if not self.vary:
-            return self
-        rng = np.random.default_rng([seed, 2])
-        return replace(
-            self,
-            area_m2=float(rng.uniform(35, 130)),
-            texture_richness=float(rng.uniform(0.5, 1)),
-            clutter=float(rng.uniform(0.3, 1)),
-            repetition=float(rng.uniform(0.3, 1)) if rng.random() < 0.7 else 0.0,
-            dark_rooms=float(rng.uniform(0, 0.4)),
-            enlarged=float(np.exp(rng.uniform(0, np.log(3)))),
-            vary=False,
-        )
+BRIGHTNESS = np.geomspace(0.12, 1.06, atlas.LEVELS)
+"""Factors on the albedo of shared materials."""
 
 
 def furnish_apartment(config: ApartmentConfig, seed: int) -> tuple[Plan, list[Patch], list[Lamp], np.random.Generator]:
-    """Plan, surfaces and lamps of an apartment before paint and light; the random generator goes on with the paint."""
+    """Plan, surfaces and lamps of an apartment, and the random generator that paints it."""
     rng = np.random.default_rng(seed)
     n_rooms = int(rng.integers(4, 7)) if config.n_rooms is None else config.n_rooms
     area = 13.0 * n_rooms * rng.uniform(0.9, 1.15) if config.area_m2 is None else config.area_m2
@@ -107,17 +36,9 @@ def furnish_apartment(config: ApartmentConfig, seed: int) -> tuple[Plan, list[Pa
 
 
 def generate_apartment(config: ApartmentConfig, seed: int, device: str = "cpu") -> TexturedMesh:
-    """A furnished apartment with one texture atlas that holds albedo and baked light.
+    """A furnished apartment in metres, z up, floor at z = 0, centred on the origin; one texture with baked light.
 
-    The same configuration and seed give the same bytes on the same device.
-
-    Args:
-        config: size, number of rooms and how hard it is to localize in.
-        seed: seed of every random choice.
-        device: Warp device that casts the light rays, "cpu" or a CUDA device.
-
-    Returns:
-        Mesh in metres, z up, floor at z = 0, centred on the origin.
+    The same configuration and seed give the same bytes on the same device, "cpu" or a CUDA device for the light rays.
 
     Raises:
         ConfigError: there is no such device.
@@ -135,11 +56,8 @@ def generate_apartment(config: ApartmentConfig, seed: int, device: str = "cpu") 
     albedo = np.clip(mean_colour[plan.patch_chart], 0, 1) ** 2.2
 
     samples = lighting.place_samples(patches, config.light_spacing_m)
-    windows = [
-        (p, floor_plan.rooms[p.room].curtains_closed)
-        for p in patches
-        if p.material.emissive and p.material.casts_shadow
-    ]
+    panes = [p for p in patches if p.material.emissive and p.material.casts_shadow]
+    windows = [(pane, floor_plan.rooms[pane.room].curtains_closed) for pane in panes]
     light = lighting.bake(patches, surface, samples, albedo, windows, lamps, device=device, rays=config.light_rays)
     chart, factors = _light_charts(plan, patches, samples, light)
     return TexturedMesh(
@@ -154,7 +72,7 @@ def generate_apartment(config: ApartmentConfig, seed: int, device: str = "cpu") 
 def _light_charts(
     plan: atlas.AtlasPlan, patches: list[Patch], samples: lighting.Samples, light: lighting.Light
 ) -> tuple[NDArray[np.int64], list[Any]]:
-    """The chart each patch uses, and the factor on each chart's albedo.
+    """The chart of each patch (P,), and the factor on each chart's albedo.
 
     A patch of a shared material takes the chart whose brightness is nearest to its light.
     """
@@ -172,10 +90,6 @@ def _light_charts(
         else:
             factors[chart[k]] = factor
     return chart, factors
-
-
-BRIGHTNESS = np.geomspace(0.12, 1.06, atlas.LEVELS)
-"""Factors on the albedo of shared materials."""
 
 
 def _uvs(plan: atlas.AtlasPlan, chart: NDArray[np.int64], surface: Surface) -> NDArray[np.float32]:

@@ -1,4 +1,4 @@
-"""Where things can stand in a room: along its walls, on its floor, on its walls; doors stay passable."""
+"""Finds places for things in a room: along its walls, on its floor, on its walls. Doors stay passable."""
 
 from __future__ import annotations
 
@@ -12,13 +12,15 @@ from wheretolook.scenes.procedural.plan import Room
 from wheretolook.scenes.procedural.shell import wall_items
 
 CELL_M = 0.1
+"""Side of the cells in which `Layout.passable` looks for ways."""
 WALKER_RADIUS_M = 0.25
 DOOR_ZONE_M = 0.95
+"""Depth of the floor before a door that stays free."""
 
 Rectangle = tuple[float, float, float, float]
 
-
 WARM = (1.0, 0.80, 0.58)
+"""Colour of a light bulb."""
 
 
 @dataclass(frozen=True)
@@ -30,35 +32,40 @@ class Lamp:
     colour: tuple[float, float, float]
 
 
-def warm_lamp(position: tuple[float, float, float], room: int, strength: float) -> Lamp:
-    """Lamp of the colour of a light bulb."""
-    return Lamp(position, room, (strength * WARM[0], strength * WARM[1], strength * WARM[2]))
-
-
 def overlap(a: Rectangle, b: Rectangle, gap: float = 0.0) -> bool:
     """Whether two rectangles (x0, y0, x1, y1) come closer than `gap`."""
     return a[0] < b[2] + gap and b[0] < a[2] + gap and a[1] < b[3] + gap and b[1] < a[3] + gap
 
 
-@dataclass
+@dataclass(frozen=True)
 class Spot:
-    """A place found along a wall: the side, the wall coordinate of its middle, its footprint in the world."""
+    """A place along a wall for a piece of furniture.
+
+    Attributes:
+        side: of the room.
+        at: wall coordinate of its middle, in metres.
+        size: width along the wall, depth into the room and height, in metres.
+        front: depth of the floor before it that must stay free, in metres.
+        footprint: in the world.
+    """
 
     side: int
     at: float
+    size: tuple[float, float, float]
+    front: float
     footprint: Rectangle
 
 
 @dataclass
 class Layout:
-    """What is taken in one room.
+    """What stands and hangs in one room, and where more can.
 
     Attributes:
         room: the room.
-        rng: source of the choices.
-        footprints: what stands on the floor.
-        keep_free: floor that nothing may stand on (before doors, wardrobes, the sofa).
-        on_wall: per wall what it is covered by, as (a0, a1, z0, z1).
+        rng: source of the random choices.
+        footprints: of what stands on the floor.
+        keep_free: floor that nothing may stand on (before doors, wardrobes, the sofa); the doors' come first.
+        on_wall: for each wall, the covered rectangles (a0, a1, z0, z1).
         patches: all that was put into the room.
         doors: for each door, a point 0.4 m before it.
         lamps: the lamps that are lit.
@@ -89,18 +96,21 @@ class Layout:
         """Keep a doorway and the floor before it free."""
         self.on_wall[side].append((a0 - 0.09, a1 + 0.09, 0.0, height + 0.09))
         self.keep_free.append(self.rectangle(side, a0 - 0.03, a1 + 0.03, 0.0, DOOR_ZONE_M))
+        self.doors.append(self.point(side, (a0 + a1) / 2, 0.4))
+
+    def point(self, side: int, at: float, off_wall: float) -> tuple[float, float]:
+        """World x, y of a wall coordinate and a distance from the wall."""
         corner, right, normal = self.room.wall_frame(side)
-        x, y, _ = corner + (a0 + a1) / 2 * right + 0.4 * normal
-        self.doors.append((float(x), float(y)))
+        x, y, _ = corner + at * right + off_wall * normal
+        return float(x), float(y)
 
     def rectangle(self, side: int, a0: float, a1: float, near: float, far: float) -> Rectangle:
         """Floor from wall coordinate a0 to a1 and from `near` to `far` metres off the wall, in the world."""
-        corner, right, normal = self.room.wall_frame(side)
-        p, q = corner + a0 * right + near * normal, corner + a1 * right + far * normal
-        return float(min(p[0], q[0])), float(min(p[1], q[1])), float(max(p[0], q[0])), float(max(p[1], q[1]))
+        (px, py), (qx, qy) = self.point(side, a0, near), self.point(side, a1, far)
+        return min(px, qx), min(py, qy), max(px, qx), max(py, qy)
 
     def passable(self, extra: Rectangle) -> bool:
-        """Whether a walker still gets from door to door, and into most of the free floor, with `extra` in the way."""
+        """Whether one can still walk from door to door, and over most of the free floor, with `extra` taken too."""
         room = self.room
         nx, ny = int(room.width / CELL_M), int(room.depth / CELL_M)
         x = room.x0 + (np.arange(nx) + 0.5) * room.width / nx
@@ -128,13 +138,9 @@ class Layout:
 
     def is_clear(self, footprint: Rectangle, gap: float = 0.02) -> bool:
         """Whether a footprint lies in the room, touches nothing and blocks no way."""
-        if not self.contains(footprint):
-            return False
-        if any(overlap(footprint, f, gap) for f in self.footprints) or any(
-            overlap(footprint, f) for f in self.keep_free
-        ):
-            return False
-        return self.passable(footprint)
+        taken = any(overlap(footprint, f, gap) for f in self.footprints)
+        taken = taken or any(overlap(footprint, f) for f in self.keep_free)
+        return self.contains(footprint) and not taken and self.passable(footprint)
 
     def wall_is_clear(self, side: int, a0: float, a1: float, z0: float, z1: float, gap: float = 0.01) -> bool:
         """Whether a piece of wall is bare."""
@@ -143,25 +149,17 @@ class Layout:
         return not any(a0 < b1 + gap and b0 < a1 + gap and z0 < h1 and h0 < z1 for b0, b1, h0, h1 in self.on_wall[side])
 
     def find_by_wall(
-        self,
-        width: float,
-        depth: float,
-        height: float,
-        *,
-        place: str = "any",
-        front: float = 0.5,
-        sides: list[int] | None = None,
+        self, size: tuple[float, float, float], place: str = "any", front: float = 0.5, sides: list[int] | None = None
     ) -> Spot | None:
         """Spot along a wall for a piece of furniture, or None.
 
         Args:
-            width: extent along the wall.
-            depth: extent into the room.
-            height: of the piece.
+            size: extent along the wall, depth into the room and height, in metres.
             place: `middle` of the wall, `corner`, or `any`.
-            front: floor that must stay free before it.
+            front: depth of the floor that must stay free before it.
             sides: the walls to try, in order; all in random order if None.
         """
+        width, depth, height = size
         order = [int(s) for s in self.rng.permutation(4)] if sides is None else sides
         if sides is None and place == "middle":
             order.sort(key=lambda s: -self.room.wall_length(s))
@@ -184,25 +182,27 @@ class Layout:
                 before = self.rectangle(side, a0, a1, depth, depth + front)
                 blocked = any(overlap(before, f, -0.01) for f in self.footprints)
                 if not blocked and self.is_clear(footprint):
-                    return Spot(side, float(at), footprint)
+                    return Spot(side, float(at), size, front, footprint)
         return None
 
-    def put_by_wall(
-        self, patches: list[Patch], spot: Spot, width: float, height: float, depth: float, front: float = 0.5
-    ) -> None:
-        """Stand patches at a spot found before, and keep the floor before them free."""
-        self.patches += wall_items(self.room, spot.side, spot.at, patches)
+    def put_by_wall(self, patches: list[Patch], spot: Spot) -> None:
+        """Stand patches at a spot, and keep the floor before them free."""
+        self.put_on_wall(spot.side, spot.at, patches)
         self.footprints.append(spot.footprint)
+        width, depth, height = spot.size
         a0, a1 = spot.at - width / 2, spot.at + width / 2
         self.on_wall[spot.side].append((a0, a1, 0.0, height))
-        if front:
-            self.keep_free.append(self.rectangle(spot.side, a0, a1, depth, depth + front))
+        if spot.front:
+            self.keep_free.append(self.rectangle(spot.side, a0, a1, depth, depth + spot.front))
 
-    def add_lamp(self, spot: Spot, off_wall: float, height: float, strength: float, along: float = 0.0) -> None:
-        """Light a lamp of a piece of furniture; `along` and `off_wall` are its x and y in the furniture frame."""
-        corner, right, normal = self.room.wall_frame(spot.side)
-        x, y, _ = corner + (spot.at - along) * right + off_wall * normal
-        self.lamps.append(warm_lamp((float(x), float(y), height), self.room.index, strength))
+    def put_on_wall(self, side: int, at: float, patches: list[Patch]) -> None:
+        """Put patches of the furniture frame against a wall, with x = 0 at a wall coordinate."""
+        self.patches += wall_items(self.room, side, at, patches)
+
+    def add_lamp(self, x: float, y: float, height: float, strength: float) -> None:
+        """Light a lamp with the colour of a light bulb at a world position."""
+        colour = (strength * WARM[0], strength * WARM[1], strength * WARM[2])
+        self.lamps.append(Lamp((x, y, height), self.room.index, colour))
 
     def find_on_floor(self, width: float, depth: float, margin: float) -> tuple[float, float] | None:
         """Centre of a free rectangle (width in x, depth in y) with `margin` around it, or None."""
@@ -216,9 +216,9 @@ class Layout:
         return None
 
     def hang(self, width: float, z0: float, z1: float, side: int, depth: float = 0.0) -> float | None:
-        """Wall coordinate for something that hangs between two heights, or None; the place is then taken.
+        """Wall coordinate for something that hangs between two heights, or None; marks the place as covered.
 
-        What stands out by `depth` metres does not hang into the way through a door.
+        What stands out from the wall by `depth` metres does not hang in a doorway.
         """
         doorways = self.keep_free[: len(self.doors)]
         length = self.room.wall_length(side)

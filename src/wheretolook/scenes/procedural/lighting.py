@@ -1,9 +1,9 @@
-"""Baked light: daylight through the windows, lamps, and what walls and furniture throw back.
+"""Baked light: daylight through the windows, lamps, and light reflected by walls and furniture.
 
 Light is computed on a coarse grid per patch by ray casting: shadow rays to points on each window and around each lamp,
-then one gather over the hemisphere that reads the direct light where its rays end (one bounce; a constant stands for
-the later ones). Random numbers come from a hash of the sample's index, one thread writes one sample, and nothing is
-accumulated atomically, so the same scene gives the same light.
+then rays over the hemisphere that read the direct light where they end (one bounce; a constant factor accounts for the
+later ones). Random numbers come from a hash of the sample's index, one thread writes one sample, and nothing is
+accumulated atomically, so the same scene always gives the same light.
 """
 
 from __future__ import annotations
@@ -24,10 +24,19 @@ from wheretolook.utils.warp import start_warp, vec3_array
 
 Float = NDArray[np.floating[Any]]
 
+SKY = (5.2, 5.7, 6.3)
+"""Radiance of a window pane per colour; lamps are in the same unit."""
+AMBIENT = (0.018, 0.019, 0.02)
+LATER_BOUNCES = 1.7
+"""Light of all bounces together, relative to that of the first."""
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+"""Weights of linear red, green and blue (ITU-R BT.709)."""
+_BINOMIAL = np.array([0.25, 0.5, 0.25], np.float32)
+
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Where light is computed.
+    """Points where light is computed.
 
     Attributes:
         points: (S, 3) metres.
@@ -45,8 +54,8 @@ class Samples:
 
 
 def place_samples(patches: Sequence[Patch], spacing_m: float) -> Samples:
-    """A grid of samples on every patch, about `spacing_m` apart, at the middles of its cells."""
-    points, normals, rooms, starts, shapes, total = [], [], [], [], [], 0
+    """A grid of samples on every patch that does not glow, about `spacing_m` apart, at the middles of its cells."""
+    points, normals, shapes = [], [], []
     for patch in patches:
         if patch.material.emissive:
             ny = nx = 0
@@ -55,25 +64,20 @@ def place_samples(patches: Sequence[Patch], spacing_m: float) -> Samples:
         else:
             coarse = spacing_m if patch.density > 0.3 else 4 * spacing_m
             nx, ny = (max(1, round(extent / coarse)) for extent in patch.size_m)
-        starts.append(total)
         shapes.append((ny, nx))
         if nx:
             p, n = _evaluate(patch, (np.arange(nx) + 0.5) / nx, (np.arange(ny) + 0.5) / ny)
             points.append(p.reshape(-1, 3))
             normals.append(n.reshape(-1, 3))
-            rooms.append(np.full(nx * ny, patch.room, np.int32))
-            total += nx * ny
-    return Samples(
-        np.concatenate(points),
-        np.concatenate(normals),
-        np.concatenate(rooms),
-        np.array(starts, np.int32),
-        np.array(shapes, np.int32),
-    )
+    shape = np.array(shapes, np.int32)
+    counts = shape.prod(1)
+    room = np.repeat(np.array([patch.room for patch in patches], np.int32), counts)
+    start = (np.cumsum(counts) - counts).astype(np.int32)
+    return Samples(np.concatenate(points), np.concatenate(normals), room, start, shape)
 
 
 def _evaluate(patch: Patch, s: Float, t: Float) -> tuple[Float, Float]:
-    """Points and unit normals (len(t), len(s), 3) of the bilinear surface."""
+    """Points and unit normals (len(t), len(s), 3) of a patch, bilinear within each of its cells."""
     i = np.clip(np.searchsorted(patch.s, s, side="right") - 1, 0, len(patch.s) - 2)
     j = np.clip(np.searchsorted(patch.t, t, side="right") - 1, 0, len(patch.t) - 2)
     a = ((s - patch.s[i]) / (patch.s[i + 1] - patch.s[i]))[None, :, None]
@@ -87,21 +91,14 @@ def _evaluate(patch: Patch, s: Float, t: Float) -> tuple[Float, Float]:
     return point, normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
 
 
-SKY = (5.2, 5.7, 6.3)
-"""Radiance of a window pane per colour; lamps are in the same unit."""
-AMBIENT = (0.018, 0.019, 0.02)
-LATER_BOUNCES = 1.7
-"""All bounces together, relative to the first."""
-
-
 @dataclass(frozen=True, eq=False)
 class Light:
     """Linear light per sample.
 
     Attributes:
         sharp: (S, 3) from the room's own windows and lamps.
-        soft: (S, 3) thrown back by surfaces, or come through doors and past curtains.
-        valid: (S,) whether the sample lies in the open rather than inside something.
+        soft: (S, 3) reflected by surfaces, or come through doors and past curtains.
+        valid: (S,) False for samples inside a solid.
     """
 
     sharp: Float
@@ -125,7 +122,7 @@ def bake(
     device: str,
     rays: int,
 ) -> Light:
-    """Cast the rays.
+    """Compute the light at all samples.
 
     Args:
         patches: all patches of the scene.
@@ -135,7 +132,7 @@ def bake(
         windows: flat patches that let daylight in, and whether a curtain is drawn before them.
         lamps: the lamps that are lit.
         device: Warp device, such as "cpu" or "cuda".
-        rays: gather rays per sample; windows and lamps take a fraction of it each.
+        rays: rays over the hemisphere per sample; each window and lamp gets a fraction of this number.
     """
     device = start_warp(device)
     kept = np.flatnonzero(np.array([p.material.casts_shadow for p in patches])[surface.patch])
@@ -148,51 +145,32 @@ def bake(
         return wp.array(np.ascontiguousarray(values, np.int32), dtype=wp.int32, device=device)
 
     mesh = wp.Mesh(points=vectors(surface.vertices), indices=integers(surface.triangles[kept].ravel()))
-    points, normals = vectors(samples.points), vectors(samples.normals)
+    places = [mesh.id, vectors(samples.points), vectors(samples.normals)]
     count = len(samples.points)
     direct, soft, bounced = (wp.empty(count, dtype=wp.vec3, device=device) for _ in range(3))
     open_share, back_share = (wp.empty(count, dtype=wp.float32, device=device) for _ in range(2))
-    wp.launch(
-        direct_kernel,
-        dim=count,
-        inputs=[
-            mesh.id,
-            points,
-            normals,
-            integers(samples.room),
-            vectors([p.positions[0, 0] for p in panes]),
-            vectors([p.positions[0, -1] - p.positions[0, 0] for p in panes]),
-            vectors([p.positions[-1, 0] - p.positions[0, 0] for p in panes]),
-            integers([p.room for p in panes]),
-            integers([covered for _, covered in windows]),
-            max(4, rays // 2),
-            wp.vec3(*SKY),
-            vectors([lamp.position for lamp in lamps]),
-            vectors([lamp.colour for lamp in lamps]),
-            integers([lamp.room for lamp in lamps]),
-            max(2, rays // 6),
-        ],
-        outputs=[direct, soft],
-        device=device,
-    )
-    wp.launch(
-        gather_kernel,
-        dim=count,
-        inputs=[
-            mesh.id,
-            points,
-            normals,
-            rays,
-            integers(surface.patch[kept]),
-            wp.array(np.ascontiguousarray(surface.st[kept], np.float32), dtype=wp.vec2, device=device),
-            integers(samples.start),
-            wp.array(samples.shape, dtype=wp.vec2i, device=device),
-            vectors(albedo),
-            direct,
-        ],
-        outputs=[bounced, open_share, back_share],
-        device=device,
-    )
+    window_inputs = [
+        vectors([p.positions[0, 0] for p in panes]),
+        vectors([p.positions[0, -1] - p.positions[0, 0] for p in panes]),
+        vectors([p.positions[-1, 0] - p.positions[0, 0] for p in panes]),
+        integers([p.room for p in panes]),
+        integers([covered for _, covered in windows]),
+        max(4, rays // 2),
+        wp.vec3(*SKY),
+    ]
+    lamp_inputs = [
+        vectors([lamp.position for lamp in lamps]),
+        vectors([lamp.colour for lamp in lamps]),
+        integers([lamp.room for lamp in lamps]),
+        max(2, rays // 6),
+    ]
+    inputs = [*places, integers(samples.room), *window_inputs, *lamp_inputs]
+    wp.launch(direct_kernel, count, inputs, [direct, soft], device=device)
+    st: Any = wp.array(np.ascontiguousarray(surface.st[kept], np.float32), dtype=wp.vec2, device=device)
+    shape: Any = wp.array(samples.shape, dtype=wp.vec2i, device=device)
+    triangle_patch = integers(surface.patch[kept])
+    inputs = [*places, rays, triangle_patch, st, integers(samples.start), shape, vectors(albedo), direct]
+    wp.launch(gather_kernel, count, inputs, [bounced, open_share, back_share], device=device)
     through_doors = soft.numpy()
     ambient = np.array(AMBIENT, np.float32) * open_share.numpy()[:, None]
     return Light(
@@ -202,50 +180,41 @@ def bake(
     )
 
 
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-
-
 def light_grids(samples: Samples, light: Light) -> list[Float | None]:
     """Light per patch as (rows, columns, 3), smoothed, with samples inside solids filled from their neighbours."""
     grids: list[Float | None] = []
     for first, (ny, nx) in zip(samples.start, samples.shape, strict=True):
-        last = first + nx * ny
         if nx == 0:
             grids.append(None)
-        elif nx * ny == 1 or not light.valid[first:last].any():
-            grids.append((light.sharp[first:last] + light.soft[first:last]).reshape(ny, nx, 3))
-        else:
-            weight = light.valid[first:last].reshape(ny, nx, 1).astype(np.float32)
-            # what comes from all around varies slowly: smooth it more
-            sharp = _smooth(light.sharp[first:last].reshape(ny, nx, 3), weight, 1)
-            grids.append(sharp + _smooth(light.soft[first:last].reshape(ny, nx, 3), weight, 4))
+            continue
+        rows = slice(first, first + nx * ny)
+        sharp, soft = (values[rows].reshape(ny, nx, 3) for values in (light.sharp, light.soft))
+        valid = light.valid[rows].reshape(ny, nx, 1)
+        if nx * ny > 1 and valid.any():
+            # Light from all around varies slowly, so it is smoothed more.
+            sharp, soft = _smooth(sharp, valid, 1), _smooth(soft, valid, 4)
+        grids.append(sharp + soft)
     return grids
 
 
-def _smooth(grid: Float, weight: Float, passes: int) -> Float:
-    """Binomial blur over the samples with weight 1, extended over those with weight 0."""
+def _smooth(grid: Float, valid: NDArray[np.bool_], passes: int) -> Float:
+    """Binomial blur over the valid samples, extended over the others."""
+    weight = valid.astype(np.float32)
     data = np.concatenate([grid * weight, weight], -1).astype(np.float32)
     for k in range(passes + 12):
         if k >= passes and (data[..., 3] > 1e-3).all():
             break
-        wider = _blur(data)
-        # past the passes asked for, only samples that still have no value take one
+        blurred = cv2.sepFilter2D(data, -1, _BINOMIAL, _BINOMIAL, borderType=cv2.BORDER_REPLICATE)
+        wider = np.asarray(blurred, np.float32).reshape(data.shape)
+        # After the requested passes, only samples without a value change.
         data = wider if k < passes else np.where(data[..., 3:] > 1e-3, data, wider)
     return np.asarray(np.where(data[..., 3:] > 1e-3, data[..., :3] / np.maximum(data[..., 3:], 1e-6), grid))
-
-
-def _blur(image: Float) -> Float:
-    blurred = cv2.sepFilter2D(image, -1, _BINOMIAL, _BINOMIAL, borderType=cv2.BORDER_REPLICATE)
-    return np.asarray(blurred, np.float32).reshape(image.shape)
-
-
-_BINOMIAL = np.array([0.25, 0.5, 0.25], np.float32)
 
 
 def to_display(light: Float, reference: float) -> Float:
     """Factor on display-space albedo: gamma, compressed as an eye or camera would, with a soft shoulder.
 
-    Albedo and light multiply in linear space; with a pure power law they also multiply after it, so light can be mapped
+    Albedo and light are multiplied in linear space. Powers of them can be multiplied as well, so light can be converted
     on its coarse grid.
     """
     luminance = np.maximum(light @ LUMINANCE, 1e-5)[..., None]

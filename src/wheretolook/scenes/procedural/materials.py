@@ -1,7 +1,7 @@
 """Surfaces that can be painted at any size: plaster, wood, planks, tiles, wallpaper, fabric, marble.
 
-A painter fills a `Canvas` with albedo in display space (sRGB, 0 to 1). Plain surfaces stay below what a feature
-detector fires on; repeated ones (tiles, wallpaper) repeat exactly, because that is what makes homes ambiguous.
+A painter fills a `Canvas` with albedo in display space (sRGB, 0 to 1). The contrast of plain surfaces is too low for a
+feature detector. Tiles and wallpaper repeat exactly, because that is what makes real homes ambiguous.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ class Material:
 
     Attributes:
         paint: fills a canvas: (height, width, 3) float32, sRGB albedo in 0 to 1.
-        emissive: shown as painted, whatever light falls on it (window panes, lamp shades).
-        shared: all patches of this material share one small piece of texture in a few brightness levels (leaves,
-            covers of books), instead of each having its own.
+        emissive: shown as painted, without baked light (window panes, lamp shades).
+        shared: all patches of this material share one small piece of texture in a few brightness levels, instead of
+            each having its own (leaves, covers of books).
         casts_shadow: whether it blocks light.
     """
 
@@ -41,25 +41,25 @@ def mix(a: ArrayLike, b: ArrayLike, amount: Image) -> Image:
     return first + (second - first) * np.asarray(amount, np.float32)[..., None]
 
 
-def shade(colour: ArrayLike, factor: float) -> Colour:
-    """Colour made darker (factor < 1) or lighter."""
-    r, g, b = np.clip(np.asarray(colour, float) * factor, 0, 0.97)
-    return float(r), float(g), float(b)
-
-
 def vary(rng: np.random.Generator, colour: ArrayLike, amount: float = 0.04) -> Colour:
     """Colour near the given one: lighter or darker, with a slight change of hue."""
     r, g, b = np.clip(np.asarray(colour, float) + amount * (rng.normal() + 0.35 * rng.normal(size=3)), 0.02, 0.96)
     return float(r), float(g), float(b)
 
 
+def fill(canvas: Canvas, colour: ArrayLike) -> Image:
+    """Image (height, width, 3) of one colour."""
+    return np.broadcast_to(np.asarray(colour, np.float32), (*canvas.shape, 3)).copy()
+
+
 def _shift(rng: np.random.Generator) -> tuple[int, int]:
+    """Where to crop a noise field: a random row and column."""
     a, b = rng.integers(0, SIZE, 2)
     return int(a), int(b)
 
 
 def line(distance_px: Image, width_px: float) -> Image:
-    """Coverage of a line of a given width by texels at a distance from its middle, antialiased."""
+    """How much of each texel a line covers, 0 to 1, from the texel's distance to the middle of the line."""
     return np.clip(width_px / 2 + 0.5 - np.abs(distance_px), 0, min(1.0, width_px))
 
 
@@ -92,13 +92,7 @@ def wood(rng: np.random.Generator, colour: ArrayLike, contrast: float = 1.0, *, 
 
 
 def planks(
-    rng: np.random.Generator,
-    colour: ArrayLike,
-    *,
-    width_m: float = 0.16,
-    length_m: float = 1.4,
-    contrast: float = 1.0,
-    along_x: bool = True,
+    rng: np.random.Generator, colour: ArrayLike, width_m: float, length_m: float, contrast: float, along_x: bool
 ) -> Material:
     """Floor of boards, each with its own tone and its own piece of grain, staggered from row to row."""
     dark = np.asarray(colour, float) * np.array([0.6, 0.53, 0.47])
@@ -136,7 +130,7 @@ def tiles(
     brick: bool = False,
     decor_every: int = 0,
 ) -> Material:
-    """Tiles with grout. Every tile has the same veins; `second` makes a chequerboard; each n-th may carry a print."""
+    """Tiles with grout and the same veins on each; `second` makes a chequerboard, each `decor_every`-th has a print."""
     petals, ink = int(rng.integers(4, 9)), vary(rng, (0.35, 0.42, 0.50), 0.12)
     shift = _shift(rng)
     tone = rng.normal(0, variation, (16, 16)).astype(np.float32)
@@ -148,10 +142,10 @@ def tiles(
         row = np.floor(row_position).astype(int)
         column_position = canvas.x / width + (0.5 * (row % 2) if brick else 0)
         column = np.floor(column_position).astype(int)
-        albedo = np.broadcast_to(np.asarray(colour, np.float32), (canvas.height, canvas.width, 3))
+        albedo = fill(canvas, colour)
         if second is not None:
-            albedo = mix(colour, second, np.broadcast_to((row + column) % 2, albedo.shape[:2]))
-        factor = 1 + np.broadcast_to(tone[row % 16, column % 16], albedo.shape[:2])
+            albedo = mix(colour, second, np.broadcast_to((row + column) % 2, canvas.shape))
+        factor = 1 + np.broadcast_to(tone[row % 16, column % 16], canvas.shape)
         if veins:
             a = (((column_position - column) * width * scale).astype(int) + shift[1]) % SIZE
             b = (((row_position - row) * height * scale).astype(int) + shift[0]) % SIZE
@@ -162,9 +156,8 @@ def tiles(
             radius = np.hypot(u, v)
             flower = 0.33 + 0.1 * np.cos(petals * np.arctan2(v, u))
             print_edge = np.abs(np.abs(radius - 0.6 * flower) - 0.35 * flower)
-            stroke = np.clip(1.5 - print_edge * min(width, height) * scale, 0, 1) * (
-                (3 * row + column) % decor_every == 0
-            )
+            printed = (3 * row + column) % decor_every == 0
+            stroke = np.clip(1.5 - print_edge * min(width, height) * scale, 0, 1) * printed
             albedo = mix(albedo, ink, 0.8 * stroke)
         across_px = (column_position - np.round(column_position)) * width * scale
         along_px = (row_position - np.round(row_position)) * height * scale
@@ -177,14 +170,14 @@ def tiles(
 def wallpaper(
     rng: np.random.Generator, colour: ArrayLike, second: ArrayLike, *, period_m: float = 0.16, motif: bool = True
 ) -> Material:
-    """Vertical stripes with, if asked for, the same small flower on each, over and over."""
+    """Vertical stripes, with the same small flower repeated on them if `motif`."""
     petals = int(rng.integers(4, 8))
     phase = float(rng.uniform(0, 6))
 
     def paint(canvas: Canvas) -> Image:
         u = canvas.x / period_m
         stripe = np.clip((np.abs(u - np.floor(u) - 0.5) - 0.25) * period_m * canvas.texels_per_m + 0.5, 0, 1)
-        albedo = mix(colour, second, np.broadcast_to(0.35 * stripe, (canvas.height, canvas.width)))
+        albedo = mix(colour, second, np.broadcast_to(0.35 * stripe, canvas.shape))
         if motif:
             cell_x = (u - np.floor(u) - 0.5) * period_m
             v = canvas.y / (1.6 * period_m) + 0.5 * (np.floor(u) % 2)
@@ -225,9 +218,8 @@ def fabric(
             amount = np.clip((np.abs((y + np.abs(x % 1 - 0.5)) % 1 - 0.5) - 0.25) * sharp + 0.5, 0, 1)
         else:
             amount = np.zeros((1, 1), np.float32)
-        amount = np.broadcast_to(amount, (canvas.height, canvas.width))
         tone = 1 + weave * canvas.crop(canvas.noise.fine, shift) + 0.4 * weave * canvas.crop(canvas.noise.cloud, shift)
-        return mix(colour, other, amount) * tone[..., None]
+        return mix(colour, other, np.broadcast_to(amount, canvas.shape)) * tone[..., None]
 
     return Material(paint, shared=shared)
 
@@ -237,9 +229,8 @@ def marble(rng: np.random.Generator, colour: ArrayLike, vein: ArrayLike, amount:
     shift = _shift(rng)
 
     def paint(canvas: Canvas) -> Image:
-        value = 0.12 * canvas.crop(canvas.noise.cloud, shift) + 0.3 * np.maximum(
-            canvas.crop(canvas.noise.veins, shift), 0
-        )
+        veins = 0.3 * np.maximum(canvas.crop(canvas.noise.veins, shift), 0)
+        value = 0.12 * canvas.crop(canvas.noise.cloud, shift) + veins
         value = value + 0.1 * canvas.crop(canvas.noise.fine, shift)
         return mix(colour, vein, np.clip(amount * value, 0, 1))
 
@@ -248,12 +239,7 @@ def marble(rng: np.random.Generator, colour: ArrayLike, vein: ArrayLike, amount:
 
 def glow(colour: ArrayLike) -> Material:
     """A lit lamp shade: bright, and no obstacle to the light inside it."""
-    base = np.asarray(colour, np.float32)
-
-    def paint(canvas: Canvas) -> Image:
-        return np.broadcast_to(base, (canvas.height, canvas.width, 3)).copy()
-
-    return Material(paint, emissive=True, casts_shadow=False)
+    return Material(lambda canvas: fill(canvas, colour), emissive=True, casts_shadow=False)
 
 
 def leaf(rng: np.random.Generator, colour: ArrayLike) -> Material:
@@ -263,7 +249,7 @@ def leaf(rng: np.random.Generator, colour: ArrayLike) -> Material:
 
     def paint(canvas: Canvas) -> Image:
         x, y = canvas.unit_x - 0.5, canvas.unit_y
-        albedo = mix(tip, colour, np.broadcast_to(y, (canvas.height, canvas.width)))
+        albedo = mix(tip, colour, np.broadcast_to(y, canvas.shape))
         rib = np.clip(1 - np.abs(x) * canvas.width / 1.5, 0, 1) + 0 * y
         side = np.clip(1 - np.abs(((y + np.abs(x)) * veins) % 1 - 0.5) * canvas.height / veins / 1.5, 0, 1)
         return albedo * (1 + 0.25 * np.maximum(rib, 0.5 * side))[..., None]

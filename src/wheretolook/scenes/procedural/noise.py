@@ -42,14 +42,12 @@ class NoiseBank:
 
 @dataclass(frozen=True)
 class Canvas:
-    """What a painter has to fill.
+    """The size, scale and origin of the image that a painter makes, and the noise it can use.
 
     Attributes:
-        height: rows in texels.
-        width: columns in texels.
+        height, width: of the image in texels.
         texels_per_m: texels per metre.
-        x_m: metres from the pattern's origin to the left edge.
-        y_m: metres from the pattern's origin to the top edge.
+        x_m, y_m: metres from the pattern's origin to the left and to the top edge.
         noise: the fields to crop from.
     """
 
@@ -59,6 +57,11 @@ class Canvas:
     x_m: float
     y_m: float
     noise: NoiseBank
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width in texels."""
+        return self.height, self.width
 
     @property
     def x(self) -> Image:

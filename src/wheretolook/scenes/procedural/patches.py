@@ -1,13 +1,12 @@
-"""The one geometric primitive of the generator: a grid of vertices that maps onto a rectangle of texture.
+"""The generator's only geometric primitive: a grid of vertices that maps onto a rectangle of texture.
 
 Every surface, from a wall to a leaf, is a `Patch`. Seen from its front, s runs right and t runs down, like the columns
-and rows of the texture it gets; triangles are counter-clockwise from there. Solids are made of patches that together
-close the surface.
+and rows of its texture, and triangles are counter-clockwise. The surface of a solid is closed by several patches.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,7 +18,7 @@ from wheretolook.scenes.procedural.materials import Material
 Float = NDArray[np.floating[Any]]
 
 HIDDEN = 0.2
-"""Texel density, relative to what is in view, of faces that stand against a wall or on the floor."""
+"""Texel density, relative to other faces, of faces that stand against a wall or on the floor."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,14 +51,12 @@ class Patch:
         """Triangles as indices into the flattened grid (T, 3) and the (s, t) of their corners (T, 3, 2)."""
         m, n = len(self.t) - 1, len(self.s) - 1
         row, column = np.mgrid[0:m, 0:n]
-        top_left = (row * (n + 1) + column)[self.mask if self.mask is not None else np.ones((m, n), bool)].ravel()
+        cells = row * (n + 1) + column
+        top_left = cells.ravel() if self.mask is None else cells[self.mask]
         bottom_left = top_left + n + 1
-        triangles = np.concatenate(
-            [
-                np.stack([top_left, bottom_left, bottom_left + 1], 1),
-                np.stack([top_left, bottom_left + 1, top_left + 1], 1),
-            ]
-        )
+        left = np.stack([top_left, bottom_left, bottom_left + 1], 1)
+        right = np.stack([top_left, bottom_left + 1, top_left + 1], 1)
+        triangles = np.concatenate([left, right])
         corners = self.positions.reshape(-1, 3)[triangles]
         area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
         triangles = triangles[area > 1e-9]  # the poles of closed surfaces of revolution
@@ -120,7 +117,13 @@ FACES: dict[str, tuple[tuple[int, int, int], tuple[int, int, int], tuple[int, in
     "top": ((-1, 1, 1), (1, 0, 0), (0, -1, 0)),
     "bottom": ((-1, -1, -1), (1, 0, 0), (0, 1, 0)),
 }
-"""In the furniture frame: y points from the wall into the room (front = +y), z up."""
+"""Faces of a box in the furniture frame: y points from the wall into the room (front = +y), z up."""
+
+
+def _face_options(number: int, hidden: bool, density: float, offset_m: tuple[float, float]) -> dict[str, Any]:
+    """Options of one face's patch: fewer texels if hidden, and a pattern that starts elsewhere on each face."""
+    offset = (offset_m[0] + 0.37 * number, offset_m[1] + 0.23 * number)
+    return {"density": density * (HIDDEN if hidden else 1.0), "offset_m": offset}
 
 
 def box(
@@ -129,25 +132,19 @@ def box(
     material: Material,
     *,
     faces: Mapping[str, Material] | None = None,
-    hidden: Iterable[str] = ("bottom",),
+    hidden: Collection[str] = ("bottom",),
     offset_m: tuple[float, float] = (0.0, 0.0),
     density: float = 1.0,
 ) -> list[Patch]:
     """Closed axis-aligned box from corner `low` to corner `high`; `faces` overrides the material of single faces."""
     lo, hi = np.asarray(low, float), np.asarray(high, float)
     centre, half = (lo + hi) / 2, (hi - lo) / 2
-    hidden = set(hidden)
-    return [
-        plane(
-            centre + half * np.array(corner),
-            2 * half * np.array(right),
-            2 * half * np.array(down),
-            (faces or {}).get(face, material),
-            density=density * (HIDDEN if face in hidden else 1.0),
-            offset_m=(offset_m[0] + 0.37 * i, offset_m[1] + 0.23 * i),
-        )
-        for i, (face, (corner, right, down)) in enumerate(FACES.items())
-    ]
+    patches = []
+    for i, (face, signs) in enumerate(FACES.items()):
+        corner, right, down = (half * np.array(sign) for sign in signs)
+        options = _face_options(i, face in hidden, density, offset_m)
+        patches.append(plane(centre + corner, 2 * right, 2 * down, (faces or {}).get(face, material), **options))
+    return patches
 
 
 def cushion(
@@ -159,18 +156,15 @@ def cushion(
     puff: tuple[float, float, float] = (0.0, 0.0, 0.0),
     rounding: int = 3,
     span: int = 4,
-    hidden: Iterable[str] = ("bottom",),
-    density: float = 1.0,
-    offset_m: tuple[float, float] = (0.0, 0.0),
+    hidden: Collection[str] = ("bottom",),
 ) -> list[Patch]:
     """Box with rounded edges; `puff` (metres per axis) swells the middle of its faces outwards."""
     lo, hi = np.asarray(low, float), np.asarray(high, float)
     centre, half = (lo + hi) / 2, (hi - lo) / 2
     radius = min(radius_m, float(half.min()) * 0.999)
-    hidden = set(hidden)
 
     def knots(extent: float) -> Float:
-        # Even angles on the rounded edge: a point h - r + r tan(a) of the box face lands at angle a.
+        # Even angles on the rounded edge, as the point h - r + r tan(a) of the box's face is moved to angle a.
         edge = extent - radius + radius * np.tan(np.linspace(0, np.pi / 4, rounding + 1))
         middle = np.linspace(-(extent - radius), extent - radius, span + 1)[1:-1]
         return np.concatenate([-edge[::-1], middle, edge])
@@ -191,17 +185,7 @@ def cushion(
             p[..., axis] += puff[axis] * np.sign(unit[..., axis]) * np.abs(unit[..., axis]) ** 0.5 * bulge
         s, t = (a - a[0]) / (a[-1] - a[0]), (b - b[0]) / (b[-1] - b[0])
         size = (2 * float(half[u != 0][0]), 2 * float(half[v != 0][0]))
-        patches.append(
-            Patch(
-                centre + p,
-                s,
-                t,
-                size,
-                material,
-                density=density * (HIDDEN if face in hidden else 1.0),
-                offset_m=(offset_m[0] + 0.37 * i, offset_m[1] + 0.23 * i),
-            )
-        )
+        patches.append(Patch(centre + p, s, t, size, material, **_face_options(i, face in hidden, 1.0, (0.0, 0.0))))
     return patches
 
 
@@ -214,25 +198,21 @@ def lathe(
     density: float = 1.0,
 ) -> list[Patch]:
     """Surface of revolution about z; `profile` lists (radius, z) downwards, radius 0 at both ends closes it."""
-    rz = np.asarray(profile, float)
-    angle = np.linspace(0, 2 * np.pi, sides + 1)
-    angle[-1] = 0.0
+    rz, angle = np.asarray(profile, float), _full_turn(sides)
     ring = np.stack([np.cos(angle), np.sin(angle)], -1)
     positions = np.empty((len(rz), sides + 1, 3))
     positions[..., :2] = rz[:, None, :1] * ring[None]
     positions[..., 2] = rz[:, None, 1]
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(rz, axis=0), axis=1))])
-    size = (2 * np.pi * float(rz[:, 0].max()), float(arc[-1]))
-    return [
-        Patch(
-            positions + np.asarray(centre, float),
-            np.linspace(0, 1, sides + 1),
-            arc / arc[-1],
-            size,
-            material,
-            density=density,
-        )
-    ]
+    size, s, t = (2 * np.pi * float(rz[:, 0].max()), float(arc[-1])), np.linspace(0, 1, sides + 1), arc / arc[-1]
+    return [Patch(positions + np.asarray(centre, float), s, t, size, material, density=density)]
+
+
+def _full_turn(sides: int) -> Float:
+    """Angles (sides + 1,) around a circle; the last is the first, exactly."""
+    angle = np.linspace(0, 2 * np.pi, sides + 1)
+    angle[-1] = 0.0
+    return angle
 
 
 def cylinder(radius_m: float, z0: float, z1: float, material: Material, **options: Any) -> list[Patch]:
@@ -240,32 +220,26 @@ def cylinder(radius_m: float, z0: float, z1: float, material: Material, **option
     return lathe([(0, z1), (radius_m, z1), (radius_m, z0), (0, z0)], material, **options)
 
 
-def tube(
-    path: ArrayLike, radius_m: ArrayLike, material: Material, *, sides: int = 8, density: float = 1.0
-) -> list[Patch]:
+def tube(path: ArrayLike, radius_m: ArrayLike, material: Material, *, sides: int = 8) -> list[Patch]:
     """Closed tube along a polyline (K, 3), with one radius or one per point."""
     points = np.asarray(path, float)
     tangent = np.gradient(points, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     radii = np.broadcast_to(np.asarray(radius_m, float), (len(points),))
-    points = np.concatenate([points[:1], points, points[-1:]])
-    tangent = np.concatenate([tangent[:1], tangent, tangent[-1:]])
-    radii = np.concatenate([[0.0], radii, [0.0]])
+    points, tangent = (np.pad(values, ((1, 1), (0, 0)), "edge") for values in (points, tangent))
+    radii = np.pad(radii, 1)  # the ends taper to a point
     helper = np.array([0.0, 0.0, 1.0]) if abs(tangent[:, 2]).max() < 0.9 else np.array([0.31, 0.95, 0.0])
     side = np.cross(tangent, helper)
     side /= np.linalg.norm(side, axis=1, keepdims=True)
     other = np.cross(tangent, side)
-    angle = np.linspace(0, 2 * np.pi, sides + 1)
-    angle[-1] = 0.0
+    angle = _full_turn(sides)
     ring = np.cos(angle)[None, :, None] * side[:, None] - np.sin(angle)[None, :, None] * other[:, None]
     positions = points[:, None] + radii[:, None, None] * ring
     length = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
-    return [grid_patch(positions, material, (2 * np.pi * float(radii.max()), length), density=density)]
+    return [grid_patch(positions, material, (2 * np.pi * float(radii.max()), length))]
 
 
-def slab_between(
-    front: Float, back: Float, material: Material, size_m: tuple[float, float], **options: Any
-) -> list[Patch]:
+def slab_between(front: Float, back: Float, material: Material, size_m: tuple[float, float]) -> list[Patch]:
     """Closed sheet from two grids (m + 1, n + 1, 3) of equal shape, both indexed as seen from the front."""
     edges = (
         np.stack([back[0], front[0]]),  # top
@@ -273,11 +247,11 @@ def slab_between(
         np.stack([back[:, 0], front[:, 0]], 1),  # left
         np.stack([front[:, -1], back[:, -1]], 1),  # right
     )
-    patches = [grid_patch(front, material, size_m, **options), grid_patch(back[:, ::-1], material, size_m, **options)]
+    patches = [grid_patch(front, material, size_m), grid_patch(back[:, ::-1], material, size_m)]
     for i, edge in enumerate(edges):
         thickness = max(float(np.linalg.norm(edge[0, 0] - (edge[1, 0] if i < 2 else edge[0, 1]))), 0.004)
         size = (size_m[0], thickness) if i < 2 else (thickness, size_m[1])
-        patches.append(grid_patch(edge, material, size, **options))
+        patches.append(grid_patch(edge, material, size))
     return patches
 
 

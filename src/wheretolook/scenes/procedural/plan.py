@@ -1,16 +1,16 @@
-"""Floor plans: a rectangle cut into rooms, each given a use, joined by doors and lit by windows."""
+"""Floor plans: a rectangle cut into rooms, each with a use, joined by doors and lit by windows."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
+
+from wheretolook.geometry.poses import Float
 
 INNER_WALL_M = 0.12
 DOOR_HEIGHT_M = 2.05
-SIDES = ("south", "east", "north", "west")
 
 
 @dataclass(frozen=True)
@@ -18,11 +18,9 @@ class Opening:
     """A door or window in a wall.
 
     Attributes:
-        kind: `door`, `wide` (an opening without a frame in the field of view of both rooms) or `window`.
-        a0: left end along the wall in metres, seen from inside the room.
-        a1: right end.
-        z0: lower edge above the floor.
-        z1: upper edge.
+        kind: `door`, `wide` (a wide opening without a frame or door) or `window`.
+        a0, a1: left and right end along the wall in metres, seen from inside the room.
+        z0, z1: lower and upper edge above the floor in metres.
         other: index of the room behind it, -1 for outside.
         owner: whether this room's side carries the jambs and the threshold.
     """
@@ -42,12 +40,9 @@ class Room:
 
     Attributes:
         index: its number.
+        x0, y0, x1, y1: west, south, east and north wall, in metres.
         kind: `living`, `kitchen`, `bedroom`, `bathroom`, `hall` or `study`.
-        x0: west wall.
-        y0: south wall.
-        x1: east wall.
-        y1: north wall.
-        openings: per side (south, east, north, west), what its wall is cut by.
+        openings: doors and windows of each side (south, east, north, west).
         lamp_on: whether its ceiling lamp is lit.
         curtains_closed: whether its windows are covered.
     """
@@ -79,13 +74,16 @@ class Room:
         """Square metres."""
         return self.width * self.depth
 
+    @property
+    def centre(self) -> tuple[float, float]:
+        """World x and y of the middle."""
+        return (self.x0 + self.x1) / 2, (self.y0 + self.y1) / 2
+
     def wall_length(self, side: int) -> float:
         """Length of a wall."""
         return self.width if side % 2 == 0 else self.depth
 
-    def wall_frame(
-        self, side: int
-    ) -> tuple[NDArray[np.floating[Any]], NDArray[np.floating[Any]], NDArray[np.floating[Any]]]:
+    def wall_frame(self, side: int) -> tuple[Float, Float, Float]:
         """Left end on the floor, direction to the right, and normal into the room, seen from inside; each (3,)."""
         corner = [(self.x1, self.y0), (self.x1, self.y1), (self.x0, self.y1), (self.x0, self.y0)][side]
         right = [(-1, 0), (0, -1), (1, 0), (0, 1)][side]
@@ -107,6 +105,7 @@ class Plan:
 
 
 def _cut(rng: np.random.Generator, width: float, depth: float, count: int, corridor: bool) -> list[Room]:
+    """A rectangle cut at random into a number of rooms, the largest again and again; a corridor is the first."""
     cells = [(0.0, 0.0, width, depth)]
     half_wall = INNER_WALL_M / 2
     hall: list[tuple[float, float, float, float]] = []
@@ -130,22 +129,21 @@ def _cut(rng: np.random.Generator, width: float, depth: float, count: int, corri
 
 def shared_wall(a: Room, b: Room) -> tuple[int, float, float] | None:
     """Side of `a` that faces `b` and the common interval in world x or y, or None if they do not touch."""
-    low_x, high_x = max(a.x0, b.x0), min(a.x1, b.x1)
-    low_y, high_y = max(a.y0, b.y0), min(a.y1, b.y1)
-    if high_x - low_x > 1e-6:
-        if abs(b.y1 + INNER_WALL_M - a.y0) < 1e-4:
-            return 0, low_x, high_x
-        if abs(a.y1 + INNER_WALL_M - b.y0) < 1e-4:
-            return 2, low_x, high_x
-    if high_y - low_y > 1e-6:
-        if abs(a.x1 + INNER_WALL_M - b.x0) < 1e-4:
-            return 1, low_y, high_y
-        if abs(b.x1 + INNER_WALL_M - a.x0) < 1e-4:
-            return 3, low_y, high_y
+    common_x = max(a.x0, b.x0), min(a.x1, b.x1)
+    common_y = max(a.y0, b.y0), min(a.y1, b.y1)
+    for side, lower, upper, (low, high) in (
+        (0, b.y1, a.y0, common_x),
+        (2, a.y1, b.y0, common_x),
+        (1, a.x1, b.x0, common_y),
+        (3, b.x1, a.x0, common_y),
+    ):
+        if high - low > 1e-6 and abs(lower + INNER_WALL_M - upper) < 1e-4:
+            return side, low, high
     return None
 
 
 def _name(rooms: list[Room], corridor: bool) -> None:
+    """Choose the rooms' kinds: bathroom the smallest, living room the largest, the kitchen beside it."""
     rest = sorted(rooms, key=lambda r: r.area)
     if corridor:
         rooms[0].kind = "hall"
@@ -169,17 +167,20 @@ def _name(rooms: list[Room], corridor: bool) -> None:
 
 
 _COST = {"hall": 0.0, "living": 1.0, "kitchen": 3.0, "study": 5.0, "bedroom": 5.0, "bathroom": 9.0}
+"""Doors are preferably between rooms of low cost."""
 
 
 def _spanning_doors(rooms: list[Room]) -> list[tuple[int, int]] | None:
+    """Doors, as pairs of rooms, that make a minimum spanning tree of the rooms (Kruskal).
+
+    None if a room cannot be reached or one would have to walk through a bathroom, bedroom or study.
+    """
     edges = []
-    for a in rooms:
-        for b in rooms[a.index + 1 :]:
-            wall = shared_wall(a, b)
-            if wall is not None and wall[2] - wall[1] > 1.35:
-                edges.append(
-                    (min(_COST[a.kind], _COST[b.kind]) * 10 + max(_COST[a.kind], _COST[b.kind]), a.index, b.index)
-                )
+    for a, b in combinations(rooms, 2):
+        wall = shared_wall(a, b)
+        if wall is not None and wall[2] - wall[1] > 1.35:
+            low, high = sorted((_COST[a.kind], _COST[b.kind]))
+            edges.append((low * 10 + high, a.index, b.index))
     group = list(range(len(rooms)))
     doors = []
     for _, i, j in sorted(edges):
@@ -193,12 +194,14 @@ def _spanning_doors(rooms: list[Room]) -> list[tuple[int, int]] | None:
     return None if any(degree[r.index] > 1 for r in private) else doors
 
 
+_SHAPES = {"hall": (1.15, 6.5), "bathroom": (1.6, 2.2), "living": (3.2, 2.0), "kitchen": (2.2, 2.0)}
+"""Least width in metres and greatest ratio of the sides, for kinds of rooms."""
+
+
 def _fits(room: Room) -> bool:
     short, long = sorted((room.width, room.depth))
-    low, slender = {"hall": (1.15, 6.5), "bathroom": (1.6, 2.2), "living": (3.2, 2.0), "kitchen": (2.2, 2.0)}.get(
-        room.kind, (2.5, 2.0)
-    )
-    return short >= low and long / short <= slender
+    least, slenderness = _SHAPES.get(room.kind, (2.5, 2.0))
+    return short >= least and long / short <= slenderness
 
 
 def _add_doors(rng: np.random.Generator, rooms: list[Room], doors: list[tuple[int, int]], height: float) -> None:
@@ -207,16 +210,11 @@ def _add_doors(rng: np.random.Generator, rooms: list[Room], doors: list[tuple[in
         wall = shared_wall(a, b)
         assert wall is not None
         side, low, high = wall
-        open_plan = {a.kind, b.kind} == {"living", "kitchen"} or (
-            {a.kind, b.kind} == {"living", "hall"} and rng.random() < 0.4
-        )
-        room_for = high - low - 0.3
-        width = (
-            float(min(rng.uniform(1.3, 2.0), room_for))
-            if open_plan and room_for > 1.3
-            else float(rng.uniform(0.86, 0.95))
-        )
-        kind, top = ("wide", min(2.25, height - 0.2)) if width > 1.2 else ("door", DOOR_HEIGHT_M)
+        kinds = {a.kind, b.kind}
+        wide = kinds == {"living", "kitchen"} or (kinds == {"living", "hall"} and rng.random() < 0.4)
+        wide = wide and high - low - 0.3 > 1.3
+        width = float(min(rng.uniform(1.3, 2.0), high - low - 0.3) if wide else rng.uniform(0.86, 0.95))
+        kind, top = ("wide", min(2.25, height - 0.2)) if wide else ("door", DOOR_HEIGHT_M)
         slack = high - low - width
         start = low + float(rng.choice([0.15, slack - 0.15, rng.uniform(0.15, max(slack - 0.15, 0.16))]))
         for room, s, other, owner in ((a, side, j, True), (b, (side + 2) % 4, i, False)):
@@ -244,10 +242,8 @@ def _add_windows(rng: np.random.Generator, rooms: list[Room]) -> None:
     for room in rooms:
         if room.kind == "hall":
             continue
-        spans = sorted(
-            ((hi - lo, side, lo, hi) for side in range(4) for lo, hi in outside_spans(room, rooms, side)), reverse=True
-        )
-        for span, side, low, high in spans[: 2 if room.kind == "living" else 1]:
+        spans = [(high - low, side, low, high) for side in range(4) for low, high in outside_spans(room, rooms, side)]
+        for span, side, low, high in sorted(spans, reverse=True)[: 2 if room.kind == "living" else 1]:
             small = room.kind == "bathroom"
             width = min(rng.uniform(0.55, 0.8) if small else rng.uniform(1.1, 2.1), span - 0.5)
             if width < 0.5:
@@ -260,8 +256,8 @@ def _add_windows(rng: np.random.Generator, rooms: list[Room]) -> None:
 def draw_plan(rng: np.random.Generator, n_rooms: int, area_m2: float, dark_rooms: float) -> Plan:
     """Random plan with `n_rooms` rooms (3 to 6) on about `area_m2`, centred on the origin.
 
-    Cuts at random until every room has a sound shape, all are reached by doors, and none but hall, living room and
-    kitchen is passed through.
+    Draws plans until every room has a good shape, all are reached by doors, and only hall, living room and kitchen are
+    passed through. `dark_rooms` is the share of rooms whose lamp is off.
     """
     height = float(rng.uniform(2.5, 2.8))
     for attempt in range(5000):

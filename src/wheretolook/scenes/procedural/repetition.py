@@ -1,4 +1,4 @@
-"""Surfaces that repeat a strong pattern over and over, as in games: full of features, all of them alike."""
+"""Surfaces that repeat a strong pattern, as in games: they have many features that look alike."""
 
 from __future__ import annotations
 
@@ -11,26 +11,18 @@ from wheretolook.scenes.procedural.atlas import AtlasPlan
 from wheretolook.scenes.procedural.noise import Canvas, Image, NoiseBank
 
 PATTERNS = 6
-"""Different patterns of one household: the same one covers several surfaces."""
+"""Number of patterns in one apartment; several surfaces have the same one."""
 
 LEAST_M = 0.7
-"""Surfaces narrower than that stay as they are."""
+"""Surfaces narrower than this stay as they are."""
 
 
 def repeat_patterns(
     plan: AtlasPlan, painted: Sequence[Image], share: float, rng: np.random.Generator, noise: NoiseBank
 ) -> list[Image]:
-    """Cover a share of the large surfaces with repeated patterns.
+    """Albedo of each chart (height, width, 3), where a share (0 to 1) of the large surfaces repeats a pattern.
 
-    Args:
-        plan: charts of the surfaces.
-        painted: albedo of each chart, (height, width, 3) float32.
-        share: of the large surfaces, 0 to 1.
-        rng: which surfaces, and the patterns.
-        noise: fields that patterns are painted with.
-
-    Returns:
-        Albedo of each chart; half of what it was, half pattern, where it repeats.
+    On these surfaces it is the mean of the pattern and of what was painted, which is repeated too.
     """
     periods_m = rng.uniform(0.6, 2.0, PATTERNS)
     materials = [artwork.picture(rng) for _ in range(PATTERNS)]

@@ -33,69 +33,47 @@ def choose_finish(style: Style, room: Room) -> Finish:
     paint = materials.plain(rng, colour)
     walls = [paint] * 4
     ceiling = materials.plain(rng, (0.92, 0.92, 0.91))
-    contrast = 0.6 + 1.6 * style.richness
-    floor = materials.planks(
-        rng,
-        style.floor_colour,
-        width_m=float(rng.uniform(0.12, 0.2)),
-        length_m=float(rng.uniform(1.1, 1.8)),
-        contrast=contrast,
-        along_x=room.width > room.depth,
-    )
+    width_m, length_m = float(rng.uniform(0.12, 0.2)), float(rng.uniform(1.1, 1.8))
+    contrast, along_x = 0.6 + 1.6 * style.richness, room.width > room.depth
+    floor = materials.planks(rng, style.floor_colour, width_m, length_m, contrast, along_x)
     if room.kind == "bathroom":
-        size = style.pick([(0.3, 0.6), (0.2, 0.2), (0.3, 0.3), (0.15, 0.15)])
-        tile = materials.vary(rng, style.pick([(0.90, 0.91, 0.90), (0.72, 0.80, 0.82), (0.84, 0.80, 0.72)]), 0.02)
-        wall = materials.tiles(
-            rng,
-            tile,
-            (0.62, 0.62, 0.60),
-            size_m=size,
-            brick=style.chance(0.3),
-            veins=0.5 * style.richness,
-            decor_every=int(rng.integers(3, 8)) if style.chance(0.3 + 0.6 * style.richness) else 0,
-        )
-        walls = [wall] * 4
-        floor = materials.tiles(
-            rng,
-            (0.62, 0.62, 0.60),
-            (0.48, 0.48, 0.47),
-            size_m=(0.3, 0.3),
-            veins=0.8 * style.richness,
-            second=(0.38, 0.40, 0.42) if style.chance(0.4) else None,
-        )
+        walls = [_bathroom_tiles(style)] * 4
+        second, veins = (0.38, 0.40, 0.42) if style.chance(0.4) else None, 0.8 * style.richness
+        size = (0.3, 0.3)
+        floor = materials.tiles(rng, (0.62, 0.62, 0.60), (0.48, 0.48, 0.47), size_m=size, veins=veins, second=second)
     elif room.kind == "kitchen":
-        floor = materials.tiles(
-            rng,
-            materials.vary(rng, (0.70, 0.66, 0.60)),
-            (0.52, 0.50, 0.47),
-            size_m=(0.4, 0.4),
-            veins=0.9 * style.richness,
-            second=(0.55, 0.48, 0.42) if style.chance(0.3) else None,
-        )
+        tile = materials.vary(rng, (0.70, 0.66, 0.60))
+        second, veins = (0.55, 0.48, 0.42) if style.chance(0.3) else None, 0.9 * style.richness
+        floor = materials.tiles(rng, tile, (0.52, 0.50, 0.47), size_m=(0.4, 0.4), veins=veins, second=second)
     if room.kind in ("living", "study") and style.chance(0.6):
         walls[int(rng.integers(4))] = materials.plain(rng, materials.vary(rng, style.pick(ACCENTS), 0.02))
-    if style.chance(
-        {"bedroom": 0.4, "hall": 0.2, "living": 0.15, "study": 0.15}.get(room.kind, 0.0) + 0.3 * style.richness
-    ) and room.kind not in ("bathroom", "kitchen"):
-        paper = materials.wallpaper(
-            rng,
-            colour,
-            materials.vary(rng, style.pick(ACCENTS), 0.03),
-            period_m=float(rng.uniform(0.12, 0.24)),
-            motif=style.chance(0.6),
-        )
-        papered = int(rng.integers(4))
-        walls = (
-            [paper] * 4
-            if style.chance(0.3)
-            else [paper if side == papered else wall for side, wall in enumerate(walls)]
-        )
+    papered = {"bedroom": 0.4, "hall": 0.2, "living": 0.15, "study": 0.15}.get(room.kind, 0.0)
+    if style.chance(papered + 0.3 * style.richness) and room.kind not in ("bathroom", "kitchen"):
+        second = materials.vary(rng, style.pick(ACCENTS), 0.03)
+        period_m = float(rng.uniform(0.12, 0.24))
+        paper = materials.wallpaper(rng, colour, second, period_m=period_m, motif=style.chance(0.6))
+        side = int(rng.integers(4))
+        if style.chance(0.3):
+            walls = [paper] * 4
+        else:
+            walls[side] = paper
     if room.kind == "bedroom" and style.chance(0.4):
         floor = materials.plain(rng, materials.vary(rng, (0.62, 0.57, 0.50)), speckle=0.03 + 0.07 * style.richness)
     return Finish((walls[0], walls[1], walls[2], walls[3]), floor, ceiling)
 
 
+def _bathroom_tiles(style: Style) -> Material:
+    rng, richness = style.rng, style.richness
+    size = style.pick([(0.3, 0.6), (0.2, 0.2), (0.3, 0.3), (0.15, 0.15)])
+    tile = materials.vary(rng, style.pick([(0.90, 0.91, 0.90), (0.72, 0.80, 0.82), (0.84, 0.80, 0.72)]), 0.02)
+    brick = style.chance(0.3)
+    every = int(rng.integers(3, 8)) if style.chance(0.3 + 0.6 * richness) else 0
+    grout = (0.62, 0.62, 0.60)
+    return materials.tiles(rng, tile, grout, size_m=size, brick=brick, veins=0.5 * richness, decor_every=every)
+
+
 def _wall(room: Room, side: int, height: float, material: Material) -> Patch:
+    """A wall with holes for its openings."""
     corner, right, _ = room.wall_frame(side)
     length = room.wall_length(side)
     openings = room.openings[side]
@@ -107,27 +85,19 @@ def _wall(room: Room, side: int, height: float, material: Material) -> Patch:
         rows = (z[1:] > o.z0 - 1e-9) & (z[:-1] < o.z1 + 1e-9)
         mask[np.ix_(rows, columns)] = False
     positions = corner + a[None, :, None] * right + z[:, None, None] * np.array([0, 0, 1.0])
-    return Patch(
-        positions,
-        a / length,
-        1 - z / height,
-        (length, height),
-        material,
-        room=room.index,
-        mask=mask,
-        offset_m=(3.1 * side, 0.0),
-    )
+    s, t, offset = a / length, 1 - z / height, (3.1 * side, 0.0)
+    return Patch(positions, s, t, (length, height), material, room=room.index, mask=mask, offset_m=offset)
 
 
 def wall_items(room: Room, side: int, at: float, patches: list[Patch]) -> list[Patch]:
-    """Patches of the furniture frame put at wall coordinate `at`, standing against that wall of the room."""
+    """Patches of the furniture frame, moved against a wall of a room with x = 0 at wall coordinate `at`."""
     corner, right, normal = room.wall_frame(side)
     rotation = np.stack([-right, normal, [0, 0, 1]], 1)
     return [replace(p, room=room.index) for p in move(patches, rotation=rotation, shift=corner + at * right)]
 
 
 def _reveal(depth: float, o: Opening, material: Material, sill: Material | None) -> list[Patch]:
-    """Inner faces of a hole in the wall, in the furniture frame around the middle of the opening."""
+    """Inner faces of an opening, in the furniture frame around its middle."""
     w = (o.a1 - o.a0) / 2
     patches = [
         plane((w, 0, o.z1), (0, -depth, 0), (0, 0, o.z0 - o.z1), material),  # faces -x
@@ -140,6 +110,7 @@ def _reveal(depth: float, o: Opening, material: Material, sill: Material | None)
 
 
 def _architrave(style: Style, o: Opening) -> list[Patch]:
+    """Frame around a door."""
     w, face, thick = (o.a1 - o.a0) / 2, 0.07, 0.018
     patches: list[Patch] = []
     for x0, x1 in ((-w - face, -w), (w, w + face)):
@@ -148,28 +119,23 @@ def _architrave(style: Style, o: Opening) -> list[Patch]:
 
 
 def _window(style: Style, room: Room, o: Opening, height: float, cloth: Material) -> list[Patch]:
-    w, y = (o.a1 - o.a0) / 2, -REVEAL_M
-    patches = _reveal(REVEAL_M, o, style.trim, style.trim)
+    """Pane that shows the view, frame, sill and, except in bathrooms and kitchens, curtains."""
+    w, y, bar, frame = (o.a1 - o.a0) / 2, -REVEAL_M, 0.05, style.trim
+    patches = _reveal(REVEAL_M, o, frame, frame)
     patches.append(plane((w, y, o.z1), (-2 * w, 0, 0), (0, 0, o.z0 - o.z1), artwork.view(style.rng), density=0.9))
-    bar, thick = 0.05, 0.05
-    frame = style.trim
     for z0, z1 in ((o.z0, o.z0 + bar), (o.z1 - bar, o.z1)):
-        patches += box((-w, y + 0.004, z0), (w, y + thick, z1), frame, hidden=("back",))
-    posts = 2 if w < 0.45 else 3
-    for x in np.linspace(-w + bar / 2, w - bar / 2, posts):
-        patches += box(
-            (x - bar / 2, y + 0.004, o.z0 + bar), (x + bar / 2, y + thick, o.z1 - bar), frame, hidden=("back",)
-        )
-    patches += box((-w - 0.04, -0.02, o.z0 - 0.03), (w + 0.04, 0.05, o.z0 + 0.004), style.trim, hidden=("back",))
+        patches += box((-w, y + 0.004, z0), (w, y + bar, z1), frame, hidden=("back",))
+    for x in np.linspace(-w + bar / 2, w - bar / 2, 2 if w < 0.45 else 3):
+        low, high = (x - bar / 2, y + 0.004, o.z0 + bar), (x + bar / 2, y + bar, o.z1 - bar)
+        patches += box(low, high, frame, hidden=("back",))
+    patches += box((-w - 0.04, -0.02, o.z0 - 0.03), (w + 0.04, 0.05, o.z0 + 0.004), frame, hidden=("back",))
     if room.kind in ("bathroom", "kitchen"):
         return patches
     top = min(o.z1 + 0.18, height - 0.05)
     patches += tube([(-w - 0.35, 0.1, top + 0.015), (w + 0.35, 0.1, top + 0.015)], 0.012, style.metal, sides=10)
-    drop = top - 0.03
-    share = w + 0.25 if room.curtains_closed else 0.38
+    width, x = (w + 0.25, (w + 0.25) / 2) if room.curtains_closed else (0.38, w + 0.08)
     for sign in (-1, 1):
-        x = sign * ((w + 0.25) / 2 if room.curtains_closed else w + 0.08)
-        patches += move(fixtures.curtain(style, share, drop, cloth), shift=(x, 0.1, top))
+        patches += move(fixtures.curtain(width, top - 0.03, cloth), shift=(sign * x, 0.1, top))
     return patches
 
 
@@ -177,45 +143,42 @@ def build_shell(style: Style, plan: Plan) -> list[Patch]:
     """All surfaces of the empty apartment."""
     finishes = [choose_finish(style, room) for room in plan.rooms]
     patches: list[Patch] = []
-    cloth = (
-        style.patterned()
-        if style.chance(0.25 + 0.4 * style.richness)
-        else materials.fabric(style.rng, materials.vary(style.rng, (0.80, 0.76, 0.68), 0.05), weave=0.02)
-    )
+    if style.chance(0.25 + 0.4 * style.richness):
+        cloth = style.patterned()
+    else:
+        cloth = materials.fabric(style.rng, materials.vary(style.rng, (0.80, 0.76, 0.68), 0.05), weave=0.02)
     for room, finish in zip(plan.rooms, finishes, strict=True):
         x0, y0, y1 = room.x0, room.y0, room.y1
-        size = (room.width, room.depth)
-        patches.append(
-            plane(
-                (x0, y1, 0),
-                (size[0], 0, 0),
-                (0, -size[1], 0),
-                finish.floor,
-                room=room.index,
-                offset_m=(x0 + 20, 20 - y1),
-            )
-        )
-        patches.append(
-            plane((x0, y0, plan.height), (size[0], 0, 0), (0, size[1], 0), finish.ceiling, room=room.index, density=0.7)
-        )
+        right, down, offset = (room.width, 0, 0), (0, room.depth, 0), (x0 + 20, 20 - y1)
+        up = (0, -room.depth, 0)
+        patches.append(plane((x0, y1, 0), right, up, finish.floor, room=room.index, offset_m=offset))
+        patches.append(plane((x0, y0, plan.height), right, down, finish.ceiling, room=room.index, density=0.7))
         for side in range(4):
             patches.append(_wall(room, side, plan.height, finish.walls[side]))
-            gaps = sorted((o.a0 - 0.07, o.a1 + 0.07) for o in room.openings[side] if o.z0 == 0)
-            at = 0.0
-            for low, high in [*gaps, (room.wall_length(side), 0.0)]:
-                if low - at > 0.03 and room.kind != "bathroom":
-                    half = (low - at) / 2
-                    board = box((-half, 0, 0), (half, 0.012, 0.07), style.trim, hidden=WALL_ENDS, density=0.7)
-                    patches += wall_items(room, side, at + half, board)
-                at = high
+            if room.kind != "bathroom":
+                patches += _skirting(style, room, side)
             for o in room.openings[side]:
-                middle = (o.a0 + o.a1) / 2
+                parts: list[Patch] = []
                 if o.kind == "window":
-                    patches += wall_items(room, side, middle, _window(style, room, o, plan.height, cloth))
-                    continue
+                    parts = _window(style, room, o, plan.height, cloth)
                 if o.kind == "door":
-                    patches += wall_items(room, side, middle, _architrave(style, o))
-                if o.owner:
+                    parts = _architrave(style, o)
+                if o.kind != "window" and o.owner:
                     jamb = style.trim if o.kind == "door" else finish.walls[side]
-                    patches += wall_items(room, side, middle, _reveal(INNER_WALL_M, o, jamb, style.second_wood))
+                    parts += _reveal(INNER_WALL_M, o, jamb, style.second_wood)
+                patches += wall_items(room, side, (o.a0 + o.a1) / 2, parts)
+    return patches
+
+
+def _skirting(style: Style, room: Room, side: int) -> list[Patch]:
+    """Boards along the foot of a wall, between the openings that reach the floor."""
+    patches: list[Patch] = []
+    gaps = sorted((o.a0 - 0.07, o.a1 + 0.07) for o in room.openings[side] if o.z0 == 0)
+    at = 0.0
+    for low, high in [*gaps, (room.wall_length(side), 0.0)]:
+        if low - at > 0.03:
+            half = (low - at) / 2
+            board = box((-half, 0, 0), (half, 0.012, 0.07), style.trim, hidden=WALL_ENDS, density=0.7)
+            patches += wall_items(room, side, at + half, board)
+        at = high
     return patches

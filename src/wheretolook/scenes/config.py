@@ -1,0 +1,83 @@
+"""What a procedural apartment is like: options only, so that the command line reads them quickly."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from wheretolook.utils.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class ApartmentConfig:
+    """Options of the procedural apartment.
+
+    Args:
+        n_rooms: number of rooms, 3 to 6; None draws it from the seed.
+        area_m2: floor area aimed at, in square metres; None takes about 13 per room.
+        texture_richness: how rich in texture surfaces are, 0 to 1; lower is harder to localize in. The contrast of
+            wood, stone and cloth, and how many pictures hang.
+        clutter: how many small things there are, 0 to 1; lower is harder. Books, plants, bottles.
+        repetition: share of large surfaces with a strong pattern that repeats, 0 to 1. Every 0.6 to 2 m, as in games:
+            such views are full of features and yet hard to localize.
+        dark_rooms: share of rooms whose lamp is off, some with their curtains closed. Higher is harder.
+        enlarged: how many times as large everything is, furniture and patterns too: halls with few, far landmarks.
+        vary: whether every apartment draws its own size and difficulty. Its area and the five numbers above come from
+            its seed, whatever they are set to: rooms unlike each other, to learn from.
+        texels_per_m: texture resolution of large surfaces; lowered if the atlas would not fit.
+        texture_size: greatest width and height of the texture in texels.
+        light_spacing_m: distance between light samples in metres.
+        light_rays: rays per light sample over the hemisphere.
+    """
+
+    n_rooms: int | None = None
+    area_m2: float | None = None
+    texture_richness: float = 0.85
+    clutter: float = 0.85
+    repetition: float = 0.0
+    dark_rooms: float = 0.2
+    enlarged: float = 1.0
+    vary: bool = False
+    texels_per_m: float = 125.0
+    texture_size: int = 4096
+    light_spacing_m: float = 0.1
+    light_rays: int = 24
+
+    def __post_init__(self) -> None:
+        if self.n_rooms is not None and not 3 <= self.n_rooms <= 6:
+            raise ConfigError("n_rooms must be 3 to 6", value=self.n_rooms)
+        if self.area_m2 is not None and not 25 <= self.area_m2 <= 200:
+            raise ConfigError("area_m2 must be 25 to 200", value=self.area_m2)
+        for name in ("texture_richness", "clutter", "repetition", "dark_rooms"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ConfigError(f"{name} must be between 0 and 1", value=getattr(self, name))
+        for name in ("enlarged", "texels_per_m", "texture_size", "light_spacing_m", "light_rays"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ConfigError(f"{name} must be a positive number", value=getattr(self, name))
+
+    def key(self) -> dict[str, Any]:
+        """What decides an apartment, but for its seed; options that came later only where they are not the default."""
+        later = ("repetition", "enlarged", "vary")
+        default = ApartmentConfig()
+        return {
+            name: value for name, value in asdict(self).items() if name not in later or value != getattr(default, name)
+        }
+
+    def of_seed(self, seed: int) -> ApartmentConfig:
+        """What the apartment of a seed is like: this, unless it is to `vary`."""
+        if not self.vary:
+            return self
+        rng = np.random.default_rng([seed, 2])
+        return replace(
+            self,
+            area_m2=float(rng.uniform(35, 130)),
+            texture_richness=float(rng.uniform(0.5, 1)),
+            clutter=float(rng.uniform(0.3, 1)),
+            repetition=float(rng.uniform(0.3, 1)) if rng.random() < 0.7 else 0.0,
+            dark_rooms=float(rng.uniform(0, 0.4)),
+            enlarged=float(np.exp(rng.uniform(0, np.log(3)))),
+            vary=False,
+        )

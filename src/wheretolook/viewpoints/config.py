@@ -1,0 +1,55 @@
+"""Options of sampling viewpoints, apart from the code that does it, so that the command line reads them quickly."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal, get_args
+
+from wheretolook.geometry.lattices import ViewLattice
+from wheretolook.utils.errors import ConfigError
+
+Split = Literal["train", "val", "test"]
+"""What a scene is for: to learn from, to choose by, to report on."""
+
+
+@dataclass(frozen=True)
+class SampleConfig(ViewLattice):
+    """Settings of the sample stage.
+
+    Args:
+        keep: directions kept at each location, those that see most landmarks; 0 keeps all. The paper's K.
+        min_visible: directions that see fewer landmarks are dropped. In the paper, those with "none or only a minimal
+            number" (Sec. 3.2).
+        max_locations: a random subset of the free locations, 0 for all.
+        max_directions: a random subset of the kept directions of each location, 0 for all; one number, or one for
+            each split, such as `{train: 50, val: 50, test: 100}`.
+        seed: seed of the random subsets.
+        distinct_pixels: rank by the number of distinct pixels with a landmark, as the released code counts, instead of
+            the number of landmarks.
+
+    Attributes:
+        memory_gb: bound on the memory that counting takes on its device, in 10^9 bytes; two million landmarks fit.
+    """
+
+    keep: int = 100
+    min_visible: int = 1
+    max_locations: int = 0
+    max_directions: int | dict[Split, int] = 0
+    seed: int = 0
+    distinct_pixels: bool = False
+    memory_gb: float = field(default=2.0, init=False)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("keep", "min_visible", "max_locations"):
+            if getattr(self, name) < 0:
+                raise ConfigError(f"sample.{name} must not be negative", value=getattr(self, name))
+        if isinstance(self.max_directions, dict) and set(self.max_directions) != set(get_args(Split)):
+            fix = "Give one number, or one for each of train, val and test."
+            raise ConfigError("sample.max_directions lacks or misnames a split", value=self.max_directions, fix=fix)
+        if min(map(self.directions_of, get_args(Split))) < 0:
+            raise ConfigError("sample.max_directions must not be negative", value=self.max_directions)
+
+    def directions_of(self, split: Split) -> int:
+        """`max_directions` for a split."""
+        return self.max_directions[split] if isinstance(self.max_directions, dict) else self.max_directions

@@ -45,7 +45,8 @@ def choose_weights(dataset: Dataset, config: EvaluateConfig, models: Sequence[Tr
     served = {path: method_of_weights(path) for path in paths}
     folder = dataset.root / "weights"
     if not served:
-        fix = "Run the train stage first, name weights, or leave methods that have learnt out."
+        need = ", ".join(name for name, kinds in asked.items() if "" not in kinds)
+        fix = f"Run the train stage first, name weights, or leave {need} out of the methods."
         raise WeightsError("there are no weights to evaluate", path=folder, fix=fix)
     for name, kinds in asked.items():
         # who asks for all methods gets those that have been trained

@@ -19,12 +19,11 @@ from wheretolook.config import Experiment, ScenesConfig
 from wheretolook.dataset.folders import Dataset, SceneFolder
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.mapping import incremental
-from wheretolook.mapping.cameras import colmap_poses
-from wheretolook.mapping.config import MapConfig
+from wheretolook.mapping.colmap_model import colmap_poses
+from wheretolook.mapping.config import KnownDistance, MapConfig, PhotographsConfig, ScaleConfig
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.mapping.photograph_config import KnownDistance, PhotographsConfig, ScaleConfig
 from wheretolook.mapping.photograph_map import map_photographs
-from wheretolook.mapping.similarity import fit_similarity
+from wheretolook.mapping.scale import fit_similarity
 from wheretolook.methods.visible import VisibleScorer
 from wheretolook.planning.config import ViewpointMapConfig
 from wheretolook.space.config import MappedSpaceConfig

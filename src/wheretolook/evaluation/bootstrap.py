@@ -9,9 +9,7 @@ from numpy.typing import NDArray
 
 from wheretolook.geometry.poses import Float
 
-PERCENTILES = (2.5, 97.5)
-"""Ends of a 95 % interval."""
-
+PERCENTILES = (2.5, 97.5)  # ends of a 95 % interval
 _SIGNS = 1  # sets the random numbers of the sign flips apart from those of the resamples
 
 
@@ -23,12 +21,9 @@ class LocationBootstrap:
     Scenes stay as they are: an interval says how sure a value is for these scenes, not for scenes to come. As every
     method sees the same resamples, differences between methods are paired.
 
-    Args:
-        location_scene: (L,) scene of each location.
-        resamples: number R of resamples, and of sign flips.
-        seed: the same seed and locations give the same resamples.
-        location_block: (L,) block of each location; blocks of different scenes are different whatever their numbers.
-            None for each location by itself.
+    Of L locations `location_scene` and `location_block` (L,) tell scene and block, None for each by itself; blocks of
+    different scenes are different whatever their numbers. The seed and the locations decide on the resamples, R in
+    number, and as many sign flips.
     """
 
     def __init__(
@@ -61,14 +56,9 @@ class LocationBootstrap:
         return sums
 
     def ratio(self, numerator: Float, denominator: Float) -> tuple[Float, Float]:
-        """95 % percentile interval of the ratio of two sums over locations.
+        """95 % percentile interval of the ratio of two sums over locations, of (L, C) and (L, C) or (L, 1).
 
-        Args:
-            numerator: (L, C).
-            denominator: (L, C) or (L, 1).
-
-        Returns:
-            Lower and upper ends, (C,) each; NaN where no scene has two blocks, or a denominator is always zero.
+        Returns lower and upper ends, (C,) each; NaN where no scene has two blocks, or a denominator is always zero.
         """
         ends = np.full((2, numerator.shape[1]), np.nan)
         if self._sizes.max(initial=0) < 2:
@@ -83,17 +73,12 @@ class LocationBootstrap:
         return ends[0], ends[1]
 
     def paired_p(self, differences: Float) -> Float:
-        """Two-sided p-values of the paired permutation test that two methods are worth the same in every block.
+        """Two-sided p-values (C,) of the paired permutation test that two methods are worth the same in every block.
 
-        If they are, a block's difference is as likely with either sign. The p-value is the share of random signs, those
-        observed among them, that bring the sum over blocks as far from zero as it is, or farther; it is at least
-        1 / (R + 1). It does not hold for expectations, as those of random choice, which are no draws.
-
-        Args:
-            differences: (L, C), one method's less the other's.
-
-        Returns:
-            (C,) in (0, 1]; NaN without locations.
+        If they are, a block's difference (of `differences`, (L, C)) is as likely with either sign. The p-value is the
+        share of random signs, those observed among them, that bring the sum over blocks as far from zero as it is, or
+        farther; it is at least 1 / (R + 1), and NaN without locations. It does not hold for expectations, as those of
+        random choice, which are no draws.
         """
         resamples, n_blocks = self._times.shape
         if n_blocks == 0:

@@ -14,29 +14,18 @@ from scipy.special import expit, logit
 from wheretolook.geometry.poses import Float
 from wheretolook.learning.old_names import with_names
 
-Good = NDArray[np.bool_]
-"""Whether each view localizes, (B,)."""
-
-BINS = 15
-"""Bins of equal width that probabilities are sorted into."""
-
-TINY = 1e-15
-"""Probabilities are kept this far from 0 and 1, so that their logits are finite."""
-
-TEMPERATURES = (0.01, 100.0)
-"""Range in which a temperature is sought."""
+Good = NDArray[np.bool_]  # whether each view localizes, (B,)
+BINS = 15  # bins of equal width that probabilities are sorted into
+TINY = 1e-15  # probabilities are kept this far from 0 and 1, so that their logits are finite
+TEMPERATURES = (0.01, 100.0)  # range in which a temperature is sought
 
 
 def reliability(probability: Float, good: Good, bins: int = BINS) -> pd.DataFrame:
-    """The reliability curve: of views that were given about the same probability, how many are good.
+    """The reliability curve: of views that were given about the same probability (B,), in [0, 1], how many are good
+    (B,).
 
-    Args:
-        probability: (B,) predicted, in [0, 1].
-        good: (B,) observed.
-        bins: bins of equal width. Each holds its lower end, the last one 1 as well.
-
-    Returns:
-        One row a bin: bin_low, bin_high, mean_predicted, share_good (both NaN where the bin is empty) and n (views).
+    One row for each bin of equal width, which holds its lower end, the last one 1 as well: bin_low, bin_high,
+    mean_predicted, share_good (both NaN where the bin is empty) and n (views).
     """
     edges = np.linspace(0, 1, bins + 1)
     rows = np.clip(np.searchsorted(edges, probability, side="right") - 1, 0, bins - 1)
@@ -55,15 +44,8 @@ def reliability(probability: Float, good: Good, bins: int = BINS) -> pd.DataFram
 
 
 def expected_calibration_error(probability: Float, good: Good, bins: int = BINS) -> float:
-    """Distance between predicted and observed shares, averaged over the views (Naeini et al., AAAI 2015).
-
-    Args:
-        probability: (B,) predicted, in [0, 1].
-        good: (B,) observed.
-        bins: see `reliability`.
-
-    Returns:
-        In [0, 1]; NaN without views.
+    """Distance in [0, 1] between predicted and observed shares of the `reliability` curve, averaged over the views
+    (Naeini et al., AAAI 2015); NaN without views.
     """
     curve = reliability(probability, good, bins)
     if not len(probability):
@@ -77,15 +59,10 @@ def negative_log_likelihood(probability: Float, good: Good) -> float:
 
 
 def fit_temperature(probability: Float, good: Good) -> float:
-    """The temperature under which the observed labels are most likely (Guo et al., ICML 2017).
+    """The temperature under which the observed labels (B,) are most likely (Guo et al., ICML 2017), in `TEMPERATURES`.
 
-    Args:
-        probability: (B,) predicted, in [0, 1].
-        good: (B,) observed.
-
-    Returns:
-        T in `TEMPERATURES`: above 1 for a network that is too sure, below 1 for one that is not sure enough. NaN where
-        all labels are of one class, or there are none: then no temperature is the best.
+    It is above 1 for a network that is too sure, below 1 for one that is not sure enough. NaN where all labels are of
+    one class, or there are none: then no temperature is the best.
     """
     if not len(good) or good.all() or not good.any():
         return float("nan")
@@ -103,16 +80,10 @@ def scale_probability(probability: Float, temperature: float) -> Float:
 
 
 def calibration_rows(probability: Float, good: Good, temperature: float) -> pd.DataFrame:
-    """The reliability curve before and, if the temperature is known, after scaling.
+    """The reliability curve before and, if the temperature is known (not NaN), after scaling.
 
-    Args:
-        probability: (B,) predicted, in [0, 1].
-        good: (B,) observed.
-        temperature: T, or NaN.
-
-    Returns:
-        Columns n_views (B) and when ("before" or "after"), those of `reliability`, and ece and nll, which are of the
-        whole curve.
+    Columns: n_views (B) and when ("before" or "after"), those of `reliability`, and ece and nll, which are of the whole
+    curve.
     """
     curves = {"before": probability}
     if np.isfinite(temperature):

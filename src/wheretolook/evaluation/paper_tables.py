@@ -16,8 +16,7 @@ from wheretolook.utils.files import write_text
 from wheretolook.utils.markdown import markdown_table
 from wheretolook.viewpoints.thresholds import ALL, THRESHOLDS, threshold_key, threshold_label
 
-KEYS = tuple(map(threshold_key, THRESHOLDS))
-"""The paper's thresholds."""
+KEYS = tuple(map(threshold_key, THRESHOLDS))  # the paper's thresholds
 
 NOTE = (
     "The paper's numbers were measured on other scenes (12 Habitat-Matterport meshes) and divided by one constant, "
@@ -74,18 +73,16 @@ _SOURCES = ("normalized", "normalized_low", "normalized_high", "released")
 
 
 def paper_tables(scores: pd.DataFrame) -> dict[str, pd.DataFrame]:
-    """The paper's tables with this project's numbers beside the printed ones.
+    """The paper's tables, "vs_others" and "input_variants", with this project's numbers beside the printed ones.
 
-    Args:
-        scores: a score table (`wheretolook.evaluation.scores.score_table`); its rows over all scenes with N = 1 are
-            taken, those of the first occlusion model and the first set of candidates.
+    Of a score table (`wheretolook.evaluation.scores.score_table`) the rows over all scenes with N = 1 are taken, those
+    of the first occlusion model and the first set of candidates.
 
-    Returns:
-        "vs_others" and "input_variants", a row for each of the paper's in its order: `paper_row` (its name there),
-        `method` (its name here) and for each threshold, in %: score_* (share divided by the oracle's) with
-        score_low_* and score_high_* (95 % bootstrap interval), released_* (share divided by 0.527) and paper_*
-        (printed); then `note`. NaN where either has no number. Where the network with the input "2d+3d" is missing,
-        the first of the paper's networks stands in for the row "proposed", and `method` says so.
+    A row for each of the paper's in its order: `paper_row` (its name there), `method` (its name here) and for each
+    threshold, in %: score_* (share divided by the oracle's) with score_low_* and score_high_* (95 % bootstrap
+    interval), released_* (share divided by 0.527) and paper_* (printed); then `note`. NaN where either has no number.
+    Where the network with the input "2d+3d" is missing, the first of the paper's networks stands in for the row
+    "proposed", and `method` says so.
     """
     rows = main_rows(scores)
     rows = rows[(rows["scene"] == ALL) & (rows["top_n"] == 1)]
@@ -116,14 +113,8 @@ def _is_network(method: str) -> bool:
 
 
 def write_paper_tables(scores: pd.DataFrame, folder: Path) -> list[Path]:
-    """Write `table_vs_others` and `table_input_variants` as .csv, .tex and .md.
-
-    Args:
-        scores: as for `paper_tables`.
-        folder: where; made when needed.
-
-    Returns:
-        The files.
+    """Write `table_vs_others` and `table_input_variants` (`paper_tables`) as .csv, .tex and .md into a folder; the
+    files.
     """
     paths = []
     for name, table in paper_tables(scores).items():
@@ -157,12 +148,9 @@ def paper_markdown(table: pd.DataFrame, title: str) -> str:
 
 
 def paper_latex(table: pd.DataFrame, title: str, label: str) -> str:
-    """A table of `paper_tables` for a document that loads booktabs: a float over the full width, intervals as indices.
+    r"""A table of `paper_tables` for a document that loads booktabs: a float over the full width, intervals as indices.
 
-    Args:
-        table: one of `paper_tables`.
-        title: first sentence of the caption.
-        label: for `\\ref`.
+    The title begins the caption, the label is for `\ref`.
     """
     groups = " & ".join(rf"\multicolumn{{3}}{{c}}{{{_escaped(threshold_label(key))}}}" for key in KEYS)
     rules = " ".join(rf"\cmidrule(lr){{{2 + 3 * index}-{4 + 3 * index}}}" for index in range(len(KEYS)))

@@ -13,23 +13,16 @@ from wheretolook.geometry.poses import Float
 
 @dataclass(frozen=True, eq=False)
 class TestViews:
-    """Labelled views to choose from.
-
-    Attributes:
-        location: (B,) int64, number of each view's location, 0 .. L-1 over all scenes.
-        viewpoint_id: (B,) int64, unique within a location.
-        good: (B, T) bool, whether the view localizes within each of T thresholds.
-        location_scene: (L,) int64, number of each location's scene.
-        location_block: (L,) int64, number of the block of neighbouring locations that each is resampled with, see
-            `wheretolook.evaluation.bootstrap.LocationBootstrap`; None for each by itself.
-    """
+    """Labelled views to choose from."""
 
     __test__ = False  # no test class, whatever its name says
 
-    location: NDArray[np.int64]
-    viewpoint_id: NDArray[np.int64]
-    good: NDArray[np.bool_]
-    location_scene: NDArray[np.int64]
+    location: NDArray[np.int64]  # (B,) int64, number of each view's location, 0 .. L-1 over all scenes
+    viewpoint_id: NDArray[np.int64]  # (B,) int64, unique within a location
+    good: NDArray[np.bool_]  # (B, T) bool, whether the view localizes within each of T thresholds
+    location_scene: NDArray[np.int64]  # (L,) int64, number of each location's scene
+    # (L,) int64, number of the block of neighbouring locations that each is resampled with, see
+    # `wheretolook.evaluation.bootstrap.LocationBootstrap`; None for each by itself
     location_block: NDArray[np.int64] | None = None
 
     @property
@@ -49,25 +42,16 @@ class TestViews:
 
 @dataclass(frozen=True, eq=False)
 class TopN:
-    """What the views chosen at each location are worth.
+    """What the views chosen at each location are worth."""
 
-    Attributes:
-        chosen: (L,) views chosen at each location: N, or all there are.
-        good: (L, T) how many of them are good within each threshold (an expectation for random choice).
-        any_good: (L, T) whether at least one is (a probability for random choice).
-    """
-
-    chosen: Float
-    good: Float
-    any_good: Float
+    chosen: Float  # (L,) views chosen at each location: N, or all there are
+    good: Float  # (L, T) how many of them are good within each threshold (an expectation for random choice)
+    any_good: Float  # (L, T) whether at least one is (a probability for random choice)
 
 
 def rank_views(views: TestViews, scores: Float) -> NDArray[np.int64]:
-    """Rank (B,) of every view within its location: 0 has the highest score; the smaller viewpoint_id wins a tie.
-
-    Args:
-        views: the candidates.
-        scores: (B,).
+    """Rank (B,) of every view within its location by scores (B,): 0 is the highest; the smaller viewpoint_id wins a
+    tie.
     """
     order = np.lexsort((views.viewpoint_id, -scores, views.location))
     location = views.location[order]
@@ -78,13 +62,7 @@ def rank_views(views: TestViews, scores: Float) -> NDArray[np.int64]:
 
 
 def choose_best(views: TestViews, ranks: NDArray[np.int64], n: int) -> TopN:
-    """Choose the N views of every location that rank first.
-
-    Args:
-        views: the candidates.
-        ranks: (B,), see `rank_views`.
-        n: N. A location with fewer views contributes all it has.
-    """
+    """Choose the n views of every location that rank first (`rank_views`); where there are fewer, all."""
     good = _sum_by_location(views, views.good & (ranks < n)[:, None])
     return TopN(np.minimum(_n_views(views), n), good, (good > 0).astype(np.float64))
 

@@ -14,26 +14,21 @@ from wheretolook.methods.styles import ORACLE, method_group, method_style
 from wheretolook.utils.markdown import markdown_table
 from wheretolook.viewpoints.thresholds import ALL, threshold_label
 
-Row = Mapping[Any, Any]
-"""A row of a score table by its columns' names."""
+Row = Mapping[Any, Any]  # a row of a score table by its columns' names
 
 Column = tuple[str, str, Callable[[Row], str]]
 """Header of a Markdown table's column, the score table's column that it needs, and the text of a row."""
 
-SCENES_ABREAST = 8
-"""Scenes in one table; more make another below."""
+SCENES_ABREAST = 8  # scenes in one table; more make another below
 
 
 def score_markdown(scores: pd.DataFrame, title: str = "Localization score") -> str:
-    """A score table (`wheretolook.evaluation.scores.score_table`) as text and tables.
+    """A score table (`wheretolook.evaluation.scores.score_table`, with `occlusion` and `candidates` or without) in
+    Markdown.
 
     The first N with all that is known; other N; the share of locations with a good view; by scene; by occlusion model
     and by set of candidates if there are several (the tables above are of the first); shares divided by the released
     code's constant; calibration; probes apart. What an older table lacks is left out.
-
-    Args:
-        scores: the table, with columns `occlusion` and `candidates` or without.
-        title: first line.
     """
     main = main_rows(scores)
     probe = main["method"].map(method_group) == "probes"

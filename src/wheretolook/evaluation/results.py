@@ -32,48 +32,30 @@ CALIBRATION_CSV, CALIBRATION_PNG, REGRET_PNG = "calibration.csv", "calibration.p
 VARIANTS_CSV = "variants.csv"
 """In a release's `results/`: scores of the networks for all inputs, as `scores.csv`, before one was chosen to ship."""
 
-LOCATIONS_PARQUET = "locations.parquet"
-"""Artifact of each nested run: what was chosen at each location, for each N."""
+LOCATIONS_PARQUET = "locations.parquet"  # artifact of each nested run: what was chosen at each location, for each N
 
 
 @dataclass(frozen=True, eq=False)
 class ScoredSet:
-    """One candidate set with the scores by one occlusion model.
+    """One candidate set with the scores by one occlusion model."""
 
-    Attributes:
-        occlusion: name of the occlusion model.
-        candidates: the views.
-        scores: (B,) scores of these views, by method.
-        choices: what each method chooses.
-        table: the score table, with columns `occlusion` and `candidates`.
-    """
-
-    occlusion: str
-    candidates: CandidateSet
-    scores: Mapping[str, Float]
-    choices: Choices
-    table: pd.DataFrame
+    occlusion: str  # name of the occlusion model
+    candidates: CandidateSet  # the views
+    scores: Mapping[str, Float]  # (B,) scores of these views, by method
+    choices: Choices  # what each method chooses
+    table: pd.DataFrame  # the score table, with columns `occlusion` and `candidates`
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """What an evaluation found.
+    """What an evaluation found."""
 
-    Attributes:
-        scenes: of the split.
-        weights: files of methods that have learnt, and the name of the method that each serves.
-        views: all labelled views.
-        scored: of each occlusion model and candidate set.
-        table: their score tables, one below the other, with columns `occlusion` and `candidates`.
-        calibration: reliability curves of learned methods, see `calibration_rows`; empty without any.
-    """
-
-    scenes: Sequence[SceneFolder]
-    weights: Mapping[Path, str]
-    views: TestViews
-    scored: Sequence[ScoredSet]
-    table: pd.DataFrame
-    calibration: pd.DataFrame
+    scenes: Sequence[SceneFolder]  # of the split
+    weights: Mapping[Path, str]  # files of methods that have learnt, and the name of the method that each serves
+    views: TestViews  # all labelled views
+    scored: Sequence[ScoredSet]  # of each occlusion model and candidate set
+    table: pd.DataFrame  # their score tables, one below the other, with columns `occlusion` and `candidates`
+    calibration: pd.DataFrame  # reliability curves of learned methods, see `calibration_rows`; empty without any
 
 
 def results_folder(dataset: Dataset, config: EvaluateConfig) -> Path:
@@ -83,13 +65,7 @@ def results_folder(dataset: Dataset, config: EvaluateConfig) -> Path:
 
 
 def evaluation_params(dataset: Dataset, scenes: Sequence[SceneFolder], weights: Iterable[Path]) -> dict[str, Any]:
-    """Parameters of an evaluation's run that tell what was evaluated.
-
-    Args:
-        dataset: evaluated.
-        scenes: those of the split.
-        weights: files of methods that have learnt.
-    """
+    """Parameters of an evaluation's run that tell what was evaluated: a dataset's scenes, and files of weights."""
     return {
         "dataset": dataset.name,
         "dataset_fingerprint": Dataset(dataset.root, dataset.camera, tuple(scenes)).fingerprint(),
@@ -98,8 +74,7 @@ def evaluation_params(dataset: Dataset, scenes: Sequence[SceneFolder], weights: 
     }
 
 
-_NAMED = ("method", "occlusion", "candidates")
-"""What names a nested run."""
+_NAMED = ("method", "occlusion", "candidates")  # what names a nested run
 
 _OF_ALL_VIEWS = ("n_locations", "average_precision", "roc_auc", "ece", "ece_scaled", "temperature")
 """Columns of a score table that do not depend on N."""
@@ -108,19 +83,16 @@ _OF_CHOSEN = re.compile("(raw|any|normalized|p)_(?!low_|high_)|(regret|differenc
 """Beginning of the columns that are logged for each N. `scores.csv`, an artifact, has the other intervals and counts;
 each metric costs MLflow 0.3 ms."""
 
-_OF_SCENE = re.compile("regret_(?!low_|high_)")
-"""Beginning of the columns that are logged for each N and scene."""
+_OF_SCENE = re.compile("regret_(?!low_|high_)")  # beginning of the columns that are logged for each N and scene
 
 
 def runs_of_rows(table: pd.DataFrame, params: Mapping[str, Any]) -> Iterator[NestedRun]:
-    """The runs that score tables are logged as: for each method, occlusion model and candidate set one.
+    """The runs that score tables, one below the other, are logged as: for each method, occlusion model and candidate
+    set one.
 
-    Its metrics are named by N, the scene unless it is all of them, and the column, such as
-    `top-1/regret_0.05m_0.4deg` and `top-5/apartment-210/regret_5m_10deg`, or by the column if N does not matter.
-
-    Args:
-        table: score tables, one below the other, with columns `occlusion` and `candidates`.
-        params: of the evaluation; the row's own are added.
+    Their parameters are those given and the row's own. Metrics are named by N, the scene unless it is all of them, and
+    the column, such as `top-1/regret_0.05m_0.4deg` and `top-5/apartment-210/regret_5m_10deg`, or by the column if N
+    does not matter.
     """
     for key, rows in table.groupby(list(_NAMED), sort=False):
         own = dict(zip(_NAMED, map(str, key), strict=True))
@@ -186,15 +158,9 @@ def log_evaluation(
     occlusion: OcclusionConfig,
     results: Path,
 ) -> None:
-    """Log an evaluation: a run with the files of `results`, and nested in it those of `runs_of_rows`.
+    """Log an evaluation: a run with the files in the folder `results`, and nested in it those of `runs_of_rows`.
 
-    Args:
-        dataset: evaluated.
-        evaluation: what it found.
-        config: of the evaluation.
-        tracking: where to log.
-        occlusion: settings of occlusion models, logged if the configuration names any.
-        results: folder of the files.
+    The settings of occlusion models are logged if the configuration names any.
     """
     views, scenes = evaluation.views, evaluation.scenes
     params = {
@@ -225,12 +191,7 @@ def log_evaluation(
 
 
 def latest_scores(tracking: TrackingConfig, dataset: str | None = None) -> pd.DataFrame | None:
-    """The score table of the newest evaluation in a store, or None if there is none.
-
-    Args:
-        tracking: the store.
-        dataset: name of the dataset evaluated; None for any.
-    """
+    """The score table of the newest evaluation in a store, of one dataset or any, or None if there is none."""
     run = newest_run(tracking, "evaluate", {"dataset": dataset} if dataset else None)
     if run is None:
         return None

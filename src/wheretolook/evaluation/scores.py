@@ -28,8 +28,7 @@ RELEASED_DIVISOR = 0.527
 _PAIRED = ("difference", "difference_low", "difference_high", "p")
 _CALIBRATION = ("ece", "ece_scaled", "temperature")
 
-Choices = Mapping[tuple[str, int], TopN]
-"""What each method, the oracle too, chooses for each N."""
+Choices = Mapping[tuple[str, int], TopN]  # what each method, the oracle too, chooses for each N
 
 
 def read_scores(path: Path) -> pd.DataFrame:
@@ -51,13 +50,7 @@ def is_probability(method: str) -> bool:
 
 
 def choose(views: TestViews, scores: Mapping[str, Float], top_n: Sequence[int]) -> Choices:
-    """Let every method choose N views of every location; see `score_table`, whose rows come in the same order.
-
-    Args:
-        views: the candidates.
-        scores: (B,) scores by method.
-        top_n: values of N.
-    """
+    """Let every method choose N views of every location; see `score_table`, whose rows come in the same order."""
     choices: dict[tuple[str, int], TopN] = {}
     for method, values in scores.items():
         if by_chance(method):
@@ -71,8 +64,7 @@ def choose(views: TestViews, scores: Mapping[str, Float], top_n: Sequence[int]) 
 def reference_method(methods: Iterable[str], name: str) -> str:
     """The method that the others are compared with: see `EvaluateConfig.reference`. "" if there is none.
 
-    Raises:
-        ConfigError: no method has that name.
+    Raises a ConfigError if no method has that name.
     """
     methods = list(methods)
     if name and name not in methods:
@@ -91,46 +83,36 @@ def score_table(
     temperatures: Mapping[str, float] | None = None,
     choices: Choices | None = None,
 ) -> pd.DataFrame:
-    """Compare methods (paper, Sec. 4.1 and its tables 2 and 3).
+    """Compare methods by their scores (B,) of views (paper, Sec. 4.1 and its tables 2 and 3).
 
-    At every location the N views with the highest score are chosen, and the chosen views of all locations are pooled.
-    A location with fewer than N views contributes what it has. The paper divides all shares by one constant, 0.527;
-    here each is also divided by the oracle's at the same threshold, scenes and N.
+    At every location the N views with the highest score are chosen, and the chosen views of all locations are pooled. A
+    location with fewer than N views contributes what it has. The paper divides all shares by one constant, 0.527; here
+    each is also divided by the oracle's at the same threshold, scenes and N.
 
     Choosing at random is not drawn but computed: its rows hold exact expectations. Its average precision and ROC AUC
     are those of one seeded draw.
 
-    Args:
-        views: the candidates.
-        scores: (B,) scores by method.
-        scenes: names of the scenes, by their number in `views`.
-        config: values of N, thresholds, bootstrap, reference.
-        temperatures: of learned methods, as far as known; see `wheretolook.evaluation.calibration`.
-        choices: what `choose` gives for the same views, scores and N, if that is known already.
+    `scenes` are the names of the scenes by their number in `views`, `temperatures` those of learned methods as far as
+    known (`wheretolook.evaluation.calibration`), `choices` what `choose` gives, if that is known already. A ConfigError
+    is raised if the reference is none of the methods.
 
-    Returns:
-        One row for each method (and the oracle), N and scene, `scene` being "all" in rows over all scenes. Columns:
-        method, top_n, scene, n_locations, n_views (chosen views), and for each threshold, such as
-        "0.05m_0.4deg":
+    One row for each method (and the oracle), N and scene, `scene` being "all" in rows over all scenes. Columns: method,
+    top_n, scene, n_locations, n_views (chosen views), and for each threshold, such as "0.05m_0.4deg":
 
-        - good_*: number of chosen views that are good.
-        - raw_*: share of good views. normalized_*: divided by the oracle's share; NaN if that is 0. released_*: divided
-          by `RELEASED_DIVISOR`, which can give more than 1.
-        - any_*: share of locations with at least one good view.
-        - regret_*: the oracle's raw share less the method's, at least 0.
-        - difference_*: the method's raw share less the reference's (`EvaluateConfig.reference`), and p_*, the p-value
-          of `LocationBootstrap.paired_p`; NaN without a reference, p_* also for random choice, an expectation.
-        - low_* and high_* of raw_, normalized_, any_, regret_ and difference_, such as raw_low_*: bootstrap interval
-          over blocks of locations, paired where two methods meet (`LocationBootstrap.ratio`).
+    - good_*: number of chosen views that are good.
+    - raw_*: share of good views. normalized_*: divided by the oracle's share; NaN if that is 0. released_*: divided by
+      `RELEASED_DIVISOR`, which can give more than 1.
+    - any_*: share of locations with at least one good view.
+    - regret_*: the oracle's raw share less the method's, at least 0.
+    - difference_*: the method's raw share less the reference's (`EvaluateConfig.reference`), and p_*, the p-value of
+      `LocationBootstrap.paired_p`; NaN without a reference, p_* also for random choice, an expectation.
+    - low_* and high_* of raw_, normalized_, any_, regret_ and difference_, such as raw_low_*: bootstrap interval over
+      blocks of locations, paired where two methods meet (`LocationBootstrap.ratio`).
 
-        Then reference (the method that differences are from, "" for none); average_precision and roc_auc of the
-        scores against the first threshold, NaN where all views are of one class; and for learned methods, NaN for
-        others, ece (expected calibration error, against the first threshold), ece_scaled (with logits divided by the
-        temperature) and temperature, both NaN where it is not known. A scene without candidates has rows with 0
-        locations and NaN.
-
-    Raises:
-        ConfigError: the reference is none of the methods.
+    Then reference (the method that differences are from, "" for none); average_precision and roc_auc of the scores
+    against the first threshold, NaN where all views are of one class; and for learned methods, NaN for others, ece
+    (expected calibration error, against the first threshold), ece_scaled (with logits divided by the temperature) and
+    temperature, both NaN where it is not known. A scene without candidates has rows with 0 locations and NaN.
     """
     pools: list[tuple[str, NDArray[np.bool_]]] = [(ALL, np.ones(views.n_locations, dtype=bool))]
     if len(scenes) > 1:

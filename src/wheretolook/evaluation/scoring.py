@@ -25,18 +25,14 @@ from wheretolook.utils.files import fingerprint
 from wheretolook.viewpoints.table import poses
 from wheretolook.visibility.config import OcclusionConfig
 
-BLOCK = 4096
-"""Views binned and scored at a time."""
-
-Weights = Mapping[Path, str]
-"""Files of weights, and the name of the method that each serves."""
+BLOCK = 4096  # views binned and scored at a time
+Weights = Mapping[Path, str]  # files of weights, and the name of the method that each serves
 
 
 def choose_weights(dataset: Dataset, config: EvaluateConfig, models: Sequence[TrainedModel | Path] | None) -> Weights:
     """The weights to evaluate: those given, or those that the configuration names, or the dataset's own.
 
-    Raises:
-        WeightsError: there are none for a method that needs them, or the dataset's were trained on other data.
+    Raises a WeightsError if there are none for a method that needs them, or the dataset's were trained on other data.
     """
     asked = {name: {method.weights for method in members(name, scorers())} for name in config.methods}
     wanted = set().union(*asked.values()) - {""}
@@ -97,26 +93,14 @@ def score_scenes(
     progress: bool,
     occlusion: OcclusionConfig | None,
 ) -> tuple[dict[str, Float], str]:
-    """Scores of every method. Views are binned once for all.
+    """Scores (B,) by method of the views in the tables of scenes, and the name of the occlusion model. They are binned
+    once.
 
-    Args:
-        dataset: gives the camera.
-        scenes: of the dataset.
-        tables: their viewpoints, B in all.
-        config: methods, seed, heading, reference.
-        weights: of methods that have learnt.
-        device: "cpu" or a CUDA device.
-        progress: show a progress bar.
-        occlusion: model to see the landmarks by; None for the one that is stored with the sampled locations.
+    The occlusion model is that to see the landmarks by; None for the one that is stored with the sampled locations.
 
-    Returns:
-        (B,) scores by method, and the name of the occlusion model.
-
-    Raises:
-        TableError: a method gives scores that are not finite.
-        WeightsError: weights were trained for another field of view.
-        MapError, SceneError: a scene has no landmarks, or no mesh where one is needed.
-        ConfigError: the reference is none of the methods.
+    Raises a TableError if a method gives scores that are not finite; a WeightsError if weights were trained for another
+    field of view; a MapError or SceneError if a scene has no landmarks, or no mesh where one is needed; a ConfigError
+    if the reference is none of the methods.
     """
     scores: dict[str, list[Float]] = {}
     used: set[str] = set()

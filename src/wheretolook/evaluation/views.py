@@ -19,36 +19,20 @@ from wheretolook.viewpoints.table import is_good, poses
 
 @dataclass(frozen=True, eq=False)
 class CandidateSet:
-    """Views to choose from.
+    """Views to choose from."""
 
-    Attributes:
-        name: as in the column `candidates`: "all", or such as "best 100".
-        mask: (B,) which of all labelled views they are.
-        views: the views.
-        location_id: (L,) of their locations, unique within a scene.
-    """
-
-    name: str
-    mask: NDArray[np.bool_]
-    views: TestViews
-    location_id: NDArray[np.int64]
+    name: str  # as in the column `candidates`: "all", or such as "best 100"
+    mask: NDArray[np.bool_]  # (B,) which of all labelled views they are
+    views: TestViews  # the views
+    location_id: NDArray[np.int64]  # (L,) of their locations, unique within a scene
 
 
 def views_of(
     scenes: Sequence[SceneFolder], tables: Sequence[pd.DataFrame], config: EvaluateConfig
 ) -> tuple[TestViews, NDArray[np.int64]]:
-    """All labelled views of scenes.
+    """All labelled views of scenes in the order of their tables, and the location_id (L,) of each of their locations.
 
-    Args:
-        scenes: the scenes, S.
-        tables: their viewpoints, in the same order, see `wheretolook.viewpoints.table.SCHEMA`.
-        config: thresholds, and the size of the squares of locations that are resampled together.
-
-    Returns:
-        The views, in the order of the tables, and the location_id (L,) of each of their locations.
-
-    Raises:
-        TableError: a table is empty, or a viewpoint has no label.
+    Raises a TableError if a table is empty, or a viewpoint has no label.
     """
     location: list[NDArray[np.int64]] = []
     location_scene: list[NDArray[np.int64]] = []
@@ -87,17 +71,9 @@ def candidate_sets(
     tables: Sequence[pd.DataFrame],
     config: EvaluateConfig,
 ) -> list[CandidateSet]:
-    """The sets of views to choose from that `config.candidates` names.
+    """The sets of views to choose from that `config.candidates` names, of views and location_id (L,) by `views_of`.
 
-    Args:
-        views: all labelled views, of L locations.
-        location_id: (L,), as `views_of` gives both.
-        scenes: their scenes.
-        tables: of these.
-        config: candidates and thresholds.
-
-    Raises:
-        TableError: all labels of a set are of one class.
+    Raises a TableError if all labels of a set are of one class.
     """
     rank = np.concatenate([table["visibility_rank"].to_numpy(np.int64) for table in tables])
     found = []

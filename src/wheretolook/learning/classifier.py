@@ -14,20 +14,16 @@ from torchmetrics.utilities.distributed import gather_all_tensors
 from wheretolook.learning.config import FittingConfig
 from wheretolook.learning.data import Batch
 
-CALIBRATION_BINS = 15
-"""Equal-width bins of the expected calibration error (Guo et al., ICML 2017)."""
+CALIBRATION_BINS = 15  # equal-width bins of the expected calibration error (Guo et al., ICML 2017)
 
 
 def weighted_bce(
     logits: Tensor, labels: Tensor, class_weights: tuple[float, float], count: float | None = None
 ) -> Tensor:
-    """Mean weighted binary cross-entropy on logits (paper, Sec. 3.3), a scalar.
+    """Mean weighted binary cross-entropy of logits and labels (B,), 0 or 1 (paper, Sec. 3.3), a scalar.
 
-    Args:
-        logits: (B,).
-        labels: (B,) float, 0 or 1.
-        class_weights: weights of the negative and the positive class.
-        count: what to divide the sum by, if not by B.
+    The weights are those of the negative and the positive class; the sum is divided by `count` if that is given, not by
+    B.
     """
     negative, positive = class_weights
     weights = negative + (positive - negative) * labels
@@ -50,19 +46,14 @@ class Augmented(Protocol):
 
 
 class ViewpointClassifier(LightningModule):
-    """Learns whether a viewpoint localizes, from batches of the network's inputs.
+    """Learns whether a viewpoint localizes, from batches of inputs of a network that gives logits (B,).
 
-    A network with a method `augment(options, *inputs)` gets its inputs through that while it learns.
+    A network with a method `augment(options, *inputs)` gets its inputs through that while it learns. The seed is of
+    dropout and noise, where several processes train.
 
     Logged every epoch: `{train,val}_loss`, `{train,val}_bce`, `l2` (the weighted penalty), `train_average_precision`
     (with dropout on), `val_average_precision`, `val_roc_auc` and `val_calibration_error`. Balancing the classes shifts
     the probabilities towards one half, so the calibration error also shows how unbalanced the labels are.
-
-    Args:
-        network: what to train; takes a batch's inputs and gives logits (B,).
-        options: of optimizer and loss.
-        class_weights: weights of the negative and the positive class.
-        seed: of dropout and noise, where several processes train.
     """
 
     def __init__(

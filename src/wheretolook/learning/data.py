@@ -23,26 +23,18 @@ from wheretolook.utils.errors import ConfigError, TableError
 from wheretolook.utils.files import fingerprint
 from wheretolook.viewpoints.table import UNLABELLED, is_good, poses
 
-BLOCK = 4096
-"""Views binned at a time."""
-
-ROOM = 2
-"""Views are kept on a GPU that has this many times the memory they need."""
+BLOCK = 4096  # views binned at a time
+ROOM = 2  # views are kept on a GPU that has this many times the memory they need
 
 
 class Batch(NamedTuple):
-    """One process's share of a batch.
+    """One process's share of a batch."""
 
-    Attributes:
-        inputs: what the network takes, tensors with B rows; of binned views means (B, C, bins, bins) float32 and
-            filled (B, bins, bins) bool.
-        labels: (B,) float32.
-        total: views in the whole batch, over all processes.
-    """
-
+    # what the network takes, tensors with B rows; of binned views means (B, C, bins, bins) float32 and filled (B, bins,
+    # bins) bool
     inputs: tuple[Tensor, ...]
-    labels: Tensor
-    total: int
+    labels: Tensor  # (B,) float32
+    total: int  # views in the whole batch, over all processes
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,22 +43,14 @@ class LabelledViews:
 
     With `CHANNELS` a view takes about 19 kB at 30 x 30 bins: 0.6 GB for 30,000 views, 6.4 GB for 340,000; with
     `ALL_CHANNELS` 51 kB.
-
-    Attributes:
-        means: (B, C, bins, bins) float32, empty bins zero; see `BinnedViews`.
-        filled: (B, bins, bins) bool.
-        labels: (B,) float32, 1 where the viewpoint localizes.
-        scene: (B,) int64, number of each view's scene in the order given.
-        location: (B,) int64, location_id of each view, unique only within its scene.
-        channels: names of the C channels.
     """
 
-    means: Tensor
-    filled: Tensor
-    labels: Tensor
-    scene: NDArray[np.int64]
-    location: NDArray[np.int64]
-    channels: tuple[str, ...] = CHANNELS
+    means: Tensor  # (B, C, bins, bins) float32, empty bins zero; see `BinnedViews`
+    filled: Tensor  # (B, bins, bins) bool
+    labels: Tensor  # (B,) float32, 1 where the viewpoint localizes
+    scene: NDArray[np.int64]  # (B,) int64, number of each view's scene in the order given
+    location: NDArray[np.int64]  # (B,) int64, location_id of each view, unique only within its scene
+    channels: tuple[str, ...] = CHANNELS  # names of the C channels
 
     def __len__(self) -> int:
         return len(self.labels)
@@ -96,22 +80,13 @@ def load_views(
     progress: bool = True,
     landmark_channels: bool = False,
 ) -> LabelledViews:
-    """Read the labelled viewpoints of some scenes and bin their landmarks.
+    """Read the labelled viewpoints of some scenes and bin their landmarks, by `ALL_CHANNELS` or by `CHANNELS` alone.
 
-    Args:
-        dataset: gives the camera.
-        scenes: scenes of the dataset.
-        config: error limits of a positive label, and the number of devices to train on.
-        bins: along each side of the image.
-        device: where the binning runs, "cpu" or a CUDA device. The views come back on this device if one device trains
-            and it has room for them, else on the CPU; for several, in memory that processes can share.
-        progress: show a progress bar.
-        landmark_channels: whether the bins also tell what landmarks are like (`ALL_CHANNELS`, not `CHANNELS`).
+    The binning runs on `device`, "cpu" or a CUDA device. The views come back on it if one device trains and it has room
+    for them, else on the CPU; for several, in memory that processes can share.
 
-    Raises:
-        TableError: a scene has no table or no labelled viewpoint, or its occlusion does not fit.
-        MapError: a scene has no landmarks.
-        ConfigError: the views do not fit into shared memory.
+    Raises a TableError if a scene has no table or no labelled viewpoint, or its occlusion does not fit; a MapError if
+    it has no landmarks; a ConfigError if the views do not fit into shared memory.
     """
     tables = [labelled_rows(scene) for scene in scenes]
     total = sum(map(len, tables))
@@ -148,8 +123,7 @@ def load_views(
 def labelled_rows(scene: SceneFolder, matches: bool = False) -> pd.DataFrame:
     """The labelled viewpoints of a scene, on request with their matches; see `wheretolook.viewpoints.table.read_table`.
 
-    Raises:
-        TableError: there is no table, no labelled viewpoint, or the matches are asked for but not stored.
+    Raises a TableError if there is no table, no labelled viewpoint, or no matches where they are asked for.
     """
     table = scene.read_table(matches)
     table = table[table["status"] != UNLABELLED]
@@ -172,10 +146,8 @@ def _share(*tensors: Tensor) -> None:
 def with_also(dataset: Dataset, names: Sequence[str]) -> Dataset:
     """A dataset together with the train scenes of others beside it.
 
-    Raises:
-        TableError: there is no such dataset, or it has no train scene.
-        ConfigError: it was made for another camera, is named twice or is the dataset itself, or one of its scenes is a
-            scene of the dataset under another name, of whatever split.
+    Raises a TableError if there is no such dataset or it has no train scene; a ConfigError if it was made for another
+    camera, is named twice or is the dataset itself, or one of its scenes is one of the dataset's under another name.
     """
     if len({dataset.name, *names}) <= len(names):
         fix = "Name other datasets in the same folder, each once."
@@ -199,10 +171,8 @@ def with_also(dataset: Dataset, names: Sequence[str]) -> Dataset:
 
 
 def training_scenes(dataset: Dataset) -> list[SceneFolder]:
-    """The scenes that are read for training: train scenes, then val scenes.
-
-    Raises:
-        TableError: there is no train scene.
+    """The scenes that are read for training: train scenes, of which a TableError says if there are none, then val
+    scenes.
     """
     train = dataset.split("train")
     if not train:
@@ -214,16 +184,9 @@ def training_scenes(dataset: Dataset) -> list[SceneFolder]:
 def validation_views(
     dataset: Dataset, scene: NDArray[np.int64], location: NDArray[np.int64], config: SharedConfig
 ) -> NDArray[np.bool_]:
-    """Which views of `training_scenes` are for validation: those of val scenes, or else of held-out locations.
+    """Which views (B,) of `training_scenes` are for validation: those of val scenes, or else of held-out locations.
 
-    Args:
-        dataset: of the scenes.
-        scene: (B,) number of each view's scene.
-        location: (B,) location of each view within its scene.
-        config: share held out, seed.
-
-    Returns:
-        (B,).
+    Of each view `scene` tells the number of its scene and `location` its location within that, (B,) each.
     """
     if dataset.split("val"):
         return scene >= len(dataset.split("train"))
@@ -247,18 +210,10 @@ def check_classes(split: str, labels: NDArray[np.bool_], dataset: Dataset, confi
 def hold_out_locations(
     scene: NDArray[np.int64], location: NDArray[np.int64], fraction: float, seed: int
 ) -> NDArray[np.bool_]:
-    """Choose locations of every scene for validation.
+    """Choose locations of every scene for validation, (B,) True where a view is held out; see `validation_views`.
 
-    All views of a location fall on one side: views that share a location share most of their landmarks.
-
-    Args:
-        scene: (B,) number of each view's scene.
-        location: (B,) location of each view within its scene.
-        fraction: share of each scene's locations, rounded up; one location always stays.
-        seed: the same seed and views give the same choice.
-
-    Returns:
-        (B,) True where the view is held out.
+    All views of a location fall on one side: views that share a location share most of their landmarks. The fraction is
+    of each scene's locations, rounded up; one location always stays. The same seed and views give the same choice.
     """
     held_out = np.zeros(len(scene), dtype=bool)
     for number in np.unique(scene):
@@ -271,14 +226,9 @@ def hold_out_locations(
 
 
 def balance_classes(labels: Tensor, seed: int) -> Tensor:
-    """Choose equally many views of both classes: all of the rarer one, and as many of the other at random.
+    """Choose equally many views of both classes: all of the rarer one, and as many of the other at random, by the seed.
 
-    Args:
-        labels: (B,) 0 or 1.
-        seed: the same seed and labels give the same choice.
-
-    Returns:
-        Rows of the chosen views, (n,) int64, in ascending order, on the CPU.
+    Returns the rows of labels (B,), 0 or 1, that are chosen: (n,) int64, in ascending order, on the CPU.
     """
     positive = labels.cpu().numpy() > 0
     classes = [np.flatnonzero(positive), np.flatnonzero(~positive)]
@@ -288,19 +238,12 @@ def balance_classes(labels: Tensor, seed: int) -> Tensor:
 
 
 class BatchLoader:
-    """Iterates over batches cut from tensors by index: no worker, no per-sample work, no copy of the views.
+    """Batches of the views in `rows` (n,), cut from tensors by index: no worker, no per-sample work, no copy of the
+    views.
 
-    With several processes, every one cuts the same batches and keeps its share of each. Shares differ by one view at
-    most and can be empty, so that all processes take equally many steps.
-
-    Args:
-        views: the views.
-        rows: which of them, (n,) int64.
-        batch_size: views a batch, over all processes; the last one may be smaller.
-        shuffle_seed: every pass has its own order, the same in every run; None keeps the order of `rows`.
-        channels: channels that batches hold.
-        rank: number of this process.
-        world_size: number of processes.
+    With several processes, every one cuts the same batches of `batch_size` and keeps its share of each. Shares differ
+    by one view at most and can be empty, so that all processes take equally many steps. With a `shuffle_seed` every
+    pass has its own order, the same in every run; None keeps the order of `rows`.
     """
 
     def __init__(
@@ -417,14 +360,9 @@ class ViewpointDataModule(LightningDataModule):
         self.use(views, validation_views(self.dataset, views.scene, views.location, self.config))
 
     def use(self, views: LabelledViews, held_out: NDArray[np.bool_]) -> None:
-        """Train on these views instead of those of the dataset.
+        """Train on these views instead of those of the dataset, without those held out (B,).
 
-        Args:
-            views: the views.
-            held_out: (B,) True where a view is for validation.
-
-        Raises:
-            TableError: the labels of a split are of one class.
+        Raises a TableError if the labels of a split are of one class.
         """
         self.train_rows, self.val_rows = (torch.from_numpy(np.flatnonzero(side)) for side in (~held_out, held_out))
         labels = views.labels.cpu()

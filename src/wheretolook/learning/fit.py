@@ -31,24 +31,16 @@ from wheretolook.utils.tracking_config import TrackingConfig
 if TYPE_CHECKING:
     from mlflow.entities import Metric
 
-MONITORED = "val_average_precision"
-"""The metric that tells which epoch was best."""
+MONITORED = "val_average_precision"  # the metric that tells which epoch was best
 
 LIGHTNING_LOGGERS = ("lightning.pytorch", "lightning.fabric")
 
-LOG_EVERY_S = 2.0
-"""Epochs are logged together after so many seconds: a transaction takes longer than a short epoch."""
-
-LOG_AT_MOST = 1000
-"""Metrics MLflow takes at a time."""
+LOG_EVERY_S = 2.0  # epochs are logged together after so many seconds: a transaction takes longer than a short epoch
+LOG_AT_MOST = 1000  # metrics MLflow takes at a time
 
 
 def home_device(config: SharedConfig) -> str:
-    """Torch device of the process that calls: "cuda:0" or "cpu".
-
-    Raises:
-        ConfigError: there are fewer GPUs than asked for.
-    """
+    """Torch device of the process that calls, "cuda:0" or "cpu"; a ConfigError if there are too few GPUs."""
     gpus = torch.cuda.device_count() if config.accelerator != "cpu" else 0
     wanted = config.devices if gpus or config.accelerator == "gpu" else 0
     if wanted > max(gpus, torch.backends.mps.is_available()):
@@ -65,12 +57,6 @@ def fit(classifier: ViewpointClassifier, data: LightningDataModule, record: Epoc
 
     With `config.devices > 1`, every device has its own process, started here and ended here: a script that calls this
     needs the usual `if __name__ == "__main__":`, and an interactive session cannot call it.
-
-    Args:
-        classifier: what to train.
-        data: batches of its network's inputs.
-        record: gathers the results.
-        config: where to train.
     """
     options = classifier.options
     callbacks: list[Callback] = [record]
@@ -105,12 +91,7 @@ def fit(classifier: ViewpointClassifier, data: LightningDataModule, record: Epoc
 
 
 class RunLog:
-    """Logs the metrics of epochs to an MLflow run, several epochs at a time.
-
-    Args:
-        tracking: the store.
-        run_id: the run, open.
-    """
+    """Logs the metrics of epochs to an open MLflow run, several epochs at a time."""
 
     def __init__(self, tracking: TrackingConfig, run_id: str) -> None:
         self.tracking, self.run_id = tracking, run_id
@@ -134,18 +115,10 @@ class RunLog:
 
 
 class EpochRecord(Checkpoint):
-    """Keeps each epoch's metrics and the best weights, shows the progress and logs it.
+    """Keeps each epoch's metrics (`rows`) and the weights that the options ask for (of the epoch `kept`), and shows and
+    logs them.
 
-    Args:
-        title: title of the progress bar.
-        options: tell which weights to keep.
-        progress: show a bar.
-        run_log: where to log, if anywhere.
-
-    Attributes:
-        rows: metrics of each epoch.
-        kept: the epoch whose weights are kept.
-        file: where a process that trains leaves the record for the one that started it; None if they are the same.
+    In `file` a process that trains leaves the record for the one that started it; None if they are the same.
     """
 
     def __init__(self, title: str, options: FittingConfig, progress: bool, run_log: RunLog | None = None) -> None:

@@ -26,23 +26,16 @@ from wheretolook.viewpoints.table import LOCALIZED, is_good, poses
 DISTANCES = [ATTRIBUTES.index(name) for name in ("distance", "mapped_distance")]
 """Attributes that are logarithms of distances: those that change when a scene is enlarged."""
 
-BLOCK = 2048
-"""Views described at a time: some million landmarks."""
+BLOCK = 2048  # views described at a time: some million landmarks
 
 
 @dataclass(frozen=True)
 class AttributeStatistics:
-    """Mean and standard deviation of what is known of each landmark, over those in view while training.
+    """Mean and standard deviation of what is known of each landmark, over those in view while training."""
 
-    Attributes:
-        mean: (A,), 0 for what is not known of any.
-        std: (A,), 1 where it would be 0.
-        attributes: names of the A attributes.
-    """
-
-    mean: tuple[float, ...]
-    std: tuple[float, ...]
-    attributes: tuple[str, ...] = ATTRIBUTES
+    mean: tuple[float, ...]  # (A,), 0 for what is not known of any
+    std: tuple[float, ...]  # (A,), 1 where it would be 0
+    attributes: tuple[str, ...] = ATTRIBUTES  # names of the A attributes
 
     @classmethod
     def of(cls, values: Tensor) -> AttributeStatistics:
@@ -62,27 +55,17 @@ class LandmarkViews:
     """Labelled viewpoints of some scenes, by the landmarks they see.
 
     A view's landmarks are in random order, and at most `most` of them are kept: any first few are a random sample.
-
-    Attributes:
-        starts: (B + 1,) int64; view b has entries `starts[b]` to `starts[b + 1]`.
-        values: (E, len(ATTRIBUTES)) float16.
-        visible: (B,) int64, landmarks that each view sees.
-        axis_height: (B,) float32, z of the optical axis in the world.
-        labels: (B,) float32, 1 where the viewpoint localizes.
-        error_m: (B,) float32, error of its position, infinite where it is not localized or its orientation is off.
-        scene: (B,) int64, number of each view's scene in the order given.
-        location: (B,) int64, location_id of each view, unique only within its scene.
-        found: (E,) bool, whether the localizer found the landmark; None where that was not asked for.
     """
 
-    starts: Tensor
-    values: Tensor
-    visible: Tensor
-    axis_height: Tensor
-    labels: Tensor
-    error_m: Tensor
-    scene: NDArray[np.int64]
-    location: NDArray[np.int64]
+    starts: Tensor  # (B + 1,) int64; view b has entries `starts[b]` to `starts[b + 1]`
+    values: Tensor  # (E, len(ATTRIBUTES)) float16
+    visible: Tensor  # (B,) int64, landmarks that each view sees
+    axis_height: Tensor  # (B,) float32, z of the optical axis in the world
+    labels: Tensor  # (B,) float32, 1 where the viewpoint localizes
+    error_m: Tensor  # (B,) float32, error of its position, infinite where it is not localized or its orientation is off
+    scene: NDArray[np.int64]  # (B,) int64, number of each view's scene in the order given
+    location: NDArray[np.int64]  # (B,) int64, location_id of each view, unique only within its scene
+    # (E,) bool, whether the localizer found the landmark; None where that was not asked for
     found: Tensor | None = None
 
     def __len__(self) -> int:
@@ -110,25 +93,13 @@ def load_landmark_views(
     progress: bool = True,
     matches: bool = False,
 ) -> LandmarkViews:
-    """Describe what the labelled viewpoints of some scenes see.
+    """Describe what the labelled viewpoints of some scenes see, `most` landmarks of a view at most; on the CPU.
 
-    Args:
-        dataset: gives the camera.
-        scenes: of the dataset.
-        config: limits of a positive label, seed of the choice of landmarks.
-        most: landmarks kept of a view.
-        device: where to describe, "cpu" or a CUDA device.
-        progress: show a progress bar.
-        matches: also tell which landmarks the localizer found: the inliers of a view that was localized, and all that
-            were matched in one that was not. Landmarks that the view does not see by the map's occlusion do not count.
+    With `matches` it is told which landmarks the localizer found: the inliers of a view that was localized, and all
+    that were matched in one that was not. Landmarks that the view does not see by the map's occlusion do not count.
 
-    Returns:
-        On the CPU.
-
-    Raises:
-        TableError: a scene has no table or no labelled viewpoint, its occlusion does not fit, or the matches are asked
-            for but not stored.
-        MapError: a scene has no landmarks.
+    Raises a TableError if a scene has no table or no labelled viewpoint, its occlusion does not fit, or the matches are
+    asked for but not stored; a MapError if it has no landmarks.
     """
     tables = [(scene, labelled_rows(scene, matches)) for scene in scenes]
     blocks: list[LandmarkViews] = []
@@ -203,24 +174,15 @@ def _joined(blocks: Sequence[LandmarkViews]) -> LandmarkViews:
 
 
 class LandmarkLoader:
-    """Batches of views for `wheretolook.methods.set.network.SetNetwork`: a window of each view's landmarks.
+    """Batches of views for `SetNetwork`: a window of each view's landmarks, of `width` at most.
 
-    With several processes, every one cuts the same batches and keeps its share of each; a share can be empty.
+    With several processes, every one cuts the same batches and keeps its share of each; a share can be empty. The
+    `shuffle_seed` is that of order, windows and sizes; None goes through the views in order, from their first landmark.
 
-    Views can come enlarged: a scene and its map, made larger as a whole, look the same and give the same matches. All
-    distances grow with the scene, the error of the position too, and the label follows from that. So a network sees
-    rooms of every size without any of them being mapped.
-
-    Args:
-        views: the views.
-        rows: rows of `views` to go through, (n,).
-        batch_size: views a batch, over all processes.
-        width: landmarks a view at most.
-        shuffle_seed: seed of order, windows and sizes; None goes through the views in order, from their first landmark.
-        enlarged: shuffled views come from 1 / enlarged to enlarged times as large, evenly in the logarithm.
-        max_error_m: limit of a positive label, for enlarged views.
-        rank: number of this process.
-        world_size: number of processes.
+    Shuffled views can come enlarged, from 1 / `enlarged` to `enlarged` times as large, evenly in the logarithm: a scene
+    and its map, made larger as a whole, look the same and give the same matches. All distances grow with the scene, the
+    error of the position too, and the label follows from that and `max_error_m`. So a network sees rooms of every size
+    without any of them being mapped.
     """
 
     def __init__(

@@ -27,54 +27,34 @@ class Model(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Learnt:
-    """What a learner has learnt.
+    """What a learner has learnt."""
 
-    Attributes:
-        model: to be saved.
-        metrics: of what is kept, on the validation views; "val_average_precision" among them.
-        counts: of what it has learnt from, such as n_train; logged as parameters.
-        history: metrics of each epoch, None where there are no epochs.
-    """
-
-    model: Model
-    metrics: dict[str, float]
+    model: Model  # to be saved
+    metrics: dict[str, float]  # of what is kept, on the validation views; "val_average_precision" among them
+    # of what it has learnt from, such as n_train; logged as parameters
     counts: dict[str, Any] = field(default_factory=dict)
-    history: pd.DataFrame | None = None
+    history: pd.DataFrame | None = None  # metrics of each epoch, None where there are no epochs
 
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """What a learner is asked to do.
+    """What a learner is asked to do."""
 
-    Attributes:
-        dataset: labelled train scenes, and val scenes if it has any.
-        method: name of the method to learn.
-        config: options that all learners share.
-        options: the method's own, such as a `FittingConfig`.
-        title: of its progress bar.
-        progress: whether to show it.
-        run_log: takes the metrics of epochs; None logs none.
-        kept: what learners that follow one another leave for the next, such as views that are binned already.
-    """
-
-    dataset: Dataset
-    method: str
-    config: SharedConfig
-    options: Any
-    title: str = ""
-    progress: bool = False
-    run_log: RunLog | None = None
+    dataset: Dataset  # labelled train scenes, and val scenes if it has any
+    method: str  # name of the method to learn
+    config: SharedConfig  # options that all learners share
+    options: Any  # the method's own, such as a `FittingConfig`
+    title: str = ""  # of its progress bar
+    progress: bool = False  # whether to show it
+    run_log: RunLog | None = None  # takes the metrics of epochs; None logs none
+    # what learners that follow one another leave for the next, such as views that are binned already
     kept: dict[str, Any] = field(default_factory=dict)
 
 
 def fit_network(
     network: nn.Module, data: LightningDataModule, task: Task, class_weights: tuple[float, float] = (1.0, 1.0)
 ) -> tuple[dict[str, float], pd.DataFrame]:
-    """Train a network by the options of a task; it then holds the weights to keep.
-
-    Returns:
-        Metrics of the epoch kept, and of all epochs.
-    """
+    """Train a network by the options of a task; it then holds the weights to keep. Their metrics, and all epochs'."""
     classifier = ViewpointClassifier(network, task.options, class_weights, task.config.seed)
     record = EpochRecord(task.title, task.options, task.progress, task.run_log)
     fit(classifier, data, record, task.config)

@@ -7,16 +7,11 @@ from numpy.typing import ArrayLike
 
 
 def fit_platt(logits: ArrayLike, labels: ArrayLike) -> tuple[float, float]:
-    """Scale and offset with which scale * logits + offset are the likeliest log-odds of the labels.
+    """Scale and offset with which scale * logits + offset are the likeliest log-odds of validation views' labels, (B,)
+    each.
 
-    Temperature scaling has no offset, so it mends how sure a model is, but not a level that is off.
-
-    Args:
-        logits: (B,), of validation views.
-        labels: (B,), whether each localizes.
-
-    Returns:
-        Scale and offset; 1 and 0 where a scale would turn the order round or the labels are of one class.
+    Temperature scaling has no offset, so it mends how sure a model is, but not a level that is off. They are 1 and 0
+    where a scale would turn the order round or the labels are of one class.
     """
     from sklearn.linear_model import LogisticRegression
 

@@ -19,21 +19,14 @@ from wheretolook.utils.version import VERSION
 
 @dataclass(frozen=True)
 class TrainedModel:
-    """What training one method left.
+    """What training one method left."""
 
-    Attributes:
-        method: its name.
-        path: its weights.
-        run_id: its MLflow run, at the time of training.
-        metrics: metrics of the epoch whose weights were kept, and that epoch's number (from 0) as "epoch".
-        reused: whether it was trained before and only found again.
-    """
-
-    method: str
-    path: Path
-    run_id: str
+    method: str  # its name
+    path: Path  # its weights
+    run_id: str  # its MLflow run, at the time of training
+    # metrics of the epoch whose weights were kept, and that epoch's number (from 0) as "epoch"
     metrics: dict[str, float]
-    reused: bool = False
+    reused: bool = False  # whether it was trained before and only found again
 
 
 def weights_path(dataset: Dataset, method: str) -> Path:
@@ -44,11 +37,8 @@ def weights_path(dataset: Dataset, method: str) -> Path:
 def about_training(dataset: Dataset, method: str, config: SharedConfig, options: Any) -> dict[str, Any]:
     """What decides which weights come out, as JSON values.
 
-    Args:
-        dataset: with the scenes of others that are learnt from as well, see `with_also`.
-        method: name of the method.
-        config: options that all learners share.
-        options: the method's own, a dataclass. What training starts from (`FittingConfig.starts_from`) decides, too.
+    The dataset comes with the scenes of others that are learnt from, see `with_also`; the options are the method's own,
+    a dataclass. What training starts from (`FittingConfig.starts_from`) decides, too.
     """
     shared = {name: value for name, value in asdict(config).items() if name in DECIDING}
     about: dict[str, Any] = {

@@ -18,14 +18,12 @@ from wheretolook.utils.tracking_config import TrackingConfig
 if TYPE_CHECKING:
     from mlflow.entities import Run
 
-HISTORY_CSV = "history.csv"
-"""Artifact of a train run: a row an epoch."""
+HISTORY_CSV = "history.csv"  # artifact of a train run: a row an epoch
 
 TRAINING_CSV = "training.csv"
 """In a release's `results/`: the histories of all that was trained, one below the other, with a column `method`."""
 
-LOG_AT_MOST = 1000
-"""Metrics MLflow takes at a time."""
+LOG_AT_MOST = 1000  # metrics MLflow takes at a time
 
 
 def params_of(about: Mapping[str, Any]) -> dict[str, Any]:
@@ -42,13 +40,8 @@ def method_of_run(run: Run) -> str:
 def train_runs(
     tracking: TrackingConfig, dataset: str = "", method: str = "", file: str = ""
 ) -> Iterator[tuple[str, Run]]:
-    """Finished train runs, the newest first, with the names of their methods.
-
-    Args:
-        tracking: the store.
-        dataset: that they were trained on; "" for any.
-        method: name of the method; "" for any.
-        file: artifact that they must have; "" for none.
+    """Finished train runs, the newest first, with the names of their methods; "" is for any dataset, any method, and
+    any files.
     """
     for run in finished_runs(tracking, "train", params={"dataset": dataset} if dataset else None, file=file):
         name = method_of_run(run)
@@ -66,11 +59,10 @@ def histories(tracking: TrackingConfig, dataset: str) -> dict[str, pd.DataFrame]
 
 
 def trained(tracking: TrackingConfig, dataset: str) -> pd.DataFrame:
-    """What the newest run of each method trained on a dataset kept.
+    """What the newest run of each method trained on a dataset kept, a row a method, the best first.
 
-    Returns:
-        A row a method, the best first: `method`, `epoch` whose weights were kept, and on the validation views
-        `average_precision`, `roc_auc` and `calibration_error`, NaN where the learner does not measure it.
+    Columns: `method`, `epoch` whose weights were kept, and on the validation views `average_precision`, `roc_auc` and
+    `calibration_error`, NaN where the learner does not measure it.
     """
     found: dict[str, dict[str, Any]] = {}
     for method, run in train_runs(tracking, dataset):
@@ -86,12 +78,8 @@ _MEASURES = ("average_precision", "roc_auc", "calibration_error")
 
 
 def log_history(tracking: TrackingConfig, run_id: str, history: pd.DataFrame) -> None:
-    """Log a history as training itself does: each epoch a step of the metrics; those that are not finite are left out.
-
-    Args:
-        tracking: the store.
-        run_id: of the run.
-        history: a row an epoch, with its number as `epoch`.
+    """Log a history, a row an epoch with its number as `epoch`, as training itself does; what is not finite is left
+    out.
     """
     from mlflow.entities import Metric
 

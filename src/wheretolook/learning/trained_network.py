@@ -24,11 +24,7 @@ class StoredNetwork(nn.Module):
 
     @classmethod
     def of_description(cls, stored: Mapping[str, Any]) -> Self:
-        """The network with this description, untrained.
-
-        Raises:
-            WeightsError: it asks for what this version does not know.
-        """
+        """The untrained network with this description; a WeightsError if it asks for what is not known here."""
         raise NotImplementedError
 
     @property
@@ -41,13 +37,8 @@ NetworkT = TypeVar("NetworkT", bound=StoredNetwork)
 
 
 class TrainedNetwork(Generic[NetworkT]):
-    """A network, the camera of its training views, and what makes its logits calibrated log-odds.
-
-    Args:
-        method: name of the method that it serves.
-        network: trained.
-        camera: of the training views.
-        scale, offset: calibrated log-odds are scale * logit + offset.
+    """A network, the camera of its training views, and what makes its logits calibrated log-odds: scale * logit +
+    offset.
     """
 
     def __init__(
@@ -61,11 +52,8 @@ class TrainedNetwork(Generic[NetworkT]):
         return self.scale * logits + self.offset
 
     def save(self, path: Path, training: Mapping[str, Any] | None = None) -> None:
-        """Write one safetensors file, atomically. The same network gives the same bytes.
-
-        Args:
-            path: file to write; its folder is made when needed.
-            training: what else to keep about the training (JSON values).
+        """Write one safetensors file, atomically, with JSON values on the training. The same network gives the same
+        bytes.
         """
         header = {
             **self.network.description(),
@@ -80,16 +68,10 @@ class TrainedNetwork(Generic[NetworkT]):
     def load(
         cls, path: str | Path, network_class: type[NetworkT], *methods: str, device: str = "cpu"
     ) -> TrainedNetwork[NetworkT]:
-        """Read what `save` wrote, ready to score (dropout off, no gradients).
+        """Read what `save` wrote for one of these methods, ready to score on a device (dropout off, no gradients).
 
-        Args:
-            path: a safetensors file.
-            network_class: what to build.
-            methods: names of the methods of which the weights may be.
-            device: torch device of the network.
-
-        Raises:
-            WeightsError: the file is missing, damaged, foreign, of another method, or does not fit its own description.
+        Raises a WeightsError if the file is missing, damaged, foreign, of another method, or does not fit its own
+        description.
         """
         tensors, header = read_weights(Path(path))
         check_serves(path, header, *methods)

@@ -15,21 +15,14 @@ from torch import Tensor
 from wheretolook.learning.old_names import name_of_header, with_name
 from wheretolook.utils.errors import WeightsError
 
-FORMAT_VERSION = 1
-"""Version of the layout of the metadata."""
-
-METADATA_KEY = "wheretolook"
-"""Key of the JSON text in the header of the file."""
+FORMAT_VERSION = 1  # version of the layout of the metadata
+METADATA_KEY = "wheretolook"  # key of the JSON text in the header of the file
 
 
 def write_weights(path: str | Path, method: str, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> None:
     """Write tensors and a description (JSON values) as one safetensors file, atomically. The same give the same bytes.
 
-    Args:
-        path: file to write; its folder is made when needed.
-        method: name of the method that the weights serve.
-        tensors: by name, on any device.
-        header: the description; "camera" is that of the training views, "training" what is known of the training.
+    Of the description "camera" is that of the training views, "training" what is known of the training.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -50,19 +43,13 @@ def check_serves(path: str | Path, header: Mapping[str, Any], *methods: str) -> 
 
 
 def read_training(path: str | Path) -> dict[str, Any]:
-    """What the train stage has written into the header of weights about their training.
-
-    Raises:
-        WeightsError: the file is missing, damaged or foreign.
-    """
+    """What the train stage has written into the header of weights about their training; see `read_weights`."""
     return with_name(read_weights(Path(path))[1].get("training", {}))
 
 
 def read_record(path: str | Path) -> dict[str, Any]:
-    """What the train stage wrote beside weights: "about", "weights_sha256", "run_id" and "metrics".
-
-    Raises:
-        WeightsError: it is missing or damaged.
+    """What the train stage wrote beside weights: "about", "weights_sha256", "run_id" and "metrics"; a WeightsError if
+    it is missing or damaged.
     """
     beside = Path(path).with_suffix(".json")
     try:
@@ -76,11 +63,7 @@ def read_record(path: str | Path) -> dict[str, Any]:
 
 
 def method_of_weights(path: str | Path) -> str:
-    """The name of the method that a weights file serves, such as "mlp-2d+z" or "set".
-
-    Raises:
-        WeightsError: the file is missing, damaged or foreign.
-    """
+    """The name of the method that weights serve, such as "mlp-2d+z" or "set"; see `read_weights`."""
     return name_of_header(read_weights(Path(path))[1])
 
 
@@ -96,8 +79,7 @@ def save_in_half(path: Path) -> None:
 def read_weights(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     """Tensors of a weights file by name, and the description in its header.
 
-    Raises:
-        WeightsError: the file is missing, damaged, foreign or of another version.
+    Raises a WeightsError if the file is missing, damaged, foreign or of another version.
     """
     if not path.is_file():
         raise WeightsError("there are no weights", path=path, fix="Run the train stage first, or correct the path.")

@@ -15,27 +15,19 @@ if TYPE_CHECKING:
     from wheretolook.inputs.bins import BinnedViews
     from wheretolook.inputs.localization_map import LocalizationMap
 
-BLOCK = 4096
-"""Views scored at a time: about 80 MB of bins."""
+BLOCK = 4096  # views scored at a time: about 80 MB of bins
 
 
 class Scorer(ABC):
     """A method that says how well a camera would localize: the paper's f_P(R, t) -> [0, 1].
 
     A scorer is built from a map, the camera that will look, and whatever else the method needs. It answers for any
-    batch of poses:
-
-    - The score of a pose depends on the pose alone: not on its place in the batch, nor on the other poses.
-    - Higher is better. Scores lie in [0, 1] where the method allows; only their order counts for choosing a view.
-    - The same scorer gives the same scores to the same poses.
+    batch of poses. The score of a pose depends on the pose alone: not on its place in the batch, nor on the other
+    poses; the same scorer gives the same scores to the same poses. Higher is better. Scores lie in [0, 1] where the
+    method allows; only their order counts for choosing a view.
 
     A new method is one file with a subclass and a record (`wheretolook.methods.method.Method`), named in
     `registry.MODULES`. One that needs binned landmarks derives from `BinnedScorer` instead.
-
-    Attributes:
-        name: of the method, as in tables and on the command line.
-        local: whether a score depends on no landmarks but those with a free line of sight from the view's location. A
-            viewpoint map then need not be built anew where added landmarks are hidden. False where it is not known.
     """
 
     name: str
@@ -49,25 +41,15 @@ class Scorer(ABC):
         """Score poses (B, 3, 4). Returns (B,) float64, finite."""
 
     def score_binned(self, cam_from_world: Float, binned: BinnedViews) -> Float:
-        """Score poses whose landmarks have been binned already, so that several methods share the binning.
-
-        Args:
-            cam_from_world: (B, 3, 4).
-            binned: the same views, as `localization_map.bin_views` bins them, with all of `CHANNELS`.
-
-        Returns:
-            (B,) float64, the same as `score` gives.
+        """The same as `score` gives, (B,), for poses that `localization_map.bin_views` has binned already, with all of
+        `CHANNELS`.
         """
         return self.score(cam_from_world)
 
 
 class BinnedScorer(Scorer):
-    """A method that scores a view by its binned landmarks alone.
-
-    Args:
-        localization_map: the map.
-        bins: bins along each side of the image.
-        landmark_channels: whether it asks what the landmarks are like (`ALL_CHANNELS`, not `CHANNELS`).
+    """A method that scores a view by its binned landmarks alone, by `ALL_CHANNELS` or by `CHANNELS`, of `bins` x `bins`
+    bins.
     """
 
     def __init__(self, localization_map: LocalizationMap, bins: int = 30, landmark_channels: bool = False) -> None:

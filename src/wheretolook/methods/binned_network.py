@@ -20,13 +20,7 @@ from wheretolook.utils.errors import WeightsError
 
 
 class BinnedNetwork(StoredNetwork):
-    """A network that takes the means (B, C, bins, bins) of its channels and filled bins (B, bins, bins).
-
-    Attributes:
-        statistics: of its C channels over the training views; by their names it takes its channels.
-        bins: along each side of the image.
-        scored_at_once: views that it scores at a time.
-    """
+    """A network that takes the means (B, C, bins, bins) of its channels and filled bins (B, bins, bins)."""
 
     statistics: InputStatistics
     bins: int
@@ -34,11 +28,7 @@ class BinnedNetwork(StoredNetwork):
 
 
 def stored_statistics(stored: Mapping[str, Any]) -> InputStatistics:
-    """Input statistics from the header of weights.
-
-    Raises:
-        WeightsError: there is a channel that this version's bins do not have.
-    """
+    """Input statistics from the header of weights; a WeightsError where this version's bins lack a channel."""
     values = stored["statistics"]
     for name in values["channels"]:
         if name not in ALL_CHANNELS:
@@ -48,19 +38,12 @@ def stored_statistics(stored: Mapping[str, Any]) -> InputStatistics:
 
 
 def standardize(means: Tensor, filled: Tensor, mean: Tensor, std: Tensor, n_certain: int) -> Tensor:
-    """Standardize each channel by its kind (paper, Sec. 3.3 "Data").
+    """Standardize each channel of means (B, C, bins, bins) by mean and std (C, 1, 1) of its kind (paper, Sec. 3.3
+    "Data").
 
     Empty bins are exactly zero afterwards, that is, the mean of their kind; so are landmark channels where a value is
-    not known.
-
-    Args:
-        means: (B, C, bins, bins).
-        filled: (B, bins, bins) bool.
-        mean, std: (C, 1, 1).
-        n_certain: the first channels, of where landmarks lie, are always known: a NaN there is an error to be seen.
-
-    Returns:
-        (B, C, bins, bins).
+    not known. The first `n_certain` channels, of where landmarks lie, are always known: a NaN there is an error to be
+    seen.
     """
     values = (means - mean) / std * filled[:, None]
     if values.shape[1] > n_certain:
@@ -78,14 +61,7 @@ class BinnedNetworkScorer(BinnedScorer):
     """The probability that a view localizes, by a network over its binned landmarks.
 
     A network knows the field of view it was trained with. A camera of another resolution but the same field of view is
-    served by scaling its pixels; another field of view is refused, since the network has never seen one.
-
-    Args:
-        localization_map: the map.
-        trained: the network.
-
-    Raises:
-        WeightsError: trained for another field of view than the map's camera.
+    served by scaling its pixels; another is refused with a WeightsError, since the network has never seen one.
     """
 
     local = True

@@ -14,17 +14,11 @@ from wheretolook.methods.method import Method, MethodStyle
 if TYPE_CHECKING:
     from wheretolook.inputs.localization_map import LocalizationMap
 
-POSE_DECIMALS = 6
-"""Poses that agree to this many decimals (of a metre, and in the rotation matrix) get the same score."""
+POSE_DECIMALS = 6  # poses that agree to this many decimals (of a metre, and in the rotation matrix) get the same score
 
 
 class RandomScorer(Scorer):
-    """Uniform random scores, a function of pose and seed, so that they do not depend on the order of the batch.
-
-    Args:
-        localization_map: not looked at.
-        seed: another seed gives other scores.
-    """
+    """Uniform random scores, a function of pose and seed, so that they do not depend on the order of the batch."""
 
     name = "random"
     local = True

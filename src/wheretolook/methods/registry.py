@@ -25,16 +25,14 @@ MODULES = (
 )  # fmt: skip
 """Modules of `wheretolook.methods` whose `METHODS` are the package's own, in the order of tables."""
 
-GROUP = "wheretolook.methods"
-"""Entry points of this group give a `Method`, or several, of another package."""
+GROUP = "wheretolook.methods"  # entry points of this group give a `Method`, or several, of another package
 
 
 @cache
 def all_methods() -> Mapping[str, Method]:
     """Every method by its name, this package's own first.
 
-    Raises:
-        ConfigError: what another package registers cannot be loaded, is no method, or has the name of another.
+    Raises a ConfigError if what another package registers cannot be loaded, is no method, or has the name of another.
     """
     found: dict[str, Method] = {}
     for module in MODULES:
@@ -74,11 +72,7 @@ def _add(found: dict[str, Method], method: Method, source: str) -> None:
 
 
 def find(name: str) -> Method | None:
-    """The method of a table's row; None for the oracle, and for what is not installed here.
-
-    Args:
-        name: of the method; several files of one method are told apart by what follows a space.
-    """
+    """The method of a table's row, named before any space; None for the oracle, and for what is not installed here."""
     return all_methods().get(name.partition(" ")[0])
 
 
@@ -104,8 +98,7 @@ def members(name: str, among: Mapping[str, Method]) -> list[Method]:
 def methods_named(names: Iterable[str], among: Mapping[str, Method]) -> list[Method]:
     """The methods that names of methods and families stand for, each once, in the order asked for.
 
-    Raises:
-        ConfigError: a name is not known, stands there twice, or there is none.
+    Raises a ConfigError if a name is not known or stands there twice, or there is none.
     """
     names = tuple(names)
     parts = {name: members(name, among) for name in names}
@@ -122,11 +115,7 @@ def describe_methods() -> dict[str, str]:
 
 
 def check_method(name: str) -> Method:
-    """The method of a name.
-
-    Raises:
-        ConfigError: no method that scores views has it.
-    """
+    """The method of a name; a ConfigError if no method that scores views has it."""
     if name not in scorers():
         raise ConfigError("unknown method", value=name, fix=f"There are {', '.join(scorers())}.")
     return scorers()[name]
@@ -139,19 +128,12 @@ def make_scorer(
     weights: str | Path | None = None,
     heading: tuple[tuple[float, float, float], ...] = (),
 ) -> Scorer:
-    """Build a method by its name.
+    """Build a method by its name, or by that of its family, for which the weights tell which one it is.
 
-    Args:
-        name: of the method; or of its family, for which the weights tell which one it is.
-        localization_map: the map and the camera that will look.
-        seed: for methods with randomness.
-        weights: for learned methods.
-        heading: for "forward": one direction, or the waypoints of a path; empty for one drawn for each location.
+    The heading is for "forward": one direction, or the waypoints of a path; empty for one drawn for each location.
 
-    Raises:
-        ConfigError: no such method, or it needs weights.
-        WeightsError: the weights cannot be used.
-        MapError: the map lacks what the method needs.
+    Raises a ConfigError if there is no such method, or it needs weights; a WeightsError if these cannot be used; a
+    MapError if the map lacks what the method needs.
     """
     known = scorers()
     family = members(name, known)
@@ -171,14 +153,9 @@ def make_scorer(
 def load_scorer(weights: str | Path, localization_map: LocalizationMap) -> Scorer:
     """The learned scorer of weights for a map: `load_scorer(weights, map).score(cam_from_world)`.
 
-    Args:
-        weights: a file that the train stage wrote, in which stands what method it is; or a folder of such files, of
-            which the one with the best validation average precision is taken.
-        localization_map: what to score views of.
-
-    Raises:
-        WeightsError: the file cannot be used, or was trained for another field of view than the map's camera.
-        MapError: the map lacks what the method needs.
+    The weights are a file that the train stage wrote, in which stands what method it is; or a folder of such files, of
+    which the one with the best validation average precision is taken. Raises a WeightsError if the file cannot be used,
+    or was trained for another field of view than the map's camera; a MapError if the map lacks what the method needs.
     """
     path = best_weights(weights) if Path(weights).is_dir() else Path(weights)
     method = _of_weights("a scorer", [method for method in scorers().values() if method.name == method.weights], path)
@@ -188,8 +165,7 @@ def load_scorer(weights: str | Path, localization_map: LocalizationMap) -> Score
 def best_weights(folder: str | Path) -> Path:
     """The weights of a folder that score views by themselves and have the best validation average precision.
 
-    Raises:
-        WeightsError: there are none, or a record of training is missing or damaged.
+    Raises a WeightsError if there are none, or a record of training is missing or damaged.
     """
     from wheretolook.learning.weights import read_record
 

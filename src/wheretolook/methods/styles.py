@@ -9,11 +9,8 @@ from typing import get_args
 from wheretolook.methods.method import Group, MethodStyle
 from wheretolook.methods.registry import find
 
-ORACLE = "oracle"
-"""Name of what knows the labels and chooses the best there is, in tables and figures."""
-
-GROUPS: tuple[Group, ...] = get_args(Group)
-"""In the order of figures."""
+ORACLE = "oracle"  # name of what knows the labels and chooses the best there is, in tables and figures
+GROUPS: tuple[Group, ...] = get_args(Group)  # in the order of figures
 
 _ORACLE_STYLE = MethodStyle("oracle", "#000000", "*", "-")
 
@@ -22,10 +19,8 @@ _SPARE = (("#CC79A7", "8", (0, (1, 1))), ("#F0E442", "H", (0, (4, 2))), ("#7F3C8
 
 
 def method_style(name: str) -> MethodStyle:
-    """Style of a method; of one that is not known, a style that depends on its name alone.
-
-    Args:
-        name: of the method. What follows a space, such as a file of weights, is told as well.
+    """Style of a method, with what follows a space in its name, such as a file of weights; by its name alone if not
+    known.
     """
     if name == ORACLE:
         return _ORACLE_STYLE
@@ -43,12 +38,7 @@ def method_group(name: str) -> Group:
 
 
 def rows_by_group(methods: Iterable[str], gap: float = 0.6) -> dict[str, float]:
-    """Where rows of methods are drawn, from the top down: in the order of `GROUPS`, then in the order given.
-
-    Args:
-        methods: names.
-        gap: between groups, in rows.
-    """
+    """Where rows of methods are drawn, from the top down, a gap (in rows) between groups, in the order of `GROUPS`."""
     ordered = sorted(methods, key=lambda method: GROUPS.index(method_group(method)))
     groups = [method_group(name) for name in ordered]
     new = [0.0] + [gap * (one != other) for one, other in zip(groups[1:], groups, strict=False)]

@@ -27,12 +27,7 @@ QUICK = (
 
 
 def log_release(experiment: Experiment, say: Say = print, attach: bool = True) -> Dataset:
-    """Log what a release holds as MLflow runs, as far as the store lacks them.
-
-    Args:
-        experiment: names the release and the store.
-        say: told what was logged.
-        attach: whether to attach figures and tables to new runs.
+    """Log what a release holds as MLflow runs, as far as the store lacks them, on request with figures and tables.
 
     Raises:
         ConfigError: the dataset is no release. TableError: there is none.

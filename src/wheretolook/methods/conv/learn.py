@@ -11,12 +11,8 @@ from wheretolook.methods.conv.network import ConvNetwork, ConvSpec
 
 
 def learn_conv(task: Task) -> Learnt:
-    """A convolutional network from a dataset's train scenes, calibrated on the validation views.
-
-    Raises:
-        TableError: no train scene, no labels, or labels of one class only.
-        MapError: a scene has no landmarks.
-        ConfigError: there are fewer GPUs than asked for, or the views do not fit into memory shared by processes.
+    """A convolutional network from a dataset's train scenes, calibrated on the validation views; raises as
+    `load_views`.
     """
     options, device = task.options, home_device(task.config)
     data = ViewpointDataModule(

@@ -16,19 +16,12 @@ from wheretolook.methods.binned_network import BinnedNetwork, n_certain, standar
 
 @dataclass(frozen=True)
 class ConvSpec:
-    """Everything that defines a convolutional network but its weights.
+    """Everything that defines a convolutional network but its weights."""
 
-    Attributes:
-        statistics: of its channels over the training views; their names are those of its input.
-        bins: bins along each side of the image.
-        widths: channels after each convolution.
-        dropout: share of pooled values dropped in training.
-    """
-
-    statistics: InputStatistics
-    bins: int
-    widths: tuple[int, ...]
-    dropout: float
+    statistics: InputStatistics  # of its channels over the training views; their names are those of its input
+    bins: int  # bins along each side of the image
+    widths: tuple[int, ...]  # channels after each convolution
+    dropout: float  # share of pooled values dropped in training
 
 
 class ConvNetwork(BinnedNetwork):
@@ -36,9 +29,6 @@ class ConvNetwork(BinnedNetwork):
 
     It looks at its channels, standardized, and at which bins are filled. Nothing is normalized on the way: how much
     there is to see is what matters most, and a normalization would hide it.
-
-    Args:
-        spec: what defines it.
     """
 
     scored_at_once = 512  # the first convolution of one view takes 115 kB
@@ -61,11 +51,8 @@ class ConvNetwork(BinnedNetwork):
         self.last = nn.Linear(2 * spec.widths[-1], 1)
 
     def forward(self, means: Tensor, filled: Tensor) -> Tensor:
-        """Logits (B,) of binned views, not calibrated.
-
-        Args:
-            means: (B, C, bins, bins) float32, of its channels.
-            filled: (B, bins, bins) bool.
+        """Logits (B,), not calibrated, of means (B, C, bins, bins) float32 of its channels and filled bins (B, bins,
+        bins).
         """
         standard = standardize(means, filled, self.mean, self.std, self.n_certain)
         values = torch.cat([standard, filled[:, None].to(means.dtype)], dim=1)
@@ -81,10 +68,6 @@ class ConvNetwork(BinnedNetwork):
 
     @classmethod
     def of_description(cls, stored: Mapping[str, Any]) -> ConvNetwork:
-        """The untrained network of a description.
-
-        Raises:
-            WeightsError: it looks at a channel that this version's bins do not have.
-        """
+        """The untrained network of a description; a WeightsError if it looks at an unknown channel of the bins."""
         widths = tuple(stored["widths"])
         return cls(ConvSpec(stored_statistics(stored), int(stored["bins"]), widths, float(stored["dropout"])))

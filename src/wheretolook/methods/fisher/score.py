@@ -24,18 +24,13 @@ from wheretolook.geometry.poses import Float, check_poses, split_poses
 from wheretolook.inputs.localization_map import LocalizationMap, shared_locations
 from wheretolook.methods.base import Scorer
 from wheretolook.methods.fisher import Approximation
-from wheretolook.visibility.frustum import LandmarkSets
+from wheretolook.visibility.frustum import LandmarkSets, PosedViews
 
-PROBE_AXES = 2000
-"""Axes among which the worst view is sought."""
+PROBE_AXES = 2000  # axes among which the worst view is sought
 
 
 class PoseInformation:
-    """Information of the views of a map, shared by all scorers that are made of it.
-
-    Args:
-        localization_map: landmarks, camera and occlusion.
-    """
+    """Information of the views of a map, shared by all scorers that are made of it."""
 
     _of_maps: ClassVar[WeakKeyDictionary[LocalizationMap, PoseInformation]] = WeakKeyDictionary()
 
@@ -102,23 +97,21 @@ class PoseInformation:
         _, rows, mask = self._locations()
         if approximation == "exact":
             seen = LandmarkSets.from_mask(mask)
-            return exact_information(self.camera, self._poses, self.points, seen, rows, self.device)
+            return exact_information(PosedViews(self.camera, self._poses, self.points, seen, rows), self.device)
         field, _ = self.field(self._poses, approximation)
         return field.information_of_views(rows, self._poses[:, 2, :3])
 
 
 class FisherScorer(Scorer):
-    """A metric of the information that a view has on its own pose.
+    """A metric ("mineig", "logdet" or "trace") of the information that a view has on its own pose.
 
-    Args:
-        localization_map: the map.
-        metric: "mineig", "logdet" or "trace".
-        approximation: "exact" sums over the landmarks in view; "quadratic" (10 factors) and "gp" (70) over all that
-            have a free line of sight, weighted by a soft visibility of the optical axis, as a field stores them.
-        about_origin: take turns of the pose about the world's origin, as the released code of the Fisher Information
-            Field does, instead of about the camera. The determinant stays the same. About the camera is the default as
-            the better one for the paper's rows on our validation scene (by trace 85 to 88 % of the oracle's score
-            against 63 to 69; by min. eigenvalue alike, but for the quadratic's 51 against 75).
+    The approximation "exact" sums over the landmarks in view; "quadratic" (10 factors) and "gp" (70) over all that have
+    a free line of sight, weighted by a soft visibility of the optical axis, as a field stores them.
+
+    With `about_origin` turns of the pose are taken about the world's origin, as the released code of the Fisher
+    Information Field does, instead of about the camera. The determinant stays the same. About the camera is the default
+    as the better one for the paper's rows on our validation scene (by trace 85 to 88 % of the oracle's score against 63
+    to 69; by min. eigenvalue alike, but for the quadratic's 51 against 75).
     """
 
     local = True

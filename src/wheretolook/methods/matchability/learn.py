@@ -17,18 +17,11 @@ from wheretolook.methods.matchability.network import MatchabilityNetwork
 
 
 class LandmarkBatches:
-    """Batches of landmarks in view, and whether each was found; several processes share out each batch.
+    """Batches of landmarks (E, len(ATTRIBUTES)) in `rows` (n,), and whether each was found; processes share out each
+    batch.
 
-    Args:
-        values: (E, len(ATTRIBUTES)).
-        found: (E,) bool.
-        rows: which of them, (n,).
-        batch_size: landmarks a batch, over all processes.
-        shuffle_seed: seed of their order; None goes through them in order.
-        rank: number of this process.
-        world_size: number of processes.
-        enlarged: shuffled landmarks come from 1 / enlarged to enlarged times as far; see
-            `wheretolook.learning.landmark_views.LandmarkLoader`.
+    A `shuffle_seed` of None goes through them in order; shuffled landmarks come from 1 / enlarged to enlarged times as
+    far, see `wheretolook.learning.landmark_views.LandmarkLoader`.
     """
 
     def __init__(
@@ -66,14 +59,7 @@ class LandmarkBatches:
 
 
 class MatchabilityData(LandmarkDataModule):
-    """Landmarks in view of a dataset's labelled viewpoints, whose matches are stored.
-
-    Args:
-        task: what to learn from.
-
-    Raises:
-        TableError: no train scene, no labels, or no stored matches.
-    """
+    """Landmarks in view of a dataset's labelled viewpoints, whose matches are stored; a TableError if they are not."""
 
     def __init__(self, task: Task) -> None:
         super().__init__(task, task.options.landmarks, matches=True)
@@ -107,8 +93,7 @@ class MatchabilityData(LandmarkDataModule):
 def learn_matchability(task: Task) -> Learnt:
     """The probability of being found, from the matches that are stored with a dataset's labels.
 
-    Raises:
-        TableError: no train scene, no labels, or no stored matches.
+    Raises a TableError if there is no train scene, no labels, or no stored matches.
     """
     data = MatchabilityData(task)
     network = MatchabilityNetwork(data.statistics, task.options.width, task.options.hidden)

@@ -21,9 +21,7 @@ LIKELY = -2.0
 class LandmarkNetwork(StoredNetwork):
     """A network over single landmarks, which takes what is known of them by name.
 
-    Args:
-        statistics: of the training views; its attributes are what the network is told of a landmark, in order.
-        options: by which it can be built anew beside the statistics.
+    The attributes of its statistics are what it is told of a landmark, in order; by its options it can be built anew.
     """
 
     def __init__(self, statistics: AttributeStatistics, **options: Any) -> None:
@@ -44,9 +42,8 @@ class LandmarkNetwork(StoredNetwork):
     def of_description(cls, stored: Mapping[str, Any]) -> Self:
         """The untrained network of a description.
 
-        Raises:
-            WeightsError: it asks for an attribute that this version's maps do not know, or lacks one that tells where a
-                landmark lies.
+        Raises a WeightsError if it asks for an attribute that this version's maps do not know, or lacks one that tells
+        where a landmark lies.
         """
         names, statistics = tuple(stored["attributes"]), stored["statistics"]
         for name in names:
@@ -63,11 +60,8 @@ class LandmarkNetwork(StoredNetwork):
 
 
 class StandardAttributes(nn.Module):
-    """What is known of landmarks, standardized; what is not known becomes 0, the mean of its kind.
-
-    Args:
-        statistics: of the training views.
-        hidden: names of attributes not to look at, which are 0 always.
+    """What is known of landmarks, standardized; what is not known becomes 0, the mean of its kind, as does what is
+    hidden.
     """
 
     mean: Tensor
@@ -87,12 +81,8 @@ class StandardAttributes(nn.Module):
 
 
 class MatchabilityNetwork(LandmarkNetwork):
-    """The probability that a landmark in view is found: matched, and an inlier of the pose.
-
-    Args:
-        statistics: of the training views.
-        width: units of each of two hidden layers.
-        hidden: names of attributes not to look at.
+    """The probability that a landmark in view is found: matched, and an inlier of the pose. It has two layers of
+    `width`.
     """
 
     def __init__(self, statistics: AttributeStatistics, width: int = 48, hidden: tuple[str, ...] = ()) -> None:
@@ -110,14 +100,8 @@ class MatchabilityNetwork(LandmarkNetwork):
 
 
 def bearing_numbers(values: Tensor, attributes: tuple[str, ...] = ATTRIBUTES) -> Tensor:
-    """Information of each landmark on the pose, `wheretolook.fisher.information.bearing_numbers` in the camera's axes.
-
-    Args:
-        values: (..., A).
-        attributes: names of the A attributes.
-
-    Returns:
-        (..., 15).
+    """Information (..., 15) of landmarks (..., A) on the pose, `fisher.information.bearing_numbers` in the camera's
+    axes.
     """
     across, down, log_distance = (values[..., attributes.index(name)] for name in ("across", "down", "distance"))
     bearing = torch.stack([across, down, torch.ones_like(across)], -1)
@@ -128,20 +112,12 @@ def bearing_numbers(values: Tensor, attributes: tuple[str, ...] = ATTRIBUTES) ->
     return torch.cat([plane * inverse**2, bearing * inverse, plane], -1)
 
 
-N_EXPECTED = 1 + 15 + 5
-"""Numbers that `expected_parts` gives of a landmark."""
+N_EXPECTED = 1 + 15 + 5  # numbers that `expected_parts` gives of a landmark
 
 
 def expected_parts(values: Tensor, log_odds: Tensor, attributes: tuple[str, ...] = ATTRIBUTES) -> Tensor:
-    """What each landmark adds to the sums that `expected_statistics` takes.
-
-    Args:
-        values: (..., A).
-        log_odds: (...,) of being found.
-        attributes: names of the A attributes.
-
-    Returns:
-        (..., N_EXPECTED).
+    """What landmarks (..., A) add to the sums of `expected_statistics`, (..., N_EXPECTED), by their log-odds of being
+    found.
     """
     found = log_odds.sigmoid()[..., None]
     across, down = (values[..., attributes.index(name), None] for name in ("across", "down"))

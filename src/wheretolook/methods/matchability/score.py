@@ -20,19 +20,13 @@ from wheretolook.methods.field_of_view import check_field_of_view
 from wheretolook.methods.matchability.network import MatchabilityNetwork, expected_parts
 from wheretolook.utils.errors import ConfigError
 
-BINS = 30
-"""Bins along each side of the image, of which those expected to hold a found landmark are counted."""
+BINS = 30  # bins along each side of the image, of which those expected to hold a found landmark are counted
 
 INLIERS, FILLED = "inliers", "bins"
 
 
 class Expectation:
-    """What the views of a map can be expected to find, shared by all scorers that are made of it.
-
-    Args:
-        localization_map: landmarks, camera and occlusion.
-        matchability: trained for cameras of the same field of view.
-    """
+    """What the views of a map can be expected to find, shared by all scorers that are made of it."""
 
     _of_maps: ClassVar[WeakKeyDictionary[LocalizationMap, dict[str, Expectation]]] = WeakKeyDictionary()
 
@@ -45,10 +39,10 @@ class Expectation:
 
     @classmethod
     def of_map(cls, localization_map: LocalizationMap, weights: str | Path) -> Expectation:
-        """What the views of a map can be expected to find by a file of weights, made once for both.
+        """What a map's views can be expected to find by a file of weights, made once for both.
 
-        Raises:
-            WeightsError: the file cannot be used, or was trained for another field of view than the map's camera.
+        Raises a WeightsError if the file cannot be used, or was trained for another field of view than the map's
+        camera.
         """
         known = cls._of_maps.setdefault(localization_map, {})
         if str(weights) not in known:
@@ -58,15 +52,11 @@ class Expectation:
         return known[str(weights)]
 
     def sums(self, describer: LandmarkDescriber, cam_from_world: Float) -> Float:
-        """What views can be expected to find.
+        """What views (B, 3, 4) can be expected to find, (B, 17), by a describer with the attributes that the model
+        takes.
 
-        Args:
-            describer: of the map, for the attributes that the model takes.
-            cam_from_world: (B, 3, 4).
-
-        Returns:
-            (B, 17): landmarks expected to be found; their information on the pose, 15 numbers (see
-            `wheretolook.fisher.information`, in the camera's axes); bins expected to hold one that is found.
+        Landmarks expected to be found; their information on the pose, 15 numbers (see `wheretolook.fisher.information`,
+        in the camera's axes); bins expected to hold one that is found.
         """
         cam_from_world = check_poses(cam_from_world)
         if not np.array_equal(cam_from_world, self._poses):  # several methods ask for the same block of views
@@ -95,15 +85,8 @@ class Expectation:
 class ExpectedScorer(Scorer):
     """Landmarks in view, each by its learned chance of being found; or the bins of the image expected to hold one.
 
-    Args:
-        localization_map: the map.
-        weights: of a matchability model.
-        kind: "inliers", the share of the map's landmarks expected to be found; "bins", the share of the image's bins
-            expected to hold one that is.
-
-    Raises:
-        WeightsError: the weights cannot be used, or were trained for another field of view than the map's camera.
-        ConfigError: no such kind.
+    The kind "inliers" is the share of the map's landmarks expected to be found; "bins" the share of the image's bins
+    expected to hold one that is; a ConfigError of others. See `Expectation.of_map` for unfit weights.
     """
 
     def __init__(self, localization_map: LocalizationMap, weights: str | Path, kind: str) -> None:
@@ -126,14 +109,7 @@ class ExpectedScorer(Scorer):
 class ExpectedFisherScorer(Scorer):
     """Expected Fisher information of the pose, each landmark in view weighted by its learned chance of being found.
 
-    Args:
-        localization_map: the map.
-        weights: of a matchability model.
-        metric: "mineig", "logdet" or "trace".
-
-    Raises:
-        WeightsError: the weights cannot be used, or were trained for another field of view than the map's camera.
-        ConfigError: no such metric.
+    The metric is "mineig", "logdet" or "trace"; a ConfigError of others. See `Expectation.of_map` for unfit weights.
     """
 
     local = True

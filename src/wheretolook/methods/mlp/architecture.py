@@ -12,11 +12,10 @@ from wheretolook.methods.mlp.network import BinnedInput, ViewpointNetwork
 
 
 def architecture_table(network: ViewpointNetwork) -> pd.DataFrame:
-    """The layers of a network (paper, Tab. 1).
+    """The layers of a network (paper, Tab. 1), a row each from the input to the score, and their sum.
 
-    Returns:
-        One row a layer, from the input to the score: `layer`, what it is; `in` and `out`, how many values it takes and
-        gives; `parameters`, how many it has learnt. The last row is their sum.
+    Columns: `layer`, what it is; `in` and `out`, how many values it takes and gives; `parameters`, how many it has
+    learnt.
     """
     spec = network.spec
     rows: list[tuple[str, int, int, int]] = []
@@ -32,15 +31,10 @@ def architecture_table(network: ViewpointNetwork) -> pd.DataFrame:
 
 
 def activations(network: ViewpointNetwork, view: BinnedViews) -> list[Float]:
-    """What a network makes of one view, on the way to its score.
+    """What a trained network makes of one view (a batch of one, with at least its channels), on the way to its score.
 
-    Args:
-        network: trained, for the camera that took the view.
-        view: a batch of one, with at least the network's channels.
-
-    Returns:
-        The standardized input (C, bins, bins); the values (width,) of each hidden layer behind its nonlinearity; and
-        last the probability, (1,).
+    The standardized input (C, bins, bins); the values (width,) of each hidden layer behind its nonlinearity; and last
+    the probability, (1,).
     """
     spec = network.spec
     chosen = view.select(spec.channels)

@@ -15,17 +15,7 @@ KEPT = "binned views"
 
 
 def learn_mlp(task: Task, channels: tuple[str, ...]) -> Learnt:
-    """The paper's network from a dataset's train scenes.
-
-    Args:
-        task: what to do.
-        channels: what the network looks at.
-
-    Raises:
-        TableError: no train scene, no labels, or labels of one class only.
-        MapError: a scene has no landmarks.
-        ConfigError: there are fewer GPUs than asked for, or the views do not fit into memory shared by processes.
-    """
+    """The paper's network over these channels from a dataset's train scenes; raises as `load_views`."""
     data, options = _views(task, channels), task.options
     statistics = data.statistics.select(channels)
     network = ViewpointNetwork(

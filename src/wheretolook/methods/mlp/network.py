@@ -17,23 +17,14 @@ from wheretolook.methods.mlp.config import MlpConfig
 
 @dataclass(frozen=True)
 class NetworkSpec:
-    """Everything that defines a network but its weights.
+    """Everything that defines a network but its weights."""
 
-    Attributes:
-        statistics: of its channels over the training views; their names are those of its input.
-        bins: bins along each side of the image.
-        layout: order of the bins in the input.
-        hidden: widths of the hidden layers.
-        dropout: share of hidden units dropped in training.
-        input_dropout: share of input values dropped in training.
-    """
-
-    statistics: InputStatistics
-    bins: int = 30
-    layout: Layout = "in_place"
-    hidden: tuple[int, ...] = (300, 300)
-    dropout: float = 0.5
-    input_dropout: float = 0.0
+    statistics: InputStatistics  # of its channels over the training views; their names are those of its input
+    bins: int = 30  # bins along each side of the image
+    layout: Layout = "in_place"  # order of the bins in the input
+    hidden: tuple[int, ...] = (300, 300)  # widths of the hidden layers
+    dropout: float = 0.5  # share of hidden units dropped in training
+    input_dropout: float = 0.0  # share of input values dropped in training
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -47,11 +38,7 @@ class NetworkSpec:
 
 
 class BinnedInput(nn.Module):
-    """Turns binned views into a network's standardized, flat input.
-
-    Args:
-        spec: statistics, bins and layout.
-    """
+    """Turns binned views into a network's standardized, flat input."""
 
     mean: Tensor
     std: Tensor
@@ -72,11 +59,8 @@ class BinnedInput(nn.Module):
 
 
 def move_to_front(values: Tensor, filled: Tensor) -> Tensor:
-    """`wheretolook.inputs.bins.arrange(..., "compact")` on tensors of any device.
-
-    Args:
-        values: (B, C, bins, bins), zero in empty bins.
-        filled: (B, bins, bins) bool.
+    """`wheretolook.inputs.bins.arrange(..., "compact")` on tensors of any device: (B, C, bins, bins), zero in empty
+    bins.
     """
     flat = filled.flatten(1)
     n_filled = flat.sum(1, keepdim=True)
@@ -90,14 +74,9 @@ def move_to_front(values: Tensor, filled: Tensor) -> Tensor:
 def add_noise(
     means: Tensor, filled: Tensor, noise_px: float, noise_m: float, channels: tuple[str, ...] = CHANNELS
 ) -> Tensor:
-    """Gaussian noise on filled bins, as the released code adds while training.
+    """Gaussian noise of these standard deviations, as the released code adds while training, on filled bins.
 
-    Args:
-        means: (B, C, bins, bins).
-        filled: (B, bins, bins) bool; empty bins stay zero.
-        noise_px: standard deviation on u and v.
-        noise_m: standard deviation on x, y and z. What landmarks are like stays as it is.
-        channels: names of the C channels.
+    It is in pixels on u and v, in metres on x, y and z; what landmarks are like stays as it is.
     """
     of_kind = {"u": noise_px, "v": noise_px, "x": noise_m, "y": noise_m, "z": noise_m}
     scale = means.new_tensor([of_kind.get(name, 0.0) for name in channels])
@@ -105,11 +84,7 @@ def add_noise(
 
 
 class ViewpointNetwork(BinnedNetwork):
-    """The paper's classifier (its architecture table): linear layers with ReLU and dropout between, one logit out.
-
-    Args:
-        spec: what defines it.
-    """
+    """The paper's classifier (its architecture table): linear layers with ReLU and dropout between, one logit out."""
 
     def __init__(self, spec: NetworkSpec) -> None:
         super().__init__()
@@ -123,12 +98,7 @@ class ViewpointNetwork(BinnedNetwork):
         self.layers = nn.Sequential(*layers, nn.Linear(width, 1))
 
     def forward(self, means: Tensor, filled: Tensor) -> Tensor:
-        """Logits (B,) of binned views.
-
-        Args:
-            means: (B, C, bins, bins) float32, of its channels.
-            filled: (B, bins, bins) bool.
-        """
+        """Logits (B,) of means (B, C, bins, bins) float32 of its channels and filled bins (B, bins, bins)."""
         return self.layers(self.input(means, filled)).squeeze(-1)
 
     def augment(self, options: MlpConfig, means: Tensor, filled: Tensor) -> tuple[Tensor, Tensor]:
@@ -143,11 +113,7 @@ class ViewpointNetwork(BinnedNetwork):
 
     @classmethod
     def of_description(cls, stored: Mapping[str, Any]) -> ViewpointNetwork:
-        """The untrained network of a description.
-
-        Raises:
-            WeightsError: it looks at a channel that this version's bins do not have.
-        """
+        """The untrained network of a description; a WeightsError if it looks at an unknown channel of the bins."""
         spec = NetworkSpec(
             stored_statistics(stored), int(stored["bins"]), stored["layout"], tuple(stored["hidden"]),
             float(stored["dropout"]), float(stored["input_dropout"]),

@@ -19,14 +19,7 @@ from wheretolook.methods.set.network import SetNetwork
 
 
 class SetData(LandmarkDataModule):
-    """The labelled viewpoints of a dataset, by the landmarks they see.
-
-    Args:
-        task: what to learn from.
-
-    Raises:
-        TableError: no train scene, no labels, or labels of one class only.
-    """
+    """The labelled viewpoints of a dataset, by the landmarks they see; a TableError if labels are of one class only."""
 
     def __init__(self, task: Task) -> None:
         super().__init__(task, MOST_OF_WINDOW * task.options.landmarks)
@@ -49,8 +42,7 @@ class SetData(LandmarkDataModule):
         )
 
 
-MOST_OF_WINDOW = 2
-"""Landmarks kept of a view, over those that a training step looks at."""
+MOST_OF_WINDOW = 2  # landmarks kept of a view, over those that a training step looks at
 
 
 LEAST_BATCHES, LEAST_BATCH, LEAST_STEPS = 16, 64, 600
@@ -67,18 +59,13 @@ def of_size(options: SetConfig, n_train: int) -> SetConfig:
 
 
 def learn_set(task: Task, data: SetData | None = None) -> Learnt:
-    """A set network from a dataset's labels.
+    """A set network from a dataset's labels, or from its views, if they have been described already.
 
     Whether landmarks are found it learns on the way, from the labels alone. If the dataset's `weights` folder has a
     matchability model of the same width, it starts from that.
 
-    Args:
-        task: what to do.
-        data: the dataset's views, if they have been described already.
-
-    Raises:
-        TableError: no train scene, no labels, or labels of one class only.
-        WeightsError: the matchability model is damaged.
+    Raises a TableError if there is no train scene, no labels, or labels of one class only; a WeightsError if the
+    matchability model is damaged.
     """
     data = data or SetData(task)
     options = data.options = of_size(task.options, len(data.train_rows))

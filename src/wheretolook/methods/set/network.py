@@ -59,16 +59,11 @@ class SetNetwork(LandmarkNetwork):
     Each landmark has a probability of being found. Weighted by it, the landmarks' Fisher information sums up to the
     information that the view can be expected to have on its pose, and its inverse to the expected covariance: how far
     off position and orientation will be, which is what a label asks. So the probability is the attention by which
-    landmarks are pooled; on request further attention pools what else there may be to know of them. All of it are sums
-    over landmarks, so a random sample of them scaled up serves in training.
+    landmarks are pooled; on request further attention pools what else there may be to know of them, in `pooled`
+    numbers. All of it are sums over landmarks, so a random sample of them scaled up serves in training.
 
-    Args:
-        statistics: of the training views.
-        width: units of the layers that look at single landmarks.
-        pooled: numbers that further attention pools.
-        head: units of the layers that decide.
-        dropout: share of the deciding layers' units dropped in training.
-        hidden: names of attributes not to look at. Of "across", "down" and "distance" the information remains.
+    `width` and `head` are units of the layers that look at single landmarks and of those that decide; `hidden` names
+    attributes not to look at. Of "across", "down" and "distance" the information remains.
     """
 
     def __init__(
@@ -92,13 +87,9 @@ class SetNetwork(LandmarkNetwork):
         )  # fmt: skip
 
     def forward(self, values: Tensor, taken: Tensor, visible: Tensor, axis_height: Tensor) -> Tensor:
-        """Logits (B,) from samples of each view's landmarks.
+        """Logits (B,) from samples (B, K, A) of each view's landmarks, of which the first `taken` (B,) are its own.
 
-        Args:
-            values: (B, K, A).
-            taken: (B,) int64, how many of the K are the view's.
-            visible: (B,) landmarks it sees in all.
-            axis_height: (B,) z of the optical axis in the world.
+        A view sees `visible` (B,) landmarks in all; `axis_height` (B,) is the z of its optical axis in the world.
         """
         there = torch.arange(values.shape[1], device=values.device) < taken[:, None]
         sums = (self.parts(values) * there[..., None]).sum(1)

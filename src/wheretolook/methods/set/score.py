@@ -21,12 +21,7 @@ from samples of a fifth of that; against looking at all, log-odds differ by 0.05
 class SetScorer(Scorer):
     """Network over the set of landmarks in view: each by its chance of being found, all by what they tell of the pose.
 
-    Args:
-        localization_map: the map.
-        trained: for cameras of the same field of view.
-
-    Raises:
-        WeightsError: trained for another field of view than the map's camera.
+    Raises a WeightsError if it was trained for another field of view than the map's camera.
     """
 
     local = True

@@ -14,9 +14,8 @@ from wheretolook.methods.sphere.views import SphereDataModule, load_sphere_views
 def learn_sphere(task: Task) -> Learnt:
     """A `SphereNetwork` from a dataset's train scenes, calibrated on the validation views.
 
-    Raises:
-        TableError: no train scene, no labels, or labels of one class only.
-        MapError: a scene's mapping cameras are not known.
+    Raises a TableError if there is no train scene, no labels, or labels of one class only; a MapError if a scene's
+    mapping cameras are not known.
     """
     dataset, config = task.dataset, task.config
     views = load_sphere_views(

@@ -20,23 +20,17 @@ from wheretolook.methods.sphere.config import SphereConfig
 from wheretolook.methods.sphere.views import FEATURES, TOWARDS, TURNING
 from wheretolook.utils.errors import WeightsError
 
-PITCHES, YAWS = 6, 18
-"""Rows and columns of the lattice, `wheretolook.geometry.lattices.yaw_pitch_angles`."""
+PITCHES, YAWS = 6, 18  # rows and columns of the lattice, `wheretolook.geometry.lattices.yaw_pitch_angles`
 
 LOWEST_PITCH_DEG, FIRST_YAW_DEG, STEP_DEG = -60.0, -180.0, 20.0
 """Where the lattice begins, and the angle between its neighbours."""
 
 
 def on_lattice(values: Tensor, rows: Tensor, axes: Tensor) -> Tensor:
-    """Values of lattices at directions, interpolated between the four around; yaw wraps, pitch ends at the outer rows.
+    """Values (B,) of lattices (L, PITCHES, YAWS) at directions (B, 3), world axes, interpolated between the four
+    around.
 
-    Args:
-        values: (L, PITCHES, YAWS).
-        rows: (B,) int64, the lattice of each direction.
-        axes: (B, 3) directions, world axes, need not be of unit length.
-
-    Returns:
-        (B,).
+    Yaw wraps, pitch ends at the outer rows. The directions need not be of unit length; `rows` (B,) are their lattices.
     """
     x, y, z = axes.unbind(1)
     yaw = torch.rad2deg(torch.atan2(y, x))
@@ -56,9 +50,6 @@ class SphereNetwork(StoredNetwork):
     """Tokens attend to each other; then the directions of the lattice to each other and to the tokens.
 
     The directions of tokens and of the lattice are told alike, so that each can find the other.
-
-    Args:
-        config: width, heads, layers and dropout.
     """
 
     lattice: Tensor
@@ -81,11 +72,9 @@ class SphereNetwork(StoredNetwork):
         self.register_buffer("lattice", lattice, persistent=False)
 
     def encode(self, tokens: Tensor, padding: Tensor | None = None) -> Tensor:
-        """Logits (L, PITCHES, YAWS) of all directions at locations.
+        """Logits (L, PITCHES, YAWS) of all directions at locations of tokens (L, T, len(FEATURES)).
 
-        Args:
-            tokens: (L, T, len(FEATURES)).
-            padding: (L, T) bool, True where there is no token; None if all are.
+        The padding (L, T) is True where there is no token; None if all are.
         """
         hidden = self.token(tokens) + self.direction(tokens[..., TOWARDS])
         for layer in self.among_tokens:
@@ -96,14 +85,7 @@ class SphereNetwork(StoredNetwork):
         return logits
 
     def forward(self, tokens: Tensor, padding: Tensor, rows: Tensor, axes: Tensor) -> Tensor:
-        """Logits (B,) of views.
-
-        Args:
-            tokens: (L, T, len(FEATURES)), of the locations that they share.
-            padding: (L, T) bool, True where there is no token.
-            rows: (B,) int64, location of each view.
-            axes: (B, 3) optical axes, world.
-        """
+        """Logits (B,) of views with optical axes (B, 3), world, at the locations `rows` (B,) of `encode`."""
         if not len(rows):  # one process's share of a small batch
             return axes.sum(1) + 0 * sum(parameter.sum() for parameter in self.parameters())
         return on_lattice(self.encode(tokens, padding), rows, axes)
@@ -123,11 +105,7 @@ class SphereNetwork(StoredNetwork):
 
     @classmethod
     def of_description(cls, stored: Mapping[str, Any]) -> SphereNetwork:
-        """The untrained network of a description.
-
-        Raises:
-            WeightsError: it was trained on other tokens.
-        """
+        """The untrained network of a description; a WeightsError if it was trained on other tokens."""
         if stored.get("features") != list(FEATURES):
             raise WeightsError("these weights ask for other tokens")
         return cls(SphereConfig(**stored["options"]))

@@ -19,14 +19,8 @@ class SphereScorer(Scorer):
     """In the manner of ActLoc: one pass over a location's landmarks and the mapping cameras scores 6 x 18 directions.
 
     A pose's score is the probability that it localizes, interpolated between those directions; roll does not count.
-
-    Args:
-        localization_map: the map, with its mapping cameras.
-        trained: for cameras of the same field of view.
-
-    Raises:
-        WeightsError: trained for another field of view than the map's camera.
-        MapError: the map has no mapping cameras.
+    Raises a WeightsError if it was trained for another field of view than the map's camera, a MapError if the map has
+    no mapping cameras.
     """
 
     def __init__(self, localization_map: LocalizationMap, trained: TrainedNetwork[SphereNetwork]) -> None:

@@ -20,7 +20,7 @@ from wheretolook.geometry.poses import Float, split_poses
 from wheretolook.inputs.localization_map import LocalizationMap, shared_locations
 from wheretolook.learning.config import SharedConfig
 from wheretolook.learning.data import Batch, has_room, labelled_rows
-from wheretolook.mapping.cameras import CAMERAS_FILE
+from wheretolook.mapping.colmap_model import CAMERAS_FILE
 from wheretolook.methods.sphere.config import SphereConfig
 from wheretolook.utils.errors import MapError
 from wheretolook.viewpoints.table import is_good, poses
@@ -33,31 +33,17 @@ FEATURES = (
 direction of a camera; log(1 + distance in metres); log(1 + landmarks with a free line of sight from the location); and
 what it is. The first token of a location is neither: it stands for all landmarks and holds their number."""
 
-TOWARDS = slice(3, 6)
-"""The features that are the unit direction."""
-
-TURNING = 9
-"""The first features, three vectors, which turn with the world."""
-
-OFFSET_M = 4.0
-"""Unit of offsets: ActLoc crops the world at so many metres."""
-
-BLOCK = 256
-"""Locations whose lines of sight are asked for at a time."""
+TOWARDS = slice(3, 6)  # the features that are the unit direction
+TURNING = 9  # the first features, three vectors, which turn with the world
+OFFSET_M = 4.0  # unit of offsets: ActLoc crops the world at so many metres
+BLOCK = 256  # locations whose lines of sight are asked for at a time
 
 
 class LocationDescriber:
     """Tells a network of locations: their landmarks with a free line of sight, and the mapping cameras.
 
-    Of more landmarks or cameras than wanted, evenly spread ones are taken, in the order of their ids.
-
-    Args:
-        localization_map: the map, with its mapping cameras.
-        config: how many landmarks and cameras at most.
-        path: of the mapping cameras, for the error.
-
-    Raises:
-        MapError: the map has no mapping cameras.
+    Of more landmarks or cameras than the configuration wants, evenly spread ones are taken, in the order of their ids.
+    Raises a MapError, which names the path, if the map has no mapping cameras.
     """
 
     def __init__(
@@ -102,25 +88,15 @@ def _spread(rows: Float, at_most: int) -> Float:
 
 @dataclass(frozen=True, eq=False)
 class SphereViews:
-    """Labelled viewpoints and the locations that they share: about 33 kB a location at 640 tokens.
+    """Labelled viewpoints and the locations that they share: about 33 kB a location at 640 tokens."""
 
-    Attributes:
-        tokens: (L, T, len(FEATURES)) float32, zero where there is none.
-        padding: (L, T) bool, True where there is none.
-        rows: (B,) int64, location of each view.
-        axes: (B, 3) float32, its optical axis in the world.
-        labels: (B,) float32, 1 where it localizes.
-        scene: (B,) int64, number of each view's scene in the order given.
-        location: (B,) int64, location_id of each view, unique only within its scene.
-    """
-
-    tokens: Tensor
-    padding: Tensor
-    rows: Tensor
-    axes: Tensor
-    labels: Tensor
-    scene: NDArray[np.int64]
-    location: NDArray[np.int64]
+    tokens: Tensor  # (L, T, len(FEATURES)) float32, zero where there is none
+    padding: Tensor  # (L, T) bool, True where there is none
+    rows: Tensor  # (B,) int64, location of each view
+    axes: Tensor  # (B, 3) float32, its optical axis in the world
+    labels: Tensor  # (B,) float32, 1 where it localizes
+    scene: NDArray[np.int64]  # (B,) int64, number of each view's scene in the order given
+    location: NDArray[np.int64]  # (B,) int64, location_id of each view, unique only within its scene
 
     def to(self, device: torch.device | str) -> SphereViews:
         """The same views with what a network takes on a device."""
@@ -141,19 +117,10 @@ def load_sphere_views(
     device: str = "cpu",
     progress: bool = True,
 ) -> SphereViews:
-    """Read the labelled viewpoints of some scenes and describe their locations.
+    """Read the labelled viewpoints of some scenes and describe their locations, on the CPU.
 
-    Args:
-        dataset: gives the camera.
-        scenes: of the dataset.
-        config: limits of a positive label.
-        options: how many landmarks and cameras at most.
-        device: of the maps. The views come back on the CPU.
-        progress: show a progress bar.
-
-    Raises:
-        TableError: a scene has no table or no labelled viewpoint, or its occlusion does not fit.
-        MapError: a scene has no landmarks, or its mapping cameras are not known.
+    Raises a TableError if a scene has no table or no labelled viewpoint, or its occlusion does not fit; a MapError if
+    it has no landmarks, or its mapping cameras are not known.
     """
     tables = [labelled_rows(scene) for scene in scenes]
     tokens: list[Tensor] = []
@@ -182,18 +149,11 @@ def load_sphere_views(
 
 
 class LocationLoader:
-    """Iterates over batches of whole locations, so that each is encoded once for all of its views.
+    """Batches of whole locations of the views `chosen` (n,), so that each is encoded once for all of its views.
 
-    With several processes, every one cuts the same batches and keeps its share of each, whole locations again; a share
-    can be empty.
-
-    Args:
-        views: the views.
-        chosen: which of them, (n,) int64.
-        batch_size: views a batch, over all processes, on average.
-        shuffle_seed: every pass has its own order of locations, the same in every run; None keeps theirs.
-        rank: number of this process.
-        world_size: number of processes.
+    With several processes, every one cuts the same batches, of `batch_size` views on average, and keeps its share of
+    each, whole locations again; a share can be empty. With a `shuffle_seed` every pass has its own order of locations,
+    the same in every run; None keeps theirs.
     """
 
     def __init__(
@@ -236,14 +196,7 @@ class LocationLoader:
 
 
 class SphereDataModule(LightningDataModule):
-    """Views of a dataset in batches of whole locations.
-
-    Args:
-        views: of train and val scenes.
-        held_out: (B,) True where a view is for validation.
-        batch_size: viewpoints of a batch, on average.
-        seed: of the order of locations.
-    """
+    """Views of a dataset in batches of whole locations, without those held out (B,) to learn from."""
 
     def __init__(self, views: SphereViews, held_out: NDArray[np.bool_], batch_size: int, seed: int = 0) -> None:
         super().__init__()

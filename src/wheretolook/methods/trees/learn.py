@@ -28,38 +28,24 @@ from wheretolook.viewpoints.table import is_good, poses
 if TYPE_CHECKING:
     from lightgbm import Booster
 
-BLOCK = 4096
-"""Views described at a time: some million landmarks."""
+BLOCK = 4096  # views described at a time: some million landmarks
 
 
 @dataclass(frozen=True, eq=False)
 class BoostedTrees:
-    """T trees of M nodes in all, as arrays.
+    """T trees of M nodes in all, as arrays."""
 
-    Attributes:
-        camera: whose views they have learnt from.
-        roots: (T,) int64, node of each tree's root.
-        feature: (M,) int64, which of `POOLED` a node asks for.
-        threshold: (M,) float64; values up to it go left.
-        missing_left: (M,) bool, whether a value that is not known goes left.
-        left, right: (M,) int64, next nodes; a leaf's are itself.
-        value: (M,) float64, of leaves, zero elsewhere.
-        depth: steps from a root to the deepest leaf.
-        baseline: log-odds to add to the sum of the trees: 0 of LightGBM's, whose first tree has it in its leaves.
-        scale, offset: what turns the sum into calibrated log-odds: scale * sum + offset.
-    """
-
-    camera: PinholeCamera
-    roots: Tensor
-    feature: Tensor
-    threshold: Tensor
-    missing_left: Tensor
-    left: Tensor
+    camera: PinholeCamera  # whose views they have learnt from
+    roots: Tensor  # (T,) int64, node of each tree's root
+    feature: Tensor  # (M,) int64, which of `POOLED` a node asks for
+    threshold: Tensor  # (M,) float64; values up to it go left
+    missing_left: Tensor  # (M,) bool, whether a value that is not known goes left
+    left: Tensor  # left, right: (M,) int64, next nodes; a leaf's are itself
     right: Tensor
-    value: Tensor
-    depth: int
-    baseline: float
-    scale: float = 1.0
+    value: Tensor  # (M,) float64, of leaves, zero elsewhere
+    depth: int  # steps from a root to the deepest leaf
+    baseline: float  # log-odds to add to the sum of the trees: 0 of LightGBM's, whose first tree has it in its leaves
+    scale: float = 1.0  # scale, offset: what turns the sum into calibrated log-odds: scale * sum + offset
     offset: float = 0.0
 
     @classmethod
@@ -108,12 +94,7 @@ class BoostedTrees:
         return self.value[nodes].sum(1) + self.baseline
 
     def save(self, path: Path, training: dict[str, Any] | None = None) -> None:
-        """Write one safetensors file, atomically. The same trees give the same bytes.
-
-        Args:
-            path: file to write; its folder is made when needed.
-            training: what else to keep about the training (JSON values).
-        """
+        """Write one safetensors file, atomically, with JSON values on the training; the same trees, the same bytes."""
         header = {
             "features": list(POOLED), "camera": asdict(self.camera),
             **{name: getattr(self, name) for name in _NUMBERS}, "training": training or {},
@@ -127,10 +108,8 @@ class BoostedTrees:
 
     @classmethod
     def load(cls, path: str | Path) -> BoostedTrees:
-        """Read what `save` wrote.
-
-        Raises:
-            WeightsError: the file is missing, damaged, foreign, of another kind, or its trees are none.
+        """Read what `save` wrote; a WeightsError if it is missing, damaged, foreign, of another kind, or its trees are
+        none.
         """
         tensors, header = read_weights(Path(path))
         check_serves(path, header, "trees")
@@ -163,19 +142,12 @@ _NUMBERS = ("depth", "baseline", "scale", "offset")
 
 @dataclass(frozen=True, eq=False)
 class PooledViews:
-    """Labelled viewpoints described by `POOLED`.
+    """Labelled viewpoints described by `POOLED`."""
 
-    Attributes:
-        values: (B, len(POOLED)) float32.
-        labels: (B,) bool, whether the viewpoint localizes.
-        scene: (B,) int64, number of each view's scene in the order given.
-        location: (B,) int64, location_id of each view, unique only within its scene.
-    """
-
-    values: NDArray[np.float32]
-    labels: NDArray[np.bool_]
-    scene: NDArray[np.int64]
-    location: NDArray[np.int64]
+    values: NDArray[np.float32]  # (B, len(POOLED)) float32
+    labels: NDArray[np.bool_]  # (B,) bool, whether the viewpoint localizes
+    scene: NDArray[np.int64]  # (B,) int64, number of each view's scene in the order given
+    location: NDArray[np.int64]  # (B,) int64, location_id of each view, unique only within its scene
 
     def only(self, mask: NDArray[np.bool_]) -> PooledViews:
         """The views where `mask` (B,) is set."""
@@ -189,18 +161,10 @@ def load_pooled(
     device: str = "cpu",
     progress: bool = True,
 ) -> PooledViews:
-    """Describe the labelled viewpoints of some scenes.
+    """Describe the labelled viewpoints of some scenes, positive within these limits in metres and degrees.
 
-    Args:
-        dataset: gives the camera.
-        scenes: of the dataset.
-        limits: metres and degrees of a positive label.
-        device: "cpu" or a CUDA device.
-        progress: show a progress bar.
-
-    Raises:
-        TableError: a scene has no table or no labelled viewpoint, or its occlusion does not fit.
-        MapError: a scene has no landmarks.
+    Raises a TableError if a scene has no table or no labelled viewpoint, or its occlusion does not fit; a MapError if
+    it has no landmarks.
     """
     values: list[NDArray[np.float32]] = []
     labels: list[NDArray[np.bool_]] = []
@@ -225,8 +189,7 @@ def load_pooled(
 def learn_trees(task: Task) -> Learnt:
     """Boosted trees from a dataset's train scenes; see `fit_trees`.
 
-    Raises:
-        TableError: no train scene, no labels, or labels of one class only.
+    Raises a TableError if there is no train scene, no labels, or labels of one class only.
     """
     dataset, config = task.dataset, task.config
     limits = config.max_error_m, config.max_error_deg
@@ -242,17 +205,10 @@ def learn_trees(task: Task) -> Learnt:
 def fit_trees(
     train: PooledViews, val: PooledViews, camera: PinholeCamera, config: TreesConfig, seed: int = 0
 ) -> tuple[BoostedTrees, dict[str, float]]:
-    """Boost trees, keep as many as order the validation views best, and calibrate their sum on these.
+    """Boost trees, keep as many as order the validation views best, and calibrate their sum on these; the trees and
+    metrics.
 
-    Args:
-        train: to learn from.
-        val: of other scenes.
-        camera: of both.
-        config: options.
-        seed: of LightGBM, which samples views to choose bins.
-
-    Returns:
-        The trees, and their metrics on the validation views.
+    LightGBM samples views by the seed to choose bins.
     """
     import lightgbm
     from sklearn.metrics import average_precision_score, log_loss, roc_auc_score

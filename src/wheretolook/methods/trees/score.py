@@ -15,12 +15,7 @@ from wheretolook.methods.trees.learn import BoostedTrees
 class TreesScorer(Scorer):
     """Boosted trees on where the visible landmarks lie and how they were mapped: the probability that a view localizes.
 
-    Args:
-        localization_map: the map.
-        trees: trained for cameras of the same field of view.
-
-    Raises:
-        WeightsError: trained for another field of view than the map's camera.
+    Raises a WeightsError if they were trained for another field of view than the map's camera.
     """
 
     name = "trees"

@@ -12,11 +12,11 @@ from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import Float, poses_looking_along
 from wheretolook.inputs.bins import bin_views_plain
-from wheretolook.mapping.cameras import save_mapping_poses
+from wheretolook.mapping.colmap_model import save_mapping_poses
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.viewpoints.config import Split
 from wheretolook.viewpoints.table import LOCALIZED, NO_POSE, TOO_FEW_MATCHES, pose_columns, write_table
-from wheretolook.visibility.frustum import LandmarkSets
+from wheretolook.visibility.frustum import LandmarkSets, PosedViews
 from wheretolook.visibility.occlusion import StoredOcclusion
 
 CAMERA = PinholeCamera(160, 120, 80.0)
@@ -64,7 +64,9 @@ def make_scene(
     location_id = np.repeat(np.arange(n_locations), n_directions)
     direction_id = np.tile(np.arange(n_directions), n_locations)
     cam_from_world = poses_looking_along(locations[location_id], fibonacci_sphere(n_directions)[direction_id])
-    binned = bin_views_plain(CAMERA, cam_from_world, landmarks.points, LandmarkSets.from_mask(mask), location_id, BINS)
+    binned = bin_views_plain(
+        PosedViews(CAMERA, cam_from_world, landmarks.points, LandmarkSets.from_mask(mask), location_id), BINS
+    )
     filled = binned.n_filled
     error_m = 0.05 * (np.median(filled) / np.maximum(filled, 1)) ** 4 * 0.999
     status = np.where(filled == 0, TOO_FEW_MATCHES, np.where(error_m > 20, NO_POSE, LOCALIZED))

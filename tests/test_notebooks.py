@@ -19,7 +19,7 @@ from pages import main, notebook_page, small_picture
 from PIL import Image
 
 from synthetic_release import make_release
-from wheretolook.methods.styles import MethodStyle, scorer_style
+from wheretolook.methods.styles import MethodStyle, method_style
 from wheretolook.utils.tracking import newest_run
 from wheretolook.utils.tracking_config import TrackingConfig
 
@@ -158,7 +158,7 @@ def known_styles() -> list[MethodStyle]:
     names = ("oracle", "random", "forward", "visible", "bins", "max-visibility", "max-visibility-swapped", "set",
              "trees", "conv", "sphere", "mlp-2d", "mlp-2d+z", "mlp-2d+3d", "expected-bins", "fisher-trace-gp",
              "fisher-logdet-exact", "fisher-mineig-quadratic")  # fmt: skip
-    return [scorer_style(name) for name in names]
+    return [method_style(name) for name in names]
 
 
 def shrunk(pixels: np.ndarray) -> tuple[Image.Image, tuple[int, int]]:

@@ -29,7 +29,7 @@ from wheretolook.fisher.soft_visibility import (
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import VoxelGrid, fibonacci_sphere
 from wheretolook.geometry.poses import Float, poses_looking_along
-from wheretolook.visibility.frustum import LandmarkSets
+from wheretolook.visibility.frustum import LandmarkSets, PosedViews
 
 ROOM_M = ((-5.0, -4.0, 0.0), (5.0, 4.0, 2.6))
 
@@ -75,7 +75,7 @@ def errors_over_samples(samples: tuple[int, ...] = (10, 15, 20, 30, 50, 70, 100,
     views = poses_looking_along(np.repeat(locations, len(axes), axis=0), np.tile(axes, (len(locations), 1)))
     rows = np.repeat(np.arange(len(locations)), len(axes))
     everything = LandmarkSets.from_mask(np.ones((len(locations), len(points)), bool))
-    exact = exact_information(camera, views, points, everything, rows)
+    exact = exact_information(PosedViews(camera, views, points, everything, rows))
     truth = information_matrices(exact)
     best = {metric: metric_of(exact, metric).reshape(len(locations), -1) for metric in METRICS}
     print(f"{len(locations)} locations, {len(axes)} directions each, {len(points):,} landmarks, none hidden")
@@ -143,16 +143,20 @@ def main() -> None:
     ):
         sets = LandmarkSets.from_mask(mask)
         few = max(1, repeats // 2)
-        timed(f"  sums, {label}", lambda s=sets: exact_information(camera, views, points, s, rows, device), few)
+        timed(
+            f"  sums, {label}",
+            lambda s=sets: exact_information(PosedViews(camera, views, points, s, rows), device),
+            few,
+        )
 
         def all_rows(s: LandmarkSets = sets) -> None:
-            numbers = exact_information(camera, views, points, s, rows, device)
+            numbers = exact_information(PosedViews(camera, views, points, s, rows), device)
             for metric in METRICS:
                 metric_of(numbers, metric, None, device)
 
         timed(f"  the three metrics, {label}", all_rows, few)
         start = time.perf_counter()
-        exact_information_plain(camera, views[:200], points, sets, rows[:200])
+        exact_information_plain(PosedViews(camera, views[:200], points, sets, rows[:200]))
         print(f"  {'  sums by NumPy, from 200 viewpoints':60} "
               f"{(time.perf_counter() - start) * len(views) / 200:9.0f} s")  # fmt: skip
 

@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from mask_agreement import MaskAgreement
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.mapping.landmarks import Landmarks
@@ -29,7 +30,6 @@ from wheretolook.space.free_space import FreeSpace
 from wheretolook.utils.tracking import log, start_run
 from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.sampling import free_locations
-from wheretolook.visibility.agreement import MaskAgreement
 from wheretolook.visibility.config import DEFAULT_RADIUS
 from wheretolook.visibility.hidden_points import HiddenPointRemoval
 from wheretolook.visibility.occlusion import MeshOcclusion

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from mask_agreement import MaskAgreement
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import poses_looking_along
@@ -27,7 +28,6 @@ from wheretolook.scenes.config import ApartmentConfig
 from wheretolook.scenes.loading import load_mesh
 from wheretolook.scenes.procedural.generator import generate_apartment
 from wheretolook.space.free_space import FreeSpace
-from wheretolook.visibility.agreement import MaskAgreement
 from wheretolook.visibility.occlusion import MeshOcclusion
 from wheretolook.visibility.tsdf import BYTES_PER_BLOCK, DepthImage, TsdfConfig, TsdfOcclusion, TsdfVolume
 

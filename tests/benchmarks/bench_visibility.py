@@ -41,8 +41,7 @@ from wheretolook.scenes.loading import load_mesh
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.utils.warp import start_warp
 from wheretolook.visibility.counting import FrustumCounter, count_plain
-from wheretolook.visibility.device_points import DevicePoints
-from wheretolook.visibility.occlusion import MeshOcclusion, NoOcclusion
+from wheretolook.visibility.occlusion import DevicePoints, MeshOcclusion, NoOcclusion
 from wheretolook.visibility.survey import survey
 
 CAMERA = PinholeCamera()
@@ -194,11 +193,11 @@ def paper_size(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
         print(f"{what:32} {threads} thread(s): {1e3 * row['median_s']:12,.2f} ms  {spread}, {rate}")
 
     def everything(threads: int) -> object:
-        return survey(CAMERA, rotations, locations, landmarks, occlusion, keep=100, threads=threads, counter=counter)
+        return survey(CAMERA, rotations, locations, landmarks, occlusion, keep=100, threads=threads)
 
     def counts_alone(threads: int) -> object:
         return survey(CAMERA, rotations, locations, landmarks, NoOcclusion(), keep=1, keep_occlusion=False,
-                      threads=threads, counter=counter)  # fmt: skip
+                      threads=threads)  # fmt: skip
 
     for threads in (1,) if on_gpu else sorted({1, len(os.sched_getaffinity(0))}):
         add("occlusion, counts, best 100", threads, lambda threads=threads: everything(threads))
@@ -239,7 +238,7 @@ def paper_size(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
         print(f"{ours['what']}, {ours['threads']} thread(s): {times:,.1f} times as fast as the twin's counts alone")
     counts = counter.count(locations[some], landmarks.double).numpy()
     print("counts equal the twin's:", bool(np.array_equal(counts, plain["counts"])))
-    seen = survey(CAMERA, rotations, locations[some], landmarks, occlusion, keep=100, counter=counter)
+    seen = survey(CAMERA, rotations, locations[some], landmarks, occlusion, keep=100)
     mask = occlusion.unoccluded(locations[some], points)
     masked = count_plain(CAMERA, rotations, locations[some], points, mask)
     print(
@@ -278,11 +277,10 @@ def scaling(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
             size = {**BASE, axis: value}
             rotations = rotation_looking_along(fibonacci_sphere(size["directions"]))
             landmarks = DevicePoints(points[: size["landmarks"]], device)
-            counter = FrustumCounter(CAMERA, rotations, len(landmarks), device)
             for what, model in (("with occlusion", occlusion), ("counts alone", NoOcclusion())):
                 work = partial(
                     survey, CAMERA, rotations, locations[: size["locations"]], landmarks, model, keep=100,
-                    counter=counter, keep_occlusion=model is occlusion, memory_bytes=round(args.memory_gb * 1e9),
+                    keep_occlusion=model is occlusion, memory_bytes=round(args.memory_gb * 1e9),
                 )  # fmt: skip
                 n = size["locations"] * size["directions"] * size["landmarks"]
                 slow = not on_gpu and (n > 5e10 or (model is occlusion and size["locations"] * size["landmarks"] > 2e7))

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from wheretolook.figures.path_film import film_frames, methods_figure, save_film, still_figure
-from wheretolook.planning.path_view import PathView
+from wheretolook.planning.route_views import PathView
 from wheretolook.utils.errors import ConfigError
 
 

@@ -14,8 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 
 from box_scenes import ROOM, furnished_room
-from wheretolook.figures.dollhouse import frustum_corners, frustum_segments
-from wheretolook.figures.house_image import dollhouse
+from wheretolook.figures.house_image import dollhouse, frustum_corners, frustum_segments
 from wheretolook.figures.inputs import BinnedImage, inputs_figure
 from wheretolook.figures.learning import learning_figure
 from wheretolook.figures.overview import View

@@ -7,20 +7,17 @@ import numpy as np
 from conftest import RandomViews
 from wheretolook.fisher.exact import exact_information, exact_information_plain
 from wheretolook.fisher.information import TRACE, bearing_numbers, information_matrices
-from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.geometry.colmap_camera import ColmapCamera
+from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import poses_looking_along, rotation_looking_along, transform
-from wheretolook.visibility.frustum import LandmarkSets
+from wheretolook.visibility.frustum import LandmarkSets, PosedViews
 
 
 def test_information_is_that_of_the_plain_twin(random_views: RandomViews, device: str) -> None:
     v = random_views
-    arguments = v.camera, v.cam_from_world, v.points, v.visible, v.location_rows
-    plain = exact_information_plain(*arguments)
-    np.testing.assert_allclose(
-        exact_information(*arguments, device), plain, rtol=1e-9, atol=1e-12 * np.abs(plain).max()
-    )
+    arguments = PosedViews(v.camera, v.cam_from_world, v.points, v.visible, v.location_rows)
+    plain = exact_information_plain(arguments)
+    np.testing.assert_allclose(exact_information(arguments, device), plain, rtol=1e-9, atol=1e-12 * np.abs(plain).max())
     assert np.sum(plain @ TRACE > 0) > 30
 
 
@@ -29,8 +26,8 @@ def test_more_views_than_a_core_takes_at_a_time(device: str) -> None:
     points, rows = rng.uniform(-4, 4, (200, 3)), rng.integers(0, 7, 1000)
     locations, mask = rng.uniform(-2, 2, (7, 3)), rng.random((7, 200)) < 0.7
     poses = poses_looking_along(locations[rows], rng.normal(size=(1000, 3)))
-    arguments = PinholeCamera(), poses, points, LandmarkSets.from_mask(mask), rows
-    np.testing.assert_allclose(exact_information(*arguments, device), exact_information_plain(*arguments), atol=1e-9)
+    arguments = PosedViews(PinholeCamera(), poses, points, LandmarkSets.from_mask(mask), rows)
+    np.testing.assert_allclose(exact_information(arguments, device), exact_information_plain(arguments), atol=1e-9)
 
 
 def test_landmarks_on_the_very_border_are_decided_alike(device: str) -> None:
@@ -46,9 +43,9 @@ def test_landmarks_on_the_very_border_are_decided_alike(device: str) -> None:
     points = np.einsum("nji,nj->ni", rotations[rng.integers(0, 40, 20_000)], rays)
     poses = poses_looking_along(np.zeros((40, 3)), fibonacci_sphere(40))
     sets = LandmarkSets.from_mask(np.ones((1, len(points)), bool))
-    arguments = camera, poses, points, sets, np.zeros(40, dtype=int)
+    arguments = PosedViews(camera, poses, points, sets, np.zeros(40, dtype=int))
     # the turn's share of the trace is twice the number of landmarks in view
-    found, plain = exact_information(*arguments, device), exact_information_plain(*arguments)
+    found, plain = exact_information(arguments, device), exact_information_plain(arguments)
     turns = [9, 12, 14]
     np.testing.assert_array_equal(np.round(found[:, turns].sum(1) / 2, 6), np.round(plain[:, turns].sum(1) / 2, 6))
     np.testing.assert_allclose(found, plain, rtol=1e-9, atol=1e-12 * np.abs(plain).max())
@@ -59,7 +56,7 @@ def test_information_by_hand(device: str) -> None:
     points = np.array([[2, 0, 0], [2, 1.9, 0], [2, 2.1, 0], [-2, 0, 0], [np.nan, 0, 0], [0, 0, 0]])
     poses = poses_looking_along(np.zeros((3, 3)), [[1.0, 0, 0], [-1, 0, 0], [0, 0, 1]])
     sets = LandmarkSets.from_mask(np.array([[True] * 6, [True, False, True, True, True, True]]))
-    found = exact_information(camera, poses[[0, 0, 1, 2]], points, sets, np.array([0, 1, 0, 0]), device)
+    found = exact_information(PosedViews(camera, poses[[0, 0, 1, 2]], points, sets, np.array([0, 1, 0, 0])), device)
     near, wide = bearing_numbers(points[:2])
     np.testing.assert_allclose(found, [near + wide, near, bearing_numbers(points[3]), np.zeros(15)], atol=1e-12)
     # a shift along the axis changes nothing, one across it half a radian for each metre
@@ -69,7 +66,7 @@ def test_information_by_hand(device: str) -> None:
 def test_a_distorted_camera_sums_up_what_it_sees(random_views: RandomViews) -> None:
     v = random_views
     camera = ColmapCamera("OPENCV", 640, 480, (300.0, 300.0, 330.0, 235.0, -0.2, 0.05, 1e-3, -1e-3))
-    found = exact_information(camera, v.cam_from_world, v.points, v.visible, v.location_rows)
+    found = exact_information(PosedViews(camera, v.cam_from_world, v.points, v.visible, v.location_rows))
     for view, pose in enumerate(v.cam_from_world):
         candidates = v.visible[v.location_rows[view]]
         seen = v.points[candidates[camera.sees(transform(pose, v.points[candidates]))]]
@@ -83,7 +80,10 @@ def test_a_pinhole_of_colmap_is_as_ours(random_views: RandomViews, device: str) 
     pinhole = (v.camera.focal_px, v.camera.focal_px, v.camera.cx, v.camera.cy)
     colmap = ColmapCamera("PINHOLE", v.camera.width, v.camera.height, pinhole)
     arguments = v.cam_from_world, v.points, v.visible, v.location_rows
-    ours, theirs = exact_information(v.camera, *arguments, device), exact_information(colmap, *arguments, device)
+    ours, theirs = (
+        exact_information(PosedViews(v.camera, *arguments), device),
+        exact_information(PosedViews(colmap, *arguments), device),
+    )
     same = np.isclose(ours @ TRACE, theirs @ TRACE, rtol=1e-6)
     assert same.mean() > 0.95  # but for landmarks on the border
     np.testing.assert_allclose(ours[same], theirs[same], rtol=1e-5, atol=1e-5)
@@ -91,9 +91,8 @@ def test_a_pinhole_of_colmap_is_as_ours(random_views: RandomViews, device: str) 
 
 def test_no_views_and_no_landmarks(device: str) -> None:
     camera, none = PinholeCamera(), LandmarkSets.from_mask(np.ones((1, 0), bool))
-    assert exact_information(camera, np.empty((0, 3, 4)), np.ones((1, 3)), none, np.empty(0, int), device).shape == (
-        0,
-        15,
-    )
+    assert exact_information(
+        PosedViews(camera, np.empty((0, 3, 4)), np.ones((1, 3)), none, np.empty(0, int)), device
+    ).shape == (0, 15)
     poses = poses_looking_along(np.zeros((2, 3)), np.eye(3)[:2])
-    assert not exact_information(camera, poses, np.empty((0, 3)), none, np.zeros(2, int), device).any()
+    assert not exact_information(PosedViews(camera, poses, np.empty((0, 3)), none, np.zeros(2, int)), device).any()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -12,10 +10,9 @@ from wheretolook.fisher.field import FisherField, stationary_axis_of_trace, wors
 from wheretolook.fisher.field_sums import field_sums, field_sums_plain
 from wheretolook.fisher.information import TRACE, information_matrices
 from wheretolook.fisher.metrics import METRICS
-from wheretolook.fisher.soft_visibility import GaussianProcessVisibility, QuadraticVisibility, SoftVisibility
+from wheretolook.fisher.soft_visibility import JITTER, GaussianProcessVisibility, QuadraticVisibility, SoftVisibility
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import Float
-from wheretolook.utils.errors import MapError
 
 HALF_ANGLE = 0.766  # of the paper's camera
 VISIBILITIES = [QuadraticVisibility(HALF_ANGLE), GaussianProcessVisibility(HALF_ANGLE, 0.45)]
@@ -41,7 +38,7 @@ def soft_sums(visibility: SoftVisibility, location: Float, points: Float, axes: 
         among = np.exp(-((visibility.axes[:, None] - visibility.axes) ** 2).sum(-1) / (2 * visibility.length**2))
         cosine = visibility.axes @ bearings.T
         seen = 1 / (1 + np.exp(-visibility.steepness * (cosine - np.cos(visibility.half_angle_rad))))
-        v = covariance @ np.linalg.solve(among + visibility.jitter * np.eye(len(among)), seen)
+        v = covariance @ np.linalg.solve(among + JITTER * np.eye(len(among)), seen)
     else:
         v = np.polyval(visibility.coefficients, axes @ bearings.T)  # type: ignore[attr-defined]
     each = jacobians(offsets)
@@ -159,8 +156,6 @@ def test_metrics_of_a_location(visibility: SoftVisibility, metric: str) -> None:
         }[metric]
         found = field.metric(1, axes, metric, about_origin)
         np.testing.assert_allclose(found, expected, rtol=1e-6)
-        if not about_origin:
-            assert field.best_axis(1, axes, metric) == np.argmax(expected)
 
 
 def test_probes_point_away_from_the_landmarks() -> None:
@@ -170,7 +165,7 @@ def test_probes_point_away_from_the_landmarks() -> None:
         field = FisherField.build(np.zeros((1, 3)), points, QuadraticVisibility(HALF_ANGLE))
         axes = fibonacci_sphere(500)
         assert worst_axis_of_trace(field, 0, axes) @ direction < -0.2
-        assert axes[field.best_axis(0, axes, "trace")] @ direction > 0.95
+        assert axes[np.argmax(field.metric(0, axes, "trace"))] @ direction > 0.95
         stationary = stationary_axis_of_trace(field, 0)
         assert stationary @ direction < -0.9
         assert np.linalg.norm(stationary) == pytest.approx(1)
@@ -198,37 +193,6 @@ def test_the_stationary_axis_has_no_gradient() -> None:
 def test_without_landmarks_the_stationary_axis_is_some_unit_vector() -> None:
     field = FisherField.build(np.zeros((1, 3)), np.empty((0, 3)), QuadraticVisibility(HALF_ANGLE))
     assert np.linalg.norm(stationary_axis_of_trace(field, 0)) == 1
-
-
-@pytest.mark.parametrize("visibility", VISIBILITIES)
-def test_a_field_comes_back_from_disk(visibility: SoftVisibility, tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    field = FisherField.build(rng.normal(size=(4, 3)), rng.normal(size=(50, 3)), visibility)
-    path = tmp_path / "field.npz"
-    field.save(path)
-    again = FisherField.load(path)
-    assert again.visibility == field.visibility
-    np.testing.assert_array_equal(again.locations, field.locations)
-    np.testing.assert_array_equal(again.factors, field.factors)
-    assert sorted(tmp_path.iterdir()) == [path]
-
-
-def test_damaged_fields_are_named(tmp_path: Path) -> None:
-    path = tmp_path / "field.npz"
-    with pytest.raises(MapError, match=r"field\.npz"):
-        FisherField.load(path)
-    field = FisherField.build(np.zeros((1, 3)), np.ones((5, 3)), VISIBILITIES[0])
-    field.save(path)
-    whole = path.read_bytes()
-    names = ("QuadraticVisibility".encode("utf-32-le"), "QuadrilateralCamera".encode("utf-32-le"))
-    assert names[0] in whole and len(names[0]) == len(names[1])
-    for damaged in (whole[: len(whole) // 2], b"", whole.replace(*names)):
-        path.write_bytes(damaged)
-        with pytest.raises(MapError, match=r"field\.npz: not a Fisher Information Field"):
-            FisherField.load(path)
-    np.savez(path, locations=field.locations, factors=field.factors, about='{"format_version": 2}')
-    with pytest.raises(MapError, match="another version"):
-        FisherField.load(path)
 
 
 @pytest.mark.parametrize("shape", [(2, 20), (1, 30), (3, 30), (30, 2)])

@@ -8,13 +8,13 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF
 
 from wheretolook.fisher.soft_visibility import (
+    JITTER,
     GaussianProcessVisibility,
     QuadraticVisibility,
     SoftVisibility,
     cone_half_angle,
 )
-from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.geometry.colmap_camera import ColmapCamera
+from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import Float
 
 QUARTER = np.pi / 4
@@ -60,7 +60,7 @@ def test_scikit_learn_predicts_the_same() -> None:
     visibility = GaussianProcessVisibility(QUARTER, 0.45, n_factors=70)
     axes, bearings = random_directions(200, 0), random_directions(30, 1)
     seen = 1 / (1 + np.exp(-15 * (visibility.axes @ bearings.T - np.cos(QUARTER))))
-    process = GaussianProcessRegressor(RBF(0.45, "fixed"), alpha=visibility.jitter, optimizer=None)
+    process = GaussianProcessRegressor(RBF(0.45, "fixed"), alpha=JITTER, optimizer=None)
     expected = process.fit(visibility.axes, seen).predict(axes)
     np.testing.assert_allclose(values(visibility, axes, bearings), expected, atol=1e-9)
 

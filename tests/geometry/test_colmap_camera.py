@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.geometry.colmap_camera import ColmapCamera
+from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.utils.errors import ConfigError, MapError
 
 

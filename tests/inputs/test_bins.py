@@ -9,8 +9,7 @@ import pytest
 
 from conftest import RandomViews
 from synthetic_dataset import make_landmarks
-from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.geometry.colmap_camera import ColmapCamera
+from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import transform
 from wheretolook.inputs.bins import arrange, bin_views, bin_views_plain, count_bins
 from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS, LANDMARK_CHANNELS, PAPER_VARIANTS
@@ -18,7 +17,7 @@ from wheretolook.inputs.landmarks_in_view import ATTRIBUTES, LandmarkDescriber
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.utils.errors import ConfigError
-from wheretolook.visibility.frustum import LandmarkSets, landmarks_in_view
+from wheretolook.visibility.frustum import LandmarkSets, PosedViews, landmarks_in_view
 
 LOOKING_ALONG_Z = np.eye(3, 4)[None]
 
@@ -39,7 +38,7 @@ def test_bins_counted_by_hand(bin_function) -> None:  # type: ignore[no-untyped-
         [1.01, 0.0, 1.0],  # pixel (60.3, 15): outside
         [0.0, 0.0, -1.0],  # behind
     ]
-    binned = bin_function(camera, LOOKING_ALONG_Z, np.array(points), hand_counted(points), np.zeros(1, int))
+    binned = bin_function(PosedViews(camera, LOOKING_ALONG_Z, np.array(points), hand_counted(points), np.zeros(1, int)))
     assert {tuple(cell): int(binned.counts[0][tuple(cell)]) for cell in np.argwhere(binned.counts[0])} == {
         (0, 0): 1, (15, 15): 2, (29, 29): 1,
     }  # fmt: skip
@@ -51,8 +50,8 @@ def test_bins_counted_by_hand(bin_function) -> None:  # type: ignore[no-untyped-
 
 def test_kernel_bins_as_its_plain_twin(random_views: RandomViews, device: str) -> None:
     v = random_views
-    arguments = v.camera, v.cam_from_world, v.points, v.visible, v.location_rows
-    kernel, plain = bin_views(*arguments, bins=12, device=device), bin_views_plain(*arguments, bins=12)
+    arguments = PosedViews(v.camera, v.cam_from_world, v.points, v.visible, v.location_rows)
+    kernel, plain = bin_views(arguments, bins=12, device=device), bin_views_plain(arguments, bins=12)
     np.testing.assert_array_equal(kernel.counts, plain.counts)
     np.testing.assert_allclose(kernel.means, plain.means, rtol=1e-5, atol=2e-5)
     assert plain.counts.sum() > 500
@@ -60,21 +59,23 @@ def test_kernel_bins_as_its_plain_twin(random_views: RandomViews, device: str) -
 
 def test_counted_bins_are_those_that_the_plain_twin_fills(random_views: RandomViews, device: str) -> None:
     v = random_views
-    arguments = v.camera, v.cam_from_world, v.points, v.visible, v.location_rows
-    plain = bin_views_plain(*arguments, bins=12)
+    arguments = PosedViews(v.camera, v.cam_from_world, v.points, v.visible, v.location_rows)
+    plain = bin_views_plain(arguments, bins=12)
     for block_bytes in (1 << 30, 3 * 12 * 12 * 4):  # all at once, and three views at a time
-        n_visible, n_filled = count_bins(*arguments, bins=12, device=device, block_bytes=block_bytes)
+        n_visible, n_filled = count_bins(arguments, bins=12, device=device, block_bytes=block_bytes)
         np.testing.assert_array_equal(n_visible, plain.n_visible)
         np.testing.assert_array_equal(n_filled, plain.n_filled)
     distorted = ColmapCamera("RADIAL", 320, 240, (150.0, 165.0, 118.0, -0.15, 0.02))
-    binned = bin_views(distorted, *arguments[1:], bins=6)
-    np.testing.assert_array_equal(count_bins(distorted, *arguments[1:], bins=6), (binned.n_visible, binned.n_filled))
+    binned = bin_views(PosedViews(distorted, *arguments[1:]), bins=6)
+    np.testing.assert_array_equal(
+        count_bins(PosedViews(distorted, *arguments[1:]), bins=6), (binned.n_visible, binned.n_filled)
+    )
 
 
 def test_a_distorted_camera_bins_what_it_projects(random_views: RandomViews) -> None:
     v = random_views
     camera = ColmapCamera("RADIAL", 320, 240, (150.0, 165.0, 118.0, -0.15, 0.02))
-    binned = bin_views(camera, v.cam_from_world, v.points, v.visible, v.location_rows, bins=6)
+    binned = bin_views(PosedViews(camera, v.cam_from_world, v.points, v.visible, v.location_rows), bins=6)
     for view, pose in enumerate(v.cam_from_world):
         seen = transform(pose, v.points[v.visible[v.location_rows[view]]])
         pixels = camera.project(seen)[camera.sees(seen)]
@@ -88,13 +89,13 @@ def landmarks_of(views: RandomViews) -> Landmarks:
 
 def test_kernel_bins_what_landmarks_are_like_as_its_plain_twin(random_views: RandomViews, device: str) -> None:
     v, landmarks = random_views, landmarks_of(random_views)
-    arguments = v.camera, v.cam_from_world, v.points, v.visible, v.location_rows
-    kernel = bin_views(*arguments, bins=12, device=device, landmarks=landmarks)
-    plain = bin_views_plain(*arguments, bins=12, landmarks=landmarks)
+    arguments = PosedViews(v.camera, v.cam_from_world, v.points, v.visible, v.location_rows)
+    kernel = bin_views(arguments, bins=12, device=device, landmarks=landmarks)
+    plain = bin_views_plain(arguments, bins=12, landmarks=landmarks)
     assert kernel.channels == plain.channels == ALL_CHANNELS
     np.testing.assert_array_equal(kernel.counts, plain.counts)
     np.testing.assert_allclose(kernel.means, plain.means, rtol=1e-5, atol=2e-5)
-    without = bin_views(*arguments, bins=12, device=device)
+    without = bin_views(arguments, bins=12, device=device)
     assert without.channels == CHANNELS
     np.testing.assert_array_equal(kernel.means[:, : len(CHANNELS)], without.means)  # who does not ask pays nothing
     assert plain.means[:, len(CHANNELS) :].std((0, 2, 3)).min() > 0.01
@@ -105,8 +106,8 @@ def test_channels_of_landmarks_are_means_of_their_attributes(random_views: Rando
     v, landmarks = random_views, landmarks_of(random_views)
     camera = ColmapCamera("RADIAL", 320, 240, (150.0, 165.0, 118.0, -0.15, 0.02)) if distorted else v.camera
     arguments = v.cam_from_world, v.points, v.visible, v.location_rows
-    binned = bin_views(camera, *arguments, bins=1, landmarks=landmarks)
-    seen = landmarks_in_view(camera, *arguments)
+    binned = bin_views(PosedViews(camera, *arguments), bins=1, landmarks=landmarks)
+    seen = landmarks_in_view(PosedViews(camera, *arguments))
     described = LandmarkDescriber(LocalizationMap(landmarks, camera)).describe(v.cam_from_world, seen)
     of_bins = [ATTRIBUTES.index(name) for name in LANDMARK_CHANNELS]
     for view in range(len(v.cam_from_world)):
@@ -119,9 +120,9 @@ def test_a_mean_with_an_unknown_value_is_unknown_and_nothing_else_is(random_view
     v, landmarks = random_views, landmarks_of(random_views)
     known = np.random.default_rng(1).random(len(landmarks)) < 0.9
     landmarks = replace(landmarks, ambiguity=np.where(known, landmarks.ambiguity, np.nan).astype(np.float32))
-    arguments = v.camera, v.cam_from_world, v.points, v.visible, v.location_rows
-    kernel = bin_views(*arguments, bins=12, device=device, landmarks=landmarks)
-    plain = bin_views_plain(*arguments, bins=12, landmarks=landmarks)
+    arguments = PosedViews(v.camera, v.cam_from_world, v.points, v.visible, v.location_rows)
+    kernel = bin_views(arguments, bins=12, device=device, landmarks=landmarks)
+    plain = bin_views_plain(arguments, bins=12, landmarks=landmarks)
     np.testing.assert_array_equal(np.isnan(kernel.means), np.isnan(plain.means))
     unknown = np.isnan(kernel.means).sum((0, 2, 3))
     assert 0 < unknown[ALL_CHANNELS.index("ambiguity")] < (kernel.counts > 0).sum()
@@ -130,15 +131,15 @@ def test_a_mean_with_an_unknown_value_is_unknown_and_nothing_else_is(random_view
 
 def test_blocks_do_not_change_the_bins(random_views: RandomViews) -> None:
     v = random_views
-    arguments = v.camera, v.cam_from_world, v.points, v.visible, v.location_rows
-    whole, blocks = bin_views(*arguments, bins=6), bin_views(*arguments, bins=6, block_bytes=7 * 36 * 24)
+    arguments = PosedViews(v.camera, v.cam_from_world, v.points, v.visible, v.location_rows)
+    whole, blocks = bin_views(arguments, bins=6), bin_views(arguments, bins=6, block_bytes=7 * 36 * 24)
     np.testing.assert_array_equal(whole.means, blocks.means)
     np.testing.assert_array_equal(whole.counts, blocks.counts)
 
 
 def test_input_sizes_are_those_of_the_variants(random_views: RandomViews) -> None:
     v = random_views
-    binned = bin_views(v.camera, v.cam_from_world, v.points, v.visible, v.location_rows)
+    binned = bin_views(PosedViews(v.camera, v.cam_from_world, v.points, v.visible, v.location_rows))
     sizes = {name: binned.select(channels).means[0].size for name, channels in PAPER_VARIANTS.items()}
     assert sizes == {"2d": 1800, "2d+z": 2700, "2d+3d": 4500}
     assert len(ALL_CHANNELS) * 900 == 12600

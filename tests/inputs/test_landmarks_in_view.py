@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from synthetic_dataset import CAMERA, make_landmarks
-from wheretolook.geometry.colmap_camera import ColmapCamera
+from wheretolook.geometry.camera import ColmapCamera
 from wheretolook.geometry.poses import Float, poses_looking_along, transform
 from wheretolook.inputs.channels import ATTRIBUTES, POSE_ATTRIBUTES
 from wheretolook.inputs.landmarks_in_view import POOLED, LandmarkDescriber, pool

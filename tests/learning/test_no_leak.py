@@ -87,5 +87,5 @@ def test_what_is_known_of_a_landmark_comes_from_map_and_pose() -> None:
     assert {name.rsplit("_", 1)[0] for name in POOLED[5:]} == set(ATTRIBUTES)
     # a describer is built of a map, and asked about poses and what is visible: there is no way in for anything else
     assert list(inspect.signature(LandmarkDescriber).parameters) == ["localization_map", "attributes"]
-    assert list(inspect.signature(LandmarkDescriber.describe).parameters) == ["self", "cam_from_world", "visible"]
+    assert list(inspect.signature(LandmarkDescriber.describe).parameters) == ["self", "cam_from_world", "in_view"]
     assert list(inspect.signature(Landmarks.attributes).parameters) == ["self"]

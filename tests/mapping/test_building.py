@@ -15,7 +15,7 @@ from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.mapping import triangulation
 from wheretolook.mapping.building import build_map
-from wheretolook.mapping.cameras import load_mapping_poses
+from wheretolook.mapping.colmap_model import load_mapping_poses
 from wheretolook.mapping.config import MapConfig, WalkConfig
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
 from wheretolook.mapping.walk import plan_walk

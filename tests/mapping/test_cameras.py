@@ -12,7 +12,7 @@ from synthetic_dataset import CAMERA, make_mapping_poses, make_scene
 from wheretolook.dataset.folders import Dataset, SceneFolder
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.mapping.cameras import load_mapping_poses, save_mapping_poses
+from wheretolook.mapping.colmap_model import load_mapping_poses, save_mapping_poses
 from wheretolook.utils.errors import MapError
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import poses_looking_along
-from wheretolook.mapping.pairs import DEPTH_STRIDE, choose_pairs, shrink_depth, surface_overlap
+from wheretolook.mapping.triangulation import DEPTH_STRIDE, choose_pairs, shrink_depth, surface_overlap
 
 CAMERA = PinholeCamera(320, 240, 160.0)
 

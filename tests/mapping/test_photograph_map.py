@@ -16,15 +16,14 @@ from mapping.marker_rooms import CAMERA, MARKERS, hand_held_poses, marker_room, 
 from wheretolook import stages
 from wheretolook.cli import main
 from wheretolook.config import Experiment, ScenesConfig
-from wheretolook.dataset.folders import Dataset
+from wheretolook.dataset.folders import Dataset, SceneFolder
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.mapping import incremental
-from wheretolook.mapping.cameras import colmap_poses
-from wheretolook.mapping.config import MapConfig
+from wheretolook.mapping.colmap_model import colmap_poses
+from wheretolook.mapping.config import KnownDistance, MapConfig, PhotographsConfig, ScaleConfig
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.mapping.photograph_config import KnownDistance, PhotographsConfig, ScaleConfig
 from wheretolook.mapping.photograph_map import map_photographs
-from wheretolook.mapping.similarity import fit_similarity
+from wheretolook.mapping.scale import fit_similarity
 from wheretolook.methods.visible import VisibleScorer
 from wheretolook.planning.config import ViewpointMapConfig
 from wheretolook.space.config import MappedSpaceConfig
@@ -232,7 +231,7 @@ def test_photographs_do_not_join_scenes_with_meshes(photographs: Path, tmp_path:
     scene = tmp_path / "mixed" / "apartment-000"
     scene.mkdir(parents=True)
     (scene / "mesh.glb").write_bytes(b"")
-    Dataset(tmp_path / "mixed", experiment.camera, (stages.SceneFolder(scene, "train"),)).save()
+    Dataset(tmp_path / "mixed", experiment.camera, (SceneFolder(scene, "train"),)).save()
     with pytest.raises(ConfigError, match="dataset of their own: --name"):
         stages.make_maps(experiment)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from wheretolook.mapping.photograph_config import PhotographsConfig
+from wheretolook.mapping.config import PhotographsConfig
 from wheretolook.mapping.photographs import (
     list_photographs,
     photograph_cameras,

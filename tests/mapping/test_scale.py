@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from wheretolook.mapping.config import KnownDistance, ScaleConfig
 from wheretolook.mapping.markers import Marker
-from wheretolook.mapping.photograph_config import KnownDistance, ScaleConfig
 from wheretolook.mapping.scale import (
     MapScale,
+    fit_similarity,
     read_marker_table,
     read_positions,
     scale_from_distance,
     scale_from_markers,
     scale_from_positions,
 )
-from wheretolook.mapping.similarity import fit_similarity
 from wheretolook.utils.errors import ConfigError, MapError
 
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=np.float64)

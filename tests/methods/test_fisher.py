@@ -21,7 +21,7 @@ from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.methods.fisher import APPROXIMATIONS, Approximation
 from wheretolook.methods.fisher.score import FisherScorer, PoseInformation, StationaryTraceScorer, WorstTraceScorer
 from wheretolook.methods.registry import make_scorer, scorers
-from wheretolook.visibility.frustum import LandmarkSets
+from wheretolook.visibility.frustum import LandmarkSets, PosedViews
 from wheretolook.visibility.occlusion import StoredOcclusion
 
 CAMERA = PinholeCamera()
@@ -88,7 +88,7 @@ def test_exact_scores_are_numpys_of_the_sums(about_origin: bool) -> None:
     mask = rng.random((4, 400)) < 0.6
     poses = views_around(locations, fibonacci_sphere(25))
     rows = np.repeat(np.arange(4), 25)
-    numbers = exact_information_plain(CAMERA, poses, landmarks.points, LandmarkSets.from_mask(mask), rows)
+    numbers = exact_information_plain(PosedViews(CAMERA, poses, landmarks.points, LandmarkSets.from_mask(mask), rows))
     matrices = information_matrices(numbers, -camera_centers(poses) if about_origin else None)
     determinant = np.linalg.det(matrices)
     expected = {

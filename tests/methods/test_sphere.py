@@ -139,7 +139,7 @@ def test_batches_hold_whole_locations_and_every_view_once(tmp_path: Path, world_
     dataset = make_dataset(tmp_path / "tiny", ("train", "train"), n_locations=5, n_directions=7)
     table = dataset.scenes[0].read_table()
     write_table(table.sample(frac=1.0, random_state=0), dataset.scenes[0].table)  # views of a location lie apart
-    views = load_sphere_views(dataset, dataset.scenes, SMALL, progress=False)
+    views = load_sphere_views(dataset, dataset.scenes, SMALL, FEW, progress=False)
     assert len(views.tokens) == 10 and views.padding.shape == views.tokens.shape[:2]
     chosen = np.flatnonzero(views.location != 2)
     loaders = [LocationLoader(views, chosen, 20, 4, rank, world_size) for rank in range(world_size)]

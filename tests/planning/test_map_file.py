@@ -16,7 +16,7 @@ from planning.rooms import GRID, build, joined, room_landmarks, room_map
 from wheretolook.methods.registry import make_scorer
 from wheretolook.planning.map_building import update_viewpoint_map
 from wheretolook.planning.map_file import ARRAYS, DESCRIPTION, LAYOUT
-from wheretolook.planning.path_comparison import shares_below
+from wheretolook.planning.scene_map import shares_below
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.utils.errors import MapFormatError
 

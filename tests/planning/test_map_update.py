@@ -15,7 +15,7 @@ from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.methods.registry import make_scorer, scorers
 from wheretolook.planning.map_building import build_viewpoint_map, update_viewpoint_map
-from wheretolook.planning.path_comparison import shares_below
+from wheretolook.planning.scene_map import shares_below
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.utils.errors import ConfigError
 from wheretolook.visibility.hidden_points import HiddenPointRemoval

@@ -13,9 +13,9 @@ from planning.rooms import build, room_landmarks
 from wheretolook.figures.paths import paths_figure
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.planning.config import PathConfig, PathsConfig
-from wheretolook.planning.path_comparison import ComparedPaths, draw_pairs, plan_pairs, shares_below
+from wheretolook.planning.path_comparison import ComparedPaths, Ways, draw_pairs, plan_pairs
 from wheretolook.planning.path_report import summarize_paths
-from wheretolook.planning.ways import Ways
+from wheretolook.planning.scene_map import shares_below
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.viewpoints.table import poses

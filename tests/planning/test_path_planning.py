@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 from wheretolook.geometry.lattices import VoxelGrid, axes_of_angles, fibonacci_sphere
 from wheretolook.geometry.poses import rotation_looking_along
 from wheretolook.planning.config import PathConfig
-from wheretolook.planning.path_improvement import improve
-from wheretolook.planning.path_planning import plan_path
+from wheretolook.planning.path_planning import improve, plan_path
 from wheretolook.planning.route_views import turned_evenly
 from wheretolook.planning.turns import pan_tilt_angles, pan_tilt_turns_deg
 from wheretolook.planning.turns import turns_deg as turns_deg_of_cameras
@@ -60,7 +59,7 @@ def looking_north() -> ViewpointMap:
         n_visible=np.ones_like(scores, dtype=np.uint32),
         landmark_ids=np.zeros(0, np.int64),
         landmark_digests=np.zeros((0, 2), np.uint64),
-        origin=MapOrigin("made", "", "fibonacci", {}, "none", "0" * 16),
+        origin=MapOrigin("made", "fibonacci", {}, "none", "0" * 16),
     )
 
 

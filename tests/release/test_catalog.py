@@ -148,7 +148,7 @@ def test_marks_of_several_viewpoints_are_the_tables() -> None:
         lines = {line.get_label(): line.get_ydata() for line in panel.lines}
         for method in ("random", "bins", "fisher-trace-exact", "mlp-2d"):
             rows = pooled[pooled["method"] == method]
-            assert lines[method_style(*method).label] == pytest.approx(100 * rows[column])
+            assert lines[method_style(method).label] == pytest.approx(100 * rows[column])
     printed = {line.get_marker(): line.get_ydata()[0] for line in panels[0].lines if len(line.get_ydata()) == 1}
     assert printed == {"D": 72.9, "s": 54.7}
     low, high = panels[0].get_ylim()

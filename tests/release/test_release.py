@@ -44,7 +44,7 @@ pytestmark = pytest.mark.usefixtures("no_pictures")
 
 TRAIN = train_config("mlp-2d", "mlp-2d+z", epochs=3, hidden=(16,), accelerator="cpu")
 EVALUATE = EvaluateConfig(("random", "visible", "bins", "fisher-trace-exact", "mlp"), resamples=100, top_n=(1, 5))
-CONFIGS = Path(__file__).parents[1] / "configs"
+CONFIGS = Path(__file__).parents[2] / "configs"
 VERSIONS = {"numpy": "2.9.9", "pycolmap": "4.1.0"}
 
 

@@ -23,7 +23,7 @@ from wheretolook.utils.errors import MissingRunError
 from wheretolook.utils.tracking import client, experiment_ids, finished_runs, newest_artifact, newest_run
 from wheretolook.utils.tracking_config import TrackingConfig
 
-PAGE = Path(__file__).parents[1] / "mlruns" / "README.md"
+PAGE = Path(__file__).parents[2] / "mlruns" / "README.md"
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
 from wheretolook.inputs.bins import InputStatistics
 from wheretolook.learning.trained_network import TrainedNetwork
-from wheretolook.mapping.cameras import save_mapping_poses
+from wheretolook.mapping.colmap_model import save_mapping_poses
 from wheretolook.methods.base import Scorer
 from wheretolook.methods.binned_network import BinnedNetworkScorer
 from wheretolook.methods.mlp.network import NetworkSpec, ViewpointNetwork
@@ -38,7 +38,6 @@ from wheretolook.space.config import FreeSpaceConfig
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.viewpoints.config import SampleConfig
-from wheretolook.viewpoints.locations import shares_good
 from wheretolook.viewpoints.sampling import free_locations, sample_viewpoints
 from wheretolook.viewpoints.table import (
     LOCALIZED,
@@ -47,6 +46,7 @@ from wheretolook.viewpoints.table import (
     outcome_in_brief,
     outcome_in_words,
     poses,
+    shares_good,
     write_table,
 )
 from wheretolook.visibility.config import OcclusionConfig

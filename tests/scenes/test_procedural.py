@@ -15,11 +15,10 @@ from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.scenes.config import ApartmentConfig
 from wheretolook.scenes.procedural import atlas, decor, fixtures, furniture
 from wheretolook.scenes.procedural import patches as patches_module
+from wheretolook.scenes.procedural.atlas import repeat_patterns
 from wheretolook.scenes.procedural.generator import furnish_apartment, generate_apartment
-from wheretolook.scenes.procedural.materials import plain
-from wheretolook.scenes.procedural.noise import NoiseBank
+from wheretolook.scenes.procedural.materials import NoiseBank, plain
 from wheretolook.scenes.procedural.plan import Plan, draw_plan
-from wheretolook.scenes.procedural.repetition import repeat_patterns
 from wheretolook.scenes.procedural.style import Style
 from wheretolook.utils.errors import ConfigError, SceneError
 

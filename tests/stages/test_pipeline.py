@@ -16,12 +16,12 @@ import pandas as pd
 import pycolmap
 import pytest
 
+from mask_agreement import MaskAgreement
 from wheretolook import stages
 from wheretolook.cli import main, parse_experiment
 from wheretolook.dataset.folders import Dataset
 from wheretolook.evaluation.config import EvaluateConfig
-from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.geometry.colmap_camera import ColmapCamera
+from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.inputs.channels import CHANNELS
 from wheretolook.inputs.localization_map import LocalizationMap
@@ -39,7 +39,6 @@ from wheretolook.utils.files import fingerprint
 from wheretolook.utils.tracking import artifact, client, newest_run
 from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import is_good, poses, read_table, write_table
-from wheretolook.visibility.agreement import MaskAgreement
 from wheretolook.visibility.hidden_points import HiddenPointRemoval
 from wheretolook.visibility.occlusion import StoredOcclusion
 

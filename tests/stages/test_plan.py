@@ -123,6 +123,6 @@ def test_a_scene_without_mesh_or_map_says_what_to_run(dataset: Path, capsys: pyt
 def test_help_teaches_and_short_flags_are_its_own(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["viewpoint-map", "--help"]) == 0
     text = capsys.readouterr().out
-    assert "--viewpoint_map.weights" in text and "ViewpointMap.load" in text and "--label.shard_size" not in text
+    assert "  --weights " in text and "ViewpointMap.load" in text and "--label.shard_size" not in text
     assert main(["evaluate", "--scene", "a"]) == 2
     assert "--scene" in capsys.readouterr().err

@@ -8,16 +8,14 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from conftest import RandomViews
-from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.geometry.colmap_camera import Camera, ColmapCamera
+from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import Float, rotation_looking_along, transform
 from wheretolook.utils.errors import ConfigError
 from wheretolook.visibility import counting
 from wheretolook.visibility.counting import FrustumCounter, count_plain
-from wheretolook.visibility.device_points import DevicePoints
-from wheretolook.visibility.field_of_view import FieldOfView
-from wheretolook.visibility.octahedral_map import cell_centers, cells_of, octahedral_directions
+from wheretolook.visibility.field_of_view import cell_centers, cells_of, octahedral_directions, tabulate
+from wheretolook.visibility.occlusion import DevicePoints
 
 DISTORTED = ColmapCamera("OPENCV", 640, 480, (300.0, 310.0, 330.0, 235.0, -0.2, 0.05, 1e-3, -1e-3))
 FISHEYE = ColmapCamera("OPENCV_FISHEYE", 640, 480, (200.0, 200.0, 320.0, 240.0, 0.01, 0.0, 0.0, 0.0))
@@ -142,7 +140,7 @@ def test_cells_cover_the_sphere_once() -> None:
 
 @pytest.mark.parametrize("camera", [DISTORTED, FISHEYE, PANORAMA])
 def test_the_table_of_a_field_of_view_is_never_wrong(camera: ColmapCamera) -> None:
-    table = FieldOfView.of(camera)
+    table = tabulate(camera)
     rng = np.random.default_rng(0)
     u, v = rng.uniform(-1, 1, (2, 300_000))
     directions = octahedral_directions(u, v)

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from conftest import RandomViews
-from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.geometry.colmap_camera import ColmapCamera
+from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import rotation_looking_along, transform
 from wheretolook.utils.errors import ConfigError
 from wheretolook.visibility.frustum import (
     MIN_DEPTH_M,
     LandmarkSets,
+    PosedViews,
     _starts,
     in_view,
     landmarks_in_view,
@@ -63,7 +63,7 @@ def test_behind_on_the_border_at_zero_depth_not_a_number(
     with np.errstate(over="ignore"):
         assert in_view(CAMERA, IDENTITY, points.astype(np.float32)).tolist() == [[seen]]
     everything = LandmarkSets.from_mask(np.ones((1, 1), bool))
-    found = landmarks_in_view(CAMERA, np.eye(3, 4)[None], points, everything, np.zeros(1, int), device)
+    found = landmarks_in_view(PosedViews(CAMERA, np.eye(3, 4)[None], points, everything, np.zeros(1, int)), device)
     assert found.indices.tolist() == ([0] if seen else [])
     assert count_everything(CAMERA, IDENTITY, np.zeros((1, 3)), points, device).tolist() == [[int(seen)]]
 
@@ -71,7 +71,7 @@ def test_behind_on_the_border_at_zero_depth_not_a_number(
 @pytest.fixture
 def count_everything():  # type: ignore[no-untyped-def]
     from wheretolook.visibility.counting import FrustumCounter
-    from wheretolook.visibility.device_points import DevicePoints
+    from wheretolook.visibility.occlusion import DevicePoints
 
     def count(camera, rotations, locations, points, device):  # type: ignore[no-untyped-def]
         on_device = DevicePoints(points, device)
@@ -97,8 +97,8 @@ def test_the_test_is_the_projection(random_views: RandomViews) -> None:
 
 def test_collected_landmarks_are_those_of_the_plain_twin(random_views: RandomViews, device: str) -> None:
     v = random_views
-    arguments = v.camera, v.cam_from_world, v.points, v.visible, v.location_rows
-    kernel, plain = landmarks_in_view(*arguments, device=device), landmarks_in_view_plain(*arguments)
+    arguments = PosedViews(v.camera, v.cam_from_world, v.points, v.visible, v.location_rows)
+    kernel, plain = landmarks_in_view(arguments, device=device), landmarks_in_view_plain(arguments)
     np.testing.assert_array_equal(kernel.starts, plain.starts)
     np.testing.assert_array_equal(kernel.indices, plain.indices)
     assert len(plain.indices) > 500 and len(plain) == len(v.cam_from_world)
@@ -109,7 +109,7 @@ def test_collected_landmarks_are_those_of_the_plain_twin(random_views: RandomVie
 def test_a_distorted_camera_collects_what_it_projects_into_its_image(random_views: RandomViews) -> None:
     v = random_views
     camera = ColmapCamera("OPENCV", 640, 480, (300.0, 300.0, 330.0, 235.0, -0.2, 0.05, 1e-3, -1e-3))
-    found = landmarks_in_view(camera, v.cam_from_world, v.points, v.visible, v.location_rows)
+    found = landmarks_in_view(PosedViews(camera, v.cam_from_world, v.points, v.visible, v.location_rows))
     for view, pose in enumerate(v.cam_from_world):
         candidates = v.visible[v.location_rows[view]]
         inside = camera.sees(transform(pose, v.points[candidates]))

@@ -9,10 +9,10 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from box_scenes import ROOM, furnished_room
+from mask_agreement import MaskAgreement
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.utils.errors import ConfigError, MapError, SceneError
-from wheretolook.visibility.agreement import MaskAgreement
 from wheretolook.visibility.hidden_points import HiddenPointRemoval, hull_length
 from wheretolook.visibility.occlusion import MeshOcclusion
 

@@ -7,17 +7,15 @@ import pytest
 
 from box_scenes import box_quads, quads_mesh, random_texture
 from conftest import RandomViews
-from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.geometry.colmap_camera import ColmapCamera
+from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float, rotation_looking_along
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.utils.errors import ConfigError, MapError, SceneError
 from wheretolook.visibility.counting import FrustumCounter, count_plain
-from wheretolook.visibility.device_points import DevicePoints
 from wheretolook.visibility.hidden_points import HiddenPointRemoval
-from wheretolook.visibility.occlusion import MeshOcclusion, NoOcclusion, OcclusionModel
+from wheretolook.visibility.occlusion import DevicePoints, MeshOcclusion, NoOcclusion, OcclusionModel
 from wheretolook.visibility.survey import survey
 
 
@@ -109,14 +107,11 @@ def test_blocks_keep_to_the_memory_allowed(
         )
 
 
-def test_a_counter_and_points_on_the_device_can_be_used_again(random_views: RandomViews, device: str) -> None:
+def test_points_on_the_device_can_be_used_again(random_views: RandomViews, device: str) -> None:
     v = random_views
     rotations, points = rotation_looking_along(v.directions), DevicePoints(v.points, device)
-    counter = FrustumCounter(v.camera, rotations, len(points), device, distinct_pixels=True)
     for rows in (slice(0, 3), slice(3, 5)):
-        seen = survey(
-            v.camera, rotations, v.locations[rows], points, NoOcclusion(), distinct_pixels=True, counter=counter
-        )
+        seen = survey(v.camera, rotations, v.locations[rows], points, NoOcclusion(), distinct_pixels=True)
         everything = np.ones((len(v.locations[rows]), len(points)), bool)
         plain = count_plain(v.camera, rotations, v.locations[rows], v.points, everything, distinct_pixels=True)
         np.testing.assert_array_equal(seen.counts, plain)
@@ -148,9 +143,6 @@ def test_bad_input_is_refused_before_any_work(random_views: RandomViews) -> None
         survey(v.camera, rotations, v.locations, v.points, Untouchable(), memory_bytes=1000)
     with pytest.raises(ConfigError, match="must not be negative"):
         survey(v.camera, rotations, v.locations, v.points, Untouchable(), keep=-1)
-    another = FrustumCounter(PinholeCamera(), rotations, len(v.points))
-    with pytest.raises(ConfigError, match="counter is of another camera"):
-        survey(v.camera, rotations, v.locations, v.points, Untouchable(), counter=another)
     on_a_landmark = np.concatenate([v.locations, v.points[:1]])
     with pytest.raises(SceneError, match="a landmark lies at the location"):
         HiddenPointRemoval().check(on_a_landmark, v.points)

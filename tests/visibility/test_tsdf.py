@@ -7,14 +7,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from box_scenes import box_quads, quads_mesh, random_texture
-from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.geometry.colmap_camera import ColmapCamera
+from mask_agreement import MaskAgreement
+from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.rendering.types import camera_rays
 from wheretolook.utils.errors import ConfigError, SceneError
-from wheretolook.visibility.agreement import MaskAgreement
 from wheretolook.visibility.occlusion import MeshOcclusion
 from wheretolook.visibility.tsdf import DepthImage, TsdfConfig, TsdfOcclusion, TsdfVolume, estimate_blocks
 

@@ -13,7 +13,7 @@ import pandas as pd
 
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import Float
-from wheretolook.mapping.cameras import CAMERAS_FILE, colmap_poses, holds_model, load_mapping_poses
+from wheretolook.mapping.colmap_model import CAMERAS_FILE, colmap_poses, holds_model, load_mapping_poses
 from wheretolook.mapping.scale import read_scale
 from wheretolook.utils.errors import ConfigError, TableError
 from wheretolook.utils.files import fingerprint, write_json

@@ -232,7 +232,7 @@ class Scene:
     def _fused(self) -> tuple[TsdfVolume, RenderedDepth]:
         """The volume that depth images fuse to, and these, rendered where the map's images were taken."""
         from wheretolook.dataset.rendered_depth import RenderedDepth
-        from wheretolook.mapping.cameras import colmap_poses
+        from wheretolook.mapping.colmap_model import colmap_poses
         from wheretolook.visibility.tsdf import TsdfConfig, TsdfVolume
 
         config = self.config.occlusion

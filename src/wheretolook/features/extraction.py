@@ -15,6 +15,8 @@ from wheretolook.features.keypoints import ExtractorConfig, Keypoints, unit_desc
 from wheretolook.utils.colmap import quiet_colmap
 from wheretolook.utils.processes import Processes
 
+_GPU_BATCH = 8
+
 
 class KeypointExtractor:
     """Extracts SIFT keypoints, on a CPU core or a GPU (COLMAP's on the CPU only: on a GPU it is not repeatable)."""
@@ -30,10 +32,9 @@ class KeypointExtractor:
             self._extractor = _colmap_sift(self.config) if self.config.method == "colmap" else _opencv_sift(self.config)
 
     def extract(self, rgb: NDArray[np.uint8]) -> Keypoints:
-        """At most `max_keypoints` keypoints of one image (H, W, 3) uint8, in an order that depends on the image alone.
+        """At most `max_keypoints` keypoints of an image (H, W, 3) uint8, in an order that depends on the image alone.
 
-        Raises:
-            ValueError: the image has another shape or type.
+        Raises ValueError if it has another shape or type.
         """
         return self.extract_batch([rgb])[0]
 
@@ -41,8 +42,7 @@ class KeypointExtractor:
         """Extract keypoints of images (H, W, 3) uint8 of one size, on a GPU all at once. See `extract`."""
         grey = [_grey(rgb) for rgb in images]
         if self.on_gpu:
-            found: list[Keypoints] = self._extractor.extract_many(np.stack([bitmap.to_array() for bitmap in grey]))
-            return found
+            return list(self._extractor.extract_many(np.stack([bitmap.to_array() for bitmap in grey])))
         if self.config.method == "colmap":
             return [self._extract_colmap(bitmap) for bitmap in grey]
         return [self._extract_opencv(bitmap.to_array()) for bitmap in grey]
@@ -90,9 +90,6 @@ class KeypointExtractor:
         return Keypoints(table[keep, :2] + np.float32(0.5), unit_descriptors(descriptors), table[keep, 2])
 
 
-_GPU_BATCH = 8
-
-
 def _grey(rgb: NDArray[np.uint8]) -> Any:
     """Convert to grey as COLMAP does (Rec. 709 weights); with other weights other keypoints pass the thresholds."""
     import pycolmap
@@ -118,10 +115,9 @@ def _colmap_sift(config: ExtractorConfig) -> Any:
 def _opencv_sift(config: ExtractorConfig) -> Any:
     import cv2
 
-    layers = 3
-    # OpenCV divides its contrast threshold by the number of layers; without the precise upscale, keypoints are biased.
-    contrast = layers * config.peak_threshold
-    return cv2.SIFT.create(0, layers, contrast, config.edge_threshold, 1.6, enable_precise_upscale=True)
+    # OpenCV divides its contrast threshold by the number of layers. Without the precise upscale, keypoints are biased.
+    contrast = 3 * config.peak_threshold
+    return cv2.SIFT.create(0, 3, contrast, config.edge_threshold, 1.6, enable_precise_upscale=True)
 
 
 _extractor_of = lru_cache(maxsize=1)(KeypointExtractor)

@@ -52,8 +52,7 @@ class Keypoints:
 
     pixels: NDArray[np.float32]  # (N, 2) (x, y) in pixels; (0.5, 0.5) is the centre of the top-left pixel
     descriptors: NDArray[np.float32]  # (N, 128) RootSIFT (Arandjelovic and Zisserman, CVPR 2012) of unit length
-    # (N,) float32, standard deviation in pixels of the Gaussian at which the keypoint was found.
-    scales_px: NDArray[np.float32]
+    scales_px: NDArray[np.float32]  # (N,) standard deviation of the Gaussian at which the keypoint was found
 
     def __len__(self) -> int:
         return len(self.pixels)

@@ -13,24 +13,17 @@ from torch import Tensor
 Matches = tuple[NDArray[np.int64], NDArray[np.int64]]
 """Rows of keypoints and rows of their landmarks, (M,) each, in ascending order of the keypoints."""
 
-GROUP = 32
-"""Landmarks per group. The two best groups are found first, and in them the two best landmarks."""
-
-_PRODUCT_BYTES = {"cpu": 2**22, "cuda": 2**30}
-"""Size of a block of products; on a CPU it should fit into the cache."""
+GROUP = 32  # landmarks; the two best groups are found first, and in them the two best landmarks
+_PRODUCT_BYTES = {"cpu": 2**22, "cuda": 2**30}  # of a block of products; on a CPU it should fit into the cache
 
 
 class DescriptorMatcher:
-    """Finds nearest neighbours among the landmarks' descriptors.
+    """Finds nearest neighbours among the landmarks' descriptors (N, 128) uint8, on "cpu" or a CUDA device.
 
     Descriptors are compared as COLMAP stores them, in whole numbers, by their scalar products. These are then exact, in
     eight-bit integers on a CPU as in half precision with single-precision sums on a GPU: both give the same neighbours,
     and those of one descriptor do not depend on what it is matched together with. `nearest_two_plain` is the twin. A
     CPU whose byte products saturate or are slow works in single precision, where 128 * 255^2 < 2^24 is exact, too.
-
-    Args:
-        descriptors: (N, 128) uint8, of the landmarks.
-        device: "cpu" or a CUDA device.
     """
 
     def __init__(self, descriptors: NDArray[np.uint8], device: str = "cpu") -> None:
@@ -53,11 +46,9 @@ class DescriptorMatcher:
     def nearest_two(
         self, descriptors: NDArray[np.uint8]
     ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-        """Nearest landmark of each descriptor (K, 128) uint8, and its products with the nearest and second nearest.
+        """Row of each descriptor's (K, 128) nearest landmark, and its products with the two nearest; (K,) each.
 
-        Returns:
-            rows (K,), nearest (K,) and second (K,); of several landmarks equally near, `rows` has any. Where there are
-            fewer than two landmarks, the missing product is -2^28.
+        Of several landmarks equally near it is any. With fewer than two landmarks, a missing product is -2^28.
         """
         # OpenMP's limit is per thread: without this, the first product in a new thread would start a thread per core.
         torch.set_num_threads(torch.get_num_threads())
@@ -115,15 +106,10 @@ def nearest_two_plain(
 
 
 def match(matcher: DescriptorMatcher, descriptors: Sequence[NDArray[np.uint8]], max_ratio: float) -> list[Matches]:
-    """2D-3D matches of several images at once.
+    """2D-3D matches of several images at once, from their descriptors (K_i, 128) uint8.
 
-    A match passes Lowe's ratio test (IJCV 2004, Sec. 7.1), and a landmark keeps only its nearest keypoint. With a
-    single landmark there is no second nearest, so nothing matches.
-
-    Args:
-        matcher: of the landmarks.
-        descriptors: of each image, (K_i, 128) uint8.
-        max_ratio: the nearest landmark's distance over the second nearest's must be below it.
+    A match passes Lowe's ratio test (IJCV 2004, Sec. 7.1): the nearest landmark's distance is less than `max_ratio` of
+    the second nearest's. A landmark keeps only its nearest keypoint. With a single landmark, nothing matches.
     """
     lengths = [len(of_image) for of_image in descriptors]
     if sum(lengths) == 0 or matcher.n_landmarks < 2:
@@ -133,10 +119,8 @@ def match(matcher: DescriptorMatcher, descriptors: Sequence[NDArray[np.uint8]], 
     distance, next_distance = (np.maximum(2 * (512**2 - best), 0) for best in (nearest, second))
     passed = distance < max_ratio**2 * next_distance
     ends = np.cumsum(lengths)
-    return [
-        _each_landmark_once(rows[start:end], distance[start:end], passed[start:end])
-        for start, end in zip(ends - lengths, ends, strict=True)
-    ]
+    images = [slice(start, end) for start, end in zip(ends - lengths, ends, strict=True)]
+    return [_each_landmark_once(rows[image], distance[image], passed[image]) for image in images]
 
 
 def _each_landmark_once(rows: NDArray[np.int64], distance: NDArray[np.int64], passed: NDArray[np.bool_]) -> Matches:

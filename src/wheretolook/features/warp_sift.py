@@ -11,10 +11,12 @@ import warp as wp
 from numpy.typing import NDArray
 
 from wheretolook.features import warp_sift_description_kernels as kernels
+from wheretolook.features import warp_sift_kernels as scale_kernels
 from wheretolook.features.keypoints import ExtractorConfig, Keypoints
-from wheretolook.features.warp_sift_kernels import BORDER, KEYS_OF_IMAGE, MAX_SIDE, Limits
-from wheretolook.features.warp_sift_scale_space import ScaleSpace, roomy, values_of_image
+from wheretolook.features.warp_sift_kernels import BORDER, KEYS_OF_IMAGE, LAYERS, LEVELS, MAX_SIDE
 from wheretolook.utils.warp import start_warp
+
+_ASSUMED_SIGMA = 0.5  # blur of an input image, in its pixels
 
 
 class WarpSift:
@@ -22,36 +24,26 @@ class WarpSift:
 
     The plain twin is `cv2.SIFT` as `KeypointExtractor` uses it, with the same constants and conventions but another
     order of summation. The keypoints of an image do not depend on the others in its batch. An extractor must be used by
-    one thread only, since it keeps its memory on the device from call to call.
-
-    Args:
-        config: see `ExtractorConfig`; its method is ignored.
-        device: a CUDA device, or "cpu" (one core and slow: for tests).
-        block_bytes: memory of the scale spaces that are filled at a time (40 MB for an image of 640 x 480).
-
-    Raises:
-        ConfigError: there is no such device.
+    one thread only, since it keeps its memory on the device from call to call. It ignores the method of its config, and
+    fills `block_bytes` of scale spaces at a time (40 MB for an image of 640 x 480). The device is a CUDA device, or
+    "cpu" (one core and slow: for tests); ConfigError if there is none such.
     """
 
     def __init__(self, config: ExtractorConfig, device: str = "cuda", block_bytes: int = 1 << 30) -> None:
         self.config = config
         self.device = start_warp(device)
         self.block_bytes = block_bytes
-        limits: Any = Limits()
+        limits: Any = scale_kernels.Limits()
         # OpenCV rounds the threshold of the extremum itself down to a whole grey value.
         limits.pre_contrast = math.floor(0.5 * config.peak_threshold * 255)
-        limits.contrast, limits.edge = config.peak_threshold, config.edge_threshold
-        self._limits = limits
+        limits.contrast, limits.edge, self._limits = config.peak_threshold, config.edge_threshold, limits
         self._space: ScaleSpace | None = None
         self._buffers: dict[str, Any] = {}
 
     def extract_many(self, grey: NDArray[np.uint8] | Any) -> list[Keypoints]:
         """At most `max_keypoints` keypoints of each grey image (B, H, W) uint8, those of most contrast first.
 
-        The images are a NumPy array, or a Warp array on any device.
-
-        Raises:
-            ValueError: the images have another shape or type, or are too large.
+        The images are a NumPy or Warp array. Raises ValueError if they have another shape or type, or are too large.
         """
         if grey.dtype not in (np.uint8, wp.uint8) or grey.ndim != 3:
             raise ValueError(f"expected (B, H, W) uint8 images, got {grey.shape} {grey.dtype}")
@@ -76,7 +68,7 @@ class WarpSift:
     def _extract_block(self, space: ScaleSpace, grey: Any) -> list[Keypoints]:
         n_images = grey.shape[0]
         space.fill(grey)
-        keys = _sorted_unique(space.find())
+        keys = np.unique(space.find())
         if len(keys) == 0:
             return [Keypoints.none() for _ in range(n_images)]
         table, place, angle, places = self._turn(space, keys)
@@ -96,10 +88,9 @@ class WarpSift:
     def _turn(
         self, space: ScaleSpace, keys: NDArray[np.int64]
     ) -> tuple[NDArray[np.float32], NDArray[np.intp], NDArray[np.float32], Any]:
-        """Positions of the K keypoints at sorted keys, and their orientations, N in all.
+        """The K keypoints at sorted keys, and their orientations, N in all.
 
-        Returns:
-            (K, 4) x, y, scale and response; the keypoint (N,) and the angle (N,) of each orientation; `Places`.
+        (K, 4) x, y, scale and response; the keypoint (N,) and the angle (N,) of each orientation; `Places`.
         """
         n = len(keys)
         places = kernels.Places()
@@ -141,19 +132,13 @@ class WarpSift:
         """An array of at least n rows, kept from call to call."""
         buffer = self._buffers.get(name)
         if buffer is None or buffer.shape[0] < n:
-            shape = (roomy(n), *row)
-            buffer = self._buffers[name] = wp.empty(shape, dtype=dtype, device=self.device)
+            buffer = self._buffers[name] = wp.empty((roomy(n), *row), dtype=dtype, device=self.device)
         return buffer
 
     def _upload(self, name: str, values: NDArray[Any], dtype: Any) -> Any:
         buffer = self._buffer(name, len(values), dtype)
         wp.copy(buffer, wp.array(values, dtype=dtype, device="cpu"), count=len(values))
         return buffer
-
-
-def _sorted_unique(keys: NDArray[np.int64]) -> NDArray[np.int64]:
-    keys = np.sort(keys)
-    return keys[np.flatnonzero(np.diff(keys, prepend=-1))]
 
 
 def _by_response(image: NDArray[np.int64], table: NDArray[np.float32], angle: NDArray[np.float32]) -> NDArray[np.intp]:
@@ -167,3 +152,131 @@ def _by_response(image: NDArray[np.int64], table: NDArray[np.float32], angle: ND
     x, y, scale, _ = table[rows].T
     order[tied] = rows[np.lexsort((angle[rows], scale, y, x, key[rows]))]
     return order
+
+
+class ScaleSpace:
+    """The Gaussian scale spaces of up to `n_images` images of one size, and the list of their extrema.
+
+    The smaller of rows and columns must exceed `BORDER`, so that there is an octave. With `first_octave` -1, keypoints
+    are looked for in the doubled image too, with 0 only from the image's own size on. `limits` is the kernels'.
+    """
+
+    def __init__(self, rows: int, columns: int, n_images: int, first_octave: int, limits: Any, device: str) -> None:
+        self.rows, self.columns, self.n_images, self.device = rows, columns, n_images, device
+        self.first_octave, self.limits = first_octave, limits
+        self.sizes = octave_sizes(rows, columns)
+        starts = np.cumsum([0, *(LEVELS * r * c for r, c in self.sizes)])
+        self.image_size = int(starts[-1])
+        self.starts = [int(start) for start in starts[:-1]]
+        rows_of, columns_of = ([size[side] for size in self.sizes] for side in (0, 1))
+        pyramid: Any = scale_kernels.Pyramid()
+        pyramid.values = wp.empty(n_images * self.image_size, dtype=wp.float32, device=device)
+        pyramid.image_size = self.image_size
+        for name, values in (("starts", self.starts), ("rows", rows_of), ("columns", columns_of)):
+            setattr(pyramid, name, wp.array(values, dtype=wp.int32, device=device))
+        self.pyramid = pyramid
+        self.grey = wp.empty((n_images, rows, columns), dtype=wp.uint8, device=device)
+        self.half_smooth = wp.empty(n_images * 4 * rows * columns, dtype=wp.float32, device=device)
+        self.number = wp.zeros(1, dtype=wp.int32, device=device)
+        self.keys = wp.empty(roomy(1000 * n_images), dtype=wp.int64, device=device)
+        self.filled = 0
+        filters = [_half_gaussian(sigma) for sigma in _sigmas()]
+        self.radii = [len(half) - 1 for half in filters]
+        self.first_weights = [int(first) for first in np.cumsum([0, *map(len, filters)])]
+        self.weights: Any = wp.array(np.concatenate(filters).astype(np.float32), dtype=wp.float32, device=device)
+        self._commands = self._record()
+
+    def fill(self, grey: Any) -> None:
+        """Compute the scale spaces of images (B, H, W) uint8, in NumPy or Warp, B at most `n_images`."""
+        if isinstance(grey, np.ndarray):
+            grey = wp.array(np.ascontiguousarray(grey), dtype=wp.uint8, device="cpu", copy=False)
+        wp.copy(self.grey, grey.contiguous(), count=grey.size)
+        if grey.shape[0] != self.filled:
+            self.filled = grey.shape[0]
+            for command, size in self._commands:
+                command.set_dim((self.filled, *size))
+        for command, _ in self._commands:
+            command.launch()
+
+    def find(self) -> NDArray[np.int64]:
+        """Keys (K,) int64 of the extrema that pass the limits, in any order and with repetitions (see `key_of`)."""
+        while True:
+            self.number.zero_()
+            for octave in range(1 + self.first_octave, len(self.sizes)):
+                rows, columns = self.sizes[octave]
+                shape = self.filled, LAYERS, rows - 2 * BORDER, columns - 2 * BORDER
+                inputs, outputs = [self.pyramid, octave, self.limits], [self.number, self.keys]
+                wp.launch(scale_kernels.extrema_kernel, shape, inputs, outputs, device=self.device)
+            number = int(self.number.numpy()[0])
+            if number <= len(self.keys):
+                return self.keys[:number].numpy()
+            self.keys = wp.empty(roomy(number), dtype=wp.int64, device=self.device)
+
+    def _record(self) -> list[tuple[Any, tuple[int, int]]]:
+        """The launches that fill the scale spaces, and how many threads of each work on an image."""
+        commands: list[tuple[Any, tuple[int, int]]] = []
+
+        def add(kernel: Any, octave: int, *inputs: Any) -> None:
+            dim = (self.n_images, *self.sizes[octave])
+            command = wp.launch(kernel, dim=dim, inputs=list(inputs), device=self.device, record_cmd=True)
+            commands.append((command, self.sizes[octave]))
+
+        def level_of(octave: int, level: int, half_smooth: bool = False) -> Any:
+            """A level of the pyramid, or the memory for one smoothed along its rows only."""
+            found: Any = scale_kernels.Level()
+            found.rows, found.columns = self.sizes[octave]
+            if half_smooth:
+                found.values, found.image_size, found.start = self.half_smooth, 4 * self.rows * self.columns, 0
+            else:
+                found.values, found.image_size = self.pyramid.values, self.image_size
+                found.start = self.starts[octave] + level * found.rows * found.columns
+            return found
+
+        def smooth(octave: int, source: int, target: int) -> None:
+            """From level to level of an octave, with the filter of the latter."""
+            filter_of_target = [self.weights, self.first_weights[target], self.radii[target]]
+            half = level_of(octave, 0, half_smooth=True)
+            add(scale_kernels.smooth_kernel, octave, level_of(octave, source), half, True, *filter_of_target)
+            add(scale_kernels.smooth_kernel, octave, half, level_of(octave, target), False, *filter_of_target)
+
+        add(scale_kernels.double_kernel, 0, self.grey, level_of(0, 0))
+        smooth(0, 0, 0)
+        for octave in range(len(self.sizes)):
+            if octave > 0:
+                add(scale_kernels.halve_kernel, octave, level_of(octave - 1, LAYERS), level_of(octave, 0))
+            searched = octave > self.first_octave
+            for level in range(1, LEVELS if searched else LAYERS + 1):
+                smooth(octave, level - 1, level)
+        return commands
+
+
+def octave_sizes(rows: int, columns: int) -> list[tuple[int, int]]:
+    """Rows and columns of the octaves that can hold a keypoint; the first has twice the image's size."""
+    sizes = [(2 * rows, 2 * columns)]
+    while min(sizes[-1]) > 2 * BORDER:
+        sizes.append((sizes[-1][0] // 2, sizes[-1][1] // 2))
+    return sizes[:-1]
+
+
+def values_of_image(rows: int, columns: int) -> int:
+    """How many values the scale space of an image has."""
+    return LEVELS * sum(r * c for r, c in octave_sizes(rows, columns))
+
+
+def _sigmas() -> list[float]:
+    """Standard deviation of the filter that makes each level from the one before, the first from the doubled image."""
+    total = [scale_kernels.SIGMA * 2 ** (level / LAYERS) for level in range(LEVELS)]
+    first = math.sqrt(scale_kernels.SIGMA**2 - (2 * _ASSUMED_SIGMA) ** 2)
+    return [first, *(math.sqrt(b**2 - a**2) for a, b in pairwise(total))]
+
+
+def _half_gaussian(sigma: float) -> NDArray[np.float64]:
+    """Weights of a Gaussian filter from its middle outwards, truncated where `cv2.GaussianBlur` does."""
+    radius = (round(8 * sigma + 1) | 1) // 2
+    weights = np.exp(-(np.arange(-radius, radius + 1) ** 2) / (2 * sigma**2))
+    return (weights / weights.sum())[radius:]
+
+
+def roomy(n: int) -> int:
+    """A power of two of at least n, so that buffers have few different sizes."""
+    return 1 << max(10, (n - 1).bit_length())

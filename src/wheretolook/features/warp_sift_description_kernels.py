@@ -144,11 +144,7 @@ def turn_kernel(histograms: wp.array3d[wp.float32], n_turns: wp.array[wp.int32],
 
 @wp.kernel
 def describe_kernel(
-    pyramid: Pyramid,
-    places: Places,
-    chosen: wp.array[wp.int32],
-    angles: wp.array[wp.float32],
-    histograms: wp.array2d[wp.float32],
+    pyramid: Pyramid, places: Places, chosen: wp.array[int], angles: wp.array[float], histograms: wp.array2d[float]
 ):
     """One cell of a descriptor: histogram of the gradients less than a cell's width from its centre."""
     row, cell = wp.tid()

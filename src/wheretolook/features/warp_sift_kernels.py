@@ -81,12 +81,8 @@ def double_kernel(grey: wp.array3d[wp.uint8], target: Level):
     left = column >> 1
     bottom = wp.min(top + (row & 1), grey.shape[1] - 1)
     right = wp.min(left + (column & 1), grey.shape[2] - 1)
-    total = (
-        wp.int32(grey[image, top, left])
-        + wp.int32(grey[image, top, right])
-        + wp.int32(grey[image, bottom, left])
-        + wp.int32(grey[image, bottom, right])
-    )
+    total = wp.int32(grey[image, top, left]) + wp.int32(grey[image, top, right])
+    total += wp.int32(grey[image, bottom, left]) + wp.int32(grey[image, bottom, right])
     target.values[place_in(target, image, row, column)] = 0.25 * wp.float32(total)
 
 
@@ -107,47 +103,33 @@ def reflected(index: wp.int32, size: wp.int32):
 
 @wp.func
 def smoothed(
-    values: wp.array[wp.float32],
-    start: wp.int32,
-    stride: wp.int32,
-    at: wp.int32,
-    size: wp.int32,
-    weights: wp.array[wp.float32],
-    first_weight: wp.int32,
-    radius: wp.int32,
+    line: wp.array[float], start: int, step: int, at: int, size: int, weights: wp.array[float], first: int, radius: int
 ):
     """A symmetric filter at one place of a line of values; `weights` are from its middle outwards."""
-    middle = start + at * stride
-    total = weights[first_weight] * values[middle]
+    middle = start + at * step
+    total = weights[first] * line[middle]
     if at >= radius and at + radius < size:
         for tap in range(1, radius + 1):
-            total += weights[first_weight + tap] * (values[middle - tap * stride] + values[middle + tap * stride])
+            total += weights[first + tap] * (line[middle - tap * step] + line[middle + tap * step])
     else:
         for tap in range(1, radius + 1):
-            before = values[start + reflected(at - tap, size) * stride]
-            after = values[start + reflected(at + tap, size) * stride]
-            total += weights[first_weight + tap] * (before + after)
+            before = line[start + reflected(at - tap, size) * step]
+            after = line[start + reflected(at + tap, size) * step]
+            total += weights[first + tap] * (before + after)
     return total
 
 
 @wp.kernel
-def smooth_kernel(
-    source: Level,
-    target: Level,
-    along_rows: wp.bool,
-    weights: wp.array[wp.float32],
-    first_weight: wp.int32,
-    radius: wp.int32,
-):
+def smooth_kernel(source: Level, target: Level, along_rows: bool, weights: wp.array[float], first: int, radius: int):
     """Smooth each row, or else each column, of a level."""
     image, row, column = wp.tid()
     value = wp.float32(0.0)
     if along_rows:
         start = place_in(source, image, row, 0)
-        value = smoothed(source.values, start, 1, column, source.columns, weights, first_weight, radius)
+        value = smoothed(source.values, start, 1, column, source.columns, weights, first, radius)
     else:
         start = place_in(source, image, 0, column)
-        value = smoothed(source.values, start, source.columns, row, source.rows, weights, first_weight, radius)
+        value = smoothed(source.values, start, source.columns, row, source.rows, weights, first, radius)
     target.values[place_in(target, image, row, column)] = value
 
 
@@ -188,15 +170,7 @@ def mixed(values: wp.array[wp.float32], at: wp.int32, a: wp.int32, b: wp.int32, 
 
 
 @wp.func
-def refined(
-    pyramid: Pyramid,
-    image: wp.int32,
-    octave: wp.int32,
-    layer: wp.int32,
-    row: wp.int32,
-    column: wp.int32,
-    limits: Limits,
-):
+def refined(pyramid: Pyramid, image: int, octave: int, layer: int, row: int, column: int, limits: Limits):
     """The extremum of the parabola through a discrete extremum and its neighbours (Lowe 2004, section 4)."""
     peak = Peak()
     peak.found = False
@@ -237,9 +211,9 @@ def refined(
         determinant = wp.dot(by_x, normal)
         offset = wp.vec3(0.0)
         if determinant != 0.0:
-            offset = (-1.0 / determinant) * wp.vec3(
-                wp.dot(gradient, normal), wp.dot(gradient, wp.cross(by_s, by_x)), wp.dot(gradient, wp.cross(by_x, by_y))
-            )
+            along_y = wp.dot(gradient, wp.cross(by_s, by_x))
+            along_s = wp.dot(gradient, wp.cross(by_x, by_y))
+            offset = (-1.0 / determinant) * wp.vec3(wp.dot(gradient, normal), along_y, along_s)
         largest = wp.max(wp.abs(offset[0]), wp.max(wp.abs(offset[1]), wp.abs(offset[2])))
         if largest < 0.5:
             settled = True
@@ -289,9 +263,7 @@ def pixel_of(key: wp.int64):
 
 
 @wp.kernel
-def extrema_kernel(
-    pyramid: Pyramid, octave: wp.int32, limits: Limits, number: wp.array[wp.int32], keys: wp.array[wp.int64]
-):
+def extrema_kernel(pyramid: Pyramid, octave: int, limits: Limits, number: wp.array[int], keys: wp.array[wp.int64]):
     """List the keypoints of an octave in any order, or only count them once the list is full.
 
     A keypoint can be listed several times, since the refinement can move several extrema to the same place.

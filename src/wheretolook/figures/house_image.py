@@ -1,18 +1,24 @@
-"""A picture of a scene from obliquely above, without its ceiling and the walls nearest to the eye."""
+"""A picture of a scene from obliquely above, without its ceiling and the near walls, and drawing on it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
 from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
-from wheretolook.geometry.poses import Float, poses_looking_along, rotation_looking_along, transform
+from wheretolook.geometry.poses import Float, invert_poses, poses_looking_along, rotation_looking_along, transform
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.cutting import cut_above
 from wheretolook.utils.errors import ConfigError, SceneError
+
+BLUE, SKY, GREEN, ORANGE, VERMILION, PURPLE = "#0072B2", "#56B4E9", "#009E73", "#E69F00", "#D55E00", "#CC79A7"
+"""The colours of Okabe and Ito (2008), which colour-blind people can tell apart."""
 
 FAR = 25.0
 """Distance of the eye in diagonals of the scene: so far that parallel lines stay parallel in the picture."""
@@ -20,19 +26,12 @@ FAR = 25.0
 
 @dataclass(frozen=True, eq=False)
 class Dollhouse:
-    """A picture of a scene on which world points can be drawn.
+    """A picture of a scene on which world points can be drawn, with the camera that took it and its pose."""
 
-    Attributes:
-        rgb: (H, W, 3) uint8; white where there is no surface.
-        depth_m: (H, W) float32, from the eye; 0 where there is no surface.
-        camera: the camera that took the picture.
-        cam_from_world: (3, 4) its pose.
-    """
-
-    rgb: NDArray[np.uint8]
-    depth_m: NDArray[np.float32]
+    rgb: NDArray[np.uint8]  # (H, W, 3); white where there is no surface
+    depth_m: NDArray[np.float32]  # (H, W), from the eye; 0 where there is no surface
     camera: PinholeCamera
-    cam_from_world: Float
+    cam_from_world: Float  # (3, 4)
 
     def pixels(self, points: ArrayLike) -> Float:
         """Pixels (..., 2) of world points (..., 3) in metres."""
@@ -60,15 +59,9 @@ def dollhouse(
 ) -> Dollhouse:
     """Render a scene from outside.
 
-    Args:
-        mesh: metres, z up.
-        azimuth_deg: direction of the eye, counter-clockwise from +x.
-        elevation_deg: of the eye, in (0, 90]; 90 gives a plan with +x to the right and +y up, whatever the azimuth.
-        cut_m: what lies above this world height is cut off; None keeps all.
-        width_px: of the picture, whose height follows.
-        one_sided: leave out triangles that turn their backs to the eye, such as ceilings and the near walls of rooms;
-            for meshes that are wound reliably.
-        device: "cpu" or a CUDA device.
+    The azimuth of the eye counts counter-clockwise from +x. Its elevation is in (0, 90]; 90 gives a plan with +x to the
+    right and +y up, whatever the azimuth. What lies above the world height `cut_m` is cut off. With `one_sided`, for
+    meshes that are wound reliably, triangles that turn their backs to the eye are left out, such as ceilings.
 
     Raises:
         ConfigError: the elevation or width is out of range.
@@ -101,3 +94,40 @@ def dollhouse(
     rgb, depth_m = rendering.rgb[0], rendering.depth_m[0]
     rgb[depth_m == 0] = 255
     return Dollhouse(rgb, depth_m, camera, pose)
+
+
+def draw_house(axes: Axes, house: Dollhouse, fade: float = 0.5) -> None:
+    """Draw the picture, with axes in its pixels; `fade` makes it paler, from 0 (as it is) to 1 (white)."""
+    height, width = house.rgb.shape[:2]
+    rgb = 255 * (house.rgb / 255.0) ** 0.7  # rooms without a lamp are dark
+    axes.imshow((rgb + fade * (255 - rgb)).astype(np.uint8), extent=(0, width, height, 0))
+    axes.set(xlim=(0, width), ylim=(height, 0), aspect="equal")
+    axes.axis("off")
+
+
+def draw_points(axes: Axes, house: Dollhouse, points: ArrayLike, **style: Any) -> None:
+    """Draw world points (N, 3) m as dots."""
+    pixels = house.pixels(points).reshape(-1, 2)
+    axes.scatter(pixels[:, 0], pixels[:, 1], **{"linewidths": 0, **style})
+
+
+def draw_segments(axes: Axes, house: Dollhouse, segments: ArrayLike, **style: Any) -> LineCollection:
+    """Draw lines between pairs of world points (..., 2, 3) m."""
+    pixels = house.pixels(np.asarray(segments)).reshape(-1, 2, 2)
+    lines = LineCollection(list(pixels), **{"capstyle": "round", **style})
+    axes.add_collection(lines, autolim=False)
+    return lines
+
+
+def frustum_corners(camera: PinholeCamera, cam_from_world: ArrayLike, depth_m: float) -> Float:
+    """Corners (B, 5, 3) m of cameras (B, 3, 4): centre, then the image's corners at a depth, from top left."""
+    half = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * (camera.cx, camera.cy) / camera.focal_px
+    corners = np.concatenate([np.zeros((1, 3)), depth_m * np.column_stack([half, np.ones(4)])])
+    world_from_cam = invert_poses(np.asarray(cam_from_world, dtype=np.float64).reshape(-1, 3, 4))
+    return corners @ np.swapaxes(world_from_cam[..., :3], -1, -2) + world_from_cam[:, None, :, 3]
+
+
+def frustum_segments(camera: PinholeCamera, cam_from_world: ArrayLike, depth_m: float) -> Float:
+    """The eight edges (B, 8, 2, 3) m of camera frusta down to a depth."""
+    edges = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]])
+    return frustum_corners(camera, cam_from_world, depth_m)[:, edges]

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.style import context
 from numpy.typing import NDArray
 
-from wheretolook.figures.dollhouse import ORANGE
+from wheretolook.figures.house_image import ORANGE
 from wheretolook.figures.style import INK, PRINT, TWO_COLUMNS_IN, new_figure
 from wheretolook.geometry.poses import Float
 from wheretolook.inputs.channels import PAPER_VARIANTS
@@ -24,27 +24,21 @@ _EMPTY = "#e8e8e8"
 
 @dataclass(frozen=True, eq=False)
 class BinnedImage:
-    """One view and the input that a network gets for it.
+    """One view and the input that a network gets for it. Rows of bins go down the image, columns right.
 
-    Attributes:
-        rgb: (H, W, 3) uint8, what the camera sees.
-        pixels: (K, 2) of the landmarks in view.
-        means: (bins, bins) mean of each channel over a bin's landmarks, by the channel's name; NaN in empty bins. Rows
-            go down the image, columns right.
-        counts: (bins, bins) landmarks in each bin.
+    `means` (bins, bins) are those of each channel over a bin's landmarks, by the channel's name; NaN in empty bins.
     """
 
-    rgb: NDArray[np.uint8]
-    pixels: Float
+    rgb: NDArray[np.uint8]  # (H, W, 3), what the camera sees
+    pixels: Float  # (K, 2) of the landmarks in view
     means: Mapping[str, Float]
-    counts: NDArray[np.int32]
+    counts: NDArray[np.int32]  # (bins, bins) landmarks in each bin
 
 
 def inputs_figure(image: BinnedImage, variants: Mapping[str, tuple[str, ...]] = PAPER_VARIANTS) -> Figure:
     """The image with its landmarks, their number in each bin, and the channels of each input variant.
 
-    Two columns wide. Right, a row for each of `variants` (names of channels, all of which `image` must have); bins
-    without landmarks are grey.
+    Right, a row for each of `variants` (names of channels, all of which `image` must have); empty bins are grey.
     """
     channels = [*dict.fromkeys(name for names in variants.values() for name in names)]
     with context(PRINT):

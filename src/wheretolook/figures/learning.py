@@ -13,7 +13,7 @@ from matplotlib.patches import ConnectionPatch
 from matplotlib.style import context
 
 from wheretolook.figures.config import Look
-from wheretolook.figures.dollhouse import BLUE, VERMILION
+from wheretolook.figures.house_image import BLUE, VERMILION
 from wheretolook.figures.inputs import BinnedImage, draw_counts, draw_landmarks, frame, n_landmarks
 from wheretolook.figures.style import INK, PRINT, TWO_COLUMNS_IN, new_figure
 from wheretolook.geometry.poses import Float
@@ -25,11 +25,7 @@ _WIDE = 10  # letters below the score
 def learning_figure(image: BinnedImage, activations: Sequence[Float], channels: Sequence[str], outcome: str) -> Figure:
     """The image with its landmarks, landmarks by bin, standardized channels, hidden layers (dark: 0), and the score.
 
-    Args:
-        image: the view, binned.
-        activations: of the network, see `wheretolook.methods.mlp.architecture.activations`.
-        channels: names of the input's channels.
-        outcome: how localizing the view ended, in words.
+    `activations` are those of `wheretolook.methods.mlp.architecture.activations`; `outcome` is put below the score.
     """
     means, *hidden, score = activations
     ratios = [2.1, 2.1, 1.0, *(1.0 for _ in hidden), 0.75]

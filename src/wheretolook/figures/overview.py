@@ -42,15 +42,9 @@ def overview_figure(
 ) -> Figure:
     """Draw a scene's map, the scores of all directions at one place, and the views they favour and avoid.
 
-    Args:
-        landmarks: (N, 3) metres.
-        locations: (L, 3) metres, labelled locations.
-        share_good: (L,) share of each location's labelled viewpoints that localize.
-        place: (3,) metres, one of the locations.
-        directions: (D, 3) unit vectors.
-        scores: (D,) predicted probabilities at `place`.
-        best: the labelled view at `place` with the highest score.
-        worst: the one with the lowest.
+    There are landmarks (N, 3) m; labelled locations (L, 3) m, and the share of each one's viewpoints that localize; one
+    of them, `place`, and the predicted probabilities (D,) of unit directions (D, 3) there; and the labelled views there
+    with the highest and the lowest score.
     """
     with context(RC):
         figure = new_figure(14.0, 3.9)

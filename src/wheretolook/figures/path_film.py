@@ -17,9 +17,11 @@ from wheretolook.figures.config import Look
 from wheretolook.figures.style import INK, RC, new_figure
 from wheretolook.geometry.poses import Float
 from wheretolook.methods.styles import method_style
-from wheretolook.planning.path_view import PathView, Pixels
-from wheretolook.planning.polylines import lengths_along
+from wheretolook.planning.route_views import PathView
+from wheretolook.planning.sequences import lengths_along
 from wheretolook.utils.errors import ConfigError
+
+Pixels = NDArray[np.uint8]
 
 PATH, SEEN = "#CC3311", "#EE9900"
 FRAMES_PER_SECOND = 8

@@ -13,7 +13,7 @@ from matplotlib.style import context
 from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.figures.config import Look
-from wheretolook.figures.dollhouse import BLUE, VERMILION
+from wheretolook.figures.house_image import BLUE, VERMILION
 from wheretolook.figures.inputs import frame
 from wheretolook.figures.overview import View
 from wheretolook.figures.style import INK, PRINT, TWO_COLUMNS_IN, new_figure
@@ -26,10 +26,7 @@ _WIDE = 27  # letters below a view
 def spread_extrema(
     directions: ArrayLike, scores: ArrayLike, n: int, apart_deg: float = 40.0, highest: bool = True
 ) -> NDArray[np.int64]:
-    """Rows of at most n directions with the highest scores (or lowest), in order, at least `apart_deg` apart.
-
-    `directions` are unit vectors (D, 3), `scores` (D,).
-    """
+    """Rows of at most n unit directions (D, 3) with the highest (or lowest) scores, at least `apart_deg` apart."""
     axes, values = np.asarray(directions, dtype=np.float64), np.asarray(scores, dtype=np.float64)
     found: list[int] = []
     for row in np.argsort(-values if highest else values, kind="stable"):
@@ -47,14 +44,10 @@ def peaks_figure(
     pits: Sequence[View],
     tried: tuple[Float, NDArray[np.bool_]] | None = None,
 ) -> Figure:
-    """The scores of all directions at one location (Hammer projection, equal area), and views from there.
+    """The scores (D,) of all unit axes (D, 3) at one location (Hammer projection, equal area), and views from there.
 
-    Args:
-        directions: (D, 3) unit optical axes, world frame.
-        scores: (D,) predicted probabilities.
-        peaks: views of high scores, the highest first; they are numbered.
-        pits: views of low scores, the lowest first; they have letters.
-        tried: axes (B, 3) of labelled views and whether each of them localizes, (B,): rings if so, else crosses.
+    `peaks` are views of high scores, the highest first, with numbers; `pits` of low scores, the lowest first, with
+    letters; `tried` axes (B, 3) of labelled views and whether each of them localizes, (B,): rings if so, else crosses.
     """
     columns = max(len(peaks), len(pits))
     with context(PRINT):

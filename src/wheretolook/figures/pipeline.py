@@ -13,17 +13,17 @@ from matplotlib.style import context
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from wheretolook.figures.dollhouse import (
+from wheretolook.figures.house_image import (
     BLUE,
     ORANGE,
     VERMILION,
+    Dollhouse,
     draw_house,
     draw_points,
     draw_segments,
     frustum_corners,
     frustum_segments,
 )
-from wheretolook.figures.house_image import Dollhouse
 from wheretolook.figures.inputs import frame
 from wheretolook.figures.style import INK, ONE_COLUMN_IN, PRINT, TWO_COLUMNS_IN, new_figure
 from wheretolook.geometry.camera import PinholeCamera
@@ -35,39 +35,22 @@ _GLYPH = 32  # directions drawn of a location
 
 @dataclass(frozen=True, eq=False)
 class Pipeline:
-    """What `pipeline_figure` draws.
+    """What `pipeline_figure` draws."""
 
-    Attributes:
-        house: the scene from above.
-        landmarks: (N, 3) of the map, metres.
-        mapping_poses: cam_from_world (M, 3, 4) of the images that the map was made from.
-        camera: intrinsics of all images.
-        locations: (L, 3) metres, the sampled locations that are shown.
-        n_locations: number of sampled locations in the whole scene.
-        n_directions: number of directions at each location.
-        best_axes: (L, 3) unit optical axis of the best view of each location.
-        best_scores: (L,) its score, a probability.
-        chosen: cam_from_world (3, 4) of the camera that is chosen.
-        chosen_score: its score.
-        seen: (N,) whether it sees each landmark.
-        rgb: (H, W, 3) uint8, its image.
-        outcome: how localizing it ended, in words; empty if not known.
-    """
-
-    house: Dollhouse
-    landmarks: Float
-    mapping_poses: Float
-    camera: PinholeCamera
-    locations: Float
-    n_locations: int
-    n_directions: int
-    best_axes: Float
-    best_scores: Float
-    chosen: Float
+    house: Dollhouse  # the scene from above
+    landmarks: Float  # (N, 3) of the map, metres
+    mapping_poses: Float  # cam_from_world (M, 3, 4) of the images that the map was made from
+    camera: PinholeCamera  # intrinsics of all images
+    locations: Float  # (L, 3) metres, the sampled locations that are shown
+    n_locations: int  # in the whole scene
+    n_directions: int  # at each location
+    best_axes: Float  # (L, 3) unit optical axis of the best view of each location
+    best_scores: Float  # (L,) its score, a probability
+    chosen: Float  # cam_from_world (3, 4) of the camera that is chosen
     chosen_score: float
-    seen: NDArray[np.bool_]
-    rgb: NDArray[np.uint8]
-    outcome: str = ""
+    seen: NDArray[np.bool_]  # (N,) whether it sees each landmark
+    rgb: NDArray[np.uint8]  # (H, W, 3), its image
+    outcome: str = ""  # how localizing it ended, in words; empty if not known
 
 
 def pipeline_figure(pipeline: Pipeline) -> Figure:

@@ -15,8 +15,16 @@ from matplotlib.style import context
 from numpy.typing import NDArray
 
 from wheretolook.figures.config import Look
-from wheretolook.figures.dollhouse import BLUE, ORANGE, SKY, VERMILION, draw_house, draw_points, draw_segments
-from wheretolook.figures.house_image import Dollhouse
+from wheretolook.figures.house_image import (
+    BLUE,
+    ORANGE,
+    SKY,
+    VERMILION,
+    Dollhouse,
+    draw_house,
+    draw_points,
+    draw_segments,
+)
 from wheretolook.figures.style import INK, PRINT, TWO_COLUMNS_IN, new_figure
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float
@@ -28,31 +36,18 @@ _MARGIN_PX = 0.04
 
 @dataclass(frozen=True, eq=False)
 class Sampling:
-    """What `sampling_figure` draws.
+    """What `sampling_figure` draws."""
 
-    Attributes:
-        plan: the scene from straight above.
-        grid: voxels of the scene.
-        layer: ids of the voxels of one layer, (V,).
-        free: (V,) whether a camera can be there.
-        place: (3,) metres, the location whose directions and occlusion are drawn.
-        directions: (D, 3) unit optical axes.
-        n_visible: (D,) landmarks in view along each of them.
-        kept: (D,) whether the direction is among the K that see most.
-        landmarks: (N, 3) metres.
-        unoccluded: (N,) whether the landmark is unoccluded from the place.
-    """
-
-    plan: Dollhouse
-    grid: VoxelGrid
-    layer: NDArray[np.int64]
-    free: NDArray[np.bool_]
-    place: Float
-    directions: Float
-    n_visible: NDArray[np.int64]
-    kept: NDArray[np.bool_]
-    landmarks: Float
-    unoccluded: NDArray[np.bool_]
+    plan: Dollhouse  # the scene from straight above
+    grid: VoxelGrid  # of the scene
+    layer: NDArray[np.int64]  # ids of the voxels of one layer, (V,)
+    free: NDArray[np.bool_]  # (V,) whether a camera can be there
+    place: Float  # (3,) metres, the location whose directions and occlusion are drawn
+    directions: Float  # (D, 3) unit optical axes
+    n_visible: NDArray[np.int64]  # (D,) landmarks in view along each of them
+    kept: NDArray[np.bool_]  # (D,) whether the direction is among the K that see most
+    landmarks: Float  # (N, 3) metres
+    unoccluded: NDArray[np.bool_]  # (N,) whether the landmark is unoccluded from the place
 
 
 def sampling_figure(sampling: Sampling) -> Figure:
@@ -116,10 +111,10 @@ def _draw_occlusion(axes: Axes, sampling: Sampling) -> None:
     _mark_place(axes, sampling)
     axes.set_anchor("N")
     axes.set_title("c  Occlusion", loc="left")
-    handles = [
-        Line2D([], [], linestyle="none", marker="o", markersize=4, color=color, label=f"{len(points):,} {name}")
-        for name, color, points in (("in sight", ORANGE, unoccluded), ("hidden", BLUE, hidden))
-    ]
+    handles = []
+    for name, color, points in (("in sight", ORANGE, unoccluded), ("hidden", BLUE, hidden)):
+        dot: Look = {"linestyle": "none", "marker": "o", "markersize": 4, "color": color}
+        handles.append(Line2D([], [], label=f"{len(points):,} {name}", **dot))
     _legend_below(axes, handles)
 
 

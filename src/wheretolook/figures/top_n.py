@@ -13,6 +13,7 @@ from matplotlib.style import context
 
 from wheretolook.evaluation.paper_tables import PAPER
 from wheretolook.evaluation.score_table import main_rows, methods_of, threshold_keys
+from wheretolook.figures.config import Look
 from wheretolook.figures.style import PRINT, TWO_COLUMNS_IN, new_figure
 from wheretolook.methods.registry import find
 from wheretolook.methods.styles import ORACLE, method_style
@@ -39,10 +40,8 @@ def top_n_figure(scores: pd.DataFrame, methods: Sequence[str] = ()) -> Figure:
     locations with a good one among N, the oracle's as lines. Whiskers are 95 % bootstrap intervals. Open grey marks are
     the paper's numbers, which it prints for N = 1 only, on other scenes and divided by its released code's constant.
 
-    Args:
-        scores: a table of `wheretolook.evaluation.scores.score_table`; its rows over all scenes are drawn, those of the
-            first occlusion model and the first set of candidates if there are several.
-        methods: those to draw; `SHOWN` if empty.
+    `scores` is a table of `wheretolook.evaluation.scores.score_table`; its rows over all scenes are drawn, of the first
+    occlusion model and set of candidates; `SHOWN` if no methods are named.
     """
     scores = main_rows(scores)
     pooled, keys = scores[scores["scene"] == ALL], threshold_keys(scores)
@@ -56,13 +55,17 @@ def top_n_figure(scores: pd.DataFrame, methods: Sequence[str] = ()) -> Figure:
                 _draw(axes, pooled, shown, top_n, f"{column}_{{}}{key}")
                 if column == "normalized":
                     axes.set_title(f"within {threshold_label(key)}")
-                    _draw_printed(axes, index)
+                    for name, (marker, _) in _PAPER_MARKS.items():
+                        mark: Look = {"markersize": 5, "color": _GREY, "markerfacecolor": "white"}
+                        axes.plot(-0.5, _PRINTED[name][index], marker, **mark)
                 else:
                     _draw_oracle(axes, pooled, top_n, f"{column}_{key}")
             line[0].set_ylabel(name)
         for axes in panels[-1]:
             axes.set_xlabel("N")
-        handles = [*panels[1, 0].get_legend_handles_labels()[0], *_printed_handles()]
+        look: Look = {"linestyle": "none", "color": _GREY, "markerfacecolor": "white"}
+        printed = [Line2D([], [], marker=marker, label=label, **look) for marker, label in _PAPER_MARKS.values()]
+        handles = [*panels[1, 0].get_legend_handles_labels()[0], *printed]
         figure.legend(handles=handles, loc="outside upper center", ncols=4, columnspacing=1.6, handlelength=1.4)
         return figure
 
@@ -96,16 +99,14 @@ def _draw(axes: Axes, pooled: pd.DataFrame, methods: Sequence[str], top_n: Seque
     """Marks of all methods over N; `column` with "low_", "high_" or nothing inserted names the table's columns."""
     places = np.arange(len(top_n), dtype=float)
     for number, method in enumerate(methods):
-        rows = pooled[pooled["method"] == method].set_index("top_n")
-        rows = rows.reindex(list(top_n))
+        rows = pooled[pooled["method"] == method].set_index("top_n").reindex(list(top_n))
         style = method_style(method)
         at = places + 0.14 * (number - (len(methods) - 1) / 2)  # side by side, or whiskers would hide one another
         value, low, high = (100 * rows[column.format(end)].to_numpy(dtype=float) for end in ("", "low_", "high_"))
         axes.vlines(at, low, high, color=style.color, linewidth=0.9)
         axes.plot(at, value, style.marker, color=style.color, markersize=5, label=style.label)
     axes.set_xticks(places, [f"{n}" for n in top_n])
-    axes.set_xlim(-0.65, len(top_n) - 0.5)
-    axes.set_ylim(top=101)
+    axes.set(xlim=(-0.65, len(top_n) - 0.5), ylim=(None, 101))
     axes.grid(axis="x", visible=False)
 
 
@@ -113,15 +114,3 @@ def _draw_oracle(axes: Axes, pooled: pd.DataFrame, top_n: Sequence[int], column:
     style, best = method_style(ORACLE), pooled[pooled["method"] == ORACLE].set_index("top_n").reindex(list(top_n))
     places = np.arange(len(top_n))
     axes.hlines(100 * best[column], places - 0.42, places + 0.42, color=style.color, linewidth=1, label=style.label)
-
-
-def _draw_printed(axes: Axes, index: int) -> None:
-    for name, (marker, _) in _PAPER_MARKS.items():
-        axes.plot(-0.5, _PRINTED[name][index], marker, markersize=5, color=_GREY, markerfacecolor="white")
-
-
-def _printed_handles() -> list[Line2D]:
-    return [
-        Line2D([], [], linestyle="none", marker=marker, color=_GREY, markerfacecolor="white", label=label)
-        for marker, label in _PAPER_MARKS.values()
-    ]

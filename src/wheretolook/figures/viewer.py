@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import open3d as o3d
 from matplotlib.colors import to_rgb
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.figures.dollhouse import BLUE, ORANGE, VERMILION, frustum_segments
+from wheretolook.figures.house_image import BLUE, ORANGE, VERMILION, frustum_segments
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
-from wheretolook.geometry.poses import Float
 from wheretolook.scenes.cutting import cut_above
 
 FRUSTUM_M = 0.25
@@ -28,24 +28,18 @@ def scene_geometries(
     camera: PinholeCamera = PinholeCamera(),
     cut_m: float | None = None,
 ) -> list[dict[str, Any]]:
-    """What Open3D's viewer draws; it lists the geometries by name, to be shown and hidden.
+    """What Open3D's viewer draws: a list of `name`, `geometry` and `material` for `open3d.visualization.draw`.
 
-    Args:
-        mesh: metres, z up; one geometry for each of its textures.
-        landmarks: (N, 3) metres.
-        cameras: cam_from_world (B, 3, 4).
-        path: (P, 3) metres.
-        camera: intrinsics of the cameras.
-        cut_m: leave out what of the mesh lies above this height, to look into rooms from above.
-
-    Returns:
-        Arguments of `open3d.visualization.draw`: `name`, `geometry` and `material` of each.
+    There is a geometry for each texture of the mesh (metres, z up), of which what lies above `cut_m` is left out; for
+    landmarks (N, 3) m; for `cameras`, cam_from_world (B, 3, 4), with intrinsics `camera`; and for the path (P, 3) m.
     """
     found: list[dict[str, Any]] = []
     if mesh is not None:
         found += _mesh_geometries(mesh if cut_m is None else cut_above(mesh, cut_m))
     if landmarks is not None:
-        found.append(_points("landmarks", np.asarray(landmarks, dtype=np.float64), ORANGE))
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.asarray(landmarks, dtype=np.float64)))
+        cloud.paint_uniform_color(np.array(to_rgb(ORANGE)))
+        found.append(_named("landmarks", cloud, "defaultUnlit", point_size=_POINT_PX))
     if cameras is not None:
         segments = frustum_segments(camera, cameras, FRUSTUM_M).reshape(-1, 2, 3)
         found.append(_lines("cameras", segments, BLUE, 1.5))
@@ -57,15 +51,11 @@ def scene_geometries(
 
 def show_scene(*parts: Any, title: str = "wheretolook", **named_parts: Any) -> None:
     """Show a scene in a window until that is closed. Needs a display. Arguments are those of `scene_geometries`."""
-    import open3d as o3d
-
     geometries = scene_geometries(*parts, **named_parts)
     o3d.visualization.draw(geometries, title=title, show_skybox=False, bg_color=(1.0, 1.0, 1.0, 1.0))
 
 
 def _mesh_geometries(mesh: TexturedMesh) -> list[dict[str, Any]]:
-    import open3d as o3d
-
     found = []
     for number, texture in enumerate(mesh.textures):
         rows = np.flatnonzero(mesh.triangle_texture == number)
@@ -87,17 +77,7 @@ def _mesh_geometries(mesh: TexturedMesh) -> list[dict[str, Any]]:
     return found
 
 
-def _points(name: str, points: Float, color: str) -> dict[str, Any]:
-    import open3d as o3d
-
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
-    cloud.paint_uniform_color(np.array(to_rgb(color)))
-    return _named(name, cloud, "defaultUnlit", point_size=_POINT_PX)
-
-
 def _lines(name: str, segments: NDArray[np.floating[Any]], color: str, width_px: float) -> dict[str, Any]:
-    import open3d as o3d
-
     lines = o3d.geometry.LineSet(
         o3d.utility.Vector3dVector(segments.reshape(-1, 3).astype(np.float64)),
         o3d.utility.Vector2iVector(np.arange(2 * len(segments), dtype=np.int32).reshape(-1, 2)),
@@ -107,8 +87,6 @@ def _lines(name: str, segments: NDArray[np.floating[Any]], color: str, width_px:
 
 
 def _named(name: str, geometry: Any, shader: str, **properties: Any) -> dict[str, Any]:
-    import open3d as o3d
-
     material = o3d.visualization.rendering.MaterialRecord()
     for key, value in {"shader": shader, **properties}.items():
         setattr(material, key, value)

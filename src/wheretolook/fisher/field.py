@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,12 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from wheretolook.fisher.field_sums import field_sums
 from wheretolook.fisher.information import N_NUMBERS, TRACE
 from wheretolook.fisher.metrics import metric_of
-from wheretolook.fisher.soft_visibility import GaussianProcessVisibility, QuadraticVisibility, SoftVisibility
+from wheretolook.fisher.soft_visibility import QuadraticVisibility, SoftVisibility
 from wheretolook.geometry.poses import Float
-from wheretolook.utils.errors import MapError
-from wheretolook.utils.npz_files import load_npz, save_npz
-
-FORMAT_VERSION = 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,14 +31,9 @@ class FisherField:
         unoccluded: NDArray[np.bool_] | None = None,
         device: str = "cpu",
     ) -> FisherField:
-        """Sum the information of all landmarks at each location.
+        """Sum the information of all landmarks (N, 3) m at each of locations (L, 3) m.
 
-        Args:
-            locations: (L, 3) metres.
-            points: (N, 3) landmarks, metres.
-            visibility: the approximation of what is in view.
-            unoccluded: (L, N), True where the line of sight is free; None if all are.
-            device: "cpu" (all cores) or a CUDA device.
+        The mask (L, N) is True where the line of sight is free; None if all are. The CPU works with all its cores.
 
         Raises:
             ConfigError: no such device.
@@ -72,48 +60,13 @@ class FisherField:
         return numbers
 
     def metric(self, row: int, axes: ArrayLike, metric: str, about_origin: bool = False) -> Float:
-        """A metric of the information at location `row` along optical axes (D, 3); (D,).
+        """A metric (see `metric_of`) of the information at location `row` along unit optical axes (D, 3); (D,).
 
-        Args:
-            row: of the location.
-            axes: (D, 3) of unit length.
-            metric: "mineig", "logdet" or "trace".
-            about_origin: rotate about the world's origin, as the released code of the Fisher Information Field does.
-
-        Raises:
-            ConfigError: no such metric.
+        With `about_origin` rotations are about the world's origin, as in the released code of the field.
         """
         numbers = self.information(row, axes)
         pivots = np.broadcast_to(-self.locations[row], (len(numbers), 3)) if about_origin else None
         return metric_of(numbers, metric, pivots)
-
-    def best_axis(self, row: int, axes: ArrayLike, metric: str) -> int:
-        """Row of the optical axis of (D, 3) with the greatest metric at location `row`."""
-        return int(np.argmax(self.metric(row, axes, metric)))
-
-    def save(self, path: Path) -> None:
-        """Write an uncompressed NPZ, atomically: locations, factors, and the approximation as JSON text."""
-        visibility: Any = self.visibility
-        about = {"format_version": FORMAT_VERSION, "kind": type(visibility).__name__, **asdict(visibility)}
-        arrays = {"locations": self.locations, "factors": self.factors, "about": np.array(json.dumps(about))}
-        save_npz(path, arrays)
-
-    @classmethod
-    def load(cls, path: Path) -> FisherField:
-        """Read what `save` wrote.
-
-        Raises:
-            MapError: the file is missing, damaged or of another version.
-        """
-        try:
-            data = load_npz(path)
-            about = json.loads(str(data["about"]))
-            if about.pop("format_version") != FORMAT_VERSION:
-                raise ValueError("another version of the format")
-            kind = {kind.__name__: kind for kind in (QuadraticVisibility, GaussianProcessVisibility)}
-            return cls(data["locations"], kind[about.pop("kind")](**about), data["factors"])
-        except (ValueError, KeyError, TypeError) as error:
-            raise MapError(f"not a Fisher Information Field: {error}", path=path, fix="Build it again.") from error
 
 
 def worst_axis_of_trace(field: FisherField, row: int, axes: ArrayLike) -> Float:

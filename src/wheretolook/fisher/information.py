@@ -43,11 +43,9 @@ def bearing_numbers(offsets: ArrayLike) -> Float:
 def information_matrices(numbers: ArrayLike, pivots: ArrayLike | None = None) -> Float:
     """Information matrices (..., 6, 6) of sums kept as numbers (..., 15); translation first, rotation second.
 
-    Args:
-        numbers: as `bearing_numbers` gives them, summed over landmarks.
-        pivots: (..., 3) offsets from the camera centre to the points that the pose is rotated about, metres: minus the
-            camera centre rotates it about the world's origin, as the released code of the Fisher Information Field
-            does. None for the camera centre. The determinant does not depend on it.
+    Pivots (..., 3) are offsets in metres from the camera centre to the points that the pose is rotated about: minus the
+    camera centre rotates it about the world's origin, as the released code of the Fisher Information Field does. None
+    for the camera centre. The determinant does not depend on it.
     """
     numbers = np.asarray(numbers, dtype=np.float64)
     matrices = np.empty((*numbers.shape[:-1], 6, 6))

@@ -23,15 +23,11 @@ ROWS_AT_ONCE = 4096  # matrices that a thread of a CPU takes at a time: a few mi
 
 
 def metric_of(numbers: ArrayLike, metric: str, pivots: ArrayLike | None = None, device: str = "cpu") -> Float:
-    """A metric (B,) of information matrices kept as numbers (B, 15); more is better.
+    """A metric (B,) of information matrices kept as numbers (B, 15), about pivots (B, 3) as in `information_matrices`.
 
-    Args:
-        numbers: (B, 15), see `wheretolook.fisher.information`.
-        metric: "trace"; "logdet", the logarithm of one plus the determinant (log(1 + d), and -log(1 - d) where an
-            approximation makes d negative), so that it is finite without landmarks and keeps the determinant's order;
-            "mineig", the smallest absolute eigenvalue, which is the smallest singular value the released code takes.
-        pivots: (B, 3) as in `information_matrices`.
-        device: "cpu" or a CUDA device.
+    More is better. The metric is "trace"; "logdet", the logarithm of one plus the determinant (log(1 + d), and
+    -log(1 - d) where an approximation makes d negative), so that it is finite without landmarks and keeps the
+    determinant's order; or "mineig", the smallest absolute eigenvalue, the singular value that the released code takes.
 
     Raises:
         ConfigError: no such metric, or no such device.
@@ -56,10 +52,7 @@ def metric_of_eigenvalues(values: Float, metric: str) -> Float:
 
 
 def eigenvalues(numbers: ArrayLike, pivots: ArrayLike | None = None, device: str = "cpu") -> Float:
-    """Eigenvalues (B, 6), in no order, of information matrices kept as numbers (B, 15).
-
-    Their errors are about 1e-16 of the matrix's norm. The arguments are those of `metric_of`.
-    """
+    """Eigenvalues (B, 6), in no order, of what `metric_of` takes; their errors are about 1e-16 of the matrix's norm."""
     numbers = np.ascontiguousarray(numbers, dtype=np.float64).reshape(-1, N_NUMBERS)
     arms = np.empty((0, 3)) if pivots is None else np.ascontiguousarray(pivots, dtype=np.float64).reshape(-1, 3)
     device = start_warp(device)

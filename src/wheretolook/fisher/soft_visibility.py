@@ -14,9 +14,11 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-from wheretolook.geometry.colmap_camera import Camera, ColmapCamera
+from wheretolook.geometry.camera import Camera, ColmapCamera
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import Float
+
+JITTER = 1e-10  # added to the diagonal of a Gaussian process's K
 
 
 class SoftVisibility(ABC):
@@ -80,27 +82,17 @@ class GaussianProcessVisibility(SoftVisibility):
 
     v(z, f) = k(z, Z) K^-1 s(Z . f) with the sampled axes Z, the kernel k(z, z') = exp(-|z - z'|^2 / 2 l^2),
     K = k(Z, Z), and s(c) = 1 / (1 + exp(-steepness (c - cos half angle))).
-
-    Args:
-        half_angle_rad: of the cone that stands for the field of view.
-        length: l, the length of a chord of the unit sphere.
-        n_factors: F; the axes are a Fibonacci lattice.
-        steepness: of the soft step.
-        jitter: added to K's diagonal.
     """
 
-    half_angle_rad: float
-    length: float
-    n_factors: int = 70
-    steepness: float = 15.0
-    jitter: float = 1e-10
+    half_angle_rad: float  # of the cone that stands for the field of view
+    length: float  # l, the length of a chord of the unit sphere
+    n_factors: int = 70  # F; the axes are a Fibonacci lattice
+    steepness: float = 15.0  # of the soft step
 
     @classmethod
-    def fitted(
-        cls, half_angle_rad: float, n_factors: int = 70, steepness: float = 15.0, jitter: float = 1e-10
-    ) -> GaussianProcessVisibility:
+    def fitted(cls, half_angle_rad: float, n_factors: int = 70, steepness: float = 15.0) -> GaussianProcessVisibility:
         """The process whose length l maximizes the marginal likelihood of the step at the axes, for many bearings."""
-        return _fitted(float(half_angle_rad), n_factors, float(steepness), float(jitter))
+        return _fitted(float(half_angle_rad), n_factors, float(steepness))
 
     @cached_property
     def axes(self) -> Float:
@@ -110,7 +102,7 @@ class GaussianProcessVisibility(SoftVisibility):
     @cached_property
     def inverse(self) -> Float:
         """K^-1, (F, F)."""
-        return np.asarray(np.linalg.inv(self.of_axes(self.axes) + self.jitter * np.eye(self.n_factors)))
+        return np.asarray(np.linalg.inv(self.of_axes(self.axes) + JITTER * np.eye(self.n_factors)))
 
     def of_axes(self, axes: Float) -> Float:
         """k(z, Z), (D, F)."""
@@ -128,23 +120,23 @@ class GaussianProcessVisibility(SoftVisibility):
         """s(c) of cosines between axis and bearing."""
         return np.asarray(0.5 * (1 + np.tanh(0.5 * self.steepness * (cosines - np.cos(self.half_angle_rad)))))
 
-    def held_out_error(self, n_bearings: int = 1000, n_axes: int = 1000, seed: int = 1) -> float:
+    def held_out_error(self) -> float:
         """Root mean square of v(z, f) - s(z . f) over random bearings and axes that the fit was not made with."""
-        rng = np.random.default_rng(seed)
-        bearings, axes = (_unit(rng.normal(size=(n, 3))) for n in (n_bearings, n_axes))
+        rng = np.random.default_rng(1)
+        bearings, axes = (_unit(rng.normal(size=(1000, 3))) for _ in range(2))
         predicted = self.of_axes(axes) @ self.finish(self.of_bearings(bearings).T)
         return float(np.sqrt(np.mean((predicted - self.step(axes @ bearings.T)) ** 2)))
 
 
 @lru_cache
-def _fitted(half_angle_rad: float, n_factors: int, steepness: float, jitter: float) -> GaussianProcessVisibility:
+def _fitted(half_angle_rad: float, n_factors: int, steepness: float) -> GaussianProcessVisibility:
     from scipy.optimize import minimize_scalar
 
     bearings = _unit(np.random.default_rng(0).normal(size=(1000, 3)))
 
     def negative_log_likelihood(log_length: float) -> float:
-        process = GaussianProcessVisibility(half_angle_rad, float(np.exp(log_length)), n_factors, steepness, jitter)
-        kernel = process.of_axes(process.axes) + jitter * np.eye(n_factors)
+        process = GaussianProcessVisibility(half_angle_rad, float(np.exp(log_length)), n_factors, steepness)
+        kernel = process.of_axes(process.axes) + JITTER * np.eye(n_factors)
         seen = process.step(process.axes @ bearings.T)  # (F, 1000)
         sign, log_determinant = np.linalg.slogdet(kernel)
         if sign <= 0:
@@ -154,7 +146,7 @@ def _fitted(half_angle_rad: float, n_factors: int, steepness: float, jitter: flo
         return float(np.inf if variance <= 0 else n_factors * np.log(variance) + log_determinant)
 
     found = minimize_scalar(negative_log_likelihood, bounds=np.log([0.05, 1.2]), method="bounded")
-    return GaussianProcessVisibility(half_angle_rad, float(np.exp(found.x)), n_factors, steepness, jitter)
+    return GaussianProcessVisibility(half_angle_rad, float(np.exp(found.x)), n_factors, steepness)
 
 
 def cone_half_angle(camera: Camera) -> float:

@@ -12,9 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from wheretolook.geometry.poses import Float
 from wheretolook.utils.errors import ConfigError
 
-GOLDEN_ANGLE = np.pi * (1 + np.sqrt(5))
-"""Azimuth between neighbours of the spiral, in radians: the paper's i * pi * (1 + sqrt 5)."""
-
+GOLDEN_ANGLE = np.pi * (1 + np.sqrt(5))  # radians between neighbours of the spiral: the paper's i * pi * (1 + sqrt 5)
 Lattice = Literal["fibonacci", "azimuth-elevation", "released", "yaw-pitch"]
 
 
@@ -60,10 +58,7 @@ class VoxelGrid:
         return np.asarray(self.lower) + (index + 0.5) * self.voxel_m
 
     def location_ids(self, points: ArrayLike) -> NDArray[np.int64]:
-        """Ids of the voxels that hold world points (..., 3) m; -1 for points outside the grid (and NaN).
-
-        The grid is closed at its upper faces, so its own bounds belong to it.
-        """
+        """Ids of the voxels that hold world points (..., 3) m; -1 outside the grid (and NaN). Its bounds are inside."""
         points = np.asarray(points, dtype=np.float64)
         inside = np.all((points >= self.lower) & (points <= self.upper), axis=-1)
         scaled = np.where(inside[..., None], (points - self.lower) / self.voxel_m, 0.0)
@@ -79,8 +74,9 @@ class ViewLattice:
     Args:
         grid: voxels along x, y and z over the scene's bounds.
         directions: directions at each location.
-        lattice: how they are spread: "fibonacci" is even, "azimuth-elevation" is the paper's comparison, "released" is
-            what the released code does, "yaw-pitch" are ActLoc's 6 pitches x 18 yaws, whatever `directions` says.
+        lattice: how directions are spread: fibonacci, azimuth-elevation, released or yaw-pitch. The first is even, the
+            second the paper's comparison, the third what the released code does, and "yaw-pitch" are ActLoc's 6 pitches
+            x 18 yaws, whatever `directions` says.
 
     Raises:
         ConfigError: no voxel, no direction, or no such lattice.
@@ -159,10 +155,7 @@ def axes_of_angles(yaw_pitch_deg: ArrayLike) -> Float:
 
 
 def direction_lattice(n: int, lattice: Lattice = "fibonacci") -> Float:
-    """Directions (m, 3) of the named lattice.
-
-    m = n, except for "azimuth-elevation", where it is the nearest product, and "yaw-pitch", which are ActLoc's 108.
-    """
+    """Directions (m, 3) of the named lattice; m = n but for "azimuth-elevation" (near n) and "yaw-pitch" (108)."""
     if lattice not in LATTICES:
         raise ConfigError("unknown lattice", value=lattice, fix=f"Use one of {', '.join(LATTICES)}.")
     return LATTICES[lattice](n)
@@ -174,7 +167,6 @@ LATTICES: dict[str, Callable[[int], Float]] = {
     "released": released_lattice,
     "yaw-pitch": lambda n: axes_of_angles(yaw_pitch_angles()),
 }
-"""What makes the directions of each `Lattice`."""
 
 
 def _positive(n: int) -> int:

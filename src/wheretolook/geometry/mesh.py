@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,22 +13,16 @@ from numpy.typing import NDArray
 class TexturedMesh:
     """Triangles with textures, in metres, z up.
 
-    Attributes:
-        vertices: (V, 3) float32, world coordinates in metres.
-        triangles: (T, 3) int32, counter-clockwise seen from the front.
-        corner_uvs: (T, 3, 2) float32. (0, 0) is the outer corner of the texture's top-left pixel, u right, v down
-            (glTF); values outside [0, 1] repeat the texture.
-        triangle_texture: (T,) int32, index into `textures`.
-        textures: each (H, W, 3) uint8, sRGB.
-        vertex_colors: (V, 3) uint8 that multiply the texture, or None for white.
+    Of `corner_uvs`, (0, 0) is the outer corner of the texture's top-left pixel, u right, v down (glTF); values outside
+    [0, 1] repeat the texture.
     """
 
-    vertices: NDArray[np.float32]
-    triangles: NDArray[np.int32]
-    corner_uvs: NDArray[np.float32]
-    triangle_texture: NDArray[np.int32]
-    textures: tuple[NDArray[np.uint8], ...]
-    vertex_colors: NDArray[np.uint8] | None = None
+    vertices: NDArray[np.float32]  # (V, 3) world coordinates in metres
+    triangles: NDArray[np.int32]  # (T, 3), counter-clockwise seen from the front
+    corner_uvs: NDArray[np.float32]  # (T, 3, 2)
+    triangle_texture: NDArray[np.int32]  # (T,) index into `textures`
+    textures: tuple[NDArray[np.uint8], ...]  # each (H, W, 3), sRGB
+    vertex_colors: NDArray[np.uint8] | None = None  # (V, 3), multiply the texture; None for white
 
     @property
     def bounds(self) -> NDArray[np.float64]:
@@ -42,9 +37,6 @@ class TexturedMesh:
 
     def only(self, keep: NDArray[np.bool_]) -> TexturedMesh:
         """The mesh with only some of its triangles, (T,) bool, and all of its vertices."""
-        return replace(
-            self,
-            triangles=self.triangles[keep],
-            corner_uvs=self.corner_uvs[keep],
-            triangle_texture=self.triangle_texture[keep],
-        )
+        names = ("triangles", "corner_uvs", "triangle_texture")
+        kept: dict[str, Any] = {name: getattr(self, name)[keep] for name in names}
+        return replace(self, **kept)

@@ -15,16 +15,15 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.geometry.colmap_camera import Camera, ColmapCamera
-from wheretolook.geometry.poses import Float, split_poses
+from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
+from wheretolook.geometry.poses import split_poses
 from wheretolook.inputs.bins_kernel import BinGrid, bin_kernel, count_bins_kernel
 from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS, Layout
 from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.warp import start_warp
 from wheretolook.visibility.frustum import (
-    LandmarkSets,
+    PosedViews,
     in_view,
     offsets_from,
     pixels_of,
@@ -39,8 +38,7 @@ if TYPE_CHECKING:
 import torch
 from torch import Tensor
 
-GPU_LANES = 32
-"""Threads that share a view on a GPU where bins are only counted."""
+GPU_LANES = 32  # threads that share a view on a GPU where bins are only counted
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,11 +65,7 @@ class BinnedViews:
         return (self.counts > 0).sum((1, 2), dtype=np.int32)
 
     def select(self, channels: tuple[str, ...]) -> BinnedViews:
-        """The same views with only the named channels, in the order asked for.
-
-        Raises:
-            ConfigError: a channel is not there.
-        """
+        """The same views with only the named channels, in that order. Raises ConfigError if one is not there."""
         unknown = [name for name in channels if name not in self.channels]
         if unknown:
             raise ConfigError("unknown input channel", value=unknown[0], fix=f"There are {', '.join(self.channels)}.")
@@ -81,8 +75,7 @@ class BinnedViews:
 def arrange(means: NDArray[np.float32], filled: NDArray[np.bool_], layout: Layout) -> NDArray[np.float32]:
     """Lay out bins (B, C, bins, bins), which are zero where not `filled` (B, bins, bins), for a network.
 
-    "in_place" keeps every bin where it is; "compact" moves the filled bins to the front in row-major order, as the
-    released code does.
+    "in_place" keeps every bin where it is; "compact" moves the filled ones to the front, row by row.
     """
     if layout == "in_place":
         return means
@@ -94,35 +87,23 @@ def arrange(means: NDArray[np.float32], filled: NDArray[np.bool_], layout: Layou
 
 
 def bin_views(
-    camera: Camera,
-    cam_from_world: Float,
-    points: Float,
-    unoccluded: LandmarkSets,
-    location_rows: NDArray[np.integer[Any]],
+    posed: PosedViews,
     bins: int = 30,
     device: str = "cpu",
     block_bytes: int = 1 << 30,
     landmarks: Landmarks | None = None,
 ) -> BinnedViews:
-    """Bin the landmarks in view of each of B views, with all of `CHANNELS` or, on request, of `ALL_CHANNELS`.
+    """Bin the landmarks in view of each of B views in bins x bins cells, with all of `CHANNELS`.
 
-    Args:
-        camera: pinhole, or any COLMAP model (which COLMAP projects on the CPU).
-        cam_from_world: (B, 3, 4).
-        points: (N, 3) landmarks in metres.
-        unoccluded: landmarks each of L locations has a free line of sight to.
-        location_rows: (B,) row of each view's location in `unoccluded`.
-        bins: bins along each side of the image.
-        device: "cpu" or a CUDA device; one thread a view, so that sums do not depend on the order of threads.
-        block_bytes: about how many bytes of views are worked on at a time.
-        landmarks: whose the points are; with them the bins also have `LANDMARK_CHANNELS`, for about three times the
-            memory.
+    With `landmarks`, whose the points are, the bins also have `LANDMARK_CHANNELS`, for about three times the memory.
+    About `block_bytes` of views are worked on at a time, a view by one thread, so that sums do not depend on the order
+    of threads; COLMAP's cameras are computed on the CPU.
     """
-    if isinstance(camera, ColmapCamera):
-        return bin_views_plain(camera, cam_from_world, points, unoccluded, location_rows, bins, landmarks)
+    if isinstance(posed.camera, ColmapCamera):
+        return bin_views_plain(posed, bins, landmarks)
     device = start_warp(device)
     channels = CHANNELS if landmarks is None else ALL_CHANNELS
-    n_views, n_channels = len(cam_from_world), len(channels)
+    n_views, n_channels = len(posed.cam_from_world), len(channels)
     means = np.empty((n_views, n_channels, bins, bins), dtype=np.float32)
     counts = np.empty((n_views, bins, bins), dtype=np.int32)
     directions: Any = wp.empty(0, dtype=wp.vec3, device=device)
@@ -131,39 +112,29 @@ def bin_views(
         directions = wp.array(landmarks.mapping_direction, dtype=wp.vec3, device=device)
         attributes = wp.array(landmarks.attributes(), dtype=wp.float32, device=device)
     block = max(1, block_bytes // (bins * bins * (n_channels + 1) * 4))
-    for rows, views, grid in _blocks(camera, cam_from_world, points, unoccluded, location_rows, bins, device, block):
+    for rows, views, grid in _blocks(posed, bins, device, block):
         n = rows.stop - rows.start
         block_means = wp.zeros((n, n_channels, bins * bins), dtype=wp.float32, device=device)
         block_counts = wp.zeros((n, bins * bins), dtype=wp.int32, device=device)
-        inputs, outputs = [views, grid, directions, attributes], [block_means, block_counts]
-        wp.launch(bin_kernel, n, inputs, outputs, device=device)
+        inputs = [views, grid, directions, attributes]
+        wp.launch(bin_kernel, n, inputs, [block_means, block_counts], device=device)
         means[rows] = block_means.numpy().reshape(-1, n_channels, bins, bins)
         counts[rows] = block_counts.numpy().reshape(-1, bins, bins)
     return BinnedViews(means, counts, channels)
 
 
 def count_bins(
-    camera: Camera,
-    cam_from_world: Float,
-    points: Float,
-    unoccluded: LandmarkSets,
-    location_rows: NDArray[np.integer[Any]],
-    bins: int = 30,
-    device: str = "cpu",
-    block_bytes: int = 1 << 30,
+    posed: PosedViews, bins: int = 30, device: str = "cpu", block_bytes: int = 1 << 30
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """`BinnedViews.n_visible` and `BinnedViews.n_filled` of views, (B,) each, without the bins' means.
-
-    The arguments are those of `bin_views`, which is the plain twin of this.
-    """
-    if isinstance(camera, ColmapCamera):
-        binned = bin_views_plain(camera, cam_from_world, points, unoccluded, location_rows, bins)
+    """`n_visible` and `n_filled` of what `bin_views`, the plain twin of this, makes, (B,) each, without the means."""
+    if isinstance(posed.camera, ColmapCamera):
+        binned = bin_views_plain(posed, bins)
         return binned.n_visible, binned.n_filled
     device = start_warp(device)
     lanes = GPU_LANES if device != "cpu" else 1
-    n_in_view, n_filled = (np.empty(len(cam_from_world), dtype=np.int32) for _ in range(2))
+    n_in_view, n_filled = (np.empty(len(posed.cam_from_world), dtype=np.int32) for _ in range(2))
     block = max(1, block_bytes // (bins * bins * 4))
-    for rows, views, grid in _blocks(camera, cam_from_world, points, unoccluded, location_rows, bins, device, block):
+    for rows, views, grid in _blocks(posed, bins, device, block):
         n = rows.stop - rows.start
         taken = wp.zeros((n, bins * bins), dtype=wp.int32, device=device)
         outputs = [wp.zeros(n, dtype=wp.int32, device=device) for _ in range(2)]
@@ -172,50 +143,31 @@ def count_bins(
     return n_in_view, n_filled
 
 
-def _blocks(
-    camera: PinholeCamera,
-    cam_from_world: Float,
-    points: Float,
-    unoccluded: LandmarkSets,
-    location_rows: NDArray[np.integer[Any]],
-    bins: int,
-    device: str,
-    block: int,
-) -> Iterator[tuple[slice, Any, Any]]:
+def _blocks(posed: PosedViews, bins: int, device: str, block: int) -> Iterator[tuple[slice, Any, Any]]:
     """Up to `block` views at a time: which of the views, and `Views` and `BinGrid` of them on the device."""
-    poses, landmarks, sets = (
-        np.asarray(cam_from_world),
-        points_on_device(points, device),
-        sets_on_device(unoccluded, device),
-    )
+    camera, poses = posed.camera, np.asarray(posed.cam_from_world)
+    assert isinstance(camera, PinholeCamera)
+    landmarks, sets = points_on_device(posed.points, device), sets_on_device(posed.unoccluded, device)
     for begin in range(0, len(poses), block):
         rows = slice(begin, min(begin + block, len(poses)))
         grid: Any = BinGrid()
         grid.rotations = wp.array(poses[rows, :, :3].astype(np.float32), dtype=wp.mat33, device=device)
         grid.focal, grid.cx, grid.cy, grid.bins = camera.focal_px, camera.cx, camera.cy, bins
         grid.columns_per_pixel, grid.rows_per_pixel = bins / camera.width, bins / camera.height
-        yield rows, views_on_device(camera, poses[rows], landmarks, sets, location_rows[rows], device), grid
+        yield rows, views_on_device(posed, rows, landmarks, sets, device), grid
 
 
-def bin_views_plain(
-    camera: Camera,
-    cam_from_world: Float,
-    points: Float,
-    unoccluded: LandmarkSets,
-    location_rows: NDArray[np.integer[Any]],
-    bins: int = 30,
-    landmarks: Landmarks | None = None,
-) -> BinnedViews:
+def bin_views_plain(posed: PosedViews, bins: int = 30, landmarks: Landmarks | None = None) -> BinnedViews:
     """What `bin_views` computes, in NumPy."""
-    channels = CHANNELS if landmarks is None else ALL_CHANNELS
+    camera, channels = posed.camera, CHANNELS if landmarks is None else ALL_CHANNELS
     attributes = None if landmarks is None else landmarks.attributes()
-    n_views, n_cells = len(cam_from_world), bins * bins
+    n_views, n_cells = len(posed.cam_from_world), bins * bins
     means = np.zeros((n_views, len(channels), n_cells), dtype=np.float32)
     counts = np.zeros((n_views, n_cells), dtype=np.int32)
-    rows = zip(*split_poses(cam_from_world), location_rows, strict=True)
+    rows = zip(*split_poses(posed.cam_from_world), posed.location_rows, strict=True)
     for view, (rotation, center, location) in enumerate(rows):
-        candidates = unoccluded[int(location)]
-        offsets = offsets_from(center, points[candidates])
+        candidates = posed.unoccluded[int(location)]
+        offsets = offsets_from(center, posed.points[candidates])
         seen = in_view(camera, rotation[None], offsets)[0]
         offsets, seen_rows = offsets[seen], candidates[seen]
         points_cam = rotate(rotation.astype(np.float32), offsets)
@@ -232,24 +184,19 @@ def bin_views_plain(
             ratio = np.log(distance) - of_map[:, MAP_ATTRIBUTES.index("mapped_distance")]
             columns += [along / distance, ratio, *of_map.T]
         for channel, values in enumerate(columns):
-            total = np.bincount(cell, weights=values, minlength=n_cells)
-            means[view, channel] = total / np.maximum(counts[view], 1)
+            means[view, channel] = np.bincount(cell, weights=values, minlength=n_cells) / np.maximum(counts[view], 1)
     return BinnedViews(means.reshape(n_views, -1, bins, bins), counts.reshape(n_views, bins, bins), channels)
 
 
-STATISTICS_BLOCK = 256
-"""Views worked through at a time when statistics are taken: few enough for a processor's cache."""
+STATISTICS_BLOCK = 256  # views worked through at a time when statistics are taken: few enough for a processor's cache
 
 
 @dataclass(frozen=True)
 class InputStatistics:
     """Mean and standard deviation of each kind of input over the filled bins of the training views.
 
-    Attributes:
-        channels: names of the channels, as in `wheretolook.inputs.channels.ALL_CHANNELS`.
-        mean: mean of each channel, in its unit (such as pixels or metres), over the values that are known.
-        std: standard deviation of each channel, in its unit; 1 where it would be 0. Infinite where no value is known,
-            so that a network does not look at a channel that it has never seen.
+    They are in each channel's unit (such as pixels or metres), over the values that are known. The deviation is 1 where
+    it would be 0, and infinite where no value is known, so that a network does not look at a channel never seen.
     """
 
     channels: tuple[str, ...]
@@ -258,13 +205,9 @@ class InputStatistics:
 
     @classmethod
     def of(cls, means: Tensor, filled: Tensor, rows: Tensor, channels: tuple[str, ...] = CHANNELS) -> InputStatistics:
-        """Statistics over the filled bins of some views.
+        """Statistics over the bins of views `rows` (n,) int64 among `means` (B, C, bins, bins) that are `filled`.
 
-        Args:
-            means: (B, C, bins, bins) binned views, empty bins zero, NaN where a value is not known.
-            filled: (B, bins, bins) bool.
-            rows: views to use, (n,) int64.
-            channels: names of the C channels.
+        Means are zero in empty bins and NaN where a value is not known; `filled` is (B, bins, bins) bool.
         """
         rows = rows.to(means.device)
         total = torch.zeros(len(channels), dtype=torch.float64, device=means.device)

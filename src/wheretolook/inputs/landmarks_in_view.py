@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from wheretolook.geometry.colmap_camera import Camera, ColmapCamera
+from wheretolook.geometry.camera import Camera, ColmapCamera
 from wheretolook.geometry.poses import Float, split_poses
 from wheretolook.inputs.channels import ATTRIBUTES
 from wheretolook.inputs.localization_map import LocalizationMap
@@ -26,19 +26,12 @@ BLOCK_ENTRIES = {"cpu": 1 << 15, "cuda": 1 << 22}  # landmarks in view a block: 
 
 @dataclass(frozen=True, eq=False)
 class ViewLandmarks:
-    """The landmarks in view of each of B views, E entries in all, one view after the other.
+    """The landmarks in view of each of B views, E entries in all, one view after the other."""
 
-    Attributes:
-        starts: (B + 1,) int64; view b has entries `starts[b]` to `starts[b + 1]`.
-        rows: (E,) int64, rows of the landmarks in the map.
-        values: (E, A) float32.
-        attributes: names of the A attributes.
-    """
-
-    starts: Tensor
-    rows: Tensor
-    values: Tensor
-    attributes: tuple[str, ...] = ATTRIBUTES
+    starts: Tensor  # (B + 1,) int64; view b has entries `starts[b]` to `starts[b + 1]`
+    rows: Tensor  # (E,) int64, rows of the landmarks in the map
+    values: Tensor  # (E, A) float32
+    attributes: tuple[str, ...] = ATTRIBUTES  # names of the A attributes
 
     def __len__(self) -> int:
         return len(self.starts) - 1
@@ -57,9 +50,7 @@ class ViewLandmarks:
 class LandmarkDescriber:
     """Finds the landmarks that views of a map see, and their attributes, on the map's device.
 
-    Args:
-        localization_map: landmarks, camera, occlusion, and the device to work on.
-        attributes: what to tell of each landmark: some of `ATTRIBUTES`, by name, in the order asked for.
+    What it tells of each landmark are some of `ATTRIBUTES`, by name, in the order asked for.
     """
 
     def __init__(self, localization_map: LocalizationMap, attributes: tuple[str, ...] = ATTRIBUTES) -> None:
@@ -104,12 +95,8 @@ class LandmarkDescriber:
     ) -> Iterator[tuple[slice, ViewLandmarks, Tensor]]:
         """Landmarks of views (B, 3, 4), in blocks of views that leave a network over the landmarks room to work.
 
-        Args:
-            cam_from_world: (B, 3, 4).
-            most: describe at most this many landmarks of a view, evenly spread over those it sees in the map's order.
-
-        Yields:
-            Which of the views, their landmarks, and how many each of them sees in all.
+        At `most` so many landmarks of a view are described, evenly spread over those it sees in the map's order. Yields
+        which of the views, their landmarks, and how many each of them sees in all.
         """
         starts, indices = self.localization_map.in_view_on_device(cam_from_world)
         n_in_view = np.diff(starts)
@@ -144,7 +131,6 @@ def _thinned(starts: Tensor, indices: Tensor, most: int) -> tuple[NDArray[np.int
 
 FILLED = 30  # bins along each side of the image, of which the filled ones are counted, as in the paper
 COARSE = 4  # bins along each side of the coarse grid
-
 QUANTILES = (0.1, 0.5, 0.9)
 
 POOLED = (

@@ -10,14 +10,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.geometry.colmap_camera import Camera, ColmapCamera
+from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import Float, camera_centers, check_poses
 from wheretolook.inputs.bins import BinnedViews, bin_views, count_bins
-from wheretolook.mapping.cameras import colmap_poses
-from wheretolook.mapping.colmap_model import read_model
+from wheretolook.mapping.colmap_model import colmap_poses, read_model
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
-from wheretolook.visibility.frustum import LandmarkSets, in_view_on_device, landmarks_in_view, points_on_device
+from wheretolook.visibility.frustum import (
+    LandmarkSets,
+    PosedViews,
+    in_view_on_device,
+    landmarks_in_view,
+    points_on_device,
+)
 from wheretolook.visibility.occlusion import NoOcclusion, OcclusionModel
 
 if TYPE_CHECKING:
@@ -34,8 +38,7 @@ class LocalizationMap:
     camera: Camera = PinholeCamera()  # the camera that will look: a pinhole, or any COLMAP model
     occlusion: OcclusionModel = NoOcclusion()  # which landmarks have a free line of sight from a location
     device: str = "cpu"  # where kernels run, "cpu" or a CUDA device
-    # cam_from_world (M, 3, 4) of the images the map was made from, where they are known.
-    mapping_poses: Float | None = None
+    mapping_poses: Float | None = None  # cam_from_world (M, 3, 4) of the images the map was made from, if known
 
     @classmethod
     def from_colmap(
@@ -63,10 +66,8 @@ class LocalizationMap:
             MapError: no usable model in the folder.
             SceneError: the mesh cannot be used.
         """
-        reconstruction = read_model(model)
-        landmarks = load_colmap_landmarks(
-            Path(model), max_reprojection_error_px=max_reprojection_error_px, reconstruction=reconstruction
-        )
+        found, worst_px = read_model(model), max_reprojection_error_px
+        landmarks = load_colmap_landmarks(Path(model), max_reprojection_error_px=worst_px, reconstruction=found)
         occlusion = occlusion or NoOcclusion()
         if mesh is not None:
             from wheretolook.scenes.loading import load_mesh
@@ -75,65 +76,47 @@ class LocalizationMap:
 
             space = FreeSpace(load_mesh(Path(mesh)), device=device)
             occlusion = MeshOcclusion(space.raycaster, two_sided=space.two_sided)
-        return cls(landmarks, camera, occlusion, device, colmap_poses(model, reconstruction).astype(np.float32))
+        return cls(landmarks, camera, occlusion, device, colmap_poses(model, found).astype(np.float32))
 
     def bin_views(self, cam_from_world: Float, bins: int = 30, landmark_channels: bool = False) -> BinnedViews:
         """Bin the landmarks that views (B, 3, 4) see, in bins x bins cells of the image.
 
         Bins have `CHANNELS`, or with `landmark_channels` also the landmarks' attributes, `ALL_CHANNELS`. Here as in
-        the other methods, views at the same location share its occlusion test.
-
-        Raises:
-            ValueError: the poses have another shape, or entries that are not finite.
+        the other methods, views at the same location share its occlusion test, and poses of another shape or with
+        entries that are not finite raise ValueError.
         """
         described = self.landmarks if landmark_channels else None
-        return bin_views(*self._views(cam_from_world), bins=bins, device=self.device, landmarks=described)
+        return bin_views(self._views(cam_from_world), bins=bins, device=self.device, landmarks=described)
 
     def count_bins(self, cam_from_world: Float, bins: int = 30) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """How many landmarks the views (B, 3, 4) see, and how many bins have one in them, (B,) each.
-
-        Raises:
-            ValueError: the poses have another shape, or entries that are not finite.
-        """
-        return count_bins(*self._views(cam_from_world), bins=bins, device=self.device)
+        """How many landmarks the views (B, 3, 4) see, and how many bins have one in them, (B,) each."""
+        return count_bins(self._views(cam_from_world), bins=bins, device=self.device)
 
     def landmarks_in_view(self, cam_from_world: Float) -> LandmarkSets:
-        """The landmarks that each of the views (B, 3, 4) sees.
-
-        Raises:
-            ValueError: the poses have another shape, or entries that are not finite.
-        """
-        return landmarks_in_view(*self._views(cam_from_world), device=self.device)
+        """The landmarks that each of the views (B, 3, 4) sees."""
+        return landmarks_in_view(self._views(cam_from_world), self.device)
 
     def in_view_on_device(self, cam_from_world: Float) -> tuple[NDArray[np.int64], Tensor]:
-        """What `landmarks_in_view` gives, its indices left on the map's device.
-
-        Returns:
-            starts: (B + 1,) int64; view b sees the landmarks `indices[starts[b]:starts[b + 1]]`.
-            indices: int32, on the map's device.
-
-        Raises:
-            ValueError: the poses have another shape, or entries that are not finite.
-        """
+        """What `landmarks_in_view` gives, starts (B + 1,) int64 and indices int32; the latter on the map's device."""
         import torch  # takes seconds to load
         import warp as wp
 
-        camera, poses, _, unoccluded, rows = self._views(cam_from_world)
-        if isinstance(camera, ColmapCamera):
-            seen = landmarks_in_view(camera, poses, self.landmarks.points, unoccluded, rows)
+        views = self._views(cam_from_world)
+        if isinstance(self.camera, ColmapCamera):
+            seen = landmarks_in_view(views)
             return seen.starts.astype(np.int64), torch.from_numpy(seen.indices).to(self.device)
-        starts, indices = in_view_on_device(camera, poses, self._points_on_device, unoccluded, rows, self.device)
+        starts, indices = in_view_on_device(views, self._points_on_device, self.device)
         return starts.astype(np.int64), wp.to_torch(indices)
 
     @cached_property
     def _points_on_device(self) -> Any:
         return points_on_device(self.landmarks.points, self.device)
 
-    def _views(self, cam_from_world: Float) -> tuple[Camera, Float, Float, LandmarkSets, NDArray[np.int64]]:
-        """Camera, checked poses, points, the unoccluded landmarks of each location, and each pose's location."""
+    def _views(self, cam_from_world: Float) -> PosedViews:
         poses, points = check_poses(cam_from_world), self.landmarks.points
         locations, rows = shared_locations(poses)
-        return self.camera, poses, points, LandmarkSets.from_mask(self.occlusion.unoccluded(locations, points)), rows
+        unoccluded = LandmarkSets.from_mask(self.occlusion.unoccluded(locations, points))
+        return PosedViews(self.camera, poses, points, unoccluded, rows)
 
 
 def shared_locations(cam_from_world: Float) -> tuple[Float, NDArray[np.int64]]:

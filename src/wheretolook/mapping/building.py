@@ -21,11 +21,11 @@ from wheretolook.features.extraction import KeypointExtractor
 from wheretolook.features.keypoints import Keypoints
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
-from wheretolook.geometry.poses import poses_looking_along
-from wheretolook.mapping.cameras import CAMERAS_FILE, colmap_poses, save_mapping_poses
+from wheretolook.geometry.poses import Float, poses_looking_along
+from wheretolook.mapping import triangulation
+from wheretolook.mapping.colmap_model import CAMERAS_FILE, colmap_poses, save_mapping_poses
 from wheretolook.mapping.config import MapConfig
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
-from wheretolook.mapping.pairs import choose_pairs, shrink_depth, surface_overlap
 from wheretolook.mapping.triangulation import image_name, triangulate_known_poses
 from wheretolook.mapping.walk import FreeSpaceQueries, plan_walk
 from wheretolook.utils.errors import MapError
@@ -74,30 +74,17 @@ def build_map(
     device: str = "cpu",
     progress: bool = True,
 ) -> MapReport:
-    """Map a scene: walk, render, extract, match, triangulate with known poses, filter.
+    """Map a scene in metres, z up: walk, render, extract, match, triangulate with known poses, filter.
 
     The result is a COLMAP model (binary) that any COLMAP tool opens, with `landmarks.npz`, `cameras.npz` and
     `report.json`, which is also returned, beside it. The model holds the filtered points only, so that every reader
     gets the same map. The folder appears when all is done; an interrupted or failed build leaves nothing behind and
-    does not touch an earlier map.
+    does not touch an earlier map, which a finished one replaces. The same seed gives the same bytes.
 
-    Args:
-        mesh: the scene, metres, z up.
-        renderer: renders `mesh`.
-        free_space: free space of `mesh`.
-        camera: intrinsics of the mapping camera.
-        config: see `MapConfig`.
-        seed: the same seed gives the same model and landmarks byte for byte.
-        out_dir: folder to make; an earlier map there is replaced.
-        raycaster: measures the distance from landmarks to the mesh; made on the CPU if None.
-        workers: processes that extract keypoints and match them. Above 1 the caller's script must be guarded
-            by `if __name__ == "__main__":`, as for any of Python's process pools.
-        device: where keypoints are extracted, "cpu" or a CUDA device.
-        progress: show progress bars.
-
-    Raises:
-        MapError: the images give no landmark, or `out_dir` holds something that is not a map.
-        SceneError: there is no floor to walk on.
+    `raycaster` measures the distance from landmarks to the mesh. Keypoints are extracted on `device`, "cpu" or a CUDA
+    device, and matched, by `workers` processes; above 1 the caller's script must be guarded by
+    `if __name__ == "__main__":`, as for any of Python's process pools. Raises MapError if the images give no landmark
+    or `out_dir` holds something that is not a map, SceneError if there is no floor to walk on.
     """
     config, out_dir, clock = config or MapConfig(), Path(out_dir), Clock()
     refuse_foreign_folder(out_dir)
@@ -112,7 +99,8 @@ def build_map(
             extracted = extract_with_colors(extractor, images, len(poses), processes, "map: render, extract", progress)
             keypoints, colors = zip(*extracted, strict=True)
         with clock("pairs"):
-            pairs = choose_pairs(surface_overlap(camera, poses, np.stack(depth)), config.partners)
+            overlap = triangulation.surface_overlap(camera, poses, np.stack(depth))
+            pairs = triangulation.choose_pairs(overlap, config.partners)
         database = partial / DATABASE_FILE
         views = camera, poses, keypoints, colors
         model = triangulate_known_poses(database, *views, pairs, config, clock, seed, processes, progress)
@@ -168,11 +156,7 @@ def save_landmarks(folder: Path, database: Path, max_reprojection_error_px: floa
 
 
 def remove_inaccurate(model: Any, max_reprojection_error_px: float, out_dir: Path, fix: str) -> int:
-    """Remove the points of a reconstruction with a larger mean reprojection error. Returns how many.
-
-    Raises:
-        MapError: no point is left.
-    """
+    """Remove points of a reconstruction with a larger mean reprojection error; how many. MapError if none is left."""
     errors = {i: point.error for i, point in model.points3D.items()}
     removed = [i for i, error in errors.items() if not error <= max_reprojection_error_px]
     if len(removed) == len(errors):
@@ -246,18 +230,14 @@ def extract_with_colors(
 
 
 def _rendered(
-    renderer: Renderer,
-    camera: PinholeCamera,
-    poses: NDArray[np.floating[Any]],
-    depth: list[NDArray[np.float32]],
-    keep_in: Path | None,
+    renderer: Renderer, camera: PinholeCamera, poses: Float, depth: list[NDArray[np.float32]], keep_in: Path | None
 ) -> Iterator[NDArray[np.uint8]]:
     """Images (H, W, 3) of poses (I, 3, 4), written to a folder if one is given. Adds their shrunk depth to `depth`."""
     import cv2
 
     for start in range(0, len(poses), _RENDER_BATCH):
         rendering = renderer.render(camera, poses[start : start + _RENDER_BATCH])
-        depth.extend(shrink_depth(rendering.depth_m))
+        depth.extend(triangulation.shrink_depth(rendering.depth_m))
         for offset, rgb in enumerate(rendering.rgb):
             if keep_in is not None:
                 keep_in.mkdir(exist_ok=True)

@@ -1,4 +1,4 @@
-"""Reads COLMAP models into arrays, with errors that say what is wrong with a file."""
+"""Reads COLMAP models into arrays, with errors that say what is wrong with a file, and stores their images' poses."""
 
 from __future__ import annotations
 
@@ -10,9 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from wheretolook.geometry.poses import Float
 from wheretolook.utils.colmap import quiet_colmap
 from wheretolook.utils.errors import MapError
+from wheretolook.utils.npz_files import load_npz, save_npz
 
+CAMERAS_FILE = "cameras.npz"  # lies beside the landmarks, small enough to travel without the COLMAP model
 MODEL_FILES = ("cameras", "images", "points3D")
 _REBUILD = "Copy or build the model again."
 # The least bytes of an entry: an image with an empty name and no 2D points, a rig of one sensor, a frame of one image.
@@ -38,8 +41,7 @@ class ModelArrays:
 def read_model(model_dir: str | Path) -> Any:
     """Read a COLMAP model as a `pycolmap.Reconstruction`, binary or text, with or without rigs and frames (3.12).
 
-    Raises:
-        MapError: the folder or a file is missing, or a file is truncated or corrupt.
+    Raises MapError if the folder or a file is missing, or a file is truncated or corrupt.
     """
     import pycolmap
 
@@ -75,8 +77,7 @@ def read_model(model_dir: str | Path) -> Any:
 def model_arrays(reconstruction: Any) -> ModelArrays:
     """Arrays of a `pycolmap.Reconstruction`. Errors it does not hold yet are computed from the observations.
 
-    Raises:
-        MapError: a track names an image that has no pose.
+    Raises MapError if a track names an image that has no pose.
     """
     points = reconstruction.points3D
     point_ids = np.array(sorted(points), dtype=np.int64)
@@ -108,8 +109,7 @@ def read_descriptors(
 ) -> list[NDArray[np.uint8]]:
     """Descriptors (K, 128) uint8 of the model's images, in the order of `model.image_ids`, joined by image name.
 
-    Raises:
-        MapError: the database is missing, unreadable, or not the one the model was built from.
+    Raises MapError if the database is missing, unreadable, or not the one the model was built from.
     """
     import pycolmap
 
@@ -143,6 +143,42 @@ def read_descriptors(
     return descriptors
 
 
+def colmap_poses(model_dir: str | Path, reconstruction: Any = None) -> Float:
+    """Poses cam_from_world (M, 3, 4) float64 of the images of a COLMAP model that have one, in the order of their ids.
+
+    The model is read from its folder, as by `read_model`, unless it is given. MapError if no image has a pose.
+    """
+    images = (reconstruction or read_model(model_dir)).images
+    posed = [images[number] for number in sorted(images) if images[number].has_pose]
+    if not posed:
+        raise MapError("the map has no images", path=model_dir, value=0, fix="Run the map stage again.")
+    return np.stack([image.cam_from_world().matrix() for image in posed])
+
+
+def holds_model(folder: Path) -> bool:
+    """Whether a folder holds a COLMAP model, binary or text."""
+    return any(all((folder / (name + suffix)).is_file() for name in MODEL_FILES) for suffix in (".bin", ".txt"))
+
+
+def save_mapping_poses(cam_from_world: Float, path: str | Path) -> None:
+    """Write poses (M, 3, 4) in single precision as an NPZ file, atomically. The same poses give the same bytes."""
+    save_npz(Path(path), {"cam_from_world": np.asarray(cam_from_world, dtype=np.float32)})
+
+
+def load_mapping_poses(path: str | Path) -> Float:
+    """Read what `save_mapping_poses` wrote, (M, 3, 4) float32. MapError if the file is missing, damaged or another."""
+    path, fix = Path(path), "Run the map stage again, or remove it to read the COLMAP model beside it instead."
+    if not path.is_file():
+        raise MapError("there is no file of the mapping images' poses", path=path, fix="Run the map stage again.")
+    try:
+        poses = load_npz(path)["cam_from_world"]
+    except (ValueError, KeyError) as error:
+        raise MapError(f"cannot read the mapping images' poses: {error}", path=path, fix=fix) from error
+    if poses.ndim != 3 or poses.shape[1:] != (3, 4) or not len(poses) or not np.isfinite(poses).all():
+        raise MapError("these are no poses of mapping images", path=path, value=poses.shape, fix=fix)
+    return np.asarray(poses, dtype=np.float32)
+
+
 def _check_count(path: Path, least_bytes: int) -> None:
     if not path.is_file():
         return  # models from before COLMAP 3.12 have no rigs and frames
@@ -154,9 +190,8 @@ def _check_count(path: Path, least_bytes: int) -> None:
 
 
 def _check_points(path: Path) -> None:
-    data = path.read_bytes()
     _check_count(path, _POINT_BYTES)
-    end = 8
+    data, end = path.read_bytes(), 8
     for _ in range(struct.unpack_from("<Q", data)[0]):
         if end + _POINT_BYTES > len(data):
             end = len(data) + 1
@@ -166,6 +201,6 @@ def _check_points(path: Path) -> None:
 
 
 def _check_size(path: Path, expected: int) -> None:
-    if path.stat().st_size != expected:
-        problem = "the file is truncated or corrupt"
-        raise MapError(problem, path=path, value=f"{path.stat().st_size} bytes", fix=_REBUILD)
+    size = path.stat().st_size
+    if size != expected:
+        raise MapError("the file is truncated or corrupt", path=path, value=f"{size} bytes", fix=_REBUILD)

@@ -58,8 +58,7 @@ def rotation_to_z(up: ArrayLike) -> Float:
     if z < -1 + 1e-12:
         return np.diag([1.0, -1.0, -1.0])
     skew = np.array([[0.0, 0.0, -x], [0.0, 0.0, -y], [x, y, 0.0]])
-    rotation: Float = np.eye(3) + skew + skew @ skew / (1 + z)
-    return rotation
+    return np.asarray(np.eye(3) + skew + skew @ skew / (1 + z))
 
 
 def _level_direction(axes: Float) -> Float | None:

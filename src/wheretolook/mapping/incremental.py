@@ -17,15 +17,10 @@ from tqdm.auto import tqdm
 
 from wheretolook.features.extraction import KeypointExtractor
 from wheretolook.features.keypoints import ExtractorConfig
+from wheretolook.mapping import photographs
 from wheretolook.mapping.building import extract_with_colors
 from wheretolook.mapping.colmap_model import read_model
-from wheretolook.mapping.photographs import (
-    PhotographCameras,
-    list_photographs,
-    photograph_pairs,
-    read_photograph,
-    reduce_photograph,
-)
+from wheretolook.mapping.photographs import PhotographCameras, list_photographs, photograph_pairs
 from wheretolook.mapping.triangulation import Stored, fill_database, match_pairs, stored_keypoints
 from wheretolook.utils.colmap import quiet_colmap
 from wheretolook.utils.errors import MapError
@@ -68,8 +63,7 @@ def photograph_features(
 ) -> PhotographFeatures:
     """Keypoints of all photographs in a folder, by the project's extractor: a later localization uses the same.
 
-    Raises:
-        MapError: there are fewer than two photographs, or one cannot be read.
+    Raises MapError if there are fewer than two photographs, or one cannot be read.
     """
     names = list_photographs(folder)
     files = [(name, (folder / name).stat().st_size, (folder / name).stat().st_mtime_ns) for name in names]
@@ -97,10 +91,7 @@ def map_incrementally(
     """Match photographs, verify the matches, and map incrementally (Schonberger and Frahm, CVPR 2016).
 
     Finished steps are kept in `work`. For `exhaustive_up_to` and `overlap` see `photograph_pairs`. The processes match;
-    COLMAP's bundle adjustment takes as many threads.
-
-    Raises:
-        MapError: the photographs do not overlap enough for any map.
+    COLMAP's bundle adjustment takes as many threads. MapError if the photographs do not overlap enough for any map.
     """
     seed %= 2**31  # COLMAP keeps it in an int
     pairs = photograph_pairs(len(features.names), exhaustive_up_to, overlap)
@@ -127,27 +118,23 @@ def map_incrementally(
 def _extract(
     folder: Path, names: list[str], max_side_px: int, extractor: KeypointExtractor, processes: Processes, progress: bool
 ) -> dict[str, NDArray[Any]]:
-    full_sizes, sizes, counts, pixels, descriptors, colors = [], [], [], [], [], []
+    full_sizes, sizes = [], []
 
-    def photographs() -> Iterator[NDArray[np.uint8]]:
+    def images() -> Iterator[NDArray[np.uint8]]:
         for name in names:
-            rgb = read_photograph(folder / name)
-            reduced = reduce_photograph(rgb, max_side_px)
+            rgb = photographs.read_photograph(folder / name)
+            reduced = photographs.reduce_photograph(rgb, max_side_px)
             full_sizes.append(rgb.shape[1::-1])
             sizes.append(reduced.shape[1::-1])
             yield reduced
 
     n = len(names)
-    extracted = extract_with_colors(extractor, photographs(), n, processes, "map: extract", progress, same_size=False)
-    for keypoints, color in extracted:
-        counts.append(len(keypoints))
-        stored = stored_keypoints(keypoints)
-        pixels.append(stored[0])
-        descriptors.append(stored[1])
-        colors.append(color)
-    parts: dict[str, list[NDArray[Any]]] = {"pixels": pixels, "descriptors": descriptors, "colors": colors}
-    joined = {name: np.concatenate(values) for name, values in parts.items()}
-    return {"full_sizes": np.array(full_sizes), "sizes": np.array(sizes), "counts": np.array(counts), **joined}
+    extracted = extract_with_colors(extractor, images(), n, processes, "map: extract", progress, same_size=False)
+    found = [(*stored_keypoints(keypoints), color) for keypoints, color in extracted]
+    counts = np.array([len(color) for *_, color in found])
+    parts = zip(("pixels", "descriptors", "colors"), zip(*found, strict=True), strict=True)
+    joined = {name: np.concatenate(values) for name, values in parts}
+    return {"full_sizes": np.array(full_sizes), "sizes": np.array(sizes), "counts": counts, **joined}
 
 
 def _fill(
@@ -192,7 +179,7 @@ def _reconstruct(
     shutil.rmtree(models, ignore_errors=True)
     models.mkdir()
     bar = tqdm(total=n_images, desc="map: register", disable=not progress, unit="image")
-    callbacks: dict[str, Any] = {
+    callbacks: Any = {
         "initial_image_pair_callback": lambda: bar.update(2),
         "next_image_callback": lambda: bar.update(1),
     }
@@ -203,10 +190,8 @@ def _reconstruct(
     ordered = sorted(found.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
     shutil.rmtree(models)
     if not ordered:
-        fix = (
-            f"Give at least {_LEAST_IMAGES} sharp photographs that share most of what they show with the next, "
-            "from different places; a focal length (map.photographs.camera_params) helps."
-        )
+        enough = f"at least {_LEAST_IMAGES} sharp photographs that share most of what they show with the next"
+        fix = f"Give {enough}, from different places; a focal length (map.photographs.camera_params) helps."
         value = f"{n_images} photographs, none placed"
         raise MapError("the photographs do not overlap enough for a map", value=value, fix=fix)
     models.mkdir()

@@ -71,11 +71,7 @@ class Landmarks:
 
     @classmethod
     def load(cls, path: str | Path) -> Landmarks:
-        """Read what `save` wrote, compact or not.
-
-        Raises:
-            MapError: the file is missing, truncated, or no file of landmarks.
-        """
+        """Read what `save` wrote, compact or not. MapError if the file is missing, truncated, or not of landmarks."""
         path, fix = Path(path), "Run the map stage again."
         if not path.is_file():
             raise MapError("there is no file of landmarks", path=path, fix=fix)
@@ -96,10 +92,8 @@ class Landmarks:
 
 def _floats(values: dict[str, NDArray[Any]], points: DTypeLike, others: DTypeLike) -> dict[str, NDArray[Any]]:
     """The same arrays, with the points and all other arrays of floats cast to the types given."""
-    return {
-        name: value.astype(points if name == "points" else others, copy=False) if value.dtype.kind == "f" else value
-        for name, value in values.items()
-    }
+    floats = {name: points if name == "points" else others for name, value in values.items() if value.dtype.kind == "f"}
+    return {name: value.astype(floats.get(name, value.dtype), copy=False) for name, value in values.items()}
 
 
 def load_colmap_landmarks(
@@ -109,17 +103,13 @@ def load_colmap_landmarks(
     device: str = "cpu",
     reconstruction: pycolmap.Reconstruction | None = None,
 ) -> Landmarks:
-    """Landmarks of a COLMAP model, with their attributes.
+    """Landmarks of a COLMAP model (binary or text) in metres, with their attributes. Its images may have many cameras.
 
-    Args:
-        model_dir: folder of a model (binary or text), in metres. Images may differ in intrinsics.
-        database: the COLMAP database the model was built from, for descriptors and ambiguity.
-        max_reprojection_error_px: landmarks with a larger mean reprojection error are left out (the paper's 0.5).
-        device: torch device for the search of the nearest descriptors.
-        reconstruction: the model, if it has been read already.
+    The database the model was built from gives descriptors and ambiguity, by a search of the nearest descriptors on a
+    torch device. Landmarks with a larger mean reprojection error are left out (the paper's 0.5). `reconstruction` is
+    the model, if it has been read already.
 
-    Raises:
-        MapError: the folder, a file or the database is missing, corrupt, or does not match; or no landmark is left.
+    Raises MapError if the folder, a file or the database is missing, corrupt or does not match, or no landmark is left.
     """
     reconstruction = reconstruction or read_model(model_dir)
     if reconstruction.num_points3D() == 0:

@@ -1,4 +1,4 @@
-"""ArUco and AprilTag markers: found in photographs by OpenCV, their corners placed in a map."""
+"""ArUco and AprilTag markers: found in photographs, with corners to hundredths of a pixel, and placed in a map."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wheretolook.geometry.poses import Float, camera_centers
-from wheretolook.mapping.marker_corners import refine_corners
 from wheretolook.utils.errors import ConfigError, MapError
 
 if TYPE_CHECKING:
@@ -21,12 +20,14 @@ if TYPE_CHECKING:
 
 _LEAST_ANGLE_DEG = 1.5  # between two rays to a marker, as for landmarks
 _SOFT_PX = 1.0  # residuals beyond this count less than by their square
+_ROUNDS = 3  # of fitting lines to the edges between the corners
+_SAMPLES = 32  # profiles across an edge
+_AWAY_FROM_CORNERS = 0.15  # share of an edge left out at either end, where its neighbours blur into it
+_STEPS_PER_PX = 4  # samples of a profile
 
-MAX_ERROR_PX = 4.0
-MAX_ERROR_SHARE = 1 / 400
-"""A marker is refused if the root mean square reprojection error of its corners exceeds both this many pixels and this
-share of the photographs' longer side. Corners are found to a fraction of a pixel; the error of a marker that was moved,
-or printed twice, is tens of pixels."""
+# A marker is refused if the root mean square reprojection error of its corners exceeds both this many pixels and this
+# share of the photographs' longer side. That of a marker that was moved, or printed twice, is tens of pixels.
+MAX_ERROR_PX, MAX_ERROR_SHARE = 4.0, 1 / 400
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,20 +61,10 @@ class Marker:
 
 
 def detect_markers(rgb: NDArray[np.uint8], dictionary: str, path: Path | None = None) -> dict[int, Float]:
-    """Find the markers of a dictionary in a photograph (H, W, 3) uint8.
+    """Corners (4, 2) of each marker in a photograph (H, W, 3) uint8 by its id, clockwise from its top left.
 
-    Args:
-        rgb: the photograph.
-        dictionary: by OpenCV's name, such as DICT_4X4_50 or DICT_APRILTAG_36H11.
-        path: of the photograph, for errors.
-
-    Returns:
-        Corners (4, 2) of each marker by its id, clockwise from its top left; (0.5, 0.5) is the centre of the top-left
-        pixel.
-
-    Raises:
-        ConfigError: OpenCV has no such dictionary.
-        MapError: two markers have the same id, so that one could not tell which is which in another photograph.
+    (0.5, 0.5) is the centre of the top-left pixel. The dictionary has OpenCV's name, such as DICT_4X4_50; else
+    ConfigError. MapError if two markers have the same id: which is which in another photograph would be open.
     """
     import cv2
 
@@ -91,9 +82,8 @@ def detect_markers(rgb: NDArray[np.uint8], dictionary: str, path: Path | None = 
 def place_marker(marker_id: int, views: Sequence[MarkerView]) -> Marker:
     """Place a marker's corners where the rays to them meet, by least reprojection error (robust: Huber-like).
 
-    Raises:
-        MapError: fewer than two photographs see the marker, or all from one direction; or no place fits all of them,
-            for instance because the marker was moved or printed twice.
+    Raises MapError if fewer than two photographs see the marker, or all from one direction; or no place fits all of
+    them, for instance because the marker was moved or printed twice.
     """
     from scipy.optimize import least_squares
 
@@ -146,11 +136,7 @@ def _reprojection(view: MarkerView, corners: Float) -> Float:
 
 @lru_cache(maxsize=4)
 def marker_detector(dictionary: str) -> Any:
-    """OpenCV's detector of a dictionary's markers.
-
-    Raises:
-        ConfigError: OpenCV has no such dictionary.
-    """
+    """OpenCV's detector of a dictionary's markers. Raises ConfigError if it has no such dictionary."""
     import cv2
 
     names = sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_"))
@@ -160,3 +146,60 @@ def marker_detector(dictionary: str) -> Any:
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
     return cv2.aruco.ArucoDetector(markers, parameters)
+
+
+def refine_corners(grey: NDArray[np.uint8], corners: Float) -> Float:
+    """Move a marker's corners (4, 2) to where lines through its edges meet, or not if an edge cannot be made out.
+
+    (0, 0) is the centre of the top-left pixel of the image (H, W) uint8; the corners are right to a pixel or two.
+    OpenCV's refinement looks at a window around each corner. Blur rounds a corner off, so that it is found inside the
+    square: in rendered images the sides come out 0.6 % short, which would become an error of the map's scale. Blur does
+    not move an edge.
+    """
+    at = np.asarray(corners, dtype=np.float64)
+    for _ in range(_ROUNDS):
+        lines = [_edge_line(grey, at[side], at[(side + 1) % 4], at.mean(0)) for side in range(4)]
+        if any(line is None for line in lines):
+            return corners
+        homogeneous = np.array([np.cross(lines[side - 1], lines[side]) for side in range(4)])  # type: ignore[arg-type]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            moved = homogeneous[:, :2] / homogeneous[:, 2:]
+        limit = 0.1 * np.linalg.norm(np.roll(at, -1, axis=0) - at, axis=1).min() + 1
+        if not np.linalg.norm(moved - corners, axis=1).max() < limit:
+            return corners
+        at = moved
+    return at
+
+
+def _edge_line(grey: NDArray[np.uint8], start: Float, end: Float, inside: Float) -> Float | None:
+    """The line (a, b, c), a x + b y + c = 0, of an edge between dark inside and bright outside; None if there is none.
+
+    In a profile across the edge, the edge is at the mean position of the rise in brightness.
+    """
+    import cv2
+
+    along = end - start
+    length = float(np.linalg.norm(along))
+    if length < 4:
+        return None
+    normal = np.array([-along[1], along[0]]) / length
+    if normal @ (inside - start) > 0:
+        normal = -normal
+    half = float(np.clip(length / 16, 1.5, 6.0))  # within the black frame, a sixth to a tenth of the marker
+    across = np.linspace(-half, half, 2 * round(half * _STEPS_PER_PX) + 1)
+    share = np.linspace(_AWAY_FROM_CORNERS, 1 - _AWAY_FROM_CORNERS, _SAMPLES)
+    middle = start + share[:, None] * along
+    at = (middle[:, None] + across[:, None] * normal).astype(np.float32)
+    profile = cv2.remap(grey.astype(np.float32), at[..., 0], at[..., 1], cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
+    rise = np.maximum(np.diff(profile, axis=1), 0)
+    total = rise.sum(1)
+    strong = total > max(10.0, 0.5 * float(np.median(total)))
+    if strong.sum() < _SAMPLES // 2:
+        return None
+    offset = (rise[strong] @ ((across[1:] + across[:-1]) / 2)) / total[strong]
+    typical = np.abs(offset - np.median(offset))
+    near = typical <= max(0.5, 3 * float(np.median(typical)))
+    points = middle[strong][near] + offset[near, None] * normal
+    center = points.mean(0)
+    across_points = np.linalg.svd(points - center)[2][1]
+    return np.array([*across_points, -across_points @ center])

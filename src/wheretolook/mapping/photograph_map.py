@@ -13,30 +13,15 @@ import numpy as np
 from tqdm.auto import tqdm
 
 from wheretolook.geometry.poses import Float
-from wheretolook.mapping.building import (
-    DATABASE_FILE,
-    REPORT_FILE,
-    Clock,
-    partial_folder,
-    refuse_foreign_folder,
-    remove_inaccurate,
-    save_landmarks,
-)
-from wheretolook.mapping.config import MapConfig
+from wheretolook.mapping import building
+from wheretolook.mapping import scale as scales
+from wheretolook.mapping.building import DATABASE_FILE, REPORT_FILE, Clock
+from wheretolook.mapping.config import MapConfig, ScaleConfig
 from wheretolook.mapping.gravity import estimate_gravity
 from wheretolook.mapping.incremental import MappedPhotographs, map_incrementally, photograph_features
 from wheretolook.mapping.markers import Marker, MarkerView, detect_markers, marker_detector, place_marker
-from wheretolook.mapping.photograph_config import ScaleConfig
 from wheretolook.mapping.photographs import photograph_cameras, read_photograph
-from wheretolook.mapping.scale import (
-    MapScale,
-    read_marker_table,
-    read_positions,
-    scale_from_distance,
-    scale_from_markers,
-    scale_from_positions,
-)
-from wheretolook.mapping.similarity import Similarity
+from wheretolook.mapping.scale import MapScale, Similarity
 from wheretolook.mapping.triangulation import color_points
 from wheretolook.utils.errors import ConfigError, MapError
 from wheretolook.utils.processes import Processes
@@ -77,31 +62,24 @@ def map_photographs(
 
     The result is what `build_map` makes: a COLMAP model with `landmarks.npz`, `cameras.npz` and `report.json`, which is
     also returned, beside it; z up, and in metres if the report's scale has a source. The folder appears when all is
-    done. Unless positions are given, the origin is the mean of the cameras' positions and the heading is arbitrary.
+    done, and replaces an earlier map. Unless positions are given, the origin is the mean of the cameras' positions and
+    the heading is arbitrary. Finished steps are kept in `work`, so that another run, for instance with another source
+    of scale, does not start over.
 
-    Args:
-        config: only `photographs`, `extractor` and `keep_database` count.
-        out_dir: folder to make; an earlier map there is replaced.
-        work: folder where finished steps are kept, so that another run, for instance with another source of scale,
-            does not start over.
-        seed: of COLMAP's sampling.
-        workers: processes that extract and match, and threads of COLMAP's bundle adjustment. With one worker the same
-            seed gives the same map; with more, COLMAP sums large problems in another order each time.
-        device: where keypoints are extracted, "cpu" or a CUDA device.
-        progress: show progress bars.
+    Of `config`, only `photographs`, `extractor` and `keep_database` count. As many threads as `workers` adjust bundles:
+    with one worker the same seed gives the same map; with more, COLMAP sums large problems in another order each time.
 
-    Raises:
-        MapError: the photographs are missing, unreadable or do not overlap; they do not give the scale asked for; or
-            `out_dir` holds something that is not a map.
-        ConfigError: a table of markers or positions is damaged, or there is no such camera model or dictionary.
+    Raises MapError if the photographs are missing, unreadable or do not overlap, if they do not give the scale asked
+    for, or if `out_dir` holds something that is not a map; ConfigError if a table of markers or positions is damaged,
+    or there is no such camera model or dictionary.
     """
     settings, out_dir, work, clock = config.photographs, Path(out_dir), Path(work), Clock()
     if settings.images is None:
         raise ConfigError("no folder of photographs was named", fix="Set map.photographs.images.")
-    refuse_foreign_folder(out_dir)
+    building.refuse_foreign_folder(out_dir)
     known = _KnownScale.read(settings.scale)  # a damaged table is reported before the work
     work.mkdir(parents=True, exist_ok=True)
-    with partial_folder(out_dir) as partial, Processes(workers) as processes:
+    with building.partial_folder(out_dir) as partial, Processes(workers) as processes:
         with clock("extract"):
             side_px, extractor = settings.max_side_px, config.extractor
             features = photograph_features(settings.images, work, side_px, extractor, processes, device, progress)
@@ -121,11 +99,11 @@ def map_photographs(
         with clock("filter_and_write"):
             model.update_point_3d_errors()
             fix = "Raise map.photographs.max_reprojection_error_px, or take sharper photographs."
-            n_removed = remove_inaccurate(model, settings.max_reprojection_error_px, out_dir, fix)
+            n_removed = building.remove_inaccurate(model, settings.max_reprojection_error_px, out_dir, fix)
             color_points(model, features.colors)
             model.write_binary(str(partial))
         with clock("landmarks"):
-            landmarks = save_landmarks(partial, mapped.database, settings.max_reprojection_error_px)
+            landmarks = building.save_landmarks(partial, mapped.database, settings.max_reprojection_error_px)
         if config.keep_database:
             shutil.copyfile(mapped.database, partial / DATABASE_FILE)
         registered = set(names.values())
@@ -167,8 +145,8 @@ class _KnownScale:
     def read(config: ScaleConfig) -> _KnownScale:
         if config.has_marker_sizes or (config.distance is not None and config.distance.marker_ids):
             marker_detector(config.dictionary)  # raises if there is no such dictionary
-        sizes = config.marker_size_m if config.marker_table is None else read_marker_table(config.marker_table)
-        return _KnownScale(config, sizes, {} if config.positions is None else read_positions(config.positions))
+        sizes = config.marker_size_m if config.marker_table is None else scales.read_marker_table(config.marker_table)
+        return _KnownScale(config, sizes, {} if config.positions is None else scales.read_positions(config.positions))
 
 
 def _scale(
@@ -178,20 +156,20 @@ def _scale(
     model, names, config = mapped.model, _registered(mapped), known.config
     centers = {name: model.images[number].projection_center() for number, name in names.items()}
     if known.positions:
-        return scale_from_positions(centers, known.positions, config.tolerance_percent)
+        return scales.scale_from_positions(centers, known.positions, config.tolerance_percent)
     scale = MapScale()
     if config.has_marker_sizes:
         views = _marker_views(mapped, folder, config.dictionary, full_sizes, progress)
         if not isinstance(known.sizes_m, float | int):
             views = {marker: seen for marker, seen in views.items() if marker in known.sizes_m}
         markers, unused = _place(views)
-        scale = scale_from_markers(markers, known.sizes_m, config.tolerance_percent, unused)
+        scale = scales.scale_from_markers(markers, known.sizes_m, config.tolerance_percent, unused)
     elif config.distance is not None:
         wanted = config.distance.marker_ids
         views = _marker_views(mapped, folder, config.dictionary, full_sizes, progress) if wanted else {}
         names_of_ends = config.distance.first, config.distance.second
         first, second = (_place_of(end, centers, views, folder) for end in names_of_ends)
-        scale = scale_from_distance(first, second, config.distance.distance_m)
+        scale = scales.scale_from_distance(first, second, config.distance.distance_m)
     return scale, replace(upright, scale=scale.factor, translation=scale.factor * upright.translation)
 
 

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.geometry.colmap_camera import ColmapCamera
-from wheretolook.mapping.photograph_config import PhotographsConfig
+from wheretolook.geometry.camera import ColmapCamera
+from wheretolook.mapping.config import PhotographsConfig
 from wheretolook.utils.colmap import quiet_colmap
 from wheretolook.utils.errors import ConfigError, MapError
 
@@ -22,11 +22,7 @@ SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 
 
 def list_photographs(folder: Path) -> list[str]:
-    """Names of the photographs in a folder and its subfolders, relative to it, sorted.
-
-    Raises:
-        MapError: there is no such folder, or it holds fewer than two photographs.
-    """
+    """Names of the photographs in a folder and its subfolders, relative to it, sorted. MapError if fewer than two."""
     if not folder.is_dir():
         raise MapError("there is no such folder", path=folder, fix="Give the folder of the photographs.")
     files = (path for path in folder.rglob("*") if path.is_file() and path.suffix.lower() in SUFFIXES)
@@ -38,11 +34,7 @@ def list_photographs(folder: Path) -> list[str]:
 
 
 def read_photograph(path: Path) -> NDArray[np.uint8]:
-    """Pixels (H, W, 3) uint8 RGB, turned upright as its EXIF orientation says.
-
-    Raises:
-        MapError: the file cannot be read.
-    """
+    """Pixels (H, W, 3) uint8 RGB, upright as the EXIF orientation says. Raises MapError if the file cannot be read."""
     import cv2
 
     try:
@@ -85,16 +77,13 @@ def photograph_cameras(
 ) -> PhotographCameras:
     """Intrinsics of photographs, given or from their EXIF data.
 
-    Takes width and height (I, 2) of each photograph as taken, upright, and as mapped.
-
-    Raises:
-        ConfigError: COLMAP has no such camera, or intrinsics are given for photographs of different sizes.
+    Takes width and height (I, 2) of each photograph as taken, upright, and as mapped. Raises ConfigError if COLMAP has
+    no such camera, or intrinsics are given for photographs of different sizes.
     """
-    given = len(config.camera_params) > 0
-    if given and len(np.unique(full_sizes, axis=0)) > 1:
-        value = np.unique(full_sizes, axis=0).tolist()
+    given, different = len(config.camera_params) > 0, np.unique(full_sizes, axis=0).tolist()
+    if given and len(different) > 1:
         fix = "Leave camera_params out, or map the photographs of each size apart."
-        raise ConfigError("camera_params are for photographs of one size", path=folder, value=value, fix=fix)
+        raise ConfigError("camera_params are for photographs of one size", path=folder, value=different, fix=fix)
     if given:
         width, height = full_sizes[0].tolist()
         ColmapCamera(config.camera_model, width, height, config.camera_params)  # raises if they do not fit the model

@@ -7,18 +7,59 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from wheretolook.geometry.poses import Float
 from wheretolook.mapping.markers import Marker
-from wheretolook.mapping.similarity import Similarity, fit_similarity
 from wheretolook.utils.errors import ConfigError, MapError
 
 Source = Literal["markers", "distance", "positions", "unknown"]
 REPORT_FILE = "report.json"
+_FLAT = 1e-6  # points whose second largest spread is below this share of the largest lie on a line
+
+
+@dataclass(frozen=True, eq=False)
+class Similarity:
+    """x -> scale * rotation x + translation."""
+
+    scale: float  # positive
+    rotation: Float  # (3, 3)
+    translation: Float  # (3,), in units of the target
+
+    def apply(self, points: ArrayLike) -> Float:
+        """Transform points (..., 3)."""
+        return np.asarray(self.scale * np.asarray(points, dtype=np.float64) @ self.rotation.T + self.translation)
+
+    def transform_model(self, model: Any) -> None:
+        """Transform a `pycolmap.Reconstruction` in place."""
+        import pycolmap
+
+        model.transform(pycolmap.Sim3d(self.scale, pycolmap.Rotation3d(self.rotation), self.translation))
+
+
+def fit_similarity(source: ArrayLike, target: ArrayLike) -> Similarity:
+    """The similarity that takes points (N, 3) to points (N, 3) with the least sum of squares.
+
+    Umeyama, "Least-Squares Estimation of Transformation Parameters Between Two Point Patterns", TPAMI 1991. Raises
+    MapError for fewer than three points, or all on a line, which leaves the rotation about it open.
+    """
+    a, b = np.asarray(source, dtype=np.float64), np.asarray(target, dtype=np.float64)
+    if len(a) < 3:
+        raise MapError("a similarity needs three points", value=len(a), fix="Give the positions of more photographs.")
+    mean_a, mean_b = a.mean(0), b.mean(0)
+    for points in (a - mean_a, b - mean_b):
+        spread = np.linalg.svd(points, compute_uv=False)
+        if spread[1] <= _FLAT * max(spread[0], 1e-12):
+            fix = "Give positions that are not on a line."
+            raise MapError("positions on one line do not fix a frame", value=len(a), fix=fix)
+    u, singular, vt = np.linalg.svd((b - mean_b).T @ (a - mean_a) / len(a))
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
+    rotation = (u * sign) @ vt
+    scale = float((singular * sign).sum() / ((a - mean_a) ** 2).sum(1).mean())
+    return Similarity(scale, rotation, mean_b - scale * rotation @ mean_a)
 
 
 @dataclass(frozen=True)
@@ -65,9 +106,7 @@ def scale_from_markers(
     """The median of true size over length in the map, over the sides of all markers.
 
     `size_m` is the side of all markers, or of each by its id; `unused` are markers that could not be placed, and why.
-
-    Raises:
-        MapError: there is no marker, or a side is off by more than the tolerance.
+    Raises MapError if there is no marker, or a side is off by more than the tolerance.
     """
     if not markers:
         reasons = "; ".join((unused or {}).values()) or "no marker of a known size was found"
@@ -81,14 +120,11 @@ def scale_from_markers(
     sides = [f"{name} side {side}" for name in names for side in range(4)]
     residuals = dict(zip(sides, off.ravel().tolist(), strict=True))
     if np.abs(off).max() > tolerance_percent:
-        worst = ", ".join(
-            f"{name}: {' '.join(f'{value:+.1f}' for value in row)} %"
-            for name, row in zip(names, off, strict=True)
-            if np.abs(row).max() > tolerance_percent
-        )
+        worst = np.flatnonzero(np.abs(off).max(1) > tolerance_percent)
+        values = [f"{names[row]}: {' '.join(f'{value:+.1f}' for value in off[row])} %" for row in worst]
         problem = f"the markers do not agree on a scale: sides off by more than {tolerance_percent:g} %"
         fix = "Measure the black squares; give markers of different sizes in a marker_table."
-        raise MapError(problem, value=worst, fix=fix)
+        raise MapError(problem, value=", ".join(values), fix=fix)
     errors_px = dict(zip(names, (marker.error_px for marker in markers), strict=True))
     n_views = dict(zip(names, (len(set(marker.images)) for marker in markers), strict=True))
     return MapScale("markers", factor, residuals, "percent", dict(unused or {}), errors_px, n_views)
@@ -105,15 +141,10 @@ def scale_from_distance(first: ArrayLike, second: ArrayLike, distance_m: float) 
 def scale_from_positions(
     centers: Mapping[str, Float], positions: Mapping[str, Float], tolerance_percent: float = 5.0
 ) -> tuple[MapScale, Similarity]:
-    """The scale, and the similarity that takes the map to the frame of known camera positions.
+    """The scale, and the similarity that takes camera centres in the map to known positions in metres, by photograph.
 
-    Args:
-        centers: camera centres in the map, by photograph.
-        positions: where photographs were taken, metres, z up. Those that the map lacks are not used.
-        tolerance_percent: how far a position may be off, of the diagonal of the box around those that are used.
-
-    Raises:
-        MapError: fewer than three of the photographs are in the map, all are on a line, or one is off by more.
+    The tolerance is a share of the diagonal of the box around the positions used. Raises MapError if fewer than three
+    photographs are in the map, all are on a line, or one is off by more.
     """
     names = [name for name in positions if name in centers]
     source = np.array([centers[name] for name in names]).reshape(-1, 3)
@@ -135,8 +166,7 @@ def scale_from_positions(
 def read_marker_table(path: Path) -> dict[int, float]:
     """Side in metres of each marker by its id, from a CSV file with the columns `id` and `size_m`.
 
-    Raises:
-        ConfigError: the file is missing or not such a table, or a marker has two sizes.
+    Raises ConfigError if the file is missing or not such a table, or a marker has two sizes.
     """
     sizes: dict[int, float] = {}
     for row in _rows(path, ("id", "size_m")):
@@ -155,8 +185,7 @@ def read_marker_table(path: Path) -> dict[int, float]:
 def read_positions(path: Path) -> dict[str, Float]:
     """Positions (3,) in metres by photograph: CSV with columns `image`, `x`, `y`, `z`, or JSON `{image: [x, y, z]}`.
 
-    Raises:
-        ConfigError: the file is missing or not such a table, or a photograph has two positions.
+    Raises ConfigError if the file is missing or not such a table, or a photograph has two positions.
     """
     if path.suffix.lower() == ".json":
         try:
@@ -179,11 +208,7 @@ def read_positions(path: Path) -> dict[str, Float]:
 
 
 def read_scale(map_dir: Path) -> MapScale | None:
-    """The scale in a map's report; None for maps of known poses, which are in metres by construction.
-
-    Raises:
-        MapError: the report is damaged.
-    """
+    """The scale in a map's report; None for maps of known poses, which are metric. MapError if it is damaged."""
     path = map_dir / REPORT_FILE
     try:
         scale = json.loads(path.read_text()).get("scale")

@@ -1,4 +1,4 @@
-"""Matches images and triangulates landmarks with known poses, in COLMAP."""
+"""Chooses pairs of images with known poses that share surface, matches them and triangulates landmarks, in COLMAP."""
 
 from __future__ import annotations
 
@@ -14,13 +14,21 @@ from tqdm.auto import tqdm
 
 from wheretolook.features.keypoints import Keypoints, quantize_descriptors
 from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.poses import camera_centers, transform
 from wheretolook.utils.colmap import quiet_colmap
 from wheretolook.utils.processes import Processes
 
 if TYPE_CHECKING:
     from wheretolook.mapping.config import MapConfig
 
+_SAMPLES_ACROSS = 16  # surface points taken from an image, in x
+DEPTH_STRIDE = 4  # depth images are kept at every fourth pixel, the centre of each 4 x 4 block being the one at index 2
+_ANGLE_DEG = (1.0, 55.0)  # between the rays of two images: less triangulates badly, more than that SIFT does not match
+_DEPTH_RATIO = 2.5  # between the distances of two images to a point: beyond it, the scales differ too much
+_DEPTH_TOLERANCE = 0.05
 _PAIRS_AT_A_TIME = 64  # that a process matches; also the step of the progress bar
+Stored = tuple[NDArray[np.float32], NDArray[np.uint8]]  # pixels (N, 2) and descriptors (N, 128), as in a database
+MatchJob = tuple[NDArray[np.int64], list[Stored], Path]
 
 
 def image_name(index: int) -> str:
@@ -43,21 +51,11 @@ def triangulate_known_poses(
 ) -> Any:
     """Match pairs of images, verify the matches against the known poses, and triangulate.
 
-    Args:
-        database: COLMAP database to make; gets keypoints, descriptors, matches and verified matches.
-        camera: intrinsics of all images.
-        cam_from_world: (I, 3, 4) poses, kept as they are.
-        keypoints: of the I images.
-        colors: (N_i, 3) uint8 colours of the keypoints.
-        pairs: (P, 2) indices of the images to match, i < j.
-        config: thresholds of verification and triangulation.
-        clock: times a step.
-        seed: of COLMAP's sampling.
-        processes: match; as many threads verify.
-        progress: show a progress bar.
+    Makes a COLMAP database of keypoints, descriptors, matches and verified matches. Takes poses (I, 3, 4), which stay
+    as they are, keypoints and their colours (N_i, 3) uint8 of each image, and pairs (P, 2) of images to match, i < j.
+    The processes match, as many threads verify; `clock` times a step.
 
-    Returns:
-        A `pycolmap.Reconstruction`, not yet filtered by reprojection error.
+    Returns a `pycolmap.Reconstruction`, not yet filtered by reprojection error.
     """
     import pycolmap
 
@@ -104,10 +102,6 @@ def color_points(model: Any, colors: Sequence[NDArray[np.uint8]]) -> None:
         point.color = np.rint(np.mean(observed, axis=0)).astype(np.uint8)
 
 
-Stored = tuple[NDArray[np.float32], NDArray[np.uint8]]
-"""Pixels (N, 2) and descriptors (N, 128) of an image's keypoints, as in a COLMAP database."""
-
-
 def match_pairs(
     stored: Sequence[Stored], pairs: NDArray[np.int64], folder: Path, processes: Processes, progress: bool = True
 ) -> Generator[NDArray[np.uint32], None, None]:
@@ -122,9 +116,6 @@ def match_pairs(
         for matches in processes.map(_run_match_job, jobs):
             yield from matches
             bar.update(len(matches))
-
-
-MatchJob = tuple[NDArray[np.int64], list[Stored], Path]
 
 
 def _match_job(pairs: NDArray[np.int64], stored: Sequence[Stored], folder: Path) -> MatchJob:
@@ -156,11 +147,9 @@ def _posed_model(camera: PinholeCamera, cam_from_world: NDArray[np.floating[Any]
     import pycolmap
 
     model = pycolmap.Reconstruction()
+    size = {"width": camera.width, "height": camera.height}
     parameters = [camera.focal_px, camera.cx, camera.cy]
-    colmap_camera = pycolmap.Camera(
-        camera_id=1, model="SIMPLE_PINHOLE", width=camera.width, height=camera.height, params=parameters
-    )
-    model.add_camera_with_trivial_rig(colmap_camera)
+    model.add_camera_with_trivial_rig(pycolmap.Camera(camera_id=1, model="SIMPLE_PINHOLE", params=parameters, **size))
     for index, pose in enumerate(np.asarray(cam_from_world, dtype=np.float64)):
         image = pycolmap.Image(name=image_name(index), camera_id=1, image_id=index + 1)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:, :3]), pose[:, 3]))
@@ -187,3 +176,60 @@ def fill_database(database: Path, model: Any, stored: Iterable[Stored]) -> None:
             db.write_image(image, use_image_id=True)
             db.write_keypoints(image_id, pixels)
             db.write_descriptors(image_id, pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, descriptors))
+
+
+def shrink_depth(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Every fourth pixel of depth images (..., H, W), for `surface_overlap`."""
+    half = DEPTH_STRIDE // 2
+    return depth_m[..., half::DEPTH_STRIDE, half::DEPTH_STRIDE].copy()
+
+
+def surface_overlap(
+    camera: PinholeCamera, cam_from_world: NDArray[np.floating[Any]], depth_m: NDArray[np.float32]
+) -> NDArray[np.float64]:
+    """Share of the surface in one image that another image sees too, similarly enough for the two to be matched.
+
+    Takes poses (I, 3, 4) and z-depth (I, h, w) from `shrink_depth`, 0 where there is none. A point counts if the other
+    image's depth agrees with it (5 %), if the rays of the two images meet at 1 to 55 degrees, and if their depths
+    differ by less than a factor of 2.5. Returns (I, I), the mean of both directions' shares; 0 on the diagonal.
+    """
+    n, h, w = depth_m.shape
+    step = max(1, w // _SAMPLES_ACROSS)
+    grid = np.meshgrid(np.arange(step // 2, h, step), np.arange(step // 2, w, step), indexing="ij")
+    rows, columns = (axis.ravel() for axis in grid)
+    pixels = np.column_stack([columns, rows]) * DEPTH_STRIDE + DEPTH_STRIDE // 2 + 0.5
+    rays = np.column_stack([(pixels - (camera.cx, camera.cy)) / camera.focal_px, np.ones(len(pixels))])
+    depth = depth_m[:, rows, columns].astype(np.float64)
+    centers = camera_centers(cam_from_world)
+    points = centers[:, None] + depth[..., None] * (rays @ np.asarray(cam_from_world)[:, :, :3])
+    seen_from = points - centers[:, None]
+    seen_from /= np.maximum(np.linalg.norm(seen_from, axis=-1, keepdims=True), 1e-9)
+    closest, farthest = np.cos(np.radians(_ANGLE_DEG))
+    share = np.zeros((n, n))
+    for j in range(n):
+        in_j = transform(cam_from_world[j], points.reshape(-1, 3)).reshape(points.shape)
+        pixel, z = camera.project(in_j), in_j[..., 2]
+        inside = (z > 0) & camera.in_image(pixel) & (depth > 0)
+        index = np.where(inside[..., None], pixel, 0).astype(np.int64) // DEPTH_STRIDE
+        there = depth_m[j, np.minimum(index[..., 1], h - 1), np.minimum(index[..., 0], w - 1)]
+        ray = points - centers[j]
+        cosine = (ray * seen_from).sum(-1) / np.maximum(np.linalg.norm(ray, axis=-1), 1e-9)
+        shared = inside & (np.abs(there - z) < _DEPTH_TOLERANCE * z) & (cosine > farthest) & (cosine < closest)
+        shared &= (z < _DEPTH_RATIO * depth) & (depth < _DEPTH_RATIO * z)
+        share[:, j] = shared.mean(1)
+    np.fill_diagonal(share, 0)
+    return (share + share.T) / 2
+
+
+def choose_pairs(overlap: NDArray[np.float64], partners: int, min_overlap: float = 0.05) -> NDArray[np.int64]:
+    """Pairs (P, 2) of each image with its `partners` images of largest overlap; i < j, sorted, each pair once.
+
+    `overlap` (I, I) is symmetric; pairs of less than `min_overlap` are left out. An image can be in more than
+    `partners` pairs, since others choose it too.
+    """
+    best = np.argsort(-overlap, axis=1, kind="stable")[:, :partners]
+    first = np.repeat(np.arange(len(overlap)), best.shape[1])
+    second = best.ravel()
+    good = overlap[first, second] >= max(min_overlap, np.finfo(float).tiny)
+    pairs = np.sort(np.column_stack([first, second])[good], axis=1)
+    return np.unique(pairs, axis=0).reshape(-1, 2)

@@ -55,16 +55,8 @@ def plan_walk(
 ) -> Walk:
     """Plan a walk that starts at a random place and goes on to the nearest unvisited floor until enough is visited.
 
-    Args:
-        free_space: what is free and where the floor is.
-        bounds: (2, 3) metres, lowest and highest corner of the scene.
-        n_images: number of poses, spaced evenly along the walk. Cameras look mostly along it.
-        config: see `WalkConfig`.
-        seed: of the start and of the camera's motion.
-
-    Raises:
-        ConfigError: fewer than two images.
-        SceneError: there is no floor to walk on.
+    `bounds` (2, 3) metres are the lowest and highest corner of the scene. The poses are spaced evenly along the walk
+    and look mostly along it. Raises ConfigError for fewer than two, SceneError if there is no floor to walk on.
     """
     config = config or WalkConfig()
     if n_images < 2:
@@ -96,7 +88,7 @@ def _reachable_places(free_space: FreeSpaceQueries, bounds: Float, config: WalkC
     i, j, h = np.meshgrid(np.arange(nx), np.arange(ny), np.arange(len(heights)), indexing="ij")
     cell = np.stack([i.ravel(), j.ravel()], axis=1)
     probes = np.column_stack([low[:2] + (cell + 0.5) * config.cell_m, heights[h.ravel()]])
-    floor = _floor(free_space, probes)
+    floor = np.asarray(free_space.floor_below(probes), dtype=np.float64)
     found = np.isfinite(floor)
     # Several probes of a cell may find the same floor: keep one place for each floor of each cell.
     key = np.column_stack([cell[found], np.rint(100 * floor[found]).astype(np.int64)])
@@ -114,7 +106,8 @@ def _reachable_places(free_space: FreeSpaceQueries, bounds: Float, config: WalkC
     a, b = _neighbours(key)
     # There must be floor at about the same height at both places and half way: no step off a gallery or over a gap.
     middle = (eyes[a] + eyes[b]) / 2
-    drop = np.column_stack([eyes[a, 2] - eyes[b, 2], middle[:, 2] - config.eye_height_m - _floor(free_space, middle)])
+    below = middle[:, 2] - config.eye_height_m - np.asarray(free_space.floor_below(middle), dtype=np.float64)
+    drop = np.column_stack([eyes[a, 2] - eyes[b, 2], below])
     near = (np.abs(drop) <= config.max_step_height_m).all(1)  # False where there is no floor (NaN)
     a, b = a[near], b[near]
     if len(a):
@@ -130,10 +123,6 @@ def _reachable_places(free_space: FreeSpaceQueries, bounds: Float, config: WalkC
         fix = "Lower cell_m or the clearance of free space."
         raise SceneError(problem, value=f"cell {config.cell_m} m", fix=fix)
     return _Places(eyes[members], steps[members][:, members])
-
-
-def _floor(free_space: FreeSpaceQueries, points: Float) -> Float:
-    return np.asarray(free_space.floor_below(points), dtype=np.float64)
 
 
 def _neighbours(key: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.geometry.colmap_camera import Camera, ColmapCamera
+from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.utils.errors import WeightsError
 
 FIELD_OF_VIEW_TOLERANCE = 1e-3

@@ -31,7 +31,11 @@ class MaxVisibilityScorer(Scorer):
 
     def score(self, cam_from_world: Float) -> Float:
         """(B,) in [0, 1]."""
-        from wheretolook.visibility.frustum import LandmarkSets, landmarks_in_view  # Warp takes seconds to load
+        from wheretolook.visibility.frustum import (  # Warp takes seconds to load
+            LandmarkSets,
+            PosedViews,
+            landmarks_in_view,
+        )
 
         poses = check_poses(cam_from_world)
         camera, device = self.localization_map.camera, self.localization_map.device
@@ -42,7 +46,7 @@ class MaxVisibilityScorer(Scorer):
         for begin in range(0, len(poses), VIEWS_AT_ONCE):
             block = poses[begin : begin + VIEWS_AT_ONCE]
             rows = np.zeros(len(block), dtype=np.int64)
-            seen = landmarks_in_view(camera, block, points, candidates, rows, device)
+            seen = landmarks_in_view(PosedViews(camera, block, points, candidates, rows), device)
             view = np.repeat(np.arange(len(block)), np.diff(seen.starts))
             depth = np.einsum("ni,ni->n", points[seen.indices], block[view, 2, :3]) + block[view, 2, 3]
             counts[begin : begin + len(block)] = np.bincount(view[depth < MAX_DEPTH_M], minlength=len(block))

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 if TYPE_CHECKING:
-    from wheretolook.geometry.colmap_camera import Camera
+    from wheretolook.geometry.camera import Camera
     from wheretolook.inputs.localization_map import LocalizationMap
     from wheretolook.learning.learner import Learnt, Task
     from wheretolook.methods.base import Scorer

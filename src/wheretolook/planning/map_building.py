@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
-from wheretolook.geometry.colmap_camera import Camera, ColmapCamera
+from wheretolook.geometry.camera import ColmapCamera
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float, rotation_looking_along
 from wheretolook.mapping.landmarks import Landmarks
@@ -20,6 +20,9 @@ from wheretolook.planning.viewpoint_map import MapOrigin, ViewpointMap
 from wheretolook.utils.errors import ConfigError, MapError, SceneError
 from wheretolook.visibility.occlusion import OcclusionModel, StoredOcclusion
 from wheretolook.visibility.survey import survey
+
+Text = str | None
+"""Text of progress bars; None shows none."""
 
 VIEWS_AT_ONCE = 16_384
 """Views scored at a time, in whole locations: enough to fill a GPU, few enough for the progress bar to move."""
@@ -35,23 +38,13 @@ SAME_SCORE = 1e-4
 
 
 def build_viewpoint_map(
-    scorer: Scorer,
-    grid: VoxelGrid,
-    free: ArrayLike,
-    directions: ArrayLike,
-    lattice: str = "",
-    progress: str | None = None,
+    scorer: Scorer, grid: VoxelGrid, free: ArrayLike, directions: ArrayLike, lattice: str = "", progress: Text = None
 ) -> ViewpointMap:
-    """Score every direction at the centre of every free voxel.
+    """Score every direction at the centre of every free voxel of a grid (metres).
 
-    Args:
-        scorer: any method, on the localization map to be used.
-        grid: voxels of the world, metres.
-        free: where a camera can be: ids of voxels (L,), such as `viewpoints.sampling.free_locations` finds, or a mask
-            of all voxels, (V,) bool.
-        directions: (D, 3) optical axes in the world, of any length, such as `direction_lattice` gives.
-        lattice: their name, kept in the map's origin.
-        progress: text of progress bars; None shows none.
+    The scorer is any method, on the localization map to be used. A camera can be in voxels whose ids (L,) are given,
+    such as `viewpoints.sampling.free_locations` finds, or a mask of all voxels (V,) bool. Directions (D, 3) are optical
+    axes in the world, of any length, such as `direction_lattice` gives; their name is kept in the map's origin.
 
     Raises:
         SceneError: no voxel is free, or the centre of one lies inside geometry.
@@ -59,39 +52,31 @@ def build_viewpoint_map(
         ConfigError: more than 65,536 directions, ids outside the grid, or neither ids nor a mask of its voxels.
         ValueError: directions that are not (D, 3), not finite or of length 0.
     """
-    axes = _unit(directions)
-    rows = _ids(free, len(grid))
+    axes, rows = _unit(directions), _ids(free, len(grid))
     if len(rows) == 0:
         raise SceneError("no voxel is free", value=len(grid), fix="Refine the grid, or check where it lies.")
     if rows[0] < 0 or rows[-1] >= len(grid):
         raise ConfigError("ids of free voxels lie outside the grid", value=(int(rows[0]), int(rows[-1])))
-    _check_landmarks(scorer.localization_map.landmarks)
+    landmarks = scorer.localization_map.landmarks
+    _check_landmarks(landmarks)
     row_of_voxel = np.full(len(grid), -1, dtype=np.int32)
     row_of_voxel[rows] = np.arange(len(rows))
     by_row = _score_and_count(scorer, grid.centers()[rows], axes, progress)
-    landmarks = scorer.localization_map.landmarks
     digests = landmark_digests(landmarks)
     origin = _origin(scorer, lattice, digests)
     return ViewpointMap(grid, row_of_voxel, axes, *by_row, landmarks.ids, digests, origin)
 
 
 def update_viewpoint_map(
-    old: ViewpointMap, scorer: Scorer, progress: str | None = None
+    old: ViewpointMap, scorer: Scorer, progress: Text = None
 ) -> tuple[ViewpointMap, NDArray[np.int64]]:
     """Update a viewpoint map after landmarks were added; equal to building it anew, for networks up to rounding.
 
     Landmarks are compared by id. Voxels from which a new landmark, or one whose attributes have changed, is unoccluded
     are scored again. Nothing else can change if a score depends only on landmarks in view (`Scorer.local`) and
     landmarks do not hide one another (`OcclusionModel.landmarks_hide`). Otherwise, and if landmarks were removed or
-    moved, all voxels are scored again. The scene's geometry must be the same; if it changed, build the map anew.
-
-    Args:
-        old: made with the same method, camera and occlusion.
-        scorer: the method, on the new localization map.
-        progress: text of progress bars; None shows none.
-
-    Returns:
-        The new map, and the ids of the voxels that were scored again.
+    moved, all voxels are scored again. The method, camera, occlusion and the scene's geometry must be the same; if they
+    changed, build the map anew. Returns the new map, and the ids of the voxels that were scored again.
 
     Raises:
         ConfigError: the map was derived from another; the method, camera or occlusion model differs; or scores or
@@ -132,26 +117,18 @@ def landmark_digests(landmarks: Landmarks) -> NDArray[np.uint64]:
 
 
 def _digests(rows: NDArray[Any]) -> NDArray[np.uint64]:
-    rows = np.ascontiguousarray(rows)
     found = b"".join(hashlib.blake2b(row.tobytes(), digest_size=8).digest() for row in rows)
     return np.frombuffer(found, dtype="<u8").astype(np.uint64)
 
 
 def _score_and_count(
-    scorer: Scorer, locations: Float, directions: Float, progress: str | None
+    scorer: Scorer, locations: Float, directions: Float, progress: Text
 ) -> tuple[NDArray[np.uint16], NDArray[np.float32], NDArray[np.uint32]]:
     """Ranked ids, scores and numbers of landmarks in view, each (L, D), of all directions at locations (L, 3) m."""
-    localization_map, rotations = scorer.localization_map, rotation_looking_along(directions)
-    options: dict[str, Any] = {"keep": 1, "keep_occlusion": False, "device": localization_map.device}
+    around, rotations = scorer.localization_map, rotation_looking_along(directions)
+    options: dict[str, Any] = {"keep": 1, "keep_occlusion": False, "device": around.device}
     options["progress"] = progress and f"{progress}: count"
-    counted = survey(
-        localization_map.camera,
-        rotations,
-        locations,
-        localization_map.landmarks.points,
-        localization_map.occlusion,
-        **options,
-    )
+    counted = survey(around.camera, rotations, locations, around.landmarks.points, around.occlusion, **options)
     ranked = np.empty((len(locations), len(directions)), dtype=np.uint16)
     scores = np.empty(ranked.shape, dtype=np.float32)
     block = max(1, VIEWS_AT_ONCE // len(directions))
@@ -235,26 +212,19 @@ def _check_unchanged(old: ViewpointMap, scorer: Scorer, rows: NDArray[np.int64])
     _, scores, n_visible = _score_and_count(scorer, old.locations[rows], old.directions, None)
     same_scores = np.allclose(scores, old.scores[rows], rtol=SAME_SCORE, atol=SAME_SCORE)
     if not (same_scores and np.array_equal(n_visible, old.n_visible[rows])):
-        raise ConfigError(
-            "a voxel that sees none of the added landmarks has other scores or counts than in the viewpoint map",
-            value=tuple(np.round(old.locations[rows[0]], 3).tolist()),
-            fix="Weights, or what stands in the scene, must have changed: build it anew.",
-        )
+        problem = "a voxel that sees none of the added landmarks has other scores or counts than in the viewpoint map"
+        value = tuple(np.round(old.locations[rows[0]], 3).tolist())
+        fix = "Weights, or what stands in the scene, must have changed: build it anew."
+        raise ConfigError(problem, value=value, fix=fix)
 
 
 def _origin(scorer: Scorer, lattice: str, digests: NDArray[np.uint64]) -> MapOrigin:
-    localization_map = scorer.localization_map
-    digest = hashlib.sha256(localization_map.landmarks.ids.tobytes() + digests.tobytes()).hexdigest()[:16]
-    return MapOrigin(
-        scorer.name, lattice, _intrinsics(localization_map.camera), localization_map.occlusion.name, digest
-    )
-
-
-def _intrinsics(camera: Camera) -> dict[str, Any]:
-    """Intrinsics as `MapOrigin.camera` holds them."""
+    around, camera = scorer.localization_map, scorer.localization_map.camera
+    digest = hashlib.sha256(around.landmarks.ids.tobytes() + digests.tobytes()).hexdigest()[:16]
     if isinstance(camera, ColmapCamera):
         model, params = camera.model, camera.params
     else:
         model, params = "PINHOLE", (camera.focal_px, camera.focal_px, camera.cx, camera.cy)
-    values = [float(value) for value in params]
-    return {"model": model, "width": camera.width, "height": camera.height, "params": values}
+    size = {"width": camera.width, "height": camera.height}
+    intrinsics = {"model": model, **size, "params": [float(value) for value in params]}
+    return MapOrigin(scorer.name, lattice, intrinsics, around.occlusion.name, digest)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,10 +16,8 @@ from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.planning.config import PlanConfig
 from wheretolook.planning.path_comparison import FORWARD
 from wheretolook.planning.path_planning import check_ends, plan_path
-from wheretolook.planning.path_view import PathView
-from wheretolook.planning.planner_map import check_methods, planner_map
-from wheretolook.planning.route_views import PlannedPath
-from wheretolook.planning.scene_map import weights_for
+from wheretolook.planning.route_views import PathView, PlannedPath
+from wheretolook.planning.scene_map import check_methods, planner_map, weights_for
 from wheretolook.rendering.warp_renderer import WarpRenderer
 
 
@@ -30,18 +29,11 @@ def plan_by_methods(
     goal: ArrayLike,
     config: PlanConfig = PlanConfig(),
 ) -> dict[str, PlannedPath]:
-    """Plan a path by each method, with progress bars; what a method thinks of the views is its own map's scores.
+    """Plan a path from start to goal, (3,) m in the world, by each method, with progress bars.
 
-    Args:
-        scene: where a camera can be, and what it sees.
-        dataset: the scene's, for weights.
-        methods: "forward", or names of scorers; empty for that of the weights, or bins without.
-        start, goal: (3,) world, metres.
-        config: voxels and directions of the viewpoint maps, costs and limits of paths, and weights for methods that
-            have learnt, if they are of their kind (`weights_for`).
-
-    Returns:
-        Paths by the names of their methods, in the order given.
+    What a method thinks of the views is its own map's scores. Methods are "forward", or names of scorers; empty for
+    that of the weights, or bins without. `config` has weights for methods that have learnt, if they are of their kind
+    (`weights_for`). Returns paths by the names of their methods, in the order given.
 
     Raises:
         ConfigError: a method needs weights, or there is none of that name. PlanningError: no path can be found.
@@ -63,22 +55,16 @@ def plan_by_methods(
 def path_views(
     path: PlannedPath, localization_map: LocalizationMap, renderer: WarpRenderer | None = None
 ) -> list[PathView]:
-    """What the camera sees along a path: the landmarks in view, and the image if there is a renderer.
-
-    Args:
-        path: W views.
-        localization_map: with a pinhole camera.
-        renderer: of the scene's mesh.
-    """
+    """What a pinhole camera sees along a path: the landmarks in view, and the image if there is a renderer."""
     camera, points = localization_map.camera, localization_map.landmarks.points
     assert isinstance(camera, PinholeCamera)
     cam_from_world = poses_looking_along(path.positions, path.axes)
     visible = localization_map.landmarks_in_view(cam_from_world)
-    rgb = None if renderer is None else renderer.render(camera, cam_from_world).rgb
-    views = []
-    for number, pose in enumerate(cam_from_world):
-        local = points[visible[number]] @ pose[:, :3].T + pose[:, 3]
-        image = None if rgb is None else rgb[number]
-        position, axis, score = path.positions[number], path.axes[number], float(path.scores[number])
-        views.append(PathView(position, axis, score, camera.project(local), (camera.width, camera.height), image))
+    images: Any = [None] * len(visible) if renderer is None else renderer.render(camera, cam_from_world).rgb
+    views, size = [], (camera.width, camera.height)
+    for number, (pose, image) in enumerate(zip(cam_from_world, images, strict=True)):
+        pixels = camera.project(points[visible[number]] @ pose[:, :3].T + pose[:, 3])
+        views.append(
+            PathView(path.positions[number], path.axes[number], float(path.scores[number]), pixels, size, image)
+        )
     return views

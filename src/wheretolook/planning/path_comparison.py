@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import ArrayLike
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 from tqdm.auto import tqdm
 
 from wheretolook.geometry.poses import Float, poses_looking_along
-from wheretolook.planning.config import PathConfig, PathsConfig
+from wheretolook.planning.config import PathsConfig
 from wheretolook.planning.path_planning import plan_path
 from wheretolook.planning.route_views import PlannedPath
 from wheretolook.planning.sequences import TurnLimit, ViewSequence, best_sequence, greedy_sequence, resample_path
 from wheretolook.planning.viewpoint_map import ViewpointMap
-from wheretolook.planning.ways import Ways
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.space.mapped_space import MappedSpace
 from wheretolook.utils.errors import PlanningError, SceneError
@@ -36,20 +39,21 @@ RULES: dict[str, Rule] = {"": best_sequence, "greedy": greedy_sequence}
 DRAWS = 50
 """Pairs drawn for each one wanted, before a scene is said to have too little room."""
 
-WAYS_M = 0.25
-"""Grid of places by which to find out whether there is a way from a start to a goal."""
+WAYS_M, MOST = 0.25, 200_000
+"""Grid of places by which to find out whether there is a way from a start to a goal, and their largest number."""
+
+BLOCK, NEAREST = 10_000, 8
+"""Places tested for free space at a time; those on the grid from which a way to a given point is tried."""
 
 
 @dataclass(frozen=True, eq=False)
 class ComparedPaths:
     """What was planned in a scene.
 
-    Attributes:
-        paths: a row for each pair, task (`PLANNED`, `GIVEN`) and method: `planned`, whether there is a path, its
-        `length_m`, `turn_deg`, `n_views`, `promised`, the mean score of its views by the method's own map (NaN for
-        "forward"), and `found_by` (`PlannedPath.found_by`).
-    views: a row for each view along them: pair, task, method, waypoint, score, and
-            `wheretolook.viewpoints.table.POSE_COLUMNS`.
+    `paths` has a row for each pair, task (`PLANNED`, `GIVEN`) and method: `planned`, whether there is a path, its
+    `length_m`, `turn_deg`, `n_views`, `promised`, the mean score of its views by the method's own map (NaN for
+    "forward"), and `found_by` (`PlannedPath.found_by`). `views` has a row for each view along them: pair, task, method,
+    waypoint, score, and `wheretolook.viewpoints.table.POSE_COLUMNS`.
     """
 
     paths: pd.DataFrame
@@ -59,9 +63,7 @@ class ComparedPaths:
 def draw_pairs(space: FreeSpace | MappedSpace, config: PathsConfig) -> Float:
     """Starts and goals (P, 2, 3) m in free space, far enough from each other, with a way between them.
 
-    Args:
-        space: where a camera can be. Above floors, heights are those asked for; without a mesh, they are drawn.
-        config: number of pairs, distance, heights, seed.
+    Above floors, heights are those asked for; without a mesh, they are drawn.
 
     Raises:
         SceneError: there is too little room.
@@ -81,8 +83,9 @@ def draw_pairs(space: FreeSpace | MappedSpace, config: PathsConfig) -> Float:
     if len(found) < config.pairs:
         raise SceneError(
             f"found only {len(found)} starts and goals {config.min_distance_m:g} m apart with a way between them",
-            value=config.pairs, fix="Lower paths.min_distance_m or paths.pairs.",
-        )  # fmt: skip
+            value=config.pairs,
+            fix="Lower paths.min_distance_m or paths.pairs.",
+        )
     return np.array(found)
 
 
@@ -94,77 +97,101 @@ def _free_points(space: FreeSpace | MappedSpace, points: Float, config: PathsCon
     return points
 
 
-def shares_below(viewpoint_map: ViewpointMap) -> ViewpointMap:
-    """The map with the share of all its views that score lower in place of each score: a ranking, in [0, 1].
+class Ways:
+    """Whether a camera can get from one place to another: a graph of free places on a grid over `space`.
 
-    Planning weighs scores against metres. Information has no upper end and other units, so it enters by its ranks.
+    Its edges join neighbours between which a camera can go straight. The grid's step `step_m` is widened where there
+    would be more than `MOST` places.
     """
-    ordered = np.sort(viewpoint_map.scores, axis=None)
-    shares = np.searchsorted(ordered, viewpoint_map.scores, side="left") / max(1, ordered.size - 1)
-    origin = viewpoint_map.origin.derive("scores replaced by ranks")
-    return replace(viewpoint_map, scores=shares.astype(np.float32), origin=origin)
+
+    def __init__(self, space: FreeSpace | MappedSpace, step_m: float) -> None:
+        self.space = space
+        low, high = np.asarray(space.bounds, dtype=np.float64)
+        step_m = max(step_m, float(np.prod(high - low) / MOST) ** (1 / 3))
+        axes = [np.arange(a + step_m / 2, max(b, a + step_m), step_m) for a, b in zip(low, high, strict=True)]
+        points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+        number = np.full(points.shape[:3], -1)
+        blocks = np.array_split(points.reshape(-1, 3), points.size // (3 * BLOCK) + 1)
+        free = np.concatenate([space.is_free(block) for block in blocks]).reshape(number.shape)
+        number[free] = np.arange(free.sum())
+        self._places: Float = points[free]
+        pairs = []
+        for axis in range(3):
+            here, there = (np.moveaxis(number, axis, 0)[part].ravel() for part in (slice(None, -1), slice(1, None)))
+            both = (here >= 0) & (there >= 0)
+            pairs.append(np.stack([here[both], there[both]], axis=1))
+        edges = np.concatenate(pairs)
+        edges = edges[space.segments_are_free(self._places[edges[:, 0]], self._places[edges[:, 1]])]
+        n = len(self._places)
+        graph = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(n, n))
+        self._part = connected_components(graph, directed=False)[1] if n else np.empty(0, dtype=np.int32)
+        self._tree = cKDTree(self._places) if n else None
+
+    def joins(self, a: ArrayLike, b: ArrayLike) -> bool:
+        """Whether the grid has a way between points (3,) m."""
+        return bool(self._parts_near(a) & self._parts_near(b))
+
+    def _parts_near(self, point: ArrayLike) -> set[int]:
+        at = np.asarray(point, dtype=np.float64)
+        if self._tree is None:
+            return set()
+        near = np.atleast_1d(self._tree.query(at, k=min(NEAREST, len(self._places)))[1])
+        straight = self.space.segments_are_free(np.tile(at, (len(near), 1)), self._places[near])
+        return {int(part) for part in self._part[near[straight]]}
 
 
 def plan_pairs(
-    pairs: Float, space: FreeSpace | MappedSpace, maps: Mapping[str, ViewpointMap], config: PathsConfig,
+    pairs: Float,
+    space: FreeSpace | MappedSpace,
+    maps: Mapping[str, ViewpointMap],
+    config: PathsConfig,
     progress: str | None = None,
-) -> ComparedPaths:  # fmt: skip
+) -> ComparedPaths:
     """Plan between pairs by every method; then choose views along the shortest paths by every method.
 
-    Args:
-        pairs: (P, 2, 3) starts and goals, metres.
-        space: where a camera can be.
-        maps: viewpoint map of each method but "forward", scores in [0, 1].
-        config: planner, and limit on turns along given paths.
-        progress: title of a progress bar; None shows none.
+    `pairs` are starts and goals (P, 2, 3) m, `maps` those of each method but "forward", with scores in [0, 1].
 
     Raises:
         PlanningError: no path was found at all.
     """
     paths: list[dict[str, Any]] = []
-    views: list[pd.DataFrame] = []
+    tables: list[pd.DataFrame] = []
 
     def add(pair: int, task: str, method: str, path: PlannedPath | None) -> None:
-        about = {"pair": pair, "task": task, "method": method, "planned": path is not None}
-        if path is None:
-            paths.append(
-                {**about, "length_m": np.nan, "turn_deg": np.nan, "n_views": 0, "promised": np.nan, "found_by": ""}
-            )
-            return
-        promised = float(path.scores.mean())
-        paths.append({**about, "length_m": path.length_m, "turn_deg": path.turn_deg, "n_views": len(path.positions),
-                      "promised": promised, "found_by": path.found_by})  # fmt: skip
-        of_view = {"waypoint": np.arange(len(path.positions)), "score": path.scores,
-                   **pose_columns(poses_looking_along(path.positions, path.axes))}  # fmt: skip
-        views.append(pd.DataFrame({"pair": pair, "task": task, "method": method, **of_view}))
+        key, names = {"pair": pair, "task": task, "method": method}, ("length_m", "turn_deg", "n_views", "promised")
+        numbers: tuple[float, ...] = (np.nan, np.nan, 0, np.nan)
+        if path is not None:
+            numbers = (path.length_m, path.turn_deg, len(path.positions), float(path.scores.mean()))
+            of_view = {"waypoint": np.arange(len(path.positions)), "score": path.scores}
+            poses = pose_columns(poses_looking_along(path.positions, path.axes))
+            tables.append(pd.DataFrame({**key, **of_view, **poses}))
+        found = {**dict(zip(names, numbers, strict=True)), "found_by": path.found_by if path else ""}
+        paths.append({**key, "planned": path is not None, **found})
 
-    limits = {name: TurnLimit.of(one.directions, config.max_turn_deg) for name, one in maps.items()}
+    def planned(ends: Float, viewpoint_map: ViewpointMap | None) -> PlannedPath | None:
+        try:
+            return plan_path(ends[0], ends[1], space, space.bounds, viewpoint_map, config.planner, progress=False)
+        except PlanningError:
+            return None
+
+    limits = {name: TurnLimit.of(views.directions, config.max_turn_deg) for name, views in maps.items()}
     with tqdm(total=len(pairs) * (1 + len(maps)), desc=progress, unit="path", disable=progress is None) as bar:
         for number, ends in enumerate(pairs):
-            shortest = _planned(ends, space, None, config.planner)
+            shortest = planned(ends, None)
             add(number, PLANNED, FORWARD, shortest)
             bar.update()
-            for name, one in maps.items():
-                add(number, PLANNED, name, _planned(ends, space, one, config.planner))
+            for name, views in maps.items():
+                add(number, PLANNED, name, planned(ends, views))
                 bar.update()
             along = None if shortest is None else resample_path(shortest.positions, config.planner.spacing_m)
             add(number, GIVEN, FORWARD, _looking_ahead(shortest, along))
-            for name, one in maps.items():
+            for name, views in maps.items():
                 for rule, choose in RULES.items():
-                    path = None if along is None else _looking_about(along, one, limits[name], config, choose)
+                    path = None if along is None else _looking_about(along, views, limits[name], config, choose)
                     add(number, GIVEN, f"{name} {rule}".strip(), path)
-    if not views:
+    if not tables:
         raise PlanningError("no path was found at all", value=f"{len(pairs)} pairs", fix="Raise paths.planner.time_s.")
-    return ComparedPaths(pd.DataFrame(paths), pd.concat(views, ignore_index=True))
-
-
-def _planned(
-    ends: Float, space: FreeSpace | MappedSpace, viewpoint_map: ViewpointMap | None, config: PathConfig
-) -> PlannedPath | None:
-    try:
-        return plan_path(ends[0], ends[1], space, space.bounds, viewpoint_map, config, progress=False)
-    except PlanningError:
-        return None
+    return ComparedPaths(pd.DataFrame(paths), pd.concat(tables, ignore_index=True))
 
 
 def _looking_ahead(shortest: PlannedPath | None, given: Float | None) -> PlannedPath | None:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,14 +15,11 @@ from tqdm.auto import tqdm
 from wheretolook.geometry.lattices import axes_of_angles
 from wheretolook.geometry.poses import Float
 from wheretolook.planning.config import PathConfig
-from wheretolook.planning.path_improvement import Space, improve
-from wheretolook.planning.polylines import between
 from wheretolook.planning.route_views import IMPROVEMENT, SEARCH, SHORT_ROUTE, PlannedPath, RouteSamples, RouteViews
+from wheretolook.planning.sequences import between, lengths_along
 from wheretolook.planning.turns import check_axis
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.utils.errors import PlanningError
-
-__all__ = ["PathConfig", "PlannedPath", "Space", "plan_path"]
 
 TABLE_STEP_DEG = 2.0
 """Step of yaw and pitch of the table of the map's direction nearest to an axis."""
@@ -38,6 +36,19 @@ SAME_M = 1e-6
 
 STARTS = 12
 """Number of start orientations to choose from if none is given."""
+
+STEPS_M = (0.05, 1.0)
+"""Range of the standard deviation by which a corner of a route is moved."""
+
+
+class Space(Protocol):
+    """Where a camera may be: `wheretolook.space.free_space.FreeSpace`, or anything that answers the same."""
+
+    def is_free(self, points: ArrayLike) -> NDArray[np.bool_]:
+        """Whether a camera may be at points (N, 3) m; (N,)."""
+
+    def segments_are_free(self, a: ArrayLike, b: ArrayLike) -> NDArray[np.bool_]:
+        """Whether it may go straight from points a to points b, (N, 3) m each; (N,)."""
 
 
 def plan_path(
@@ -58,14 +69,8 @@ def plan_path(
     Without a viewpoint map the path is the shortest found. The camera, fixed to the front of the robot, looks forward
     along it, as level as `PathConfig.pitch_deg` allows, without limit on turns.
 
-    Args:
-        start, goal: (3,) world, metres.
-        space: where the camera may be.
-        bounds: (2, 3) lowest and highest corner of the space to plan in, metres.
-        viewpoint_map: scores of views, in [0, 1].
-        config: costs and limits.
-        start_axis: (3,) optical axis to start with, world; None lets the planner choose.
-        progress: show a progress bar.
+    `start` and `goal` are (3,) world, metres; `bounds` the lowest and highest corner (2, 3) m of the space to plan in;
+    the map's scores are in [0, 1]; `start_axis` (3,) is the optical axis to start with, None lets the planner choose.
 
     Raises:
         PlanningError: the start or the goal is not free or lies outside the bounds; they are the same; the axis is
@@ -78,8 +83,8 @@ def plan_path(
         raise ValueError(f"start and goal must be finite, got {ends.tolist()}")
     check_ends(ends, space, box)
     if viewpoint_map is None and start_axis is not None:
-        problem_text = "without a viewpoint map the camera looks ahead"
-        raise PlanningError(problem_text, value=start_axis, fix="Give no start axis.")
+        fix = "Give no start axis."
+        raise PlanningError("without a viewpoint map the camera looks ahead", value=start_axis, fix=fix)
     problem = _Problem(ends, box, space, viewpoint_map, config)
     orientations = problem.start_orientations(start_axis)
     rng = np.random.default_rng(0)
@@ -99,7 +104,7 @@ def plan_path(
             route = improve(route, _shorter, _length(route), space, box, seconds, rng)
         if viewpoint_map is None:
             assert route is not None
-            _finish(bar)
+            bar.update(max(0.0, bar.total - bar.n))
             return _looking_ahead(route, config)
         axis = None if start_axis is None else axes_of_angles(np.degrees(orientations[0]))
         views = RouteViews(viewpoint_map, config, axis)
@@ -131,20 +136,12 @@ def plan_path(
         better = improve(places, cost_below, cheapest.cost, space, box, end - time.monotonic(), rng)
         if better is not places:
             add(views.best(better), better, IMPROVEMENT)
-        _finish(bar)
+        bar.update(max(0.0, bar.total - bar.n))
     return found[min(found)][0]
 
 
-def _finish(bar: Any) -> None:
-    bar.update(max(0.0, bar.total - bar.n))
-
-
 def check_ends(ends: Float, space: Space, bounds: Float) -> None:
-    """Check that a start and a goal (2, 3) m are different places where a camera can be.
-
-    Raises:
-        PlanningError: they are not.
-    """
+    """Raise a PlanningError unless a start and a goal (2, 3) m are different places where a camera can be."""
     low, high = bounds
     for name, point in zip(("start", "goal"), ends, strict=True):
         if not ((point >= low) & (point <= high)).all() or not space.is_free(point[None])[0]:
@@ -172,6 +169,59 @@ def _shorter(places: Float, limit: float) -> float | None:
     return length if length < limit - 1e-9 else None
 
 
+def improve(
+    places: Float,
+    cost_below: Callable[[Float, float], float | None],
+    cost: float,
+    space: Space,
+    bounds: Float,
+    seconds: float,
+    rng: np.random.Generator,
+    most: int | None = None,
+) -> Float:
+    """Improve a route by shortcuts and by moving, adding and removing corners; returns the cheapest found, (S', 3) m.
+
+    Every route tried lies in free space and keeps its ends.
+
+    `places` (S, 3) m are the corners of a free route and `cost` is its cost; `cost_below` is that of a route if less
+    than a limit, else None. `bounds` (2, 3) m are corners of the space to plan in; `most` limits the routes tried.
+    """
+    end, tried = time.monotonic() + seconds, 0
+    while time.monotonic() < end and (most is None or tried < most):
+        tried += 1
+        candidate, first, last = _varied(places, bounds, rng)
+        # only the changed segments need to be tested
+        if not space.segments_are_free(candidate[first:last], candidate[first + 1 : last + 1]).all():
+            continue
+        found = cost_below(candidate, cost)
+        if found is not None:
+            places, cost = candidate, found
+    return places
+
+
+def _varied(places: Float, bounds: Float, rng: np.random.Generator) -> tuple[Float, int, int]:
+    """A random variation of a route, and the first and last corner between which it differs."""
+    n, step = len(places), np.exp(rng.uniform(*np.log(STEPS_M)))
+    kind = rng.integers(4) if n > 2 else rng.integers(2)
+    if kind == 0:  # a new corner beside a random point of the route
+        after = int(rng.integers(1, n))
+        t = rng.random()
+        new = places[after - 1] * (1 - t) + places[after] * t + rng.normal(0, step, 3)
+        return np.insert(places, after, new.clip(*bounds), axis=0), after - 1, after + 1
+    if kind == 1:  # a shortcut between two random points of the route
+        at = lengths_along(places)
+        a, b = np.sort(rng.uniform(0, at[-1], 2))
+        ends = between(at, places, np.array([a, b]))
+        before, after = int((at < a).sum()), int((at <= b).sum())
+        return np.concatenate([places[:before], ends, places[after:]]), before - 1, before + 2
+    row = int(rng.integers(1, n - 1))
+    if kind == 2:  # remove a corner
+        return np.delete(places, row, axis=0), row - 1, row
+    moved = places.copy()
+    moved[row] = (moved[row] + rng.normal(0, step, 3)).clip(*bounds)
+    return moved, row - 1, row + 1
+
+
 class _Problem:
     """A planning problem over states x, y, z (m), yaw, pitch (radians); without a map the last two do not matter."""
 
@@ -194,11 +244,9 @@ class _Problem:
         x, y, z = check_axis(axis)
         yaw, pitch = math.atan2(y, x), math.asin(z)
         if not self.pitch[0] - 1e-6 <= pitch <= self.pitch[1] + 1e-6:
-            value, fix = (
-                f"{math.degrees(pitch):.1f} deg",
-                f"Start within {self.config.pitch_deg} degrees, or widen pitch_deg.",
-            )
-            raise PlanningError("the camera cannot be pitched as it should start", value=value, fix=fix)
+            problem, value = "the camera cannot be pitched as it should start", f"{math.degrees(pitch):.1f} deg"
+            fix = f"Start within {self.config.pitch_deg} degrees, or widen pitch_deg."
+            raise PlanningError(problem, value=value, fix=fix)
         return [(yaw, min(max(pitch, self.pitch[0]), self.pitch[1]))]
 
     def motion_cost(self, a: tuple[float, ...], b: tuple[float, ...]) -> float:
@@ -250,7 +298,6 @@ class _Problem:
         space = _state_space(low, high, pitch, 0.2 if self.map is not None else 1e-6)
         information = base.SpaceInformation(space)
         information.setStateValidityChecker(lambda state: bool(self.space.is_free([_numbers(state)[:3]])[0]))
-
         possible, cost_of = self.motion_is_possible, self.motion_cost
 
         class Motions(base.MotionValidator):
@@ -269,7 +316,9 @@ class _Problem:
         definition = base.ProblemDefinition(information)
         for yaw, start_pitch in orientations:
             state = space.allocState()
-            _write(state, (*self.ends[0], start_pitch, yaw))
+            for index, number in enumerate((*self.ends[0], start_pitch)):
+                state[0][index] = float(number)
+            state[1].value = float(yaw)
             definition.addStartState(state)
         around_goal = base.GoalSpace(information)
         around_goal.setSpace(_state_space(self.ends[1] - 1e-9, self.ends[1] + 1e-9, pitch, 1.0))
@@ -319,11 +368,10 @@ def _forward(positions: Float, pitch: Float) -> Float:
     Where the path goes straight up or down, the yaw stays as before.
     """
     steps = np.gradient(positions, axis=0)[:, :2] if len(positions) > 1 else np.array([[1.0, 0.0]])
+    if not (np.linalg.norm(steps, axis=1) > 1e-9).any():
+        steps = np.tile([1.0, 0.0], (len(steps), 1))
     length = np.linalg.norm(steps, axis=1)
     known = length > 1e-9
-    if not known.any():
-        steps, known = np.tile([1.0, 0.0], (len(steps), 1)), np.ones(len(steps), dtype=bool)
-        length = np.ones(len(steps))
     last = np.maximum.accumulate(np.where(known, np.arange(len(steps)), int(np.argmax(known))))
     level = (steps / np.maximum(length, 1e-9)[:, None])[last]
     least = float(np.clip(0.0, *pitch))
@@ -334,13 +382,6 @@ def _numbers(state: Any) -> tuple[float, float, float, float, float]:
     """x, y, z, yaw, pitch of a state."""
     place = state[0]
     return place[0], place[1], place[2], state[1].value, place[3]
-
-
-def _write(state: Any, numbers: tuple[float, ...]) -> None:
-    """Set x, y, z, pitch, yaw of a state."""
-    for index in range(4):
-        state[0][index] = float(numbers[index])
-    state[1].value = float(numbers[4])
 
 
 def _wrapped(angle: float) -> float:

@@ -23,26 +23,23 @@ PATHS_CSV, PATHS_MD, PATHS_PNG = "paths.csv", "paths.md", "paths.png"
 ALL = "all"
 """Name of the rows over all scenes."""
 
+Tags = Mapping[str, str] | None
+
 
 def summarize_paths(paths: pd.DataFrame, views: pd.DataFrame, config: PathsConfig) -> pd.DataFrame:
-    """A row for each scene (and all of them), task and method.
+    """A row for each scene (and all of them), task and method, NaN where there is no data.
 
-    Args:
-        paths: `wheretolook.planning.path_comparison.ComparedPaths.paths` of all scenes, with a column `scene`.
-        views: their views, with `scene`, `status`, `error_m` and `error_deg`.
-        config: limits of the errors, resamples, seed.
+    `paths` and `views` are those of `wheretolook.planning.path_comparison.ComparedPaths` of all scenes, with a column
+    `scene`, the views also with `status`, `error_m` and `error_deg`.
 
     Returns:
         `localized`, the share of all views that localize; `times_forward` and `times_forward_length`, the ratios of
         this share and of the length to those of "forward", over the pairs that both could plan; 95 % intervals of the
         first two by resampling pairs within scenes; `failures` to plan, `turn_deg_per_m`, and `promised`, the mean
-        score. NaN where there is no data.
+        score.
     """
-    good = (
-        (views["status"] == LOCALIZED)
-        & (views["error_m"] < config.max_error_m)
-        & (views["error_deg"] < config.max_error_deg)
-    )
+    near = (views["error_m"] < config.max_error_m) & (views["error_deg"] < config.max_error_deg)
+    good = near & (views["status"] == LOCALIZED)
     key = ["scene", "task", "method", "pair"]
     counted = views.assign(good=good).groupby(key, sort=False)["good"].agg(["sum", "size"]).reset_index()
     table = paths.merge(counted.rename(columns={"sum": "good", "size": "n"}), on=key, how="left")
@@ -61,10 +58,8 @@ def summarize_paths(paths: pd.DataFrame, views: pd.DataFrame, config: PathsConfi
 
 def _draws(table: pd.DataFrame, config: PathsConfig) -> NDArray[np.int64]:
     """How often each pair of `_pairs_of` is drawn, (resamples, P), with replacement within its scene."""
-    pairs = _pairs_of(table)
-    rng = np.random.default_rng(config.seed)
-    times = np.zeros((config.resamples, len(pairs)), dtype=np.int64)
-    scene = pairs.get_level_values("scene")
+    scene, rng = _pairs_of(table).get_level_values("scene"), np.random.default_rng(config.seed)
+    times = np.zeros((config.resamples, len(scene)), dtype=np.int64)
     for name in dict.fromkeys(scene):
         columns = np.flatnonzero(scene == name)
         drawn = rng.integers(0, len(columns), (config.resamples, len(columns)))
@@ -87,11 +82,9 @@ def _row(of_method: pd.DataFrame, forward: pd.DataFrame, draws: NDArray[np.int64
         return np.divide(a, b, out=np.full(len(a), np.nan), where=b > 0)
 
     def ratio(weights: NDArray[Any]) -> NDArray[Any]:
-        ours, theirs = (quotient(*((weights * both) @ table).T) for table in (counts, base_counts))
-        return quotient(ours, theirs)
+        return quotient(*(quotient(*((weights * both) @ table).T) for table in (counts, base_counts)))
 
     whole = np.ones((1, len(index)))
-    shares, ratios = _interval(quotient(*(draws @ counts).T)), _interval(ratio(draws))
     metres = float(of_method["length_m"].sum())
     lengths = [table["length_m"].to_numpy()[both].sum() for table in (method, base)]
     return {
@@ -99,11 +92,9 @@ def _row(of_method: pd.DataFrame, forward: pd.DataFrame, draws: NDArray[np.int64
         "failures": int((~of_method["planned"]).sum()),
         "views": int(counts[:, 1].sum()),
         "localized": float(quotient(*(whole @ counts).T)[0]),
-        "localized_low": shares[0],
-        "localized_high": shares[1],
+        **_interval("localized", quotient(*(draws @ counts).T)),
         "times_forward": float(ratio(whole)[0]),
-        "times_forward_low": ratios[0],
-        "times_forward_high": ratios[1],
+        **_interval("times_forward", ratio(draws)),
         "times_forward_length": float(lengths[0] / lengths[1]) if lengths[1] else float("nan"),
         "length_m": float(of_method["length_m"].mean()),
         "turn_deg_per_m": float(of_method["turn_deg"].sum() / metres) if metres else float("nan"),
@@ -111,11 +102,11 @@ def _row(of_method: pd.DataFrame, forward: pd.DataFrame, draws: NDArray[np.int64
     }
 
 
-def _interval(draws: NDArray[Any]) -> tuple[float, float]:
-    """Ends of the 95 % interval of the draws that are finite."""
+def _interval(name: str, draws: NDArray[Any]) -> dict[str, float]:
+    """Ends of the 95 % interval of the draws that are finite, by the names of their columns."""
     known = draws[np.isfinite(draws)]
     low, high = np.percentile(known, (2.5, 97.5)) if len(known) else (np.nan, np.nan)
-    return float(low), float(high)
+    return {f"{name}_low": float(low), f"{name}_high": float(high)}
 
 
 def path_markdown(summary: pd.DataFrame, config: PathsConfig) -> str:
@@ -137,11 +128,7 @@ def path_markdown(summary: pd.DataFrame, config: PathsConfig) -> str:
 
 
 def log_paths(
-    params: Mapping[str, Any],
-    summary: pd.DataFrame,
-    results: Path,
-    tracking: TrackingConfig,
-    tags: Mapping[str, str] | None = None,
+    params: Mapping[str, Any], summary: pd.DataFrame, results: Path, tracking: TrackingConfig, tags: Tags = None
 ) -> str:
     """Log a comparison: a run with its files, and in it one for each task and method over all scenes.
 

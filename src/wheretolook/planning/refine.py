@@ -51,17 +51,12 @@ def refine_directions(
     """Improve axes by a pattern search on the sphere (Hooke and Jeeves 1961; compass search, Kolda et al. 2003).
 
     Eight axes one step away from the current one are scored; the best of them replaces it if it scores higher,
-    otherwise the step is halved. All views are searched together, so that the scorer gets batches. Scores need not be
-    continuous.
+    otherwise the step is halved, until it falls below the last. All views are searched together, so that the scorer
+    gets batches. Scores need not be continuous.
 
-    Args:
-        scorer: any method.
-        locations: (B, 3) world, metres.
-        axes: (B, 3) to begin with, of any length, such as the best of a lattice.
-        max_angle_deg: largest angle from the first axis; the default exceeds the distance of neighbours on a lattice of
-            500 directions.
-        first_step_deg: first step; about half that distance works well.
-        last_step_deg: the search ends when the step falls below this.
+    The search begins at locations (B, 3) m with axes (B, 3) of any length, such as the best of a lattice. The default
+    `max_angle_deg` from there exceeds the distance of neighbours on a lattice of 500 directions; about half that
+    distance works well as the first step.
 
     Raises:
         ValueError: locations or axes are not finite, have no length or differ in number, or an angle is not positive.

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from wheretolook.geometry.lattices import axes_of_angles
 from wheretolook.geometry.poses import Float
 from wheretolook.planning.config import PathConfig
-from wheretolook.planning.polylines import between, lengths_along
-from wheretolook.planning.sequences import TurnLimit, best_sequence
+from wheretolook.planning.sequences import TurnLimit, best_sequence, between, lengths_along
 from wheretolook.planning.turns import pan_tilt_angles
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.utils.errors import PlanningError
@@ -29,12 +28,9 @@ improving either."""
 class PlannedPath:
     """A path of a camera, sampled at its corners and every `PathConfig.spacing_m` or a little less.
 
-    Attributes:
-        positions: (W, 3) world, metres.
-        axes: (W, 3) unit optical axes in the world.
-        scores: (W,) scores of the views in the viewpoint map, 0 outside its free voxels; NaN without a map.
-        cost: as `PathConfig` defines it, by the trapezoidal rule over the views.
-        found_by: `SHORT_ROUTE`, `SEARCH` or `IMPROVEMENT`; empty if it was not planned.
+    `positions` (W, 3) m and unit optical `axes` (W, 3) are in the world; `scores` (W,) those of the views in the
+    viewpoint map, 0 outside its free voxels, NaN without a map; `cost` as `PathConfig` defines it, by the trapezoidal
+    rule over the views; `found_by` is `SHORT_ROUTE`, `SEARCH` or `IMPROVEMENT`, empty if the path was not planned.
     """
 
     positions: Float
@@ -56,14 +52,27 @@ class PlannedPath:
 
 
 @dataclass(frozen=True, eq=False)
-class RouteSamples:
-    """Points along a route, by arc length in metres.
+class PathView:
+    """One view along a path.
 
-    Attributes:
-        corners: (S,) arc lengths of its corners.
-        even: (E,) equal steps, no longer than the spacing.
-        along: (W,) both together; a path sampled without its corners would cut through walls.
-        positions: (W, 3) world, metres, at `along`.
+    `position` (3,) m and unit optical `axis` (3,) are in the world; `score` is in [0, 1], NaN if unknown; `pixels`
+    (K, 2) are those of the landmarks in view, in an image of `size_px` (width, height); `rgb` (H, W, 3) is None if the
+    scene cannot be rendered.
+    """
+
+    position: Float
+    axis: Float
+    score: float
+    pixels: Float
+    size_px: tuple[int, int]
+    rgb: NDArray[np.uint8] | None
+
+
+@dataclass(frozen=True, eq=False)
+class RouteSamples:
+    """Points along a route, by arc length in metres: its S corners, E even steps no longer than the spacing, and both.
+
+    `along` (W,) holds both: a path sampled without its corners would cut through walls. `positions` (W, 3) m are there.
     """
 
     corners: Float

@@ -1,9 +1,12 @@
-"""The viewpoint map of a scene of a dataset."""
+"""The viewpoint map of a scene of a dataset, the weights that score it, and the map that a planner is given."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
+from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from wheretolook.dataset.folders import RELEASE, Dataset
 from wheretolook.dataset.scene import Scene
@@ -12,22 +15,23 @@ from wheretolook.geometry.lattices import ViewLattice
 from wheretolook.learning.provenance import was_trained_on
 from wheretolook.learning.weights import method_of_weights, read_record, read_training, read_weights
 from wheretolook.methods.field_of_view import same_field_of_view
-from wheretolook.methods.registry import load_scorer, make_scorer, members, scorers
+from wheretolook.methods.registry import find, load_scorer, make_scorer, members, methods_named, scorers
 from wheretolook.planning.map_building import build_viewpoint_map
+from wheretolook.planning.path_planning import Space
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.utils.errors import ConfigError, WeightsError
+
+REACH = 2
+"""A voxel borrows from voxels at most this many away along each axis."""
+
+INSIDE = np.stack(np.meshgrid(*[(-1 / 3, 0.0, 1 / 3)] * 3, indexing="ij"), -1).reshape(-1, 3)
+"""Points of a voxel that are tested for free space (27, 3), relative to its centre in units of its size."""
 
 
 def scene_viewpoint_map(
     scene: Scene, views: ViewLattice, method: str = "", weights: Path | None = None
 ) -> ViewpointMap:
-    """Build the viewpoint map of a scene, with progress bars.
-
-    Args:
-        scene: where a camera can be, what it sees, and where kernels run.
-        views: voxels and directions.
-        method: that scores; empty for that of the weights, or bins without.
-        weights: of a method that has learnt.
+    """Build the viewpoint map of a scene by a method (empty for that of the weights, or bins), with progress bars.
 
     Raises:
         SceneError: no voxel is free. MapError: there are no landmarks.
@@ -46,14 +50,8 @@ def weights_for(
 ) -> Path | None:
     """The weights that a method scores with: those given if they are of its kind, or else the best there are.
 
-    Args:
-        method: its name; empty for whatever the weights are of.
-        dataset: see `default_weights`.
-        given: a file of weights.
-        say: told of files that cannot be used, and why.
-
-    Returns:
-        None for a method that has learnt nothing, or if there are none.
+    An empty `method` stands for whatever the weights are of; `say` is told of files that cannot be used, and why. None
+    for a method that has learnt nothing, or if there are no weights (`default_weights`).
 
     Raises:
         WeightsError: the file given is missing or damaged.
@@ -69,10 +67,7 @@ def weights_for(
 def default_weights(dataset: Dataset, say: Callable[[str], None] = print, kinds: Collection[str] = ()) -> Path | None:
     """The best weights of a dataset, or else of the release beside it, that serve its camera's field of view.
 
-    Args:
-        dataset: whose `weights` folder is looked into first.
-        say: told of files that cannot be used, and why.
-        kinds: names of methods of which they may be; empty for all that score views by themselves.
+    They are of one of the methods named by `kinds`; empty for all that score views by themselves.
     """
     kinds = kinds or {name for name, method in scorers().items() if method.weights == name}
     for root in (dataset.root, dataset.root.parent / RELEASE):
@@ -94,3 +89,65 @@ def default_weights(dataset: Dataset, say: Callable[[str], None] = print, kinds:
         if fitting:
             return max(fitting, key=lambda path: fitting[path])
     return None
+
+
+def planner_map(
+    scene: Scene, dataset: Dataset, views: ViewLattice, method: str = "", weights: Path | None = None
+) -> ViewpointMap:
+    """The map that a planner is given: scores in [0, 1], and something to go by wherever a camera can be.
+
+    Scores are the method's probabilities, or ranks of scores that are none; views are borrowed where needed. `weights`
+    are those of `weights_for`; the dataset is named where they are missing.
+
+    Raises:
+        ConfigError: the method needs weights. Else as `scene_viewpoint_map`.
+    """
+    if weights is None and any(known.weights for known in members(method, scorers())):
+        raise ConfigError(f"{method} needs weights", path=dataset.root, fix="Train it, or name weights.")
+    scored = scene_viewpoint_map(scene, views, method, weights)
+    scored_by = find(scored.origin.scorer)
+    if scored_by is None or not scored_by.probability:
+        scored = shares_below(scored)
+    return with_borrowed_views(scored, scene.space)
+
+
+def check_methods(methods: Iterable[str]) -> None:
+    """Raise a ConfigError if there is no method of a name; an empty one stands for that of the weights."""
+    for name in filter(None, methods):
+        methods_named([name], scorers())
+
+
+def shares_below(viewpoint_map: ViewpointMap) -> ViewpointMap:
+    """The map with the share of all its views that score lower in place of each score: a ranking, in [0, 1].
+
+    Planning weighs scores against metres. Information has no upper end and other units, so it enters by its ranks.
+    """
+    ordered = np.sort(viewpoint_map.scores, axis=None)
+    shares = np.searchsorted(ordered, viewpoint_map.scores, side="left") / max(1, ordered.size - 1)
+    origin = viewpoint_map.origin.derive("scores replaced by ranks")
+    return replace(viewpoint_map, scores=shares.astype(np.float32), origin=origin)
+
+
+def with_borrowed_views(viewpoint_map: ViewpointMap, space: Space) -> ViewpointMap:
+    """A map for planners: voxels with free space but an occupied centre get the views of the nearest voxel in reach.
+
+    A voxel is in reach if a camera can go straight to its centre, so nothing is borrowed through walls. In the result,
+    a derived map (`MapOrigin.derived`), voxels share rows, so it can be neither saved nor updated.
+    """
+    rows, centers = viewpoint_map.row_of_voxel.copy(), viewpoint_map.grid.centers()
+    size = viewpoint_map.grid.voxel_m
+    known, unknown = np.flatnonzero(rows >= 0), np.flatnonzero(rows < 0)
+    points = centers[unknown][:, None] + INSIDE * size
+    free = space.is_free(points.reshape(-1, 3)).reshape(len(unknown), len(INSIDE))
+    order = np.argsort((INSIDE**2).sum(1), kind="stable")
+    for voxel, own, is_free in zip(unknown, points, free, strict=True):
+        if not is_free.any():
+            continue
+        start = own[order[is_free[order]][0]]  # the free point nearest to the centre
+        near = known[(np.abs(centers[known] - centers[voxel]) <= (REACH + 1e-6) * size).all(1)]
+        near = near[np.argsort(np.linalg.norm(centers[near] - start, axis=1), kind="stable")]
+        if len(near):
+            clear = space.segments_are_free(np.tile(start, (len(near), 1)), centers[near])
+            if clear.any():
+                rows[voxel] = viewpoint_map.row_of_voxel[near[int(np.argmax(clear))]]
+    return replace(viewpoint_map, row_of_voxel=rows, origin=viewpoint_map.origin.derive("views borrowed by neighbours"))

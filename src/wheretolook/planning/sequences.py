@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.geometry.poses import Float, rotation_looking_along
-from wheretolook.planning.polylines import between, lengths_along
 from wheretolook.planning.turns import (
     check_axis,
     pan_tilt_angles,
@@ -30,11 +29,9 @@ CELL_DEG, TURN_PENALTY = 20.0, 0.02
 class TurnLimit:
     """Which directions can follow each other: those that a camera without roll reaches by one rotation in the limit.
 
-    Attributes:
-        directions: (D, 3) unit optical axes in the world.
-        max_turn_deg: largest angle of the rotation between two waypoints, included.
-        neighbours: (D, K) int64, ids reachable from each direction, including itself, ascending, padded with D.
-        pan_tilt: whether the angle is that of a pan-tilt head (`wheretolook.planning.turns.pan_tilt_turns_deg`).
+    `directions` (D, 3) are unit optical axes in the world; `max_turn_deg` is the largest angle of the rotation between
+    two waypoints, included, that of a pan-tilt head if `pan_tilt` (`turns.pan_tilt_turns_deg`); `neighbours` (D, K) are
+    the ids reachable from each direction, including itself, ascending, padded with D.
     """
 
     directions: Float
@@ -88,10 +85,8 @@ def best_sequence(scores: ArrayLike, limit: TurnLimit, start: ArrayLike | None =
     Dynamic programming over directions (Viterbi 1967), O(W D K). Of several with the same sum, the one with the lowest
     id at the last waypoint is chosen, then at the one before, and so on.
 
-    Args:
-        scores: (W, D) of each waypoint and direction; -inf forbids one.
-        limit: on the turn between waypoints.
-        start: orientation before the first waypoint, see `TurnLimit.from_start`; None allows any direction there.
+    `scores` (W, D) are of each waypoint and direction; -inf forbids one. `start` is the orientation before the first
+    waypoint, see `TurnLimit.from_start`; None allows any direction there.
 
     Raises:
         PlanningError: no sequence keeps the limit; names the waypoint that cannot be reached.
@@ -170,6 +165,16 @@ def resample_path(points: ArrayLike, spacing_m: float = SPACING_M) -> Float:
     at = lengths_along(path)
     # a remainder that is only rounding adds no waypoint
     return between(at, path, np.append(np.arange(0, at[-1] - 1e-9 * spacing_m, spacing_m), at[-1]))
+
+
+def lengths_along(places: Float) -> Float:
+    """Length from the start of a polyline (S, 3) to each of its corners, (S,), in its unit."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1))])
+
+
+def between(knots: Float, values: Float, at: Float) -> Float:
+    """Values (S, C) at ascending knots (S,), linearly interpolated at (W,); (W, C)."""
+    return np.column_stack([np.interp(at, knots, column) for column in values.T])
 
 
 def _check(scores: ArrayLike, limit: TurnLimit) -> Float:

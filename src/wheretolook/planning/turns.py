@@ -14,22 +14,14 @@ TOLERANCE_DEG = 1e-5
 
 
 def within(angles_deg: Float, limit_deg: float) -> NDArray[np.bool_]:
-    """Which angles are at most the limit, up to rounding.
-
-    Raises:
-        ValueError: the limit is negative or NaN.
-    """
+    """Which angles are at most the limit, up to rounding; raises a ValueError for one that is negative or NaN."""
     if not limit_deg >= 0:
         raise ValueError(f"a limit of an angle must be at least 0 degrees, got {limit_deg}")
     return np.asarray(angles_deg <= limit_deg + TOLERANCE_DEG)
 
 
 def check_axis(axis: ArrayLike) -> Float:
-    """An axis (3,) of any length as a unit vector.
-
-    Raises:
-        ValueError: another shape, not finite, or of no length.
-    """
+    """An axis (3,) of any length as a unit vector; raises a ValueError if it is not finite or has no length."""
     given = np.asarray(axis, dtype=np.float64)
     length = np.linalg.norm(given)
     if given.shape != (3,) or not 0 < length < np.inf:
@@ -60,11 +52,9 @@ def angles_to_axis_deg(directions: Float, axis: Float) -> Float:
 
 
 def turns_from_deg(current: ArrayLike, rotations: Float) -> Float:
-    """Rotation angles (D,) in degrees from one orientation to others.
+    """Rotation angles (D,) in degrees from one orientation to others, cam_from_world (D, 3, 3).
 
-    Args:
-        current: (3,) axis of a camera without roll, or (3, 3) cam_from_world rotation.
-        rotations: (D, 3, 3) cam_from_world.
+    `current` is the axis (3,) of a camera without roll, or a cam_from_world rotation (3, 3).
 
     Raises:
         ValueError: `current` has another shape, is not finite, no rotation, or an axis of no length.

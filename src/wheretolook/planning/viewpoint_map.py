@@ -38,40 +38,28 @@ class ViewChoice(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ViewChoices:
-    """The best orientation at each of N points.
-
-    Attributes:
-        found: (N,) bool; False where a point lies outside the grid or in a voxel that is not free.
-        direction_id: (N,) int64; -1 where not found.
-        score: (N,) float32; NaN where not found.
-        n_visible: (N,) int64; 0 where not found.
-    """
+    """The best orientation at each of N points; found is False outside the grid or in a voxel that is not free."""
 
     found: NDArray[np.bool_]
-    direction_id: NDArray[np.int64]
-    score: NDArray[np.float32]
-    n_visible: NDArray[np.int64]
+    direction_id: NDArray[np.int64]  # -1 where not found
+    score: NDArray[np.float32]  # NaN where not found
+    n_visible: NDArray[np.int64]  # 0 where not found
 
 
 @dataclass(frozen=True)
 class MapOrigin:
-    """What a viewpoint map was made from.
+    """What a viewpoint map was made from: names of the method, the directions' lattice and the occlusion model.
 
-    Attributes:
-        scorer: name of the method.
-        lattice: name of the directions' lattice, "" for others.
-        camera: intrinsics: COLMAP's name of the "model", "width" and "height" in pixels, "params" in COLMAP's order.
-        occlusion: name of the occlusion model.
-        landmarks: 16 hexadecimal digits that change with any landmark.
-        derived: what was done to the map since it was built, such as scores replaced by ranks; "" if nothing. A derived
-            map answers queries, but cannot be saved or updated.
+    `camera` has COLMAP's name of the "model", "width" and "height" in pixels, and "params" in COLMAP's order. `derived`
+    tells what was done to the map since it was built, such as scores replaced by ranks; "" if nothing. A derived map
+    answers queries, but cannot be saved or updated.
     """
 
     scorer: str
-    lattice: str
+    lattice: str  # "" for others
     camera: dict[str, Any]
     occlusion: str
-    landmarks: str
+    landmarks: str  # 16 hexadecimal digits that change with any landmark
     derived: str = ""
 
     def derive(self, what: str) -> MapOrigin:
@@ -122,9 +110,8 @@ class ViewpointMap:
         if len(self.row_of_voxel) != len(self.grid):
             raise ValueError(f"row_of_voxel must be of length {len(self.grid)}, got {len(self.row_of_voxel)}")
         used = self.row_of_voxel[self.row_of_voxel >= 0]
-        if self.row_of_voxel.min(initial=-1) < -1 or not (
-            self.origin.derived or np.array_equal(used, np.arange(len(used)))
-        ):
+        in_order = self.origin.derived or np.array_equal(used, np.arange(len(used)))
+        if self.row_of_voxel.min(initial=-1) < -1 or not in_order:
             raise ValueError("row_of_voxel must be -1 or count up with voxels, using every row once")
 
     @classmethod
@@ -156,8 +143,7 @@ class ViewpointMap:
         """
         origin = asdict(self.origin)
         if derived := origin.pop("derived"):
-            fix = "Save the map it was derived from."
-            problem = "a map derived from another is for planners and not to be saved"
+            problem, fix = "a map derived from another is not to be saved", "Save the map it was derived from."
             raise MapFormatError(problem, path=Path(folder), value=derived, fix=fix)
         write_map(folder, self.grid, origin, {name: getattr(self, name) for name in ARRAYS})
 
@@ -179,11 +165,7 @@ class ViewpointMap:
         return self.grid.centers()[self.voxel_of_row]
 
     def row(self, point: Point) -> int:
-        """Row of the free voxel that holds a world point (3,) m; -1 if none does.
-
-        Raises:
-            ValueError: a coordinate is not finite.
-        """
+        """Row of the free voxel that holds a world point (3,) m; -1 if none does."""
         x, y, z = point
         x, y, z = float(x), float(y), float(z)  # faster than NumPy's scalars
         x0, y0, z0, x1, y1, z1, dx, dy, dz, nx, ny, nz, rows = self._hash
@@ -205,7 +187,7 @@ class ViewpointMap:
         """The n best orientations at a world point (3,) m, or all if there are fewer, the best first.
 
         Raises:
-            ValueError: n is no whole number of at least 1, or a coordinate is not finite.
+            ValueError: n is no whole number of at least 1.
         """
         if not isinstance(n, int | np.integer) or n < 1:
             raise ValueError(f"n must be a whole number of at least 1, got {n!r}")
@@ -213,12 +195,10 @@ class ViewpointMap:
         return None if row < 0 else [self._choice(row, choice) for choice in self.ranked[row, :n].tolist()]
 
     def best_in_cone(self, point: Point, axis: ArrayLike, half_angle_deg: float) -> ViewChoice | None:
-        """The best orientation whose optical axis is at most `half_angle_deg` from a world axis (3,).
-
-        Returns None also if no direction of the lattice lies in the cone.
+        """The best orientation whose optical axis is at most `half_angle_deg` from a world axis (3,), or None.
 
         Raises:
-            ValueError: the point or the axis is not finite, or the axis has no length.
+            ValueError: the axis is not finite or has no length.
         """
         row = self.row(point)
         inside = within(angles_to_axis_deg(self.directions, check_axis(axis)), half_angle_deg)
@@ -231,8 +211,7 @@ class ViewpointMap:
         roll, or a (3, 3) cam_from_world rotation. Returns None also if no direction of the lattice is in reach.
 
         Raises:
-            ValueError: the point or `current` is not finite, an axis has no length, or a matrix is not a rotation (such
-                as a reflection).
+            ValueError: `current` is not finite, an axis without length, or no rotation (such as a reflection).
         """
         row = self.row(point)
         if np.shape(current) == (3, 3) and not np.linalg.det(np.asarray(current, dtype=np.float64)) > 0:
@@ -240,11 +219,7 @@ class ViewpointMap:
         return self._best_of(row, within(turns_from_deg(current, self._rotations), max_turn_deg))
 
     def best_many(self, points: ArrayLike) -> ViewChoices:
-        """The best orientation at each of world points (N, 3) m.
-
-        Raises:
-            ValueError: points of another shape, or not finite.
-        """
+        """The best orientation at each of world points (N, 3) m; raises as `rows`."""
         rows = self.rows(points)
         found = rows >= 0
         direction, score, n_visible = self._best_of_rows
@@ -315,12 +290,9 @@ class ViewpointMap:
     def _best_of_rows(self) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.int64]]:
         """Id, score and landmarks in view of the best direction of each row; a last entry stands for row -1."""
         best = self.ranked[:, 0].astype(np.int64)
-        rows = np.arange(len(best))
-        return (
-            np.append(best, -1),
-            np.append(self.scores[rows, best], np.float32(np.nan)),
-            np.append(self.n_visible[rows, best].astype(np.int64), 0),
-        )
+        at = np.arange(len(best)), best
+        scores, counts = self.scores[at], self.n_visible[at].astype(np.int64)
+        return np.append(best, -1), np.append(scores, np.float32(np.nan)), np.append(counts, 0)
 
 
 _CORNERS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(8, 3)

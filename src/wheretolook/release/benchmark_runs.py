@@ -9,6 +9,8 @@ from tempfile import TemporaryDirectory
 
 import pandas as pd
 
+from wheretolook.figures.runtimes import runtime_figure, scaling_figure
+from wheretolook.figures.style import save_figure
 from wheretolook.utils.tracking import log, start_run
 from wheretolook.utils.tracking_config import TrackingConfig
 
@@ -25,16 +27,9 @@ def log_runtimes(
 ) -> str:
     """Log measured times as a run of the stage "benchmark", with both tables and their figures; returns its id.
 
-    Args:
-        tracking: where to log.
-        sizes: table of `wheretolook.figures.runtimes.runtime_figure`.
-        growth: table of `scaling_figure`; may be empty.
-        tags: further tags.
-        file: from which `sizes` were read, to be logged unchanged.
+    The tables are those of `runtime_figure` and `scaling_figure` (may be empty) in `wheretolook.figures.runtimes`. The
+    file from which `sizes` were read, if given, is logged unchanged.
     """
-    from wheretolook.figures.runtimes import runtime_figure, scaling_figure
-    from wheretolook.figures.style import save_figure
-
     metrics = {}
     for row in sizes.dropna(subset="median_s").to_dict("records"):
         name = f"{row['what']} {row['device'].split(':')[0]} {row['threads']} threads s"

@@ -58,14 +58,10 @@ _CAMERAS = "`map/cameras.npz` holds the poses cam_from_world of the images that 
 
 
 def write_card(release: Dataset, defaults: Mapping[str, Any]) -> Path:
-    """Write `<release>/README.md` from what lies in the release's folder. The same files give the same bytes.
+    """Write `<release>/README.md` from the weights and scores in the release's folder, and return its path.
 
-    Args:
-        release: with weights and scores.
-        defaults: of the settings in `release.json`, as JSON values: the card tells what differs from them.
-
-    Returns:
-        The card's path.
+    The same files give the same bytes. `defaults` are those of the settings in `release.json`, as JSON values: the card
+    tells what differs from them.
 
     Raises:
         WeightsError: not exactly one of the paper's networks ships, or a record of training is missing.
@@ -91,7 +87,7 @@ def release_card(release: Dataset, defaults: Mapping[str, Any]) -> str:
     shares = label_summary(tables, {scene.name: scene.split for scene in release.scenes}).shares
     everything = shares.iloc[-1]
     source, config = about["source"], f"configs/{release.name}.yaml"
-    root = f"data/{release.name}"
+    root, changed = f"data/{release.name}", _difference(about["settings"], defaults)
     results = release.root / "results"
     if not (results / SCORES_CSV).is_file():
         raise TableError("there are no scores", path=results / SCORES_CSV, fix="Run the evaluate stage.")
@@ -133,7 +129,7 @@ def release_card(release: Dataset, defaults: Mapping[str, Any]) -> str:
         f"Shares in % of viewpoints that localize within the limits; the label is the first, "
         f"{threshold_label(threshold_key(THRESHOLDS[0]))}. Settings of `configs/{source}.yaml` that are not the "
         "defaults (all of them are in `release.json`):",
-        f"```yaml\n{_changed_settings(about['settings'], defaults)}```",
+        f"```yaml\n{yaml.safe_dump(changed, sort_keys=False, default_flow_style=None, width=110)}```",
         *_label_text(release),
         _TABLES,
         *([_CAMERAS] if all(scene.mapping_cameras.is_file() for scene in release.scenes) else []),
@@ -169,7 +165,6 @@ def release_card(release: Dataset, defaults: Mapping[str, Any]) -> str:
 
 
 def _weights(release: Dataset) -> list[Path]:
-    """All weights that ship."""
     return sorted((release.root / "weights").glob("*.safetensors"))
 
 
@@ -210,32 +205,21 @@ def _label_table(release: Dataset, shares: pd.DataFrame) -> str:
     landmarks = {scene: len(Landmarks.load(scene.landmarks)) for scene in release.scenes}
     lines = []
     for row in shares.to_dict("records"):
-        n_landmarks = sum(
-            n
-            for scene, n in landmarks.items()
-            if row["scene"] in (ALL, scene.name) and row["split"] in (ALL, scene.split)
-        )
-        counts = [f"{n:,}" for n in (n_landmarks, row["n_locations"], row["n_views"])]
+        of_row = [n for x, n in landmarks.items() if row["scene"] in (ALL, x.name) and row["split"] in (ALL, x.split)]
+        counts = [f"{n:,}" for n in (sum(of_row), row["n_locations"], row["n_views"])]
         lines.append([row["scene"], row["split"], *counts, *[f"{100 * row[column]:.1f}" for column in POSITIVE]])
     limits = [threshold_label(threshold_key(threshold)) for threshold in THRESHOLDS]
     return markdown_table(["scene", "split", "landmarks", "locations", "viewpoints", *limits], lines)
 
 
-def _changed_settings(settings: Mapping[str, Any], defaults: Mapping[str, Any]) -> str:
-    """Settings that differ from the defaults, as YAML."""
-    changed = _difference(settings, defaults)
-    return yaml.safe_dump(changed, sort_keys=False, default_flow_style=None, width=110)
-
-
 def _difference(values: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
+    """What differs from the defaults, in nested mappings too."""
     changed = {}
     for name, value in values.items():
         default = defaults.get(name)
         if isinstance(value, dict) and isinstance(default, dict):
-            value = _difference(value, default)
-            if value:
-                changed[name] = value
-        elif value != default:
+            value, default = _difference(value, default), {}
+        if value != default:
             changed[name] = value
     return changed
 
@@ -245,11 +229,10 @@ def _label_text(release: Dataset) -> list[str]:
     manifests = [_json(scene.label_manifest) for scene in release.scenes if scene.label_manifest.is_file()]
     if not manifests:
         return []
-    versions = {
-        package: " and ".join(sorted({manifest["versions"].get(package, "unknown") for manifest in manifests}))
-        for package in manifests[0]["versions"]
-    }
-    first = manifests[0]
+    first, versions = manifests[0], {}
+    for package in first["versions"]:
+        found = {manifest["versions"].get(package, "unknown") for manifest in manifests}
+        versions[package] = " and ".join(sorted(found))
     return [
         f"Keypoints: {_pairs(first['extractor'])}. Localizer: {_pairs(first['localizer'])}. Labelled with "
         f"{_pairs(versions)}."
@@ -259,11 +242,9 @@ def _label_text(release: Dataset) -> list[str]:
 def _training_text(weights: Path, training: Mapping[str, Any], record: Mapping[str, Any], shares: pd.DataFrame) -> str:
     config = training["config"]
     n_views = {row["split"]: row["n_views"] for row in shares[shares["scene"] == ALL].to_dict("records")}
-    validated = (
-        f"validated on the {n_views['val']:,} of the val scenes"
-        if "val" in n_views
-        else f"{100 * config['val_fraction']:g} % of each scene's locations held out for validation"
-    )
+    validated = f"{100 * config['val_fraction']:g} % of each scene's locations held out for validation"
+    if "val" in n_views:
+        validated = f"validated on the {n_views['val']:,} of the val scenes"
     return (
         f"From the {n_views['train']:,} viewpoints of the train scenes, {validated}. Of the "
         f"paper's networks {weights.name}, which ships, had the best validation average precision. Kept is epoch "
@@ -282,18 +263,21 @@ def _network_table(weights: Path, training: Mapping[str, Any]) -> str:
         about = record["about"]
         if about["method"] != training["method"] and {**about, "method": training["method"]} == training:
             trained.append(record)
-    names = [name for name in trained[0]["metrics"] if name.startswith("val_")]
-    lines = [
-        [
-            method_style(record["about"]["method"]).label,
-            "yes" if number == 0 else "no",
-            f"{record['metrics']['epoch'] + 1:.0f}",
-            *[f"{record['metrics'].get(name, float('nan')):.4f}" for name in names],
-        ]
-        for number, record in enumerate(trained)
-    ]
-    header = ["network", "ships", "epoch", *[name.removeprefix("val_").replace("_", " ") for name in names]]
-    return markdown_table(header, lines)
+    names = [name.removeprefix("val_") for name in trained[0]["metrics"] if name.startswith("val_")]
+    lines = []
+    for number, record in enumerate(trained):
+        epoch = f"{record['metrics']['epoch'] + 1:.0f}"
+        lines.append([_label(record), "no" if number else "yes", epoch, *_validated(record, names)])
+    return markdown_table(["network", "ships", "epoch", *[name.replace("_", " ") for name in names]], lines)
+
+
+def _label(record: Mapping[str, Any]) -> str:
+    return method_style(record["about"]["method"]).label
+
+
+def _validated(record: Mapping[str, Any], names: Sequence[str]) -> list[str]:
+    """Validation metrics of a training record."""
+    return [f"{record['metrics'].get(f'val_{name}', float('nan')):.4f}" for name in names]
 
 
 def _learner_text(network: Path) -> list[str]:
@@ -310,25 +294,16 @@ def _learner_text(network: Path) -> list[str]:
     ]
     if not records:
         return []
-    lines = [
-        [
-            method_style(record["about"]["method"]).label,
-            "yes" if ships else "no",
-            *[f"{record['metrics'].get(f'val_{name}', float('nan')):.4f}" for name in _LEARNER_METRICS],
-        ]
-        for ships, record in records
-    ]
+    lines, options, further = [], [], []
+    for ships, record in records:
+        label, config = _label(record), record["about"]["config"]
+        lines.append([label, "yes" if ships else "no", *_validated(record, _LEARNER_METRICS)])
+        own = {name: x for name, x in config.items() if name not in DECIDING}
+        if ships and own:
+            options.append(f"{label}: {_pairs(own)}, seed {config['seed']}.")
+        if record["about"].get("also"):
+            further.append(f"{label}: {', '.join(record['about']['also'])}.")
     header = ["beside it", "ships", *[name.replace("_", " ") for name in _LEARNER_METRICS]]
-    options = [
-        f"{method_style(record['about']['method']).label}: {_pairs(own)}, seed {record['about']['config']['seed']}."
-        for ships, record in records
-        if ships and (own := {name: x for name, x in record["about"]["config"].items() if name not in DECIDING})
-    ]
-    further = [
-        f"{method_style(record['about']['method']).label}: {', '.join(record['about']['also'])}."
-        for _, record in records
-        if record["about"].get("also")
-    ]
     return [
         "Learnt from the same viewpoints, with what is known of each landmark (matchability: whether the localizer "
         "finds a landmark, from the stored matches; its metrics are of landmarks, not of viewpoints):",
@@ -354,21 +329,21 @@ def _size_text(release: Dataset) -> str:
     n_views = sum(len(scene.read_table()) for scene in release.scenes)
     n_landmarks = sum(len(Landmarks.load(scene.landmarks)) for scene in release.scenes)
     n_locations = sum(len(StoredOcclusion.load(scene.occlusion).locations) for scene in release.scenes)
+    shown = {name: size for name, size in parts.items() if size and name != "text"}
     return (
-        f"{size_text({name: size for name, size in parts.items() if size and name != 'text'})}; "
-        f"{parts['tables'] / n_views:.1f} bytes a viewpoint, {parts['landmarks'] / n_landmarks:.1f} a landmark, "
+        f"{size_text(shown)}; {parts['tables'] / n_views:.1f} bytes a viewpoint, "
+        f"{parts['landmarks'] / n_landmarks:.1f} a landmark, "
         f"{parts['occlusion'] / n_locations:.0f} a location"
     )
 
 
 def _pairs(values: Mapping[str, Any]) -> str:
-    return ", ".join(f"{name} {_value(value)}" for name, value in values.items())
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, Sequence) and not isinstance(value, str):
-        return " × ".join(map(str, value))
-    return "none" if value is None else str(value)
+    texts = []
+    for name, value in values.items():
+        if isinstance(value, Sequence) and not isinstance(value, str):
+            value = " × ".join(map(str, value))
+        texts.append(f"{name} {'none' if value is None else value}")
+    return ", ".join(texts)
 
 
 def _json(path: Path) -> dict[str, Any]:

@@ -21,13 +21,37 @@ from wheretolook.evaluation.calibration import read_calibration
 from wheretolook.evaluation.report import score_markdown
 from wheretolook.evaluation.results import CALIBRATION_CSV, SCORES_CSV
 from wheretolook.evaluation.scores import read_scores
+from wheretolook.figures.calibration import calibration_figure
 from wheretolook.figures.config import FiguresConfig
+from wheretolook.figures.inputs import inputs_figure
+from wheretolook.figures.lattices import fibonacci_figure
+from wheretolook.figures.learning import learning_figure
+from wheretolook.figures.occlusion import occlusion_figure
+from wheretolook.figures.path_film import methods_figure
+from wheretolook.figures.paths import paths_figure
+from wheretolook.figures.peaks import peaks_figure
+from wheretolook.figures.pipeline import pipeline_figure
+from wheretolook.figures.runtimes import runtime_figure, scaling_figure
+from wheretolook.figures.sampling import sampling_figure
+from wheretolook.figures.scores import regret_figure, score_figure
 from wheretolook.figures.style import save_figure
+from wheretolook.figures.top_n import top_n_figure
+from wheretolook.figures.training import training_figure
 from wheretolook.learning.runs import HISTORY_CSV, histories, method_of_run, train_runs
-from wheretolook.methods.registry import learned
+from wheretolook.methods.registry import learned, load_scorer
 from wheretolook.planning.path_report import PATHS_CSV
 from wheretolook.release.benchmark_runs import RUNTIMES_CSV, SCALING_CSV
 from wheretolook.release.copy import is_release, read_about
+from wheretolook.release.paper_architecture import paper_architecture_table
+from wheretolook.release.showcase import Showcase, open_showcase
+from wheretolook.release.showcase_figures import (
+    Learning,
+    learning_of,
+    peaks_of,
+    pipeline_of,
+    planned_views,
+    sampling_of,
+)
 from wheretolook.utils.errors import ConfigError, MissingRunError, WhereToLookError
 from wheretolook.utils.files import write_text
 from wheretolook.utils.markdown import markdown_table
@@ -39,7 +63,6 @@ if TYPE_CHECKING:
 
     from wheretolook.methods.base import Scorer
     from wheretolook.methods.binned_network import BinnedNetworkScorer
-    from wheretolook.release.showcase import Showcase
 
 Texts = Mapping[str, str]
 """A table: its text by the ending of its file, such as "md"."""
@@ -47,13 +70,7 @@ Texts = Mapping[str, str]
 
 @dataclass(frozen=True)
 class Source:
-    """What an item is drawn from.
-
-    Attributes:
-        dataset: that the figures are about.
-        tracking: the store.
-        runs: those that the item needs, the newest of each kind; none for items that need no run.
-    """
+    """What an item is drawn from: the dataset that it is about, and the newest of each kind of run that it needs."""
 
     dataset: Dataset
     tracking: TrackingConfig
@@ -63,9 +80,8 @@ class Source:
         """An artifact of the first run."""
         return artifact(self.tracking, self.runs[0].info.run_id, name)
 
-    def scores(self) -> pd.DataFrame:
-        """The score table of an evaluation."""
-        return read_scores(self.file(SCORES_CSV))
+
+Drawer = Callable[[Source], Figure | Texts]
 
 
 @dataclass(frozen=True)
@@ -91,7 +107,7 @@ class Item:
     paper: str
     what: str
     notebook: str
-    draw: Callable[[Source], Figure | Texts]
+    draw: Drawer
     stage: str = "evaluate"
     file: str = SCORES_CSV
     command: str = "wheretolook evaluate --config {config}"
@@ -123,50 +139,31 @@ def _source_of(dataset: Dataset) -> str:
     return str(read_about(dataset)["source"]) if is_release(dataset) else dataset.name
 
 
-def _scores(source: Source) -> Figure:
-    from wheretolook.figures.scores import score_figure
+def _of(
+    draw: Callable[[pd.DataFrame], Figure], file: str, read: Callable[[Path], pd.DataFrame] = pd.read_csv
+) -> Drawer:
+    """Draws a figure of the table that lies in an artifact."""
 
-    return score_figure(source.scores())
+    def drawer(source: Source) -> Figure:
+        return draw(read(source.file(file)))
+
+    return drawer
+
+
+def _of_scores(draw: Callable[[pd.DataFrame], Figure]) -> Drawer:
+    return _of(draw, SCORES_CSV, read_scores)
 
 
 def _score_table(source: Source) -> Texts:
-    scores = source.scores()
+    scores = read_scores(source.file(SCORES_CSV))
     return {"md": score_markdown(scores), "csv": scores.to_csv(index=False)}
 
 
-def _regret(source: Source) -> Figure:
-    from wheretolook.figures.scores import regret_figure
-
-    return regret_figure(source.scores())
-
-
-def _occlusion(source: Source) -> Figure:
-    from wheretolook.figures.occlusion import occlusion_figure
-
-    return occlusion_figure(source.scores())
-
-
-def _top_n(source: Source) -> Figure:
-    from wheretolook.figures.top_n import top_n_figure
-
-    return top_n_figure(source.scores())
-
-
-def _calibration(source: Source) -> Figure:
-    from wheretolook.figures.calibration import calibration_figure
-
-    return calibration_figure(read_calibration(source.file(CALIBRATION_CSV)))
-
-
 def _training(source: Source) -> Figure:
-    from wheretolook.figures.training import training_figure
-
     return training_figure(histories(source.tracking, source.dataset.name))
 
 
 def _architecture(source: Source) -> Texts:
-    from wheretolook.release.paper_architecture import paper_architecture_table
-
     params = {method_of_run(run): run.data.params for run in source.runs}
     networks = [params[name] for name, method in learned().items() if method.ships == "network" and name in params]
     if not networks:
@@ -179,93 +176,52 @@ def _architecture(source: Source) -> Texts:
     }
 
 
-def _paper_table(name: str) -> Callable[[Source], Texts]:
+def _paper_table(name: str) -> Drawer:
     return lambda source: {ending: source.file(f"table_{name}.{ending}").read_text() for ending in ("md", "csv", "tex")}
 
 
-def _paths(source: Source) -> Figure:
-    from wheretolook.figures.paths import paths_figure
-
-    return paths_figure(pd.read_csv(source.file(PATHS_CSV)))
-
-
-def _runtimes(source: Source) -> Figure:
-    from wheretolook.figures.runtimes import runtime_figure
-
-    return runtime_figure(pd.read_csv(source.file(RUNTIMES_CSV)))
-
-
-def _scaling(source: Source) -> Figure:
-    from wheretolook.figures.runtimes import scaling_figure
-
-    return scaling_figure(pd.read_csv(source.file(SCALING_CSV)))
-
-
 def _lattices(source: Source) -> Figure:
-    from wheretolook.figures.lattices import fibonacci_figure
-
     return fibonacci_figure()
 
 
-@lru_cache(maxsize=1)
-def _showcase(root: Path) -> Showcase:
-    from wheretolook.release.showcase import open_showcase
-
-    return open_showcase(Dataset.load(root))
+_open = lru_cache(maxsize=1)(open_showcase)
 
 
 def _shown(source: Source, weights: str = "") -> tuple[Showcase, Scorer, int]:
     """The first test scene of a release, a scorer of it, and a place where looking matters."""
-    from wheretolook.methods.registry import load_scorer
-
-    showcase = _showcase(source.dataset.root)
+    showcase = _open(source.dataset)
     scorer = load_scorer(source.dataset.root / "weights" / weights, showcase.localization_map)
     return showcase, scorer, showcase.instructive_location()
 
 
-def _pipeline(source: Source) -> Figure:
-    from wheretolook.figures.pipeline import pipeline_figure
-    from wheretolook.release.showcase_figures import pipeline_of
+def _learnt(source: Source) -> Learning:
+    showcase, scorer, location = _shown(source, "mlp-2d+z.safetensors")
+    return learning_of(showcase, cast("BinnedNetworkScorer", scorer), location)
 
+
+def _pipeline(source: Source) -> Figure:
     return pipeline_figure(pipeline_of(*_shown(source)))
 
 
 def _learning(source: Source) -> Figure:
-    from wheretolook.figures.learning import learning_figure
-    from wheretolook.release.showcase_figures import learning_of
-
-    showcase, scorer, location = _shown(source, "mlp-2d+z.safetensors")
-    return learning_figure(*learning_of(showcase, cast("BinnedNetworkScorer", scorer), location))
+    return learning_figure(*_learnt(source))
 
 
 def _sampling(source: Source) -> Figure:
-    from wheretolook.figures.sampling import sampling_figure
-    from wheretolook.release.showcase_figures import sampling_of
-
-    showcase = _showcase(source.dataset.root)
+    showcase = _open(source.dataset)
     return sampling_figure(sampling_of(showcase, showcase.instructive_location()))
 
 
 def _inputs(source: Source) -> Figure:
-    from wheretolook.figures.inputs import inputs_figure
-    from wheretolook.release.showcase_figures import learning_of
-
-    showcase, scorer, location = _shown(source, "mlp-2d+z.safetensors")
-    return inputs_figure(learning_of(showcase, cast("BinnedNetworkScorer", scorer), location).image)
+    return inputs_figure(_learnt(source).image)
 
 
 def _peaks(source: Source) -> Figure:
-    from wheretolook.figures.peaks import peaks_figure
-    from wheretolook.release.showcase_figures import peaks_of
-
     return peaks_figure(*peaks_of(*_shown(source)))
 
 
 def _planning(source: Source) -> Figure:
-    from wheretolook.figures.path_film import methods_figure
-    from wheretolook.release.showcase_figures import planned_views
-
-    showcase = _showcase(source.dataset.root)
+    showcase = _open(source.dataset)
     return methods_figure(planned_views(showcase, source.dataset), showcase.localization_map.landmarks.points)
 
 
@@ -273,13 +229,10 @@ _TRAIN = "wheretolook train --config {config}"
 _BENCH = "python tests/benchmarks/bench_visibility.py{} --out cpu.json && python tests/benchmarks/bench_visibility.py" \
     " --draw cpu.json --log"  # fmt: skip
 _LOG_RELEASE = "wheretolook log-release --config {config}"
-_OTHERS = (("dataset", "interiors"),)
 
 _SET, _PAPERS, _WIDEST = ((("dataset", "{dataset}"), ("method", method)) for method in ("set", "mlp-2d+z", "mlp-2d+3d"))
-_TRAIN_SET, _TRAIN_WIDEST = (
-    "wheretolook train --config configs/release-set.yaml",
-    f"{_TRAIN} --train.methods '[mlp-2d+3d]'",
-)
+_TRAIN_SET = "wheretolook train --config configs/release-set.yaml"
+_TRAIN_WIDEST = f"{_TRAIN} --train.methods '[mlp-2d+3d]'"
 
 ITEMS: tuple[Item, ...] = (
     Item("pipeline", "Fig. 1", "from a map to the camera that is turned", "01_pipeline", _pipeline, "train", "",
@@ -295,28 +248,28 @@ ITEMS: tuple[Item, ...] = (
          file="table_vs_others.md"),
     Item("planning", "Fig. 5", "the same way by three methods", "07_planning", _planning, "train", "", _TRAIN_SET,
          _SET, of_release=True),
-    Item("paths", "Fig. 5", "planned paths that localize", "07_planning", _paths, "paths", PATHS_CSV,
-         "wheretolook compare-paths --config {source}", of_source=True),
-    Item("runtimes", "Fig. 6", "times of the visibility check", "08_runtimes", _runtimes, "benchmark", RUNTIMES_CSV,
-         _BENCH.format(""), ()),
+    Item("paths", "Fig. 5", "planned paths that localize", "07_planning", _of(paths_figure, PATHS_CSV),
+         "paths", PATHS_CSV, "wheretolook compare-paths --config {source}", of_source=True),
+    Item("runtimes", "Fig. 6", "times of the visibility check", "08_runtimes", _of(runtime_figure, RUNTIMES_CSV),
+         "benchmark", RUNTIMES_CSV, _BENCH.format(""), ()),
     Item("table_input_variants", "Table 3", "inputs of the network", "05_tables", _paper_table("input_variants"),
          file="table_input_variants.md"),
-    Item("top_n", "Fig. 7", "several viewpoints of a location", "06_top_n", _top_n),
+    Item("top_n", "Fig. 7", "several viewpoints of a location", "06_top_n", _of_scores(top_n_figure)),
     Item("inputs", "", "from an image to an input", "03_inputs", _inputs, "train", "", _TRAIN, _PAPERS,
          of_release=True),
     Item("peaks", "", "what the network looks at", "04_training", _peaks, "train", "", _TRAIN_SET, _SET,
          of_release=True),
     Item("training", "", "learning curves", "04_training", _training, "train", HISTORY_CSV, _TRAIN),
-    Item("calibration", "", "whether probabilities mean what they say", "04_training", _calibration,
-         file=CALIBRATION_CSV),
-    Item("scores", "", "all methods at all thresholds", "05_tables", _scores),
+    Item("calibration", "", "whether probabilities mean what they say", "04_training",
+         _of(calibration_figure, CALIBRATION_CSV, read_calibration), file=CALIBRATION_CSV),
+    Item("scores", "", "all methods at all thresholds", "05_tables", _of_scores(score_figure)),
     Item("score_table", "", "all that an evaluation tells", "05_tables", _score_table),
-    Item("regret", "", "what each method loses", "05_tables", _regret),
-    Item("occlusion", "", "what seeing through walls changes", "05_tables", _occlusion),
-    Item("regret_interiors", "", "what each loses on scenes by others", "05_tables", _regret, command=_LOG_RELEASE,
-         params=_OTHERS, of_release=True),
-    Item("visibility_scaling", "", "how time and memory grow", "08_runtimes", _scaling, "benchmark", SCALING_CSV,
-         _BENCH.format(" --scaling"), ()),
+    Item("regret", "", "what each method loses", "05_tables", _of_scores(regret_figure)),
+    Item("occlusion", "", "what seeing through walls changes", "05_tables", _of_scores(occlusion_figure)),
+    Item("regret_interiors", "", "what each loses on scenes by others", "05_tables", _of_scores(regret_figure),
+         command=_LOG_RELEASE, params=(("dataset", "interiors"),), of_release=True),
+    Item("visibility_scaling", "", "how time and memory grow", "08_runtimes", _of(scaling_figure, SCALING_CSV),
+         "benchmark", SCALING_CSV, _BENCH.format(" --scaling"), ()),
 )  # fmt: skip
 """The paper's in its order, then those that it has none of."""
 
@@ -327,20 +280,8 @@ def catalog_text() -> str:
     return markdown_table(["name", "paper", "shows", "notebook", "run"], rows)
 
 
-def draw_item(item: Item, dataset: Dataset, tracking: TrackingConfig) -> tuple[Figure | Texts, tuple[str, ...]] | None:
-    """An item and the ids of the runs it was drawn from; None if the store has no such run."""
-    source = Source(dataset, tracking, item.runs(dataset, tracking))
-    if item.stage and not source.runs:
-        return None
-    return item.draw(source), tuple(run.info.run_id for run in source.runs)
-
-
 def check_names(config: FiguresConfig) -> None:
-    """Check that there are all the items that are asked for.
-
-    Raises:
-        ConfigError: there is no item of such a name.
-    """
+    """Raise ConfigError unless there are all the items that are asked for."""
     unknown = set(config.only) - {item.name for item in ITEMS}
     if unknown:
         raise ConfigError("unknown figure", value=sorted(unknown), fix="`wheretolook figures --list` names them.")
@@ -350,22 +291,11 @@ def write_items(
     dataset: Dataset, tracking: TrackingConfig, config: FiguresConfig = FiguresConfig(),
     say: Callable[[str], None] = print,
 ) -> dict[str, str]:  # fmt: skip
-    """Write all items, those of a figure as several kinds of files, and attach them to their runs.
+    """Write all items about a dataset, figures as several kinds of files, and attach them to their runs.
 
     The files tell the runs that they were drawn from: figures in their metadata (`wheretolook.figures.style.note_of`),
-    Markdown and TeX in a comment.
-
-    Args:
-        dataset: that the figures are about.
-        tracking: the store.
-        config: options.
-        say: told what was written, and what is missing.
-
-    Returns:
-        For each item that could not be made, the command to run first.
-
-    Raises:
-        ConfigError: there is no item of such a name.
+    Markdown and TeX in a comment. Returns, for each item that could not be made, the command to run first, or what is
+    wrong. Raises as `check_names`.
     """
     check_names(config)
     out, missing = config.out or dataset.root / "results" / "figures", {}
@@ -377,20 +307,18 @@ def write_items(
                 missing[item.name] = "wheretolook figures --config configs/release.yaml"
             say(f"{item.name}: only releases have it")
             continue
-        reason = "no such run"
         try:
-            drawn = draw_item(item, dataset, tracking)
+            source = Source(dataset, tracking, item.runs(dataset, tracking))
+            if item.stage and not source.runs:
+                missing[item.name] = item.command_for(dataset)
+                say(f"{item.name}: no such run; first: {missing[item.name]}")
+                continue
+            content = item.draw(source)
         except WhereToLookError as error:
-            drawn, reason = None, str(error)
-        if drawn is None and reason != "no such run":
-            missing[item.name] = reason
-            say(f"{item.name}: {reason}")
+            missing[item.name] = str(error)
+            say(f"{item.name}: {error}")
             continue
-        if drawn is None:
-            missing[item.name] = item.command_for(dataset)
-            say(f"{item.name}: {reason}; first: {missing[item.name]}")
-            continue
-        content, ids = drawn
+        ids = [run.info.run_id for run in source.runs]
         files = _write(item.name, content, f"runs: {', '.join(ids)} ({item.stage})" if ids else "", out, config.kinds)
         for run_id in ids:
             folder = artifact(tracking, run_id, "figures")

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from wheretolook.dataset.folders import RELEASE_FILE, Dataset, SceneFolder
-from wheretolook.mapping.cameras import CAMERAS_FILE, save_mapping_poses
+from wheretolook.mapping.colmap_model import CAMERAS_FILE, save_mapping_poses
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.methods.method import Method
 from wheretolook.methods.registry import learned, scorers
@@ -43,17 +43,9 @@ def copy_dataset(dataset: Dataset, root: Path, settings: Mapping[str, Any]) -> D
     """Write a compact copy of a labelled dataset. The same dataset gives the same bytes.
 
     Tables are written compact (`viewpoints.table.COMPACT_SCHEMA`), without matches, landmarks without descriptors and
-    in half precision, the mapping images' poses if they are known, and what labels were made with without the list of
-    shards. Weights and results that lie there
+    in half precision, the mapping images' poses if they are known, what labels were made with without the list of
+    shards, and the dataset's settings, JSON values. Weights and results that lie at `root`, `<data>/<release_name>`,
     stay; the card and the scores of networks that do not ship go if the data changed.
-
-    Args:
-        dataset: what to copy.
-        root: where to write it, `<data>/<release_name>`.
-        settings: it was made with, as JSON values.
-
-    Returns:
-        The copy.
 
     Raises:
         ConfigError: the release's folder holds another dataset, or a release of another one.
@@ -74,19 +66,13 @@ def copy_dataset(dataset: Dataset, root: Path, settings: Mapping[str, Any]) -> D
         copy.label_manifest.unlink(missing_ok=True)
         if scene.label_manifest.is_file():
             write_json(copy.label_manifest, _manifest(scene.label_manifest))
-    about = {
-        "source": dataset.name,
-        "source_fingerprint": dataset.fingerprint(),
-        "code_version": VERSION,
-        "settings": dict(settings),
-    }
-    write_json(root / RELEASE_FILE, about)
+    source = {"source": dataset.name, "source_fingerprint": dataset.fingerprint()}
+    write_json(root / RELEASE_FILE, {**source, "code_version": VERSION, "settings": dict(settings)})
     release = Dataset(root, dataset.camera, tuple(copy for _, copy in copied))
     release.save()
-    if before is not None:
-        for scene in before.scenes:
-            if scene.name not in {copy.name for copy in release.scenes}:
-                shutil.rmtree(scene.folder, ignore_errors=True)
+    for scene in before.scenes if before is not None else ():
+        if scene.name not in {copy.name for copy in release.scenes}:
+            shutil.rmtree(scene.folder, ignore_errors=True)
     if release.fingerprint() != fingerprint:
         for outdated in (CARD, "results/variants.csv"):
             (root / outdated).unlink(missing_ok=True)
@@ -152,10 +138,7 @@ def ship_weights(release: Dataset) -> Choice:
     """Choose what ships; store the weights of the paper's network in half precision, put the rest on the shelf.
 
     The shelf is `weights/others/`, where no evaluation finds them. A matchability model stays where it is: methods that
-    weight landmarks need it. Done again, nothing changes.
-
-    Raises:
-        WeightsError: as `choose_weights_to_ship`.
+    weight landmarks need it. Done again, nothing changes. Raises as `choose_weights_to_ship`.
     """
     from wheretolook.learning.weights import read_record, save_in_half
 
@@ -171,19 +154,15 @@ def ship_weights(release: Dataset) -> Choice:
 
 
 def sizes(root: Path, weights: bool = True) -> dict[str, int]:
-    """Bytes of what ships of a release, by kind of file. Figures and shelved weights do not ship.
+    """Bytes of what ships of the release at `root`, by kind of file. Figures and shelved weights do not ship.
 
-    Args:
-        root: folder of the release.
-        weights: whether to count the weights; before they are chosen there may be several.
+    Before it is chosen which weights do, there may be several: they can be left out.
 
     Raises:
         StorageError: it is not smaller than `MAX_BYTES`.
     """
-    kinds = {
-        "viewpoints.parquet": "tables", "landmarks.npz": "landmarks", CAMERAS_FILE: "cameras",
-        "occlusion.npz": "occlusion",
-    }  # fmt: skip
+    kinds = {"viewpoints.parquet": "tables", "landmarks.npz": "landmarks", CAMERAS_FILE: "cameras"}
+    kinds["occlusion.npz"] = "occlusion"
     parts = dict.fromkeys((*kinds.values(), "weights", "text"), 0)
     for path in root.rglob("*"):
         shelved = path.suffix == ".safetensors" and (path.parent.name == SHELF or not weights)
@@ -191,10 +170,9 @@ def sizes(root: Path, weights: bool = True) -> dict[str, int]:
         if path.is_file() and not shelved and not drawn:
             parts["weights" if path.suffix == ".safetensors" else kinds.get(path.name, "text")] += path.stat().st_size
     if sum(parts.values()) >= MAX_BYTES:
-        raise StorageError(
-            f"the release is not smaller than {MAX_BYTES / 1e6:.0f} MB", path=root, value=size_text(parts),
-            fix="Label fewer viewpoints or scenes, or map with fewer landmarks.",
-        )  # fmt: skip
+        problem = f"the release is not smaller than {MAX_BYTES / 1e6:.0f} MB"
+        fix = "Label fewer viewpoints or scenes, or map with fewer landmarks."
+        raise StorageError(problem, path=root, value=size_text(parts), fix=fix)
     return parts
 
 
@@ -214,9 +192,8 @@ def read_about(release: Dataset) -> dict[str, Any]:
         about = dict(json.loads(path.read_text()))
         return {name: about[name] for name in ("source", "source_fingerprint", "code_version", "settings")}
     except (OSError, ValueError, TypeError, KeyError) as error:
-        raise ConfigError(
-            f"not the description of a release: {error}", path=path, fix="Run `wheretolook release` on its source."
-        ) from error
+        fix = "Run `wheretolook release` on its source."
+        raise ConfigError(f"not the description of a release: {error}", path=path, fix=fix) from error
 
 
 def _release_of(root: Path, source: str) -> Dataset | None:
@@ -238,6 +215,5 @@ def _manifest(path: Path) -> dict[str, Any]:
         content = json.loads(path.read_text())
         return {name: value for name, value in content.items() if name not in ("shards", "store_matches")}
     except (ValueError, AttributeError) as error:
-        raise TableError(
-            f"not what the label stage wrote: {error}", path=path, fix="Remove it, or label the scene again."
-        ) from error
+        fix = "Remove it, or label the scene again."
+        raise TableError(f"not what the label stage wrote: {error}", path=path, fix=fix) from error

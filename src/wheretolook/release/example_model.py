@@ -32,14 +32,11 @@ def make_example_model(
 ) -> ExampleModel:
     """Generate rooms from a seed and map them from images along a walk, in 15 seconds on one core.
 
-    A model that was made in this folder before is replaced.
-
-    Raises:
-        MapError: the images give no landmark, or something else is in the model's place.
+    A model that was made in this folder before is replaced. Raises MapError if the images give no landmark, or
+    something else is in the model's place.
     """
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    example = ExampleModel(folder / "model", folder / "scan.glb")
+    Path(folder).mkdir(parents=True, exist_ok=True)
+    example = ExampleModel(Path(folder) / "model", Path(folder) / "scan.glb")
     save_glb(generate_apartment(apartment, seed), example.scan)
     mesh = load_mesh(example.scan)
     space, config = FreeSpace(mesh), MapConfig(n_images=n_images)

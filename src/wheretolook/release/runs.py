@@ -19,29 +19,14 @@ import pandas as pd
 from wheretolook.dataset.folders import Dataset
 from wheretolook.evaluation.results import SCORES_CSV, evaluation_params, runs_of_rows
 from wheretolook.evaluation.scores import read_scores
-from wheretolook.learning.runs import (
-    HISTORY_CSV,
-    TRAINING_CSV,
-    log_history,
-    params_of,
-    read_histories,
-    records,
-    train_runs,
-)
+from wheretolook.learning.runs import HISTORY_CSV, TRAINING_CSV, log_history, params_of, read_histories, records
+from wheretolook.learning.runs import train_runs as runs_of_training
 from wheretolook.methods.registry import learned
 from wheretolook.planning.path_report import PATHS_CSV, log_paths
 from wheretolook.release.benchmark_runs import RUNTIMES_CSV, SCALING_CSV, log_runtimes
 from wheretolook.release.card import GENERALIZATION_CSV
-from wheretolook.utils.tracking import (
-    NestedRun,
-    artifact,
-    client,
-    experiment_ids,
-    finished_runs,
-    log,
-    log_nested,
-    start_run,
-)
+from wheretolook.utils.tracking import NestedRun, artifact, experiment_ids, finished_runs, log, log_nested, start_run
+from wheretolook.utils.tracking import client as client_of
 from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import UNLABELLED, is_good
 from wheretolook.viewpoints.thresholds import ALL
@@ -57,38 +42,21 @@ Say = Callable[[str], None]
 
 @dataclass
 class ReleaseRuns:
-    """Ids of the runs of a release in a store.
+    """Ids of the runs of a release in a store; None for what the release does not have."""
 
-    Attributes:
-        evaluate: by the dataset evaluated on, the release first.
-        train: by the method.
-        learners: the comparison of learners; None if the release has none, as with what follows.
-        paths: planned paths.
-        benchmark: measured times.
-        new: how many of all these were logged now.
-    """
-
-    evaluate: dict[str, str] = field(default_factory=dict)
-    train: dict[str, str] = field(default_factory=dict)
+    evaluate: dict[str, str] = field(default_factory=dict)  # by the dataset evaluated on, the release first
+    train: dict[str, str] = field(default_factory=dict)  # by the method
     learners: str | None = None
     paths: str | None = None
     benchmark: str | None = None
-    new: int = 0
+    new: int = 0  # how many of all these were logged now
 
 
 def log_release(dataset: Dataset, tracking: TrackingConfig, say: Say = lambda text: None) -> ReleaseRuns:
-    """Log what a release holds, as far as the store does not have it yet.
+    """Log what a release holds, as far as the store does not have it yet. Returns the runs, those found again too.
 
-    What an earlier call left half done, because it was killed, is deleted first; of several calls at once one waits for
-    the other.
-
-    Args:
-        dataset: a release with its results.
-        tracking: the store; made if there is none.
-        say: told what was logged.
-
-    Returns:
-        The runs, those found again too.
+    The store is made if there is none. What an earlier call left half done, because it was killed, is deleted first; of
+    several calls at once one waits for the other.
     """
     with _alone(tracking):
         _forget_halves(tracking)
@@ -106,7 +74,7 @@ def _alone(tracking: TrackingConfig) -> Iterator[None]:
 
 def _forget_halves(tracking: TrackingConfig) -> None:
     """Delete runs that were being logged from a release when something ended it, and those nested in them."""
-    mlflow = client(tracking)
+    mlflow = client_of(tracking)
     experiments = list(experiment_ids(mlflow, tracking).values())
 
     def matching(condition: str) -> list[str]:
@@ -143,11 +111,8 @@ def _log_missing(dataset: Dataset, tracking: TrackingConfig, say: Say) -> Releas
         history = histories.get(method)
         found = _train_run(tracking, path, record, history is not None)
         runs.train[method] = keep(f"the training of {method}", found, _log_training, path, record, history)
-    for file, stage, log_file in (
-        (LEARNERS_CSV, "learners", _log_learners),
-        (PATHS_CSV, "paths", _log_paths),
-        (RUNTIMES_CSV, "benchmark", _log_benchmark),
-    ):
+    learners, paths = (LEARNERS_CSV, "learners", _log_learners), (PATHS_CSV, "paths", _log_paths)
+    for file, stage, log_file in (learners, paths, (RUNTIMES_CSV, "benchmark", _log_benchmark)):
         if (results / file).is_file():
             found = _found(tracking, stage, file, (results / file).read_bytes())
             setattr(runs, stage, keep(file, found, log_file, dataset))
@@ -165,7 +130,7 @@ def _found(tracking: TrackingConfig, stage: str, name: str, content: bytes) -> s
 def _train_run(tracking: TrackingConfig, path: Path, record: dict[str, Any], with_history: bool) -> str | None:
     """The run that trained these weights, or the one that was logged from their record."""
     method = record["about"]["method"]
-    for _, run in train_runs(tracking, method=method, file=HISTORY_CSV if with_history else ""):
+    for _, run in runs_of_training(tracking, method=method, file=HISTORY_CSV if with_history else ""):
         logged = artifact(tracking, run.info.run_id, path.name)
         if run.info.run_id == record["run_id"] or (logged.is_file() and logged.read_bytes() == path.read_bytes()):
             return str(run.info.run_id)
@@ -197,9 +162,8 @@ def _log_others(name: str, table: pd.DataFrame, dataset: Dataset, tracking: Trac
 
 def _choices(table: pd.DataFrame) -> dict[str, Any]:
     """What of an evaluation's options its table tells."""
-    return {name: tuple(table[name].unique().tolist()) for name in ("top_n", "occlusion", "candidates")} | {
-        "reference": table["reference"].iloc[0]
-    }
+    choices = {name: tuple(table[name].unique().tolist()) for name in ("top_n", "occlusion", "candidates")}
+    return {**choices, "reference": table["reference"].iloc[0]}
 
 
 def _log_evaluation(
@@ -239,9 +203,8 @@ def _log_learners(dataset: Dataset, tracking: TrackingConfig) -> str:
         numbers: dict[str, float] = {}
         for measure in ("average_precision", "roc_auc", "ece", "regret"):
             values = pd.to_numeric(rows[measure])
-            numbers |= {
-                f"{measure}_{split}": float(mean) for split, mean in values.groupby(rows["split"]).mean().items()
-            }
+            means = values.groupby(rows["split"]).mean()
+            numbers |= {f"{measure}_{split}": float(mean) for split, mean in means.items()}
             numbers |= {f"{measure}/{scene}": float(one) for scene, one in zip(rows["scene"], values, strict=True)}
         named = dict(zip(("learner", "learnt_from", "seed"), map(str, key), strict=True))
         nested.append(NestedRun(" ".join(filter(None, named.values())), {"dataset": dataset.name, **named}, numbers))

@@ -14,12 +14,10 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.dataset.folders import RELEASE_FILE, Dataset, SceneFolder
+from wheretolook.dataset.folders import RELEASE_FILE, Dataset
 from wheretolook.dataset.scene import Scene, SceneConfig
 from wheretolook.figures.house_image import Dollhouse, dollhouse
-from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import VoxelGrid
-from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float
 from wheretolook.scenes.config import ApartmentConfig
 from wheretolook.scenes.procedural.generator import generate_apartment
@@ -27,9 +25,8 @@ from wheretolook.space.config import FreeSpaceConfig
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.utils.options import recorded
 from wheretolook.viewpoints.config import SampleConfig
-from wheretolook.viewpoints.locations import instructive_location
 from wheretolook.viewpoints.sampling import free_locations
-from wheretolook.viewpoints.table import is_good
+from wheretolook.viewpoints.table import instructive_location, is_good
 from wheretolook.visibility.config import OcclusionConfig
 from wheretolook.visibility.occlusion import StoredOcclusion
 
@@ -47,22 +44,10 @@ _SEEDED = re.compile(r"apartment-(\d+)")
 class Showcase(Scene):
     """A scene of a release, with everything that figures ask for; its lines of sight are found by the mesh.
 
-    Args:
-        files, camera, config, device, mesh: see `Scene`.
-        sampling: how its viewpoints were sampled.
+    `sampling` is how its viewpoints were sampled.
     """
 
-    def __init__(
-        self,
-        files: SceneFolder,
-        camera: PinholeCamera,
-        config: SceneConfig,
-        device: str,
-        mesh: TexturedMesh,
-        sampling: SampleConfig,
-    ) -> None:
-        super().__init__(files, camera, config, device, mesh)
-        self.sampling = sampling
+    sampling: SampleConfig
 
     @cached_property
     def table(self) -> pd.DataFrame:
@@ -126,21 +111,16 @@ class Showcase(Scene):
 
     def summary(self) -> str:
         """How much of everything there is, as a sentence."""
-        n_locations = self.table["location_id"].nunique()
+        n_locations, good = self.table["location_id"].nunique(), is_good(self.table).mean()
         cameras = "" if self.mapping_poses is None else f" of {len(self.mapping_poses)} images"
-        good = is_good(self.table).mean()
         return (
-            f"**{self.name}**: {len(self.mesh.triangles):,} triangles; a map{cameras} with {len(self.landmarks):,} "
-            f"landmarks; {len(self.table):,} labelled viewpoints at {n_locations} locations, of which {good:.0%} "
-            "localize."
+            f"**{self.name}**: {len(self.mesh.triangles):,} triangles; a map{cameras} with "
+            f"{len(self.landmarks):,} landmarks; {len(self.table):,} labelled viewpoints at {n_locations} locations, "
+            f"of which {good:.0%} localize."
         )
 
     def viewpoints(self, location_id: int) -> pd.DataFrame:
-        """Rows of the table at a location.
-
-        Raises:
-            ConfigError: it has none.
-        """
+        """Rows of the table at a location. Raises ConfigError if it has none."""
         rows = self.table[self.table["location_id"] == location_id]
         if len(rows) == 0:
             fix = "Take one of the table's location_id."
@@ -148,21 +128,13 @@ class Showcase(Scene):
         return rows
 
     def instructive_location(self, height_m: float = EYE_M) -> int:
-        """The location of a layer where to look matters most (`instructive_location`).
-
-        If the layer has no viewpoint, one of any height.
-        """
+        """The location of a layer where to look matters most; if the layer has no viewpoint, one of any height."""
         rows = self.table[self.table["location_id"].isin(self.layer(height_m))]
         return instructive_location(rows if len(rows) else self.table)
 
 
 def open_showcase(dataset: Dataset, name: str | None = None, device: str = "cpu") -> Showcase:
-    """A scene of a release of generated apartments.
-
-    Args:
-        dataset: the release.
-        name: of the scene; None takes the first test scene.
-        device: where kernels run.
+    """A scene of a release of generated apartments, by default the first test scene.
 
     Raises:
         ConfigError: it is no release, or has no such scene. SceneError: the scene was not generated from a seed, or
@@ -170,9 +142,8 @@ def open_showcase(dataset: Dataset, name: str | None = None, device: str = "cpu"
     """
     about = dataset.root / RELEASE_FILE
     if not about.is_file():
-        raise ConfigError(
-            "this dataset is no release", path=dataset.root, fix="Open one that `wheretolook release` made."
-        )
+        fix = "Open one that `wheretolook release` made."
+        raise ConfigError("this dataset is no release", path=dataset.root, fix=fix)
     settings = json.loads(about.read_text())["settings"]
     scene = dataset.scene(name) if name else (*dataset.split("test"), *dataset.scenes)[0]
     seeded = _SEEDED.fullmatch(scene.name)
@@ -181,8 +152,8 @@ def open_showcase(dataset: Dataset, name: str | None = None, device: str = "cpu"
     occlusion = recorded(OcclusionConfig, {**settings["occlusion"], "model": "mesh"})
     config = SceneConfig(occlusion, recorded(FreeSpaceConfig, settings["scenes"]["free_space"]))
     mesh = generate_apartment(recorded(ApartmentConfig, settings["scenes"]["apartment"]), int(seeded[1]), device=device)
-    sampling = recorded(SampleConfig, settings["sample"])
-    showcase = Showcase(scene, dataset.camera, config, device, mesh, sampling)
+    showcase = Showcase(scene, dataset.camera, config, device, mesh)
+    showcase.sampling = recorded(SampleConfig, settings["sample"])
     if settings["occlusion"]["model"] == "mesh":
         _check_same(showcase)
     return showcase
@@ -194,9 +165,7 @@ def _check_same(scene: Scene) -> None:
     some = stored.locations[:: max(1, len(stored.locations) // _CHECKED)]
     same = (scene.occlusion.unoccluded(some, points) == stored.unoccluded(some, points)).mean()
     if not same >= SAME_OCCLUSION:
-        raise SceneError(
-            "made anew from its seed, the scene is not the one that was labelled",
-            path=scene.files.folder,
-            value=f"{same:.1%} of the lines of sight are as stored",
-            fix="Check out the version of the code that release.json names.",
-        )
+        problem = "made anew from its seed, the scene is not the one that was labelled"
+        value = f"{same:.1%} of the lines of sight are as stored"
+        fix = "Check out the version of the code that release.json names."
+        raise SceneError(problem, path=scene.files.folder, value=value, fix=fix)

@@ -23,8 +23,8 @@ from wheretolook.methods.binned_network import BinnedNetworkScorer
 from wheretolook.planning.config import PathsConfig, PlanConfig
 from wheretolook.planning.method_paths import path_views, plan_by_methods
 from wheretolook.planning.path_comparison import draw_pairs
-from wheretolook.planning.path_view import PathView
 from wheretolook.planning.refine import score_directions
+from wheretolook.planning.route_views import PathView
 from wheretolook.release.showcase import EYE_M, Showcase
 from wheretolook.utils.errors import ConfigError
 from wheretolook.viewpoints.table import UNLABELLED, is_good, outcome_in_brief, outcome_in_words, poses
@@ -137,8 +137,7 @@ def learning_of(showcase: Showcase, scorer: BinnedNetworkScorer, location_id: in
 def mistaken_location(showcase: Showcase, scorer: Scorer, height_m: float = EYE_M) -> int:
     """The location of a layer with the largest mean difference between predicted probabilities and labels.
 
-    Raises:
-        ConfigError: the layer has no viewpoint.
+    Raises ConfigError if the layer has no viewpoint.
     """
     rows = showcase.table[showcase.table["location_id"].isin(showcase.layer(height_m))]
     if len(rows) == 0:
@@ -168,14 +167,7 @@ def peaks_of(showcase: Showcase, scorer: Scorer, location_id: int, n: int = 3, a
 def rendered_views(
     scene: Scene, rows: pd.DataFrame, scores: Float, words: Callable[[pd.Series], str]
 ) -> tuple[View, ...]:
-    """Viewpoints with what a camera sees there and what became of it.
-
-    Args:
-        scene: with a mesh.
-        rows: B labelled viewpoints of it.
-        scores: (B,).
-        words: says in words how a row's label came out.
-    """
+    """B labelled viewpoints of a scene with a mesh, with what a camera sees, their scores (B,) and labels in words."""
     looked = poses(rows)
     seen = zip(scene.renderer.render(scene.camera, looked).rgb, looked, scores, range(len(rows)), strict=True)
     return tuple(View(rgb, pose[2, :3], float(score), words(rows.iloc[row])) for rgb, pose, score, row in seen)
@@ -191,10 +183,7 @@ def planned_views(
     methods: Sequence[str] = PLANNED_BY,
     config: PlanConfig = PlanConfig(grid=(8, 8, 4), directions=200),
 ) -> dict[str, list[PathView]]:
-    """The views along the paths of several methods between the farthest of ten random pairs of start and goal.
-
-    The methods use the weights of the scene's dataset.
-    """
+    """The views along several methods' paths, by the dataset's weights, between the farthest of ten random pairs."""
     pairs = draw_pairs(showcase.space, PathsConfig(pairs=10))
     start, goal = pairs[np.linalg.norm(pairs[:, 1] - pairs[:, 0], axis=1).argmax()]
     paths = plan_by_methods(showcase, dataset, methods, start, goal, config)
@@ -202,8 +191,6 @@ def planned_views(
 
 
 def _survey(showcase: Showcase, locations: Float) -> Survey:
-    localization_map, rotations = showcase.localization_map, rotation_looking_along(showcase.directions)
-    options: dict[str, Any] = {"keep": showcase.keep, "keep_occlusion": False, "device": localization_map.device}
-    return survey(
-        showcase.camera, rotations, locations, localization_map.landmarks.points, localization_map.occlusion, **options
-    )
+    rotations, points = rotation_looking_along(showcase.directions), showcase.landmarks.points
+    options: dict[str, Any] = {"keep": showcase.keep, "keep_occlusion": False, "device": showcase.device}
+    return survey(showcase.camera, rotations, locations, points, showcase.occlusion, **options)

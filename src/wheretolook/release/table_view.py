@@ -20,18 +20,15 @@ DIVIDED = f"/{RELEASED_DIVISOR}"
 
 
 def latest_paper_table(tracking: TrackingConfig, name: str, dataset: str = "") -> pd.DataFrame:
-    """A table ("vs_others" or "input_variants") of `wheretolook.evaluation.paper_tables.paper_tables`.
+    """The paper's table "vs_others" or "input_variants", from the newest evaluation of a dataset, or of any ("").
 
-    It is taken from the newest evaluation of a dataset, or of any ("").
-
-    Raises:
-        MissingRunError: there is none.
+    Raises MissingRunError if there is none.
     """
     return pd.read_csv(newest_artifact(tracking, "evaluate", f"table_{name}.csv", dataset))
 
 
 def paper_cells(table: pd.DataFrame) -> pd.DataFrame:
-    """A table of `wheretolook.evaluation.paper_tables.paper_tables` as text.
+    """The text of a table of `wheretolook.evaluation.paper_tables.paper_tables`.
 
     A row for each of the paper's methods, by its names there and here; for each threshold the columns "ours" (% of the
     oracle's share), "95 %" (its interval), "/0.527" and "paper", with a dash for missing numbers.

@@ -73,10 +73,7 @@ class Open3DRenderer:
     def _footprint(
         self, face: NDArray[np.int64], t: Float, normals: Float, rays: Float, ray_from_pixel: Float
     ) -> Float:
-        """The footprints of pixels: how far a hit moves on the texture as the pixel moves by one in x and in y.
-
-        (N, 2, 2) texels per pixel, the columns for x and y.
-        """
+        """How far a hit moves on the texture as the pixel moves by one in x and in y (columns), (N, 2, 2) texels."""
         slant = np.einsum("nd,nd->n", normals, rays)
         slant = np.where(np.abs(slant) < 1e-4, np.where(slant < 0, -1e-4, 1e-4), slant)
         by_pixel = ray_from_pixel[:, :2]  # (3, 2)

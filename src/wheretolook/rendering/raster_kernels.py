@@ -14,24 +14,22 @@ import warp as wp
 
 from wheretolook.rendering.trace_kernel import Appearance, pixel_of, ray_through, shade
 
+# Triangles are widened by this many pixels, so that rounding opens no gap between neighbours.
 _SLACK = wp.constant(wp.float64(1.0e-9))
-"""Triangles are widened by this many pixels, so that rounding opens no gap between neighbours."""
-
+# Up to this sine of the angle between a triangle's plane and the camera, the camera counts as in the plane.
 _FLAT = wp.constant(wp.float64(1.0e-13))
-"""Up to this sine of the angle between a triangle's plane and the camera, the camera counts as in the plane."""
 
 
 @wp.kernel(enable_backward=False)
 def project_kernel(
-    vertices: wp.array[wp.vec3],
-    pixel_from_world: wp.array[wp.mat33d],
+    points: wp.array[wp.vec3],
+    rotation: wp.array[wp.mat33d],
     offset: wp.array[wp.vec3d],
     projected: wp.array2d[wp.vec3d],
 ):
     b, i = wp.tid()
-    v = vertices[i]
-    at = wp.vec3d(wp.float64(v[0]), wp.float64(v[1]), wp.float64(v[2]))
-    projected[b, i] = pixel_from_world[b] * at + offset[b]
+    at = wp.vec3d(wp.float64(points[i][0]), wp.float64(points[i][1]), wp.float64(points[i][2]))
+    projected[b, i] = rotation[b] * at + offset[b]
 
 
 @wp.func
@@ -48,10 +46,7 @@ def _within(span: wp.vec2d, slope: wp.float64, value: wp.float64):
 
 @wp.kernel(enable_backward=False)
 def raster_kernel(
-    projected: wp.array2d[wp.vec3d],
-    indices: wp.array[wp.int32],
-    nearness: wp.array3d[wp.float32],
-    triangle: wp.array3d[wp.int32],
+    projected: wp.array2d[wp.vec3d], indices: wp.array[int], nearness: wp.array3d[float], triangle: wp.array3d[int]
 ):
     # One thread per triangle. That is safe only on the CPU, where the threads run one after the other.
     b, face = wp.tid()

@@ -10,11 +10,7 @@ import warp as wp
 
 @wp.kernel
 def unoccluded_kernel(
-    mesh: wp.uint64,
-    origins: wp.array[wp.vec3],
-    points: wp.array[wp.vec3],
-    margin_m: wp.float32,
-    unoccluded: wp.array2d[wp.bool],
+    mesh: wp.uint64, origins: wp.array[wp.vec3], points: wp.array[wp.vec3], margin_m: float, clear: wp.array2d[bool]
 ):
     i, j = wp.tid()
     ray = points[j] - origins[i]
@@ -23,7 +19,7 @@ def unoccluded_kernel(
     blocked = wp.bool(False)
     if reach > 0.0:
         blocked = wp.mesh_query_ray_anyhit(mesh, origins[i], ray / distance, reach)
-    unoccluded[i, j] = not blocked
+    clear[i, j] = not blocked
 
 
 @wp.kernel
@@ -48,11 +44,9 @@ def cast_kernel(
 
 
 @wp.kernel
-def distance_kernel(
-    mesh: wp.uint64, points: wp.array[wp.vec3], max_distance_m: wp.float32, distance_m: wp.array[wp.float32]
-):
+def distance_kernel(mesh: wp.uint64, points: wp.array[wp.vec3], farthest_m: float, distance_m: wp.array[float]):
     i = wp.tid()
-    nearest = wp.mesh_query_point_no_sign(mesh, points[i], max_distance_m)
+    nearest = wp.mesh_query_point_no_sign(mesh, points[i], farthest_m)
     distance_m[i] = wp.inf
     if nearest.result:
         at = wp.mesh_eval_position(mesh, nearest.face, nearest.u, nearest.v)
@@ -61,11 +55,7 @@ def distance_kernel(
 
 @wp.kernel
 def clear_kernel(
-    mesh: wp.uint64,
-    starts: wp.array[wp.vec3],
-    ends: wp.array[wp.vec3],
-    clearance_m: wp.float32,
-    clear: wp.array[wp.bool],
+    mesh: wp.uint64, starts: wp.array[wp.vec3], ends: wp.array[wp.vec3], clearance_m: float, clear: wp.array[bool]
 ):
     # A ball as large as the distance to the nearest surface is empty, so step by that distance less the clearance.
     i = wp.tid()

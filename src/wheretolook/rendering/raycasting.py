@@ -19,29 +19,17 @@ from wheretolook.utils.warp import start_warp, vec3_array
 
 @dataclass(frozen=True, eq=False)
 class RayHits:
-    """First hits of R rays.
+    """First hits of R rays."""
 
-    Attributes:
-        distance_m: (R,) float32, from the ray's origin; infinite where nothing is hit.
-        triangle: (R,) int32, the triangle hit; -1 where nothing is hit.
-        front: (R,) bool, whether the triangle's front (corners counter-clockwise) was hit.
-    """
-
-    distance_m: NDArray[np.float32]
-    triangle: NDArray[np.int32]
-    front: NDArray[np.bool_]
+    distance_m: NDArray[np.float32]  # (R,) from the ray's origin; infinite where nothing is hit
+    triangle: NDArray[np.int32]  # (R,) the triangle hit; -1 where nothing is hit
+    front: NDArray[np.bool_]  # (R,) whether the triangle's front (corners counter-clockwise) was hit
 
 
 class MeshRaycaster:
-    """Answers ray and distance queries on a mesh.
+    """Answers ray and distance queries on a mesh, on "cpu" (one core) or a CUDA device such as "cuda" or "cuda:1".
 
-    Args:
-        mesh: the geometry; textures are not used.
-        device: "cpu" (one core) or a CUDA device such as "cuda" or "cuda:1".
-        block_rays: rays traced at a time in `occluded`, which bounds the memory on the device.
-
-    Raises:
-        ConfigError: if there is no such device.
+    `occluded` traces `block_rays` at a time, to bound the memory on the device. ConfigError if there is no such device.
     """
 
     def __init__(self, mesh: TexturedMesh, device: str = "cpu", block_rays: int = 1 << 28) -> None:
@@ -51,23 +39,17 @@ class MeshRaycaster:
         self.warp_mesh = warp_mesh(mesh, self.device)
 
     def occluded(self, origins: ArrayLike, points: ArrayLike, margin_m: float = 0.02) -> NDArray[np.bool_]:
-        """Whether something lies between each of origins (L, 3) and each of points (N, 3), in metres.
+        """Whether something lies between each of origins (L, 3) and each of points (N, 3), in metres; (L, N).
 
         Geometry closer to the point than `margin_m` does not count, so that a landmark on (or, by its triangulation
-        error, a little behind) a surface is not hidden by that surface.
-
-        Returns:
-            (L, N) bool, True where the open segment from the origin to `margin_m` before the point meets a triangle.
-            Segments shorter than the margin are never occluded.
+        error, a little behind) a surface is not hidden by that surface. Shorter segments are never occluded.
         """
         origins_at = np.asarray(origins, dtype=np.float64).reshape(-1, 3)
         points_on_device = vec3_array(points, self.device)
         n_points = points_on_device.shape[0]
         occluded = np.zeros((len(origins_at), n_points), dtype=np.bool_)
-        if occluded.size == 0:
-            return occluded
         threads = len(os.sched_getaffinity(0)) if self.device == "cpu" else 1
-        block = max(1, min(self.block_rays // n_points, -(-len(origins_at) // threads)))
+        block = max(1, min(self.block_rays // max(n_points, 1), -(-len(origins_at) // threads)))
 
         def work(start: int) -> None:
             rows = slice(start, start + block)
@@ -82,8 +64,7 @@ class MeshRaycaster:
         """The negation of `occluded`, as a Warp array (L, N) of bool; `points` (N,) is a Warp array of vec3."""
         origins_on_device = vec3_array(origins, self.device)
         shape = (origins_on_device.shape[0], points.shape[0])
-        (unoccluded,) = self._launch(unoccluded_kernel, shape, [origins_on_device, points, margin_m], wp.bool)
-        return unoccluded
+        return self._launch(unoccluded_kernel, shape, [origins_on_device, points, margin_m], wp.bool)[0]
 
     def cast(self, origins: ArrayLike, directions: ArrayLike) -> RayHits:
         """First hits of rays from origins (R, 3) metres along directions (R, 3) of any length."""
@@ -112,8 +93,8 @@ class MeshRaycaster:
     def _upload_pairs(self, **arrays: ArrayLike) -> list[Any]:
         """Two arrays (N, 3) on the device. Raises ValueError if their lengths differ."""
         uploaded: list[Any] = [vec3_array(values, self.device) for values in arrays.values()]
-        lengths = [f"{array.shape[0]} {name}" for name, array in zip(arrays, uploaded, strict=True)]
         if uploaded[0].shape != uploaded[1].shape:
+            lengths = [f"{array.shape[0]} {name}" for name, array in zip(arrays, uploaded, strict=True)]
             raise ValueError(" for ".join(lengths))
         return uploaded
 

@@ -11,11 +11,9 @@ from numpy.typing import NDArray
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.utils.errors import SceneError
 
+# Up to this ratio of a pixel footprint's axes, several samples along the long axis replace a coarser mip level. 8 keeps
+# floors and walls sharp that are seen at a slant.
 MAX_ANISOTROPY = 8
-"""Up to this ratio of a pixel footprint's axes, several samples along the long axis replace a coarser mip level.
-
-8 keeps floors and walls sharp that are seen at a slant.
-"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,18 +23,12 @@ class TexturePyramids:
     Each level is the box average of the level below it, taken of the stored sRGB values. Averaging linear light would
     be closer to a sensor, but Open3D and Habitat's unlit shader filter in sRGB too, and SIFT builds its scale space in
     it: a surface seen from afar then gives the same descriptor as the surface seen from near and blurred. It also needs
-    no decoding per sample.
-
-    Attributes:
-        texels: (S,) uint32, red in the lowest byte, rows top to bottom, level after level, texture after texture.
-        level_start: (K, L) int32, index in `texels` where level l of texture k starts.
-        size: (K, 3) int32, width and height of level 0 and the number of levels. Level l is
-            max(1, width >> l) x max(1, height >> l).
+    no decoding per sample. Level l is max(1, width >> l) x max(1, height >> l).
     """
 
-    texels: NDArray[np.uint32]
-    level_start: NDArray[np.int32]
-    size: NDArray[np.int32]
+    texels: NDArray[np.uint32]  # (S,) red in the lowest byte, rows top to bottom, level by level, texture by texture
+    level_start: NDArray[np.int32]  # (K, L) index in `texels` where level l of texture k starts
+    size: NDArray[np.int32]  # (K, 3) width and height of level 0 and the number of levels
 
 
 def build_pyramids(textures: tuple[NDArray[np.uint8], ...]) -> TexturePyramids:
@@ -61,11 +53,8 @@ def build_pyramids(textures: tuple[NDArray[np.uint8], ...]) -> TexturePyramids:
             start = level_start[k, level]
             texels[start : start + width * height, :3] = image.reshape(-1, 3)
     size = [(t.shape[1], t.shape[0], levels) for t, levels in zip(textures, n_levels, strict=True)]
-    return TexturePyramids(
-        texels.view("<u4").reshape(-1).astype(np.uint32, copy=False),
-        level_start.astype(np.int32),
-        np.array(size, dtype=np.int32),
-    )
+    flat = texels.view("<u4").reshape(-1).astype(np.uint32, copy=False)
+    return TexturePyramids(flat, level_start.astype(np.int32), np.array(size, dtype=np.int32))
 
 
 def texel_gradients(mesh: TexturedMesh) -> NDArray[np.float32]:

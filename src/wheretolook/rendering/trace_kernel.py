@@ -26,13 +26,16 @@ class Appearance:
 
 
 @wp.func
+def _byte(value: float):
+    return wp.uint8(wp.clamp(value + 0.5, 0.0, 255.0))
+
+
+@wp.func
 def _texel(texels: wp.array[wp.uint32], index: wp.int32):
-    value = texels[index]
-    return wp.vec3(
-        wp.float32(value & wp.uint32(255)),
-        wp.float32((value >> wp.uint32(8)) & wp.uint32(255)),
-        wp.float32((value >> wp.uint32(16)) & wp.uint32(255)),
-    )
+    red = texels[index] & wp.uint32(255)
+    green = (texels[index] >> wp.uint32(8)) & wp.uint32(255)
+    blue = (texels[index] >> wp.uint32(16)) & wp.uint32(255)
+    return wp.vec3(wp.float32(red), wp.float32(green), wp.float32(blue))
 
 
 @wp.func
@@ -61,13 +64,7 @@ def _bilinear(a: Appearance, texture: wp.int32, level: wp.int32, uv: wp.vec2):
 
 @wp.func
 def shade(
-    a: Appearance,
-    face: wp.int32,
-    weights: wp.vec3,
-    depth_m: wp.float32,
-    normal: wp.vec3,
-    direction: wp.vec3,
-    to_ray: wp.mat33,
+    a: Appearance, face: int, weights: wp.vec3, depth_m: float, normal: wp.vec3, direction: wp.vec3, to_ray: wp.mat33
 ):
     """Colour of a hit, filtered over the pixel's footprint; `Open3DRenderer` does the same in NumPy."""
     uv = weights[0] * a.corner_uvs[face, 0] + weights[1] * a.corner_uvs[face, 1] + weights[2] * a.corner_uvs[face, 2]
@@ -117,17 +114,11 @@ def shade(
     color = color / wp.float32(n_taps)
 
     if a.vertex_colors.shape[0] > 0:
-        tint = (
-            weights[0] * a.vertex_colors[a.indices[3 * face]]
-            + weights[1] * a.vertex_colors[a.indices[3 * face + 1]]
-            + weights[2] * a.vertex_colors[a.indices[3 * face + 2]]
-        )
-        color = wp.cw_mul(color, tint)
-    return wp.vec3ub(
-        wp.uint8(wp.clamp(color[0] + 0.5, 0.0, 255.0)),
-        wp.uint8(wp.clamp(color[1] + 0.5, 0.0, 255.0)),
-        wp.uint8(wp.clamp(color[2] + 0.5, 0.0, 255.0)),
-    )
+        first = a.vertex_colors[a.indices[3 * face]]
+        second = a.vertex_colors[a.indices[3 * face + 1]]
+        third = a.vertex_colors[a.indices[3 * face + 2]]
+        color = wp.cw_mul(color, weights[0] * first + weights[1] * second + weights[2] * third)
+    return wp.vec3ub(_byte(color[0]), _byte(color[1]), _byte(color[2]))
 
 
 @wp.func

@@ -14,15 +14,10 @@ from wheretolook.geometry.poses import Float
 
 @dataclass(frozen=True, eq=False)
 class Rendering:
-    """Images of a batch of B poses.
+    """Images of a batch of B poses."""
 
-    Attributes:
-        rgb: (B, H, W, 3) uint8, sRGB; black where the ray through the pixel's centre meets nothing.
-        depth_m: (B, H, W) float32, z-depth along the optical axis in metres; 0 where the ray meets nothing.
-    """
-
-    rgb: NDArray[np.uint8]
-    depth_m: NDArray[np.float32]
+    rgb: NDArray[np.uint8]  # (B, H, W, 3) sRGB; black where the ray through the pixel's centre meets nothing
+    depth_m: NDArray[np.float32]  # (B, H, W) z-depth along the optical axis in metres; 0 where the ray meets nothing
 
 
 class Renderer(Protocol):

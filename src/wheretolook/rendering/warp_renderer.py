@@ -33,17 +33,11 @@ class WarpRenderer:
     Textures are filtered over the pixel's exact footprint: trilinearly between mip levels chosen by the footprint's
     short axis, averaged over up to 8 samples along its long axis. See `TexturePyramids` for the colour space.
 
-    Args:
-        mesh: what to render.
-        device: "cpu" (one core) or a CUDA device such as "cuda" or "cuda:1".
-        block_bytes: memory for poses that are rendered together; a larger batch is rendered in blocks.
-        method: "rays" traces a ray for every pixel. "raster" rasterizes, on the CPU only: it gives the same images up
-            to rounding, in a third of the time for 640 x 480 pixels of 100,000 triangles on one core. None takes
-            `method_on` the device.
-
-    Raises:
-        ConfigError: if there is no such device, or the method does not run there.
-        SceneError: if the textures are too large, or there is no triangle.
+    The device is "cpu" (one core) or a CUDA device such as "cuda:1"; poses in `block_bytes` are rendered together. The
+    method "rays" traces a ray for every pixel. "raster", on the CPU only, gives the same images up to rounding, in a
+    third of the time for 640 x 480 pixels of 100,000 triangles on one core. None takes `method_on` the device. Raises
+    ConfigError if there is no such device or the method does not run there, SceneError if the textures are too large
+    or there is no triangle.
     """
 
     def __init__(

@@ -60,11 +60,8 @@ class ApartmentConfig:
 
     def key(self) -> dict[str, Any]:
         """What decides an apartment, but for its seed; options that came later only where they are not the default."""
-        later = ("repetition", "enlarged", "vary")
-        default = ApartmentConfig()
-        return {
-            name: value for name, value in asdict(self).items() if name not in later or value != getattr(default, name)
-        }
+        later, default = ("repetition", "enlarged", "vary"), asdict(ApartmentConfig())
+        return {name: value for name, value in asdict(self).items() if name not in later or value != default[name]}
 
     def of_seed(self, seed: int) -> ApartmentConfig:
         """What the apartment of a seed is like: this, unless it is to `vary`."""

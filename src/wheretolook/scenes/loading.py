@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import io
+import json
 import os
+import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from os import PathLike
@@ -16,7 +18,6 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from wheretolook.geometry.mesh import TexturedMesh
-from wheretolook.scenes.texture_references import check_texture_references
 from wheretolook.utils.errors import ConfigError, SceneError
 
 # Rotations that turn the named axis of a file into the world's z axis.
@@ -29,6 +30,7 @@ _Z_UP_FROM = {
     "-z": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
 }
 _SUFFIXES = (".glb", ".ply", ".obj")
+_READABLE = ("image/png", "image/jpeg", "image/webp")
 _MIN_AREA_M2 = 1e-12  # a square of a thousandth of a millimetre
 _MIN_EXTENT_M = 1e-3
 _WHITE = np.full((1, 1, 3), 255, dtype=np.uint8)
@@ -52,21 +54,18 @@ def load_mesh(path: str | PathLike[str], up: str = "z") -> TexturedMesh:
     Each material of the file becomes a texture; one without an image becomes a texture of one pixel in its colour.
     Vertex colours, which count as sRGB, multiply the texture. Triangles without area are dropped.
 
-    Args:
-        path: a .glb, .ply (with texture coordinates and a `TextureFile`, or coloured vertices or faces) or .obj file
-            (with its .mtl), or a folder `<id>-<name>` that holds `<name>.glb`, as in the Habitat-Matterport dataset.
-        up: the axis of the file that points up: "z", "y", "x" or one of these with a minus sign. glTF prescribes y, but
-            many scans are z up nevertheless. A scene with the wrong axis has no free space.
+    Takes a .glb, .ply (with texture coordinates and a `TextureFile`, or coloured vertices or faces) or .obj file (with
+    its .mtl), or a folder `<id>-<name>` that holds `<name>.glb`, as in the Habitat-Matterport dataset. `up` is the axis
+    of the file that points up: "z", "y", "x" or one of these with a minus sign. glTF prescribes y, but many scans are z
+    up nevertheless. A scene with the wrong axis has no free space.
 
-    Raises:
-        SceneError: if the file is missing, unreadable, empty, flat, not finite, without any texture or colour, or
-            refers to a texture that is missing or in a format that is not supported.
-        ConfigError: if `up` is none of the six axes.
+    Raises SceneError if the file is missing, unreadable, empty, flat, not finite, without any texture or colour, or
+    refers to a texture that is missing or in a format that is not supported; ConfigError if `up` is no such axis.
     """
     if up not in _Z_UP_FROM:
         raise ConfigError("unknown up axis", value=up, fix=f"Use one of {', '.join(_Z_UP_FROM)}")
     file = _mesh_file(Path(path))
-    check_texture_references(file)
+    _check_texture_references(file)
     try:
         scene = trimesh.load_scene(str(file), process=False)
         parts = list(_parts(scene))
@@ -250,9 +249,8 @@ def _geometry(mesh: TexturedMesh, faces: NDArray[np.int64], image: _EncodedJpeg)
     uv = mesh.corner_uvs[faces].reshape(-1, 2)
     keys = np.column_stack([index.astype(np.int32), uv.view(np.int32)])
     _, first, corners = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    material = trimesh.visual.material.PBRMaterial(
-        baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True
-    )
+    matte = {"metallicFactor": 0.0, "roughnessFactor": 1.0, "doubleSided": True}
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=image, **matte)
     visual = trimesh.visual.TextureVisuals(uv=uv[first].astype(np.float64) * (1, -1) + (0, 1), material=material)
     if mesh.vertex_colors is not None:
         opaque = np.full((len(first), 1), 255, dtype=np.uint8)
@@ -283,3 +281,67 @@ def _mark_unlit(tree: dict[str, Any]) -> None:
     for material in tree.get("materials", []):
         material["extensions"] = {"KHR_materials_unlit": {}}
     tree.setdefault("extensionsUsed", []).append("KHR_materials_unlit")
+
+
+def _check_texture_references(path: Path) -> None:
+    """Raise SceneError if a GLB, PLY or OBJ file refers to a texture that is missing or in a format not supported.
+
+    trimesh leaves such images out, or puts a grey placeholder in their place, without an error.
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".glb":
+        for image in _glb_json(path).get("images", []):
+            mime_type = image.get("mimeType", "")
+            if "bufferView" in image and mime_type not in _READABLE:
+                fix = "Use the GLB with JPEG or PNG textures; a .basis.glb holds compressed ones"
+                raise SceneError("a texture is in a format that is not supported", path=path, value=mime_type, fix=fix)
+        return
+    for texture in _ply_textures(path) if suffix == ".ply" else _obj_textures(path):
+        if not texture.is_file():
+            fix = "Put the image where the mesh expects it"
+            raise SceneError("a texture is missing", path=path, value=str(texture), fix=fix)
+
+
+def _glb_json(path: Path) -> dict[str, Any]:
+    """The JSON chunk of a binary glTF 2.0 file (glTF 2.0 specification, section 4.4)."""
+    fix = "Check that the file was copied whole"
+    with path.open("rb") as file:
+        header = file.read(20)
+        if len(header) < 20 or header[:4] != b"glTF":
+            raise SceneError("not a binary glTF file", path=path, fix=fix)
+        _, version, length, json_length, _ = struct.unpack("<4sIIII", header)
+        if length != path.stat().st_size or version != 2:
+            value = f"{path.stat().st_size} of {length} bytes, version {version}"
+            raise SceneError("a truncated glTF file or not of version 2", path=path, value=value, fix=fix)
+        try:
+            content: dict[str, Any] = json.loads(file.read(json_length))
+        except ValueError as error:
+            raise SceneError("the glTF file is corrupt", path=path, value=str(error)) from error
+        return content
+
+
+def _ply_textures(path: Path) -> list[Path]:
+    with path.open("rb") as file:
+        for raw in file:
+            line = raw.decode("utf-8", errors="replace").strip()
+            if line.lower().startswith("comment texturefile "):
+                return [path.parent / line[len("comment texturefile ") :].strip()]
+            if line == "end_header":
+                break
+    return []
+
+
+def _obj_textures(path: Path) -> list[Path]:
+    textures = []
+    with path.open(encoding="utf-8", errors="replace") as file:
+        libraries = [path.parent / line[7:].strip() for line in file if line.startswith("mtllib ")]
+    for library in libraries:
+        if not library.is_file():
+            fix = "Put it where the mesh expects it"
+            raise SceneError("the material library is missing", path=path, value=str(library), fix=fix)
+        for line in library.read_text(encoding="utf-8", errors="replace").splitlines():
+            # A map with options (-s, -o ...) before its file name is not checked.
+            words = line.split(maxsplit=1)
+            if len(words) == 2 and words[0].lower() == "map_kd" and not words[1].startswith("-"):
+                textures.append(library.parent / words[1].strip().replace("\\", "/"))
+    return textures

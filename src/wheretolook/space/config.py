@@ -35,9 +35,8 @@ class FreeSpaceConfig:
 
     def __post_init__(self) -> None:
         if not self.clearance_m > 0 or not self.max_floor_drop_m > 0:
-            raise ConfigError(
-                "clearance and floor drop must be positive", value=(self.clearance_m, self.max_floor_drop_m)
-            )
+            value = (self.clearance_m, self.max_floor_drop_m)
+            raise ConfigError("clearance and floor drop must be positive", value=value)
 
 
 @dataclass(frozen=True)
@@ -54,7 +53,5 @@ class MappedSpaceConfig:
 
     def __post_init__(self) -> None:
         if not self.max_camera_distance_m > 0 or not self.clearance_m >= 0:
-            raise ConfigError(
-                "the distance to cameras must be positive, the clearance not negative",
-                value=(self.max_camera_distance_m, self.clearance_m),
-            )
+            problem = "the distance to cameras must be positive, the clearance not negative"
+            raise ConfigError(problem, value=(self.max_camera_distance_m, self.clearance_m))

@@ -13,20 +13,10 @@ _N_SIDEDNESS_POINTS = 1024  # random points that decide whether triangles are on
 
 
 class FreeSpace:
-    """Tests locations and straight paths in a scene.
+    """Tests locations and straight paths in a scene with a mesh, z up. Raises ConfigError if there is no such device.
 
-    Args:
-        mesh: the scene, z up.
-        config: what counts as free.
-        device: "cpu" or a CUDA device.
-
-    Attributes:
-        raycaster: the mesh, for rays and distances.
-        bounds: (2, 3) metres, lowest and highest corner of the scene.
-        two_sided: whether both sides of a triangle count as a surface.
-
-    Raises:
-        ConfigError: if there is no such device.
+    `bounds` (2, 3) are its lowest and highest corner in metres, `two_sided` says whether both sides of a triangle count
+    as a surface, and `raycaster` has the mesh, for rays and distances.
     """
 
     def __init__(self, mesh: TexturedMesh, config: FreeSpaceConfig | None = None, device: str = "cpu") -> None:
@@ -41,14 +31,11 @@ class FreeSpace:
             self.two_sided = not self._sees_fronts()
 
     def is_free(self, points: ArrayLike) -> NDArray[np.bool_]:
-        """Whether a camera can be at points (N, 3) metres.
+        """Whether a camera can be at points (N, 3) metres; (N,).
 
         A point is free if it lies within the bounds, no geometry is closer than `clearance_m`, the first surface
         straight below is level (within 60 degrees) and at most `max_floor_drop_m` away, and the point is enclosed, as
         `FreeSpaceConfig` says.
-
-        Returns:
-            (N,) bool.
         """
         at = np.asarray(points, dtype=np.float64).reshape(-1, 3)
         free = ((at >= self.bounds[0]) & (at <= self.bounds[1])).all(axis=1)  # the cheap tests first
@@ -59,12 +46,9 @@ class FreeSpace:
         return free
 
     def segments_are_free(self, a: ArrayLike, b: ArrayLike) -> NDArray[np.bool_]:
-        """Whether a camera can move straight from a (N, 3) to b (N, 3) metres.
+        """Whether a camera can move straight from a (N, 3) to b (N, 3) metres; (N,).
 
         Both ends must be free and every point between must keep the clearance; it need not be above a floor.
-
-        Returns:
-            (N,) bool.
         """
         start, end = (np.asarray(points, dtype=np.float64).reshape(-1, 3) for points in (a, b))
         free = self.is_free(start) & self.is_free(end)

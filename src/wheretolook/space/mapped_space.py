@@ -10,26 +10,15 @@ from wheretolook.geometry.poses import Float
 from wheretolook.space.config import MappedSpaceConfig
 from wheretolook.utils.errors import MapError
 
-STEP_M = 0.02
-"""Step between the points of a path segment that must be near mapping cameras."""
-
+STEP_M = 0.02  # between the points of a path segment that must be near mapping cameras
 _OUTLIERS = 0.01  # share of landmarks left out at either end of each axis, since a wrong one may lie anywhere
 
 
 class MappedSpace:
-    """Tests locations against a map's landmarks and cameras.
+    """Tests locations against a map's landmarks (N, 3) m and the places (M, 3) m where its images were taken.
 
-    Args:
-        landmarks: (N, 3) metres.
-        cameras: (M, 3) metres, where the map's images were taken.
-        config: what counts as free.
-
-    Attributes:
-        bounds: (2, 3) metres: the box around the cameras, enlarged by `max_camera_distance_m`, within the box around
-            cameras and landmarks (without the outermost per cent along each axis).
-
-    Raises:
-        MapError: there are no landmarks or no cameras.
+    `bounds` (2, 3) m is the box around the cameras, enlarged by `max_camera_distance_m`, within the box around cameras
+    and landmarks (without the outermost per cent along each axis). Raises MapError without landmarks or cameras.
     """
 
     def __init__(self, landmarks: ArrayLike, cameras: ArrayLike, config: MappedSpaceConfig | None = None) -> None:
@@ -54,13 +43,10 @@ class MappedSpace:
         return free
 
     def segments_are_free(self, a: ArrayLike, b: ArrayLike) -> NDArray[np.bool_]:
-        """Whether a camera can move straight from a (N, 3) to b (N, 3) metres.
+        """Whether a camera can move straight from a (N, 3) to b (N, 3) metres; (N,).
 
         Both ends must be free, no landmark may be closer to the segment than the clearance, and the segment must stay
         near mapping cameras (tested every 2 cm).
-
-        Returns:
-            (N,) bool.
         """
         ends = (np.asarray(points, dtype=np.float64).reshape(-1, 3) for points in (a, b))
         start, end = np.broadcast_arrays(*ends)

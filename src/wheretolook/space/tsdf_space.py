@@ -28,17 +28,9 @@ class TsdfSpace(FreeSpace):
     farther away than the clearance. Elsewhere the surface counts as a mesh does in `FreeSpace`; its fronts face the
     cameras that saw it, so the inside of closed objects is not free.
 
-    Args:
-        volume: the fused depth images; not needed any more afterwards.
-        images: the same images.
-        config: what counts as free; `two_sided` is ignored, since the surface is one-sided.
-        device: "cpu" or a CUDA device.
-        progress: show a progress bar.
-
-    Attributes:
-        cells: grid of cells over the bounds.
-        to_unseen_m: (nx, ny, nz) float32, distance from each cell's centre to the nearest centre of a cell that no
-            image saw through.
+    The volume is of the same images and not needed any more afterwards; `two_sided` is ignored, since the surface is
+    one-sided. Over the bounds lies a grid of `cells`; `to_unseen_m` (nx, ny, nz) is the distance from each one's centre
+    to the nearest centre of a cell that no image saw through.
 
     Raises:
         SceneError: the depth images show no surface.
@@ -71,12 +63,9 @@ class TsdfSpace(FreeSpace):
         return free
 
     def segments_are_free(self, a: ArrayLike, b: ArrayLike) -> NDArray[np.bool_]:
-        """Whether a camera can move straight from a (N, 3) to b (N, 3) metres.
+        """Whether a camera can move straight from a (N, 3) to b (N, 3) metres; (N,).
 
         As in `FreeSpace`, and all of the segment must be clear of unseen space (tested at most a voxel apart).
-
-        Returns:
-            (N,) bool.
         """
         start, end = (np.asarray(points, dtype=np.float64).reshape(-1, 3) for points in (a, b))
         free = super().segments_are_free(start, end)
@@ -105,10 +94,7 @@ class TsdfSpace(FreeSpace):
 def seen_through(
     points: Float, images: Sequence[DepthImage], max_depth_m: float, progress: bool = True
 ) -> NDArray[np.bool_]:
-    """Whether at least one depth image saw something behind each of points (N, 3) in metres; (N,).
-
-    Readings beyond `max_depth_m` are left out.
-    """
+    """Whether a depth image saw something behind points (N, 3) m, but for readings beyond `max_depth_m`; (N,)."""
     seen = np.zeros(len(points), dtype=bool)
     for index in tqdm(range(len(images)), desc="seen space", unit="image", disable=not progress):
         image = images[index]

@@ -32,16 +32,14 @@ FOLDER = "paths"
 def compare_paths(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> pd.DataFrame:
     """Paths planned by several methods, rendered and localized: `<dataset>/results/paths.{csv,md,png}`, MLflow runs.
 
-    Needs the map stage only. What was planned and localized before is used again.
-
-    Returns:
-        `wheretolook.planning.path_report.summarize_paths`.
+    Needs the map stage only. What was planned and localized before is used again. Returns what
+    `wheretolook.planning.path_report.summarize_paths` makes of it.
 
     Raises:
         ConfigError: no such scene or method, or no weights. WeightsError: the weights cannot be used.
         SceneError: a scene has no mesh, or too little room for starts and goals.
     """
-    from wheretolook.planning.planner_map import check_methods
+    from wheretolook.planning.scene_map import check_methods
 
     dataset, config = dataset_after(experiment, "map"), experiment.paths
     check_methods(config.methods)
@@ -69,8 +67,7 @@ def _plan(scene: Scene, dataset: Dataset, config: PathsConfig, say: Say) -> Comp
     """The paths of a scene: those that are there if they were planned with the same settings."""
     from wheretolook.labelling.labeller import storing
     from wheretolook.planning.path_comparison import FORWARD, ComparedPaths, draw_pairs, plan_pairs
-    from wheretolook.planning.planner_map import planner_map
-    from wheretolook.planning.scene_map import weights_for
+    from wheretolook.planning.scene_map import planner_map, weights_for
 
     files, folder = scene.files, _folder(dataset, scene)
     weights = {method: weights_for(method, dataset, config.weights, say) for method in config.methods}
@@ -85,11 +82,8 @@ def _plan(scene: Scene, dataset: Dataset, config: PathsConfig, say: Say) -> Comp
     if made.is_file() and all(path.is_file() for path in tables.values()) and json.loads(made.read_text()) == key:
         say(f"{scene.name}: reusing {folder}")
         return ComparedPaths(**{name: pd.read_parquet(path) for name, path in tables.items()})
-    maps = {
-        method: planner_map(scene, dataset, config, method, weights[method])
-        for method in config.methods
-        if method != FORWARD
-    }
+    mapped = [name for name in config.methods if name != FORWARD]
+    maps = {name: planner_map(scene, dataset, config, name, weights[name]) for name in mapped}
     found = plan_pairs(draw_pairs(scene.space, config), scene.space, maps, config, f"plan {scene.name}")
     made.unlink(missing_ok=True)
     with storing(folder):
@@ -156,14 +150,8 @@ def _report(
         write_text(folder / PATHS_MD, markdown)
         views.to_parquet(folder / FOLDER / "views.parquet", index=False)
     save_figure(paths_figure(summary), folder / PATHS_PNG)
-    params = {
-        "dataset": dataset.name,
-        "pairs": config.pairs,
-        "seed": config.seed,
-        "time_s": config.planner.time_s,
-        "score_weight": config.planner.score_weight,
-        "max_turn_deg": config.max_turn_deg,
-    }
+    params = {"dataset": dataset.name, "pairs": config.pairs, "seed": config.seed, "time_s": config.planner.time_s}
+    params |= {"score_weight": config.planner.score_weight, "max_turn_deg": config.max_turn_deg}
     log_paths(params, summary, folder, tracking)
     say(markdown)
     say(f"-> {folder / PATHS_CSV}, {PATHS_MD}, {PATHS_PNG}; every view in {folder / FOLDER}")
@@ -176,12 +164,8 @@ def _folder(dataset: Dataset, scene: Scene) -> Path:
 
 def _as_table(views: pd.DataFrame) -> pd.DataFrame:
     """Views as rows of a table of viewpoints, to be labelled."""
-    n = len(views)
-    values: dict[str, Any] = {
-        "viewpoint_id": np.arange(n), "location_id": np.arange(n), "direction_id": np.zeros(n),
-        "n_visible": np.zeros(n), "visibility_rank": np.zeros(n), "status": np.full(n, UNLABELLED),
-        "error_m": np.full(n, np.nan), "error_deg": np.full(n, np.nan), "n_inliers": np.zeros(n),
-    }  # fmt: skip
+    values: dict[str, Any] = dict.fromkeys(("viewpoint_id", "location_id"), np.arange(len(views)))
+    values |= {"status": UNLABELLED, "error_m": np.nan, "error_deg": np.nan}
     types = {field.name: field.type.to_pandas_dtype() for field in SCHEMA if field.name != "status"}
-    columns = {name: values.get(name, views.get(name)) for name in SCHEMA.names}
-    return pd.DataFrame(columns).astype(types)
+    columns = {name: values.get(name, views.get(name, 0)) for name in SCHEMA.names}
+    return pd.DataFrame(columns, index=range(len(views))).astype(types)

@@ -35,22 +35,14 @@ def run_demo(experiment: Experiment) -> None:
     config = experiment.scenes
     n_scenes = config.train + config.val + config.test + len(config.meshes)
     cost = {name: seconds * (n_scenes if name in STAGES else 1) for name, seconds in SECONDS.items()}
-    steps: dict[str, Callable[..., object]] = {
-        "scenes": stages.make_scenes,
-        "map": stages.make_maps,
-        "sample": stages.sample,
-        "label": stages.label,
-        "train": stages.train,
-        "evaluate": stages.evaluate,
-    }
+    functions = (stages.make_scenes, stages.make_maps, stages.sample, stages.label, stages.train, stages.evaluate)
+    steps: dict[str, Callable[..., object]] = dict(zip(SECONDS, functions, strict=True))
     if config.train == 0 and not any(mesh.split == "train" for mesh in config.meshes):
         del steps["train"], cost["train"]  # meshes of one's own, evaluated with weights from elsewhere
         asked = methods_named(experiment.evaluate.methods, scorers())
         if any(method.weights for method in asked) and not experiment.evaluate.weights:
-            raise ConfigError(
-                "no scene to learn from, and no weights to evaluate",
-                fix="Name weights in evaluate.weights, or leave methods that have learnt out of evaluate.methods.",
-            )
+            fix = "Name weights in evaluate.weights, or leave methods that have learnt out of evaluate.methods."
+            raise ConfigError("no scene to learn from, and no weights to evaluate", fix=fix)
     start = time.monotonic()
     layout = "{desc}: {percentage:3.0f}%|{bar}| {elapsed} elapsed, about {remaining} remain"
     with tqdm(total=sum(cost.values()), desc="demo", bar_format=layout, smoothing=0) as bar:
@@ -65,18 +57,11 @@ def run_demo(experiment: Experiment) -> None:
     _say_where(experiment, time.monotonic() - start)
 
 
-def draw_overview(experiment: Experiment, weights: Path) -> Path:
+def draw_overview(experiment: Experiment, weights: Path) -> None:
     """Draw `<dataset>/results/overview.png`: the last scene's map, and what a network thinks of one place in it.
 
-    The place is one where to look matters (`wheretolook.viewpoints.locations.instructive_location`).
-
-    Args:
-        experiment: all stages up to label have been run.
-        weights: file of a trained scorer, or a folder of such files, of which the best is taken; its camera must have
-            the dataset's field of view.
-
-    Returns:
-        The picture's path.
+    The place is one where to look matters (`wheretolook.viewpoints.table.instructive_location`). The weights are a
+    file, or a folder of files of which the best is taken, for a camera of the dataset's field of view.
 
     Raises:
         TableError: there is no dataset, or its last scene is not labelled.
@@ -85,8 +70,7 @@ def draw_overview(experiment: Experiment, weights: Path) -> Path:
     from wheretolook.figures.overview import overview_figure
     from wheretolook.figures.style import save_figure
     from wheretolook.release.showcase_figures import rendered_views
-    from wheretolook.viewpoints.locations import instructive_location, shares_good
-    from wheretolook.viewpoints.table import outcome_in_words, poses
+    from wheretolook.viewpoints.table import instructive_location, outcome_in_words, poses, shares_good
 
     dataset = Dataset.load(experiment.root)
     scene = open_scene(experiment, dataset, dataset.scenes[-1])
@@ -106,9 +90,7 @@ def draw_overview(experiment: Experiment, weights: Path) -> Path:
     around = scorer.score(poses_looking_along(np.tile(place, (len(directions), 1)), directions))
     points, shares = localization_map.landmarks.points, shares_good(table)[1]
     figure = overview_figure(points, locations, shares, place, directions, around, best, worst)
-    path = dataset.root / "results" / OVERVIEW
-    save_figure(figure, path)
-    return path
+    save_figure(figure, dataset.root / "results" / OVERVIEW)
 
 
 def _say(stage: str, text: str) -> None:
@@ -120,18 +102,10 @@ def _tick(bar: tqdm, seconds: float, work: float) -> None:
 
 
 def _say_where(experiment: Experiment, seconds: float) -> None:
-    dataset = Dataset.load(experiment.root)
-    scene = dataset.scenes[-1]
-    rows = [
-        ("score table", dataset.root / "results" / "scores.md"),
-        ("score figure", dataset.root / "results" / "scores.png"),
-        ("overview", dataset.root / "results" / OVERVIEW),
-        ("trained weights", dataset.root / "weights"),
-        ("a scene", scene.mesh),
-        ("its COLMAP map", scene.map),
-        ("its viewpoints", scene.table),
-    ]
+    scene, results = Dataset.load(experiment.root).scenes[-1], experiment.root / "results"
+    places = {"score table": results / "scores.md", "score figure": results / "scores.png"}
+    places |= {"overview": results / OVERVIEW, "trained weights": experiment.root / "weights", "a scene": scene.mesh}
+    places |= {"its COLMAP map": scene.map, "its viewpoints": scene.table}
     print(f"\nDone in {seconds / 60:.1f} minutes.")
-    for name, path in rows:
-        print(f"  {name:<16}{path}")
-    print(f"  compare runs    {ui_command(experiment.tracking)}")
+    for name, place in {**places, "compare runs": ui_command(experiment.tracking)}.items():
+        print(f"  {name:<16}{place}")

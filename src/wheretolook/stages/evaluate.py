@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import pandas as pd
+
 from wheretolook.config import Experiment
 from wheretolook.dataset.folders import Dataset
 from wheretolook.evaluation.config import EvaluateConfig
@@ -15,17 +17,14 @@ from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.visibility.config import OcclusionConfig
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from wheretolook.learning.provenance import TrainedModel
 
 
 def evaluate(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> pd.DataFrame:
     """Stage 6: the score table of all methods on the test scenes, `<dataset>/results/`, and nested MLflow runs."""
     dataset = dataset_after(experiment, "label")
-    scores = evaluate_methods(
-        dataset, experiment.evaluate, experiment.tracking, device=experiment.warp_device, occlusion=experiment.occlusion
-    )
+    device, occlusion = experiment.warp_device, experiment.occlusion
+    scores = evaluate_methods(dataset, experiment.evaluate, experiment.tracking, device=device, occlusion=occlusion)
     tick(1)
     return scores
 
@@ -51,11 +50,8 @@ def evaluate_methods(
 
     Args:
         dataset: labelled scenes; they need not be of the dataset the models were trained on.
-        config: methods, values of N, thresholds.
-        tracking: where to log.
         models: models or weights files to compare, instead of those that `config.weights` tells.
         progress: show a progress bar, and print the table at the end.
-        device: where kernels and networks run, "cpu" or a CUDA device.
         occlusion: settings of the models that `config.occlusions` names.
 
     Returns:
@@ -84,26 +80,11 @@ def evaluate_methods(
 
 
 def write_results(folder: Path, table: pd.DataFrame, calibration: pd.DataFrame, title: str) -> None:
-    """Write tables, report and figures; what belongs to an earlier evaluation goes.
-
-    Args:
-        folder: where; made when needed.
-        table: score tables of all occlusion models and candidate sets, one below the other.
-        calibration: reliability curves of learned methods, as `calibration_figure` wants them; empty without any.
-        title: of the report.
-    """
+    """Write tables (all occlusion models and candidate sets, one below the other), reliability curves of learned
+    methods, if there are any, and figures, under a title; what belongs to an earlier evaluation goes."""
+    from wheretolook.evaluation import results
     from wheretolook.evaluation.paper_tables import write_paper_tables
     from wheretolook.evaluation.report import score_markdown
-    from wheretolook.evaluation.results import (
-        CALIBRATION_CSV,
-        CALIBRATION_PNG,
-        OCCLUSION_PNG,
-        REGRET_PNG,
-        SCORES_CSV,
-        SCORES_MD,
-        SCORES_PNG,
-        VARIANTS_CSV,
-    )
     from wheretolook.evaluation.score_table import main_rows
     from wheretolook.evaluation.scores import read_scores
     from wheretolook.figures.calibration import calibration_figure
@@ -111,25 +92,19 @@ def write_results(folder: Path, table: pd.DataFrame, calibration: pd.DataFrame, 
     from wheretolook.figures.scores import regret_figure, score_figure
     from wheretolook.figures.style import save_figure
 
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, text in ((SCORES_CSV, table.to_csv(index=False)), (SCORES_MD, score_markdown(table, title))):
-        write_text(folder / name, text)
-    variants = folder / VARIANTS_CSV
+    write_text(folder / results.SCORES_CSV, table.to_csv(index=False))
+    write_text(folder / results.SCORES_MD, score_markdown(table, title))
+    variants, papers = folder / results.VARIANTS_CSV, table
     if variants.is_file():  # the paper's tables have a row for each of the network's inputs, which a release knows
         others = main_rows(read_scores(variants))
-        others = others[~others["method"].isin(table["method"])]
-        write_paper_tables(pd.concat([table, others], ignore_index=True), folder)
-    else:
-        write_paper_tables(table, folder)
-    save_figure(score_figure(table), folder / SCORES_PNG)
-    save_figure(regret_figure(table), folder / REGRET_PNG)
+        papers = pd.concat([table, others[~others["method"].isin(table["method"])]], ignore_index=True)
+    write_paper_tables(papers, folder)
+    save_figure(score_figure(table), folder / results.SCORES_PNG)
+    save_figure(regret_figure(table), folder / results.REGRET_PNG)
+    for name in (results.OCCLUSION_PNG, results.CALIBRATION_CSV, results.CALIBRATION_PNG):
+        (folder / name).unlink(missing_ok=True)
     if table["occlusion"].nunique() > 1:
-        save_figure(occlusion_figure(table), folder / OCCLUSION_PNG)
-    else:
-        (folder / OCCLUSION_PNG).unlink(missing_ok=True)
+        save_figure(occlusion_figure(table), folder / results.OCCLUSION_PNG)
     if len(calibration):
-        write_text(folder / CALIBRATION_CSV, calibration.to_csv(index=False))
-        save_figure(calibration_figure(calibration), folder / CALIBRATION_PNG)
-    else:
-        for name in (CALIBRATION_CSV, CALIBRATION_PNG):
-            (folder / name).unlink(missing_ok=True)
+        write_text(folder / results.CALIBRATION_CSV, calibration.to_csv(index=False))
+        save_figure(calibration_figure(calibration), folder / results.CALIBRATION_PNG)

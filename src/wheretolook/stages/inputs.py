@@ -37,41 +37,31 @@ def dataset_after(experiment: Experiment, needs: str) -> Dataset:
     if needs != "label":
         refuse_release(experiment.root)
     if dataset.camera != experiment.camera:
-        raise ConfigError(
-            "the dataset was made with another camera",
-            path=experiment.root,
-            value=dataset.camera,
-            fix="Run the scenes stage with this configuration, or give the experiment another name.",
-        )
+        fix = "Run the scenes stage with this configuration, or give the experiment another name."
+        problem = "the dataset was made with another camera"
+        raise ConfigError(problem, path=experiment.root, value=dataset.camera, fix=fix)
     for scene in dataset.scenes:
         if read_stamp(scene, needs) is None:
-            raise TableError(
-                f"the {needs} stage has not been run for this scene, or not since an earlier stage remade its input",
-                path=scene.folder,
-                fix=f"Run `wheretolook {needs}`.",
+            problem = (
+                f"the {needs} stage has not been run for this scene, or not since an earlier stage remade its input"
             )
+            raise TableError(problem, path=scene.folder, fix=f"Run `wheretolook {needs}`.")
     return dataset
 
 
 def open_scene(experiment: Experiment, dataset: Dataset, files: SceneFolder) -> Scene:
     """A scene of the dataset as the experiment looks at it; nothing is read yet."""
-    config = SceneConfig(
-        experiment.occlusion,
-        experiment.scenes.free_space,
-        experiment.scenes.mapped_space,
-        experiment.map.photographs.assume_metric,
-    )
+    scenes, assume_metric = experiment.scenes, experiment.map.photographs.assume_metric
+    config = SceneConfig(experiment.occlusion, scenes.free_space, scenes.mapped_space, assume_metric)
     return Scene(files, dataset.camera, config, experiment.device)
 
 
 def refuse_release(root: Path) -> None:
     """Raise a ConfigError if a release lies there."""
     if (root / RELEASE_FILE).is_file():
-        raise ConfigError(
-            "a release has no meshes and maps, and would be lost if they were made anew",
-            path=root,
-            fix="Use it with train, evaluate and release alone, or give the experiment another name.",
-        )
+        problem = "a release has no meshes and maps, and would be lost if they were made anew"
+        fix = "Use it with train, evaluate and release alone, or give the experiment another name."
+        raise ConfigError(problem, path=root, fix=fix)
 
 
 @contextmanager
@@ -86,11 +76,7 @@ def naming_scene(path: Path) -> Iterator[None]:
 
 
 def extractor_of(scene: SceneFolder) -> ExtractorConfig:
-    """The keypoint extractor the map was made with: queries must use the same.
-
-    Raises:
-        MapError: the map's report is missing or damaged.
-    """
+    """The keypoint extractor the map was made with: queries must use the same. Raises MapError without its report."""
     from wheretolook.features.keypoints import ExtractorConfig
 
     path = scene.map / "report.json"
@@ -108,16 +94,10 @@ def existing(path: Path, error: type[SceneError] | type[MapError], stage: str) -
 
 
 def mesh_fingerprint(path: Path) -> str:
-    """A mesh file changes when its size or date does; it may be gigabytes.
-
-    Raises:
-        SceneError: there is no such file.
-    """
+    """A mesh file changes when its size or date does; it may be gigabytes. Raises SceneError if there is none."""
     if not path.exists():
         raise SceneError("there is no such mesh", path=path, fix="Check the path.")
     files = [path]
-    if path.is_dir():
-        files = sorted(file for file in path.iterdir() if file.is_file())
-    elif path.suffix.lower() != ".glb":  # materials and textures lie beside it
-        files = sorted(file for file in path.parent.iterdir() if file.is_file())
+    if path.is_dir() or path.suffix.lower() != ".glb":  # materials and textures lie beside it
+        files = sorted(file for file in (path if path.is_dir() else path.parent).iterdir() if file.is_file())
     return " ".join(f"{file.resolve()}:{file.stat().st_size}:{file.stat().st_mtime_ns}" for file in files)

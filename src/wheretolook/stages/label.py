@@ -35,7 +35,10 @@ def label(experiment: Experiment, say: Say = print, tick: Tick = lambda work: No
     """
     dataset, config = dataset_after(experiment, "sample"), experiment.label
     for files in dataset.scenes:
-        _refuse_photographs(files)
+        if files.is_photographed:
+            problem = "this scene is known from photographs alone: without a mesh its viewpoints cannot be rendered, "
+            fix = "Score its viewpoints with weights trained elsewhere, or use a scene with a mesh."
+            raise SceneError(f"{problem}and so not labelled", path=files.folder, fix=fix)
     to_label: list[tuple[SceneFolder, str]] = []
     for files in sorted(dataset.scenes, key=lambda files: files.split == "train"):  # those to evaluate on come first
         parts = [asdict(config.localizer), asdict(extractor_of(files)), asdict(dataset.camera)]
@@ -73,15 +76,8 @@ def _label(
     tasks: list[LabelTask] = []
     for files, _ in to_label:
         scene = open_scene(experiment, dataset, files)
-        job = SceneJob(
-            files.mesh,
-            files.landmarks,
-            scene.camera,
-            config.localizer,
-            extractor_of(files),
-            scene.device,
-            config.store_matches,
-        )
+        options = (config.localizer, extractor_of(files), scene.device, config.store_matches)
+        job = SceneJob(files.mesh, files.landmarks, scene.camera, *options)
         tasks.append(LabelTask(scene.name, job, files.read_table(), _shards(files)))
     seconds: dict[str, float] = {}
     start, replacing = time.monotonic(), False
@@ -110,21 +106,8 @@ def _shards(files: SceneFolder) -> Path:
 
 
 def _report(files: SceneFolder, table: pd.DataFrame, say: Say) -> None:
-    say(
-        f"{files.name}: {is_good(table).mean():.0%} of {len(table):,} viewpoints localize within 5 cm and 0.4 degrees "
-        f"-> {files.table}"
-    )
-
-
-def _refuse_photographs(files: SceneFolder) -> None:
-    """Raise SceneError if a scene is of photographs: views that nobody photographed cannot be rendered."""
-    if files.is_photographed:
-        raise SceneError(
-            "this scene is known from photographs alone: without a mesh its viewpoints cannot be rendered, and so not "
-            "labelled",
-            path=files.folder,
-            fix="Score its viewpoints with weights trained elsewhere, or use a scene with a mesh.",
-        )
+    good = f"{is_good(table).mean():.0%} of {len(table):,} viewpoints localize within 5 cm and 0.4 degrees"
+    say(f"{files.name}: {good} -> {files.table}")
 
 
 def log_labels(
@@ -133,12 +116,7 @@ def log_labels(
     """Summarize the labels of a dataset, write `<dataset>/results/labels.csv`, `.md` and `.png`, and log an MLflow run.
 
     The run is of stage "label"; its metrics are the numbers of `LabelSummary.shares` over all scenes and, with the
-    split's name in front, over each split.
-
-    Args:
-        dataset: labelled scenes.
-        tracking: where to log.
-        seconds: how long each stage took, by its name, logged as metrics `seconds_<name>`.
+    split's name in front, over each split, and the seconds that each step took, `seconds_<name>`.
 
     Raises:
         TableError: there is no scene, a scene has no viewpoints, or one of them has no label.
@@ -151,16 +129,11 @@ def log_labels(
     tables = {scene.name: _labelled_table(scene) for scene in dataset.scenes}
     summary = label_summary(tables, {scene.name: scene.split for scene in dataset.scenes})
     folder = dataset.root / "results"
-    markdown = label_markdown(summary, f"Labels of {dataset.name}")
-    for name, text in ((LABELS_CSV, summary.shares.to_csv(index=False)), (LABELS_MD, markdown)):
-        write_text(folder / name, text)
+    write_text(folder / LABELS_CSV, summary.shares.to_csv(index=False))
+    write_text(folder / LABELS_MD, label_markdown(summary, f"Labels of {dataset.name}"))
     save_figure(label_figure(summary), folder / LABELS_PNG)
 
-    params = {
-        "dataset": dataset.name,
-        "dataset_fingerprint": dataset.fingerprint(),
-        "scenes": " ".join(scene.name for scene in dataset.scenes),
-    }
+    params = {"dataset": dataset.name, "dataset_fingerprint": dataset.fingerprint(), "scenes": " ".join(tables)}
     metrics = {f"seconds_{name}": value for name, value in (seconds or {}).items()}
     for row in summary.shares[summary.shares["scene"] == ALL].to_dict("records"):
         prefix = "" if row["split"] == ALL else f"{row['split']}_"

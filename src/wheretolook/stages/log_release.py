@@ -12,18 +12,22 @@ from wheretolook.stages.inputs import Say
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.tracking import ui_command
 
-QUICK = ("top_n", "table_vs_others", "table_input_variants", "training", "calibration", "scores", "regret", "paths",
-         "runtimes")  # fmt: skip
+QUICK = (
+    "top_n",
+    "table_vs_others",
+    "table_input_variants",
+    "training",
+    "calibration",
+    "scores",
+    "regret",
+    "paths",
+    "runtimes",
+)
 """Figures and tables that need no scene, and so only seconds."""
 
 
 def log_release(experiment: Experiment, say: Say = print, attach: bool = True) -> Dataset:
-    """Log what a release holds as MLflow runs, as far as the store lacks them.
-
-    Args:
-        experiment: names the release and the store.
-        say: told what was logged.
-        attach: whether to attach figures and tables to new runs.
+    """Log what a release holds as MLflow runs, as far as the store lacks them, on request with figures and tables.
 
     Raises:
         ConfigError: the dataset is no release. TableError: there is none.

@@ -38,22 +38,13 @@ def make_maps(experiment: Experiment, say: Say = print, tick: Tick = lambda work
             from wheretolook.mapping.building import build_map
 
             with naming_scene(files.mesh):
-                report = build_map(
-                    scene.mesh,
-                    scene.renderer,
-                    scene.mesh_space,
-                    scene.camera,
-                    experiment.map,
-                    seed=seed,
-                    out_dir=files.map,
-                    workers=experiment.n_workers,
-                    raycaster=scene.raycaster,
-                    device=scene.device,
-                )
+                shown = (scene.mesh, scene.renderer, scene.mesh_space, scene.camera)
+                workers, device = experiment.n_workers, scene.device
+                report = build_map(*shown, experiment.map, seed, files.map, scene.raycaster, workers, device)
             write_stamp(files, "map", key)
+            found = f"{report.n_landmarks:,} landmarks from {report.n_registered} images"
             say(
-                f"{scene.name}: {report.n_landmarks:,} landmarks from {report.n_registered} images, median "
-                f"{report.median_distance_to_mesh_cm:.2f} cm from the mesh -> {files.map}"
+                f"{scene.name}: {found}, median {report.median_distance_to_mesh_cm:.2f} cm from the mesh -> {files.map}"
             )
         tick(1)
     return dataset

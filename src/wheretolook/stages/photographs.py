@@ -5,11 +5,11 @@ from __future__ import annotations
 import re
 import zlib
 from dataclasses import asdict, replace
+from pathlib import Path
 
 from wheretolook.config import Experiment
 from wheretolook.dataset.folders import Dataset, SceneFolder
 from wheretolook.dataset.stamps import is_done, read_stamp, stage_key, write_stamp
-from wheretolook.mapping.photograph_config import PhotographsConfig
 from wheretolook.mapping.scale import read_scale
 from wheretolook.stages.inputs import Say, Tick
 from wheretolook.utils.errors import ConfigError
@@ -28,7 +28,7 @@ def map_photograph_scene(experiment: Experiment, say: Say = print, tick: Tick = 
 
     settings, root = experiment.map.photographs, experiment.root
     assert settings.images is not None
-    scene = SceneFolder(root / _scene_name(settings), "test")
+    scene = SceneFolder(root / _scene_name(settings.images, settings.name), "test")
     dataset = _dataset_with(scene, experiment)
     files = [settings.images / name for name in list_photographs(settings.images)]
     tables = [path for path in (settings.scale.marker_table, settings.scale.positions) if path is not None]
@@ -43,14 +43,11 @@ def map_photograph_scene(experiment: Experiment, say: Say = print, tick: Tick = 
     if not is_done(scene, "map", key, scene.landmarks, scene.mapping_cameras):
         from wheretolook.mapping.photograph_map import map_photographs
 
-        device = experiment.warp_device
-        work = scene.folder / "photographs"
-        report = map_photographs(experiment.map, scene.map, work, seed, experiment.n_workers, device)
+        how = (scene.folder / "photographs", seed, experiment.n_workers, experiment.warp_device)
+        report = map_photographs(experiment.map, scene.map, *how)
         write_stamp(scene, "map", key)
-        say(
-            f"{scene.name}: {report.n_landmarks:,} landmarks from {report.n_registered} of {report.n_images} "
-            f"photographs -> {scene.map}"
-        )
+        used_images = f"{report.n_registered} of {report.n_images} photographs"
+        say(f"{scene.name}: {report.n_landmarks:,} landmarks from {used_images} -> {scene.map}")
         if report.unregistered:
             say(f"{scene.name}: not placed: {', '.join(report.unregistered)}")
     else:
@@ -63,33 +60,26 @@ def map_photograph_scene(experiment: Experiment, say: Say = print, tick: Tick = 
     return dataset
 
 
-def _scene_name(settings: PhotographsConfig) -> str:
-    assert settings.images is not None
-    name = settings.name or settings.images.resolve().name
+def _scene_name(images: Path, name: str) -> str:
+    name = name or images.resolve().name
     if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9._-]*", name) or name in ("weights", "results", "all"):
-        raise ConfigError(
-            "a scene's name becomes a folder's",
-            value=name,
-            fix="Set map.photographs.name, of letters, digits, '.', '_' and '-'.",
-        )
+        fix = "Set map.photographs.name, of letters, digits, '.', '_' and '-'."
+        raise ConfigError("a scene's name becomes a folder's", value=name, fix=fix)
     return name
 
 
 def _dataset_with(scene: SceneFolder, experiment: Experiment) -> Dataset:
     """The experiment's dataset with this scene, which may be there already."""
     root = experiment.root
-    others: tuple[SceneFolder, ...] = ()
+    scenes = [scene]
     if (root / "dataset.json").is_file():
         known = Dataset.load(root)
-        others = tuple(other for other in known.scenes if other.name != scene.name)
+        scenes += [other for other in known.scenes if other.name != scene.name]
         if not all(other.is_photographed for other in known.scenes):
-            raise ConfigError(
-                "this dataset holds scenes with meshes, which photographs do not join",
-                path=root,
-                value=[other.name for other in known.scenes],
-                fix="Give the photographs a dataset of their own: --name.",
-            )
+            problem = "this dataset holds scenes with meshes, which photographs do not join"
+            names, fix = [other.name for other in known.scenes], "Give the photographs a dataset of their own: --name."
+            raise ConfigError(problem, path=root, value=names, fix=fix)
         if known.camera != experiment.camera:
             for other in known.scenes:  # what was sampled with another camera is no longer valid
                 write_stamp(other, "map", read_stamp(other, "map") or "")
-    return Dataset(root, experiment.camera, tuple(sorted((*others, scene), key=lambda scene: scene.name)))
+    return Dataset(root, experiment.camera, tuple(sorted(scenes, key=lambda scene: scene.name)))

@@ -18,8 +18,7 @@ from wheretolook.utils.tracking import log, start_run
 from wheretolook.viewpoints.table import pose_columns
 
 if TYPE_CHECKING:
-    from wheretolook.planning.path_view import PathView
-    from wheretolook.planning.route_views import PlannedPath
+    from wheretolook.planning.route_views import PathView, PlannedPath
 
 
 def plan(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> PlannedPath:
@@ -54,22 +53,16 @@ def plan(experiment: Experiment, say: Say = print, tick: Tick = lambda work: Non
     written.insert(0, "path.csv")
     _log(experiment, dataset, scene.name, list(paths), path, [folder / name for name in written])
     score = "" if np.isnan(path.scores).any() else f", mean score {np.mean(path.scores):.2f}"
-    n_views = len(path.positions)
-    say(
-        f"{scene.name}: {path.length_m:.2f} m, {path.turn_deg:.0f} degrees of turning, {n_views} views{score} -> "
-        f"{folder}: {', '.join(written)}"
-    )
+    found = f"{path.length_m:.2f} m, {path.turn_deg:.0f} degrees of turning, {len(path.positions)} views{score}"
+    say(f"{scene.name}: {found} -> {folder}: {', '.join(written)}")
     tick(1)
     return path
 
 
-def _draw(
-    views: dict[str, list[PathView]],
-    landmarks: np.ndarray,
-    title: str,
-    folder: Path,
-    film: Literal["gif", "mp4", "none"],
-) -> list[str]:
+Film = Literal["gif", "mp4", "none"]
+
+
+def _draw(views: dict[str, list[PathView]], landmarks: np.ndarray, title: str, folder: Path, film: Film) -> list[str]:
     """Draw the last of several methods' paths, and all side by side. Returns the names of the files written."""
     from wheretolook.figures.path_film import film_frames, methods_figure, save_film, still_figure
     from wheretolook.figures.style import save_figure
@@ -90,15 +83,13 @@ def _log(
     experiment: Experiment, dataset: Dataset, scene: str, methods: list[str], path: PlannedPath, files: list[Path]
 ) -> None:
     config = experiment.plan
-    params = {
+    params: dict[str, object] = {
         "dataset": dataset.name,
         "scene": scene,
         "method": methods[-1],
         "methods": " ".join(methods),
-        "start": config.start,
-        "goal": config.goal,
-        "score_weight": config.planner.score_weight,
     }
+    params |= {"start": config.start, "goal": config.goal, "score_weight": config.planner.score_weight}
     metrics = {"length_m": path.length_m, "turn_deg": path.turn_deg, "score": float(path.scores.mean())}
     tags = {"dataset": dataset.name}
     with start_run(experiment.tracking, f"plan {scene}", "plan", params, tags=tags) as (client, run):

@@ -27,55 +27,42 @@ def release(experiment: Experiment, say: Say = print, tick: Tick = lambda work: 
     """
     from wheretolook.evaluation.results import SCORES_CSV, VARIANTS_CSV
     from wheretolook.learning.runs import keep_histories
+    from wheretolook.release import copy as releases
     from wheretolook.release.card import write_card
-    from wheretolook.release.copy import (
-        choose_weights_to_ship,
-        copy_dataset,
-        is_release,
-        ship_weights,
-        size_text,
-        sizes,
-        trained_weights,
-    )
 
     dataset = dataset_after(experiment, "label")
-    if not is_release(dataset):
-        copy = copy_dataset(dataset, experiment.data / experiment.release_name, release_settings(experiment))
+    if not releases.is_release(dataset):
+        copy = releases.copy_dataset(dataset, experiment.data / experiment.release_name, release_settings(experiment))
         for scene, source in zip(copy.scenes, dataset.scenes, strict=True):
             stamp = read_stamp(source, "label")
             assert stamp is not None  # `_dataset` has seen it
             write_stamp(scene, "label", stamp)
-        say(f"{len(copy.scenes)} scenes -> {copy.root}: {size_text(sizes(copy.root, weights=False))}")
+        say(f"{len(copy.scenes)} scenes -> {copy.root}: {releases.size_text(releases.sizes(copy.root, weights=False))}")
         say("next: train on it, then `wheretolook release` with its own configuration")
         return copy
     # on the CPU, as those who have no GPU will do it
     on_cpu = replace(experiment, device="cpu", evaluate=replace(experiment.evaluate, weights=()))
     results = dataset.root / "results"
-    if choose_weights_to_ship(dataset).shelved:  # all that were trained, before only the best are left
-        methods = tuple(method.name for method in trained_weights(dataset).values())
+    if releases.choose_weights_to_ship(dataset).shelved:  # all that were trained, before only the best are left
+        methods = tuple(method.name for method in releases.trained_weights(dataset).values())
         evaluate(replace(on_cpu, evaluate=replace(on_cpu.evaluate, methods=methods, reference="")), say)
         shutil.copyfile(results / SCORES_CSV, results / VARIANTS_CSV)
-    choice = ship_weights(dataset)
+    choice = releases.ship_weights(dataset)
     compared = ", ".join(f"{name} {value:.4f}" for name, value in choice.precision.items())
     say(f"validation average precision: {compared}")
     say(f"the paper's network that ships, in half precision: {choice.network}; the best of all: {choice.best}")
     keep_histories(dataset, experiment.tracking)
-    sizes(dataset.root)  # too large? then before the evaluation
+    releases.sizes(dataset.root)  # too large? then before the evaluation
     evaluate(on_cpu, say, tick)
     say(f"the card -> {write_card(dataset, release_settings(Experiment()))}")
-    say(size_text(sizes(dataset.root)))
+    say(releases.size_text(releases.sizes(dataset.root)))
     return dataset
 
 
 def release_settings(experiment: Experiment) -> dict[str, Any]:
     """Settings that decide what a dataset holds, as JSON values. Meshes go by name: paths mean nothing elsewhere."""
     meshes = [{"name": mesh.scene_name, "split": mesh.split, "up": mesh.up} for mesh in experiment.scenes.meshes]
-    settings = {
-        "camera": asdict(experiment.camera),
-        "scenes": {**asdict(experiment.scenes), "meshes": meshes},
-        "map": asdict(experiment.map),
-        "occlusion": asdict(experiment.occlusion),
-        "sample": asdict(experiment.sample),
-        "label": {"localizer": asdict(experiment.label.localizer)},
-    }
+    settings = {name: asdict(getattr(experiment, name)) for name in ("camera", "scenes", "map", "occlusion", "sample")}
+    settings["scenes"]["meshes"] = meshes
+    settings["label"] = {"localizer": asdict(experiment.label.localizer)}
     return dict(json.loads(json.dumps(settings, default=str)))

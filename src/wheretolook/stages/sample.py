@@ -55,17 +55,9 @@ def _sample(scene: Scene, config: SampleConfig, say: Say) -> None:
     files = scene.files
     with naming_scene(scene.source):
         grid, free = scene.free_voxels(config, scene.sampled_space)
-        table, occlusion = sample_viewpoints(
-            grid,
-            free,
-            scene.landmarks,
-            scene.camera,
-            scene.occlusion,
-            config,
-            scene.device,
-            progress=f"sample {scene.name}",
-            split=files.split,
-        )
+        seen = (scene.landmarks, scene.camera, scene.occlusion)
+        title = f"sample {scene.name}"
+        table, occlusion = sample_viewpoints(grid, free, *seen, config, scene.device, title, files.split)
     occlusion.save(files.occlusion)
     write_table(table, files.table)
     n_locations = table["location_id"].nunique()

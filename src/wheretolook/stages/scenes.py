@@ -30,8 +30,7 @@ def make_scenes(experiment: Experiment, say: Say = print, tick: Tick = lambda wo
     splits = [split for split, number in numbers.items() for _ in range(number)]
     sources: dict[SceneFolder, Callable[[], TexturedMesh]] = {}
     keys: dict[SceneFolder, list[Any]] = {}
-    for index, split in enumerate(splits):
-        seed = config.seed + index
+    for seed, split in enumerate(splits, config.seed):
         scene = SceneFolder(root / f"apartment-{seed:03d}", split)
         sources[scene] = partial(_generate, experiment, seed)
         keys[scene] = [config.apartment.key(), seed]
@@ -44,7 +43,9 @@ def make_scenes(experiment: Experiment, say: Say = print, tick: Tick = lambda wo
 
     for scene, make in sources.items():
         key = stage_key("scenes", keys[scene])
-        if not is_done(scene, "scenes", key, scene.mesh):
+        if is_done(scene, "scenes", key, scene.mesh):
+            say(f"{scene.name}: reusing {scene.mesh}")
+        else:
             from wheretolook.scenes.loading import save_glb
 
             mesh = make()
@@ -52,8 +53,6 @@ def make_scenes(experiment: Experiment, say: Say = print, tick: Tick = lambda wo
             save_glb(mesh, scene.mesh)
             write_stamp(scene, "scenes", key)
             say(f"{scene.name}: {len(mesh.triangles):,} triangles -> {scene.mesh}")
-        else:
-            say(f"{scene.name}: reusing {scene.mesh}")
         tick(1)
     dataset = Dataset(root, experiment.camera, tuple(sources))
     if (root / "dataset.json").is_file() and Dataset.load(root).camera != experiment.camera:

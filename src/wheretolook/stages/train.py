@@ -43,20 +43,10 @@ def train_methods(
     progress: bool = True,
     force: bool = False,
 ) -> list[TrainedModel]:
-    """Train methods.
+    """Train methods on labelled train scenes, and val scenes if there are any: one MLflow run and model for each.
 
     Writes `<dataset>/weights/<method>.safetensors` and, beside it, a JSON file that tells what it was trained on. A
-    method already trained with the same options on the same train and val scenes is not trained again.
-
-    Args:
-        dataset: labelled train scenes, and val scenes if it has any.
-        config: options.
-        tracking: where to log; one MLflow run a method.
-        progress: show progress bars.
-        force: train even if there is nothing new.
-
-    Returns:
-        One model a method, in the order of `config.methods`.
+    method already trained with the same options on the same train and val scenes is not trained again, unless forced.
 
     Raises:
         TableError: no train scene, no labels, or labels of one class only; or a dataset of `config.also` is missing.
@@ -79,15 +69,9 @@ def train_methods(
 
 
 def _train(
-    method: Method,
-    dataset: Dataset,
-    config: TrainConfig,
-    path: Path,
-    about: dict[str, Any],
-    tracking: TrackingConfig,
-    progress: bool,
-    kept: dict[str, Any],
-) -> TrainedModel:
+    method: Method, dataset: Dataset, config: TrainConfig, path: Path, about: dict[str, Any], tracking: TrackingConfig,
+    progress: bool, kept: dict[str, Any],
+) -> TrainedModel:  # fmt: skip
     from lightning.pytorch import seed_everything
     from lightning.pytorch.utilities.seed import isolate_rng
 

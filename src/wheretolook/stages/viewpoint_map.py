@@ -15,10 +15,7 @@ if TYPE_CHECKING:
 def viewpoint_map(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> dict[str, ViewpointMap]:
     """For planners: every direction scored at every free voxel of a scene, `<scene>/viewpoint-map/`.
 
-    Needs the map stage only. It is built anew each time.
-
-    Returns:
-        The viewpoint map of each scene asked for, by the scene's name.
+    Needs the map stage only. It is built anew each time. Returns those of the scenes asked for, by the scene's name.
 
     Raises:
         ConfigError: no such scene or method, or the method needs weights. WeightsError: the weights cannot be used.
@@ -39,10 +36,7 @@ def viewpoint_map(experiment: Experiment, say: Say = print, tick: Tick = lambda 
         views.save(folder)
         built[scene.name] = views
         n_rows, n_directions = views.scores.shape
-        scorer = views.origin.scorer
-        say(
-            f"{scene.name}: {n_directions} directions at {n_rows} free voxels of {len(views.grid)}, scored by {scorer} "
-            f"-> {folder}"
-        )
+        scored = f"{n_directions} directions at {n_rows} free voxels of {len(views.grid)}"
+        say(f"{scene.name}: {scored}, scored by {views.origin.scorer} -> {folder}")
         tick(1)
     return built

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -24,11 +24,7 @@ if TYPE_CHECKING:
 
 
 def free_locations(grid: VoxelGrid, free_space: FreeSpace | MappedSpace) -> NDArray[np.int64]:
-    """Ids of the grid's locations in free space, ascending.
-
-    Raises:
-        SceneError: there is none.
-    """
+    """Ids of the grid's locations in free space, ascending. Raises SceneError if there is none."""
     ids = np.flatnonzero(free_space.is_free(grid.centers()))
     if len(ids) == 0:
         problem = f"none of the {len(grid)} locations is in free space"
@@ -48,21 +44,11 @@ def sample_viewpoints(
     progress: str | None = None,
     split: Split = "train",
 ) -> tuple[pd.DataFrame, StoredOcclusion]:
-    """Choose viewpoints by how many landmarks they see.
+    """Choose viewpoints by how many landmarks they see, at locations (L,) of the grid, the centres of its voxels.
 
     At every location all directions of the lattice are ranked by the number of landmarks in view (descending, then by
-    direction id), and the best K are kept.
-
-    Args:
-        grid: voxel grid; a location is the centre of a voxel.
-        location_ids: ids of the locations to use, (L,).
-        landmarks: of the map.
-        camera: intrinsics of the viewpoints.
-        occlusion: which landmarks have a free line of sight.
-        config: see `SampleConfig`.
-        device: where landmarks in view are counted.
-        progress: text of a progress bar; None shows none.
-        split: of the scene, for options that differ by split.
+    direction id), and the best K are kept. Some options differ by the scene's split. The progress bar has a text; None
+    shows none.
 
     Returns:
         The table of viewpoints, unlabelled, in the order of their ids (location id times the number of directions, plus
@@ -77,19 +63,10 @@ def sample_viewpoints(
     ids = np.sort(_subset(np.asarray(location_ids, dtype=np.int64), config.max_locations, rng))
     locations = grid.centers()[ids]
     directions = config.axes()
-    rotations, memory_bytes = rotation_looking_along(directions), round(config.memory_gb * 1e9)
-    seen = survey(
-        camera,
-        rotations,
-        locations,
-        landmarks.points,
-        occlusion,
-        keep=config.keep,
-        progress=progress,
-        distinct_pixels=config.distinct_pixels,
-        device=device,
-        memory_bytes=memory_bytes,
-    )
+    options: dict[str, Any] = {"keep": config.keep, "distinct_pixels": config.distinct_pixels, "progress": progress}
+    options |= {"device": device, "memory_bytes": round(config.memory_gb * 1e9)}
+    rotations = rotation_looking_along(directions)
+    seen = survey(camera, rotations, locations, landmarks.points, occlusion, **options)
     counts, rank = seen.counts, np.full(seen.counts.shape, -1)
     np.put_along_axis(rank, seen.best, np.arange(seen.best.shape[1])[None], axis=1)
 
@@ -103,19 +80,18 @@ def sample_viewpoints(
         n_landmarks, fix = len(landmarks.points), "Lower sample.min_visible, or map the scene with more images."
         problem = f"from no location does a viewpoint see {config.min_visible} of the {n_landmarks} landmarks"
         raise SceneError(problem, value=int(counts.max(initial=0)), fix=fix)
-    table = pd.DataFrame(
-        {
-            "viewpoint_id": ids[row_index] * len(directions) + direction,
-            "location_id": ids[row_index],
-            "direction_id": direction,
-            **pose_columns(poses_looking_along(locations[row_index], directions[direction])),
-            "n_visible": counts[row_index, direction],
-            "visibility_rank": rank[row_index, direction],
-        }
-    )
-    unlabelled = table.assign(status=UNLABELLED, error_m=np.float32(np.nan), error_deg=np.float32(np.nan), n_inliers=0)
+    columns = {
+        "viewpoint_id": ids[row_index] * len(directions) + direction,
+        "location_id": ids[row_index],
+        "direction_id": direction,
+        **pose_columns(poses_looking_along(locations[row_index], directions[direction])),
+        "n_visible": counts[row_index, direction],
+        "visibility_rank": rank[row_index, direction],
+    }
+    nan = np.float32(np.nan)
     assert seen.occlusion is not None
-    return unlabelled, seen.occlusion
+    table = pd.DataFrame(columns).assign(status=UNLABELLED, error_m=nan, error_deg=nan, n_inliers=0)
+    return table, seen.occlusion
 
 
 def _subset(values: NDArray[np.int64], at_most: int, rng: np.random.Generator) -> NDArray[np.int64]:

@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from wheretolook.geometry.poses import Float, camera_centers, quaternion_from_rotation, rotation_from_quaternion
 from wheretolook.utils.errors import TableError
@@ -20,20 +21,11 @@ from wheretolook.utils.errors import TableError
 POSE_COLUMNS = ("qw", "qx", "qy", "qz", "tx", "ty", "tz")
 CENTER_COLUMNS = ("x_m", "y_m", "z_m")
 
-SCHEMA = pa.schema(
-    [
-        ("viewpoint_id", pa.int64()),
-        ("location_id", pa.int32()),
-        ("direction_id", pa.int32()),
-        *[(name, pa.float64()) for name in POSE_COLUMNS],
-        ("n_visible", pa.int32()),
-        ("visibility_rank", pa.int32()),
-        ("status", pa.string()),
-        ("error_m", pa.float32()),
-        ("error_deg", pa.float32()),
-        ("n_inliers", pa.int32()),
-    ]
-)
+_COLUMNS = {"viewpoint_id": pa.int64(), "location_id": pa.int32(), "direction_id": pa.int32()}
+_COLUMNS |= dict.fromkeys(POSE_COLUMNS, pa.float64())
+_COLUMNS |= {"n_visible": pa.int32(), "visibility_rank": pa.int32(), "status": pa.string()}
+_COLUMNS |= {"error_m": pa.float32(), "error_deg": pa.float32(), "n_inliers": pa.int32()}
+SCHEMA = pa.schema(_COLUMNS)
 """Columns of `viewpoints.parquet`. The pose is cam_from_world (quaternion wxyz, translation in metres), rank 0 is the
 direction that sees most landmarks at its location. Until a viewpoint is labelled its status is "unlabelled"; afterwards
 it is "localized", "too_few_matches" or "no_pose". Errors are those of the pose that RANSAC found, even if it has too
@@ -74,16 +66,24 @@ def pose_columns(cam_from_world: Float) -> dict[str, Float]:
 
 
 def is_good(table: pd.DataFrame, max_error_m: float = 0.05, max_error_deg: float = 0.4) -> np.ndarray:
-    """Labels (B,): True if a viewpoint was localized with both errors below their limits.
-
-    Raises:
-        TableError: a row has no label yet.
-    """
+    """Labels (B,): True if localized with both errors below their limits. Raises TableError if one has no label yet."""
     unlabelled = int((table["status"] == UNLABELLED).sum())
     if unlabelled:
         raise TableError("viewpoints without labels", value=unlabelled, fix="Run the label stage (it resumes).")
     good = (table["status"] == LOCALIZED) & (table["error_m"] < max_error_m) & (table["error_deg"] < max_error_deg)
     return good.to_numpy()
+
+
+def shares_good(table: pd.DataFrame) -> tuple[NDArray[np.int64], Float]:
+    """Ids (L,) of a table's locations, ascending, and the share of each one's viewpoints that localize, (L,)."""
+    ids, rows = np.unique(table["location_id"].to_numpy(np.int64), return_inverse=True)
+    return ids, np.bincount(rows, weights=is_good(table)) / np.bincount(rows)
+
+
+def instructive_location(table: pd.DataFrame) -> int:
+    """The first location whose share of viewpoints that localize is nearest to 0.5: where to look matters there."""
+    ids, shares = shares_good(table)
+    return int(ids[np.argmin(np.abs(shares - 0.5))])
 
 
 def outcome_in_words(label: pd.Series) -> str:
@@ -108,12 +108,10 @@ def outcome_in_brief(label: pd.Series) -> str:
 
 
 def write_table(table: pd.DataFrame, path: Path, compact: bool = False) -> None:
-    """Write a table atomically as zstd Parquet with checksums. The same rows give the same bytes.
+    """Write a table atomically as zstd Parquet with checksums; the same rows give the same bytes.
 
-    Args:
-        table: viewpoints, see `SCHEMA`; both columns of `MATCH_FIELDS` are written too if they are there.
-        path: file to write; its folder is made when needed.
-        compact: write `COMPACT_SCHEMA`, about 18 bytes a row. Read back, poses agree to 1e-12 and all else exactly.
+    Columns are those of `SCHEMA`, and of `MATCH_FIELDS` if both are there. A compact table has `COMPACT_SCHEMA`, about
+    18 bytes a row; read back, its poses agree to 1e-12 and all else exactly.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".partial")

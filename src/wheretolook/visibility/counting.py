@@ -8,20 +8,12 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.geometry.colmap_camera import Camera, ColmapCamera
+from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import Float
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.warp import start_warp
 from wheretolook.visibility import counting_kernel, pixel_kernel
-from wheretolook.visibility.counting_kernel import (
-    SortedLandmarks,
-    cell_kernel,
-    count_field_kernel,
-    count_kernel,
-    sort_kernel,
-)
-from wheretolook.visibility.field_of_view import FieldOfView
+from wheretolook.visibility.field_of_view import tabulate
 from wheretolook.visibility.frustum import (
     MIN_DEPTH_M,
     frustum_sides,
@@ -32,7 +24,6 @@ from wheretolook.visibility.frustum import (
     rotate,
     sides_rounding,
 )
-from wheretolook.visibility.pixel_kernel import count_pixels_kernel
 from wheretolook.visibility.sphere_cells import SphereCells, choose_size
 
 GPU_LANES = 16  # threads that share a location and an orientation on a GPU
@@ -54,8 +45,7 @@ class FrustumCounter:
         distinct_pixels: count the pixels that some landmark falls on instead of the landmarks, as the released code
             does. With a COLMAP camera this is done in NumPy, thousands of times slower.
         size: cells along a side of the sphere's map, instead of what suits `n_points`.
-        scratch_bytes: memory for the bitmaps of distinct pixels, or for lists of landmarks that a COLMAP camera must be
-            asked about.
+        scratch_bytes: for bitmaps of distinct pixels, or for lists of landmarks to ask a COLMAP camera about.
 
     Raises:
         ConfigError: no such device, a size that is not even, or rotations that are not finite or of another shape.
@@ -82,7 +72,7 @@ class FrustumCounter:
             wp.load_module(module, device=self.device)  # only one thread may do that
         self.lanes = GPU_LANES if wp.get_device(self.device).is_cuda else 1
         on_host = isinstance(camera, ColmapCamera) and distinct_pixels
-        self._field = FieldOfView.of(camera) if isinstance(camera, ColmapCamera) and not on_host else None
+        self._field = tabulate(camera) if isinstance(camera, ColmapCamera) and not on_host else None
         self.size = size or choose_size(n_points)
         if not on_host:
             self.cells = SphereCells.of(camera, rotations, self.size, self.device)
@@ -100,11 +90,6 @@ class FrustumCounter:
         """Memory in bytes that `count` and the ranking of its result take for each location."""
         return n_points * (8 + 12) + (self.size**2 + 1) * 8 + len(self.rotations) * (4 + 4 + 8 + 8)
 
-    def serves(self, camera: Camera, rotations: Float, distinct_pixels: bool, device: str) -> bool:
-        """Whether this counter was made for a camera, rotations (D, 3, 3), a rule and a device."""
-        same = (camera, distinct_pixels, device) == (self.camera, self.distinct_pixels, self.device)
-        return same and np.array_equal(np.asarray(rotations, dtype=np.float32), self.rotations)
-
     @property
     def fixed_bytes(self) -> int:
         """Memory in bytes that `count` takes for any number of locations."""
@@ -115,15 +100,10 @@ class FrustumCounter:
         return int(np.iinfo(np.int32).max // max(n_points, self.size**2 + 1)) - 1
 
     def count(self, locations: ArrayLike, points: Any, unoccluded: Any | None = None) -> Any:
-        """Count from camera centres (L, 3) in the world, metres.
+        """Counts (L, D), int32, from camera centres (L, 3) in the world, metres.
 
-        Args:
-            locations: (L, 3) metres.
-            points: (N,) landmarks, a Warp array of vec3d on the device.
-            unoccluded: (L, N) Warp array of bool on the device; None if every line of sight is free.
-
-        Returns:
-            (L, D) counts, a Warp array of int32 on the device.
+        Counts, landmarks (N,) of vec3d and mask (L, N) of bool are Warp arrays on the device; without a mask all lines
+        of sight are free.
 
         Raises:
             ConfigError: there are more than `max_locations`; `survey` divides them into blocks.
@@ -142,12 +122,13 @@ class FrustumCounter:
         numbers: Any = wp.zeros(len(at) * n_cells + 1, dtype=wp.int32, device=device)
         mask = wp.empty((0, 0), dtype=wp.bool, device=device) if unoccluded is None else unoccluded
         inputs = [centers, points, unoccluded is not None, mask, self.size, self._near]
-        wp.launch(cell_kernel, shape, inputs, [places, numbers], device=device)
+        wp.launch(counting_kernel.cell_kernel, shape, inputs, [places, numbers], device=device)
         starts: Any = wp.empty_like(numbers)
         wp.utils.array_scan(numbers, starts, inclusive=False)
         offsets: Any = wp.empty(max(1, shape[0] * shape[1]), dtype=wp.vec3, device=device)
-        wp.launch(sort_kernel, shape, [centers, points, places, starts, self.size], [offsets], device=device)
-        landmarks: Any = SortedLandmarks()
+        inputs = [centers, points, places, starts, self.size]
+        wp.launch(counting_kernel.sort_kernel, shape, inputs, [offsets], device=device)
+        landmarks: Any = counting_kernel.SortedLandmarks()
         landmarks.size, landmarks.starts, landmarks.offsets = self.size, starts, offsets
         landmarks.inside_starts, landmarks.inside = self.cells.inside.starts, self.cells.inside.cells
         landmarks.border_starts, landmarks.border = self.cells.border.starts, self.cells.border.cells
@@ -156,7 +137,7 @@ class FrustumCounter:
         if self.distinct_pixels:
             return self._count_pixels(landmarks, counts)
         inputs = [self._sides, landmarks, self._rounding, wp.float64(MIN_DEPTH_M), self.lanes]
-        wp.launch(count_kernel, (*counts.shape, self.lanes), inputs, [counts], device=device)
+        wp.launch(counting_kernel.count_kernel, (*counts.shape, self.lanes), inputs, [counts], device=device)
         return counts
 
     def _count_pixels(self, landmarks: Any, counts: Any) -> Any:
@@ -170,7 +151,8 @@ class FrustumCounter:
         for first in range(0, n_views, block):
             bits.zero_()
             shape = (min(block, n_views - first), self.lanes)
-            wp.launch(count_pixels_kernel, shape, [*inputs, first, self.lanes], [bits, counts], device=self.device)
+            views = [*inputs, first, self.lanes]
+            wp.launch(pixel_kernel.count_pixels_kernel, shape, views, [bits, counts], device=self.device)
         return counts
 
     def _count_by_field(self, landmarks: Any, counts: Any) -> Any:
@@ -185,7 +167,7 @@ class FrustumCounter:
             block = min(block, n_views - first)
             number.zero_()
             inputs, outputs = [*shared, first, self.lanes], [counts, number, pairs, unsure]
-            wp.launch(count_field_kernel, (block, self.lanes), inputs, outputs, device=device)
+            wp.launch(counting_kernel.count_field_kernel, (block, self.lanes), inputs, outputs, device=device)
             n = int(number.numpy()[0])
             if n <= capacity:
                 self._ask_camera(pairs[:n].numpy(), unsure[:n].numpy(), counts)
@@ -218,10 +200,7 @@ def count_plain(
     unoccluded: NDArray[np.bool_],
     distinct_pixels: bool = False,
 ) -> NDArray[np.int32]:
-    """What `FrustumCounter.count` computes, (L, D), in NumPy: every landmark against every orientation.
-
-    Takes rotations (D, 3, 3), locations (L, 3) and points (N, 3) in metres, and a mask (L, N).
-    """
+    """What `FrustumCounter.count` computes, (L, D), in NumPy: every landmark (N, 3) against every orientation."""
     rotations, points = np.asarray(rotations), np.asarray(points)
     counts = np.zeros((len(unoccluded), len(rotations)), dtype=np.int32)
     for row, location in enumerate(np.asarray(locations)):

@@ -1,4 +1,9 @@
-"""The field of view of a camera of any model, tabulated over the sphere of directions."""
+"""The field of view of a camera of any model, tabulated over the sphere of directions.
+
+The table is the sphere's octahedral map (Praun and Hoppe, "Spherical parametrization and remeshing", 2003): the
+octahedron |x| + |y| + |z| = 1 is unfolded onto the square [-1, 1]^2, which is cut into size x size square cells.
+`cell_of` in `counting_kernel` finds the cell of a direction.
+"""
 
 from __future__ import annotations
 
@@ -6,12 +11,11 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from wheretolook.geometry.colmap_camera import ColmapCamera
+from wheretolook.geometry.camera import ColmapCamera
 from wheretolook.geometry.poses import Float
-from wheretolook.visibility.octahedral_map import cell_centers, cells_of
 
 TABLE_SIZE = 1024  # cells along a side of the table: 0.06 to 0.19 degrees from a cell's centre to its farthest corner
 MAX_DEPTH_RAD = 0.25  # deeper than this is not told apart: cells of the sphere that need more are small in number
@@ -34,14 +38,10 @@ class FieldOfView:
     # of the field of view; negative: likewise out of view; zero: the border may pass through the cell.
     depth_rad: NDArray[np.float32]
 
-    @classmethod
-    def of(cls, camera: ColmapCamera, size: int = TABLE_SIZE) -> FieldOfView:
-        """Tabulate a camera, which takes about a second. The four latest tables are kept."""
-        return _tabulate(camera, size)
-
 
 @lru_cache(maxsize=4)
-def _tabulate(camera: ColmapCamera, size: int) -> FieldOfView:
+def tabulate(camera: ColmapCamera, size: int = TABLE_SIZE) -> FieldOfView:
+    """The table of a camera, which takes about a second. The four latest are kept."""
     centers, radii = cell_centers(size)
     grid = np.arange(size * size).reshape(size, size)
     # The map's edge folds onto itself, mirrored: beyond (row, size - 1) lies (size - 1 - row, size - 1).
@@ -74,10 +74,7 @@ def _tabulate(camera: ColmapCamera, size: int) -> FieldOfView:
 
 
 def _rays_of_image(camera: ColmapCamera) -> tuple[Float, NDArray[np.bool_]]:
-    """Unit rays (n, 3) of pixels on a grid over the image and along its edge, and which are on the edge, (n,).
-
-    Only pixels whose rays the camera sees.
-    """
+    """Unit rays (n, 3) that the camera sees through a grid of pixels and the image's edge, and which lie on it."""
     side = np.linspace(1e-9, 1 - 1e-9, EDGE_SAMPLES)
     coarse = side[:: EDGE_SAMPLES // GRID_SAMPLES]
     x, y = (part.ravel() for part in np.meshgrid(coarse, coarse))
@@ -98,3 +95,36 @@ def _border_between(camera: ColmapCamera, seen: Float, unseen: Float) -> Float:
         is_seen = camera.sees(middle)[:, None]
         seen, unseen = np.where(is_seen, middle, seen), np.where(is_seen, unseen, middle)
     return seen
+
+
+def octahedral_directions(u: ArrayLike, v: ArrayLike) -> Float:
+    """Directions (..., 3) with |x| + |y| + |z| = 1 of points (u, v) of the octahedral map, each in [-1, 1]."""
+    u, v = np.broadcast_arrays(np.asarray(u, dtype=np.float64), np.asarray(v, dtype=np.float64))
+    z = 1 - np.abs(u) - np.abs(v)
+    sign_u, sign_v = np.where(u >= 0, 1.0, -1.0), np.where(v >= 0, 1.0, -1.0)
+    x = np.where(z >= 0, u, (1 - np.abs(v)) * sign_u)
+    y = np.where(z >= 0, v, (1 - np.abs(u)) * sign_v)
+    return np.stack([x, y, z], axis=-1)
+
+
+def cell_centers(size: int) -> tuple[Float, Float]:
+    """Unit directions (size * size, 3) of the cells' centres, row by row, and the angle (size * size,) in radians from
+    each to the farthest corner of its cell."""
+    middle, edge = (np.arange(size) + 0.5) / size * 2 - 1, np.arange(size + 1) / size * 2 - 1
+    centers = octahedral_directions(middle[None, :], middle[:, None])
+    corners = octahedral_directions(edge[None, :], edge[:, None])
+    centers /= np.linalg.norm(centers, axis=-1, keepdims=True)
+    corners /= np.linalg.norm(corners, axis=-1, keepdims=True)
+    chords = [np.linalg.norm(centers - corners[i : i + size, j : j + size], axis=-1) for i in (0, 1) for j in (0, 1)]
+    return np.asarray(centers.reshape(-1, 3)), 2 * np.arcsin(np.max(chords, axis=0) / 2).reshape(-1)
+
+
+def cells_of(directions: ArrayLike, size: int) -> NDArray[np.int64]:
+    """Cells (...) of directions (..., 3) of any length but zero: what `cell_of` in the kernels computes, in NumPy."""
+    at = np.asarray(directions, dtype=np.float64)
+    x, y, z = np.moveaxis(at / np.abs(at).sum(-1, keepdims=True), -1, 0)
+    sign_x, sign_y = np.where(x >= 0, 1.0, -1.0), np.where(y >= 0, 1.0, -1.0)
+    u = np.where(z >= 0, x, (1 - np.abs(y)) * sign_x)
+    v = np.where(z >= 0, y, (1 - np.abs(x)) * sign_y)
+    column, row = (np.clip(((part + 1) / 2 * size).astype(np.int64), 0, size - 1) for part in (u, v))
+    return row * size + column

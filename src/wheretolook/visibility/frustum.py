@@ -10,14 +10,13 @@ Rounding the normals moves the border of the view by less than 1e-4 pixels.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.geometry.colmap_camera import Camera, ColmapCamera
+from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import Float, split_poses
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.warp import start_warp
@@ -39,7 +38,6 @@ class LandmarkSets:
         return len(self.starts) - 1
 
     def __getitem__(self, row: int) -> NDArray[np.int32]:
-        """Landmark rows of one set."""
         return self.indices[self.starts[row] : self.starts[row + 1]]
 
     @classmethod
@@ -59,6 +57,16 @@ def _starts(lengths: NDArray[np.integer[Any]]) -> NDArray[np.int32]:
     if len(ends) and ends[-1] > np.iinfo(np.int32).max:
         raise ConfigError("too many landmarks for one call", value=int(ends[-1]), fix="Ask for fewer views at once.")
     return np.concatenate([[0], ends]).astype(np.int32)
+
+
+class PosedViews(NamedTuple):
+    """B views of landmarks, whose locations are looked up among L, so that views share what is unoccluded there."""
+
+    camera: Camera
+    cam_from_world: Float  # (B, 3, 4)
+    points: Float  # (N, 3) landmarks in metres
+    unoccluded: LandmarkSets  # landmarks that each of L locations has a free line of sight to
+    location_rows: NDArray[np.integer[Any]]  # (B,) row of each view's location in `unoccluded`
 
 
 def frustum_sides(camera: PinholeCamera, rotations: ArrayLike) -> NDArray[np.float32]:
@@ -93,15 +101,9 @@ def offsets_from(location: ArrayLike, points: ArrayLike) -> NDArray[np.float32]:
 
 
 def in_view(camera: Camera, rotations: ArrayLike, offsets: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Which offsets each orientation of a camera sees: the definition, in NumPy.
+    """Which offsets (N, 3) m from the centre, in the world, rotations (D, 3, 3) cam_from_world of a camera see; (D, N).
 
-    Args:
-        camera: pinhole, or any COLMAP model.
-        rotations: (D, 3, 3) cam_from_world.
-        offsets: (N, 3) from the camera centre, in the world, metres.
-
-    Returns:
-        (D, N); offsets that are not finite are never seen.
+    This is the definition, in NumPy. Offsets that are not finite are never seen.
     """
     with np.errstate(invalid="ignore"):
         if isinstance(camera, ColmapCamera):
@@ -134,34 +136,15 @@ def pixels_of(camera: Camera, points_cam: Float) -> Float:
     return camera.focal_px * (points_cam[..., :2] / points_cam[..., 2:]) + (camera.cx, camera.cy)
 
 
-def landmarks_in_view(
-    camera: Camera,
-    cam_from_world: Float,
-    points: Float,
-    unoccluded: LandmarkSets,
-    location_rows: NDArray[np.integer[Any]],
-    device: str = "cpu",
-) -> LandmarkSets:
-    """The landmarks each view sees (paper, Sec. 3.2).
-
-    Args:
-        camera: pinhole, or any COLMAP model (in NumPy on the CPU).
-        cam_from_world: (B, 3, 4).
-        points: (N, 3) landmarks in metres.
-        unoccluded: landmarks each of L locations has a free line of sight to.
-        location_rows: (B,) row of each view's location in `unoccluded`.
-        device: "cpu" or a CUDA device; one thread a view.
-
-    Returns:
-        B sets of landmark rows, ascending.
+def landmarks_in_view(views: PosedViews, device: str = "cpu") -> LandmarkSets:
+    """The landmarks each of B views sees (paper, Sec. 3.2): B sets. COLMAP's cameras are computed in NumPy on the CPU.
 
     Raises:
         ConfigError: there are more entries than an int32 counts; ask for fewer views.
     """
-    if isinstance(camera, ColmapCamera):
-        return landmarks_in_view_plain(camera, cam_from_world, points, unoccluded, location_rows)
-    there = points_on_device(points, device)
-    starts, indices = in_view_on_device(camera, cam_from_world, there, unoccluded, location_rows, device)
+    if isinstance(views.camera, ColmapCamera):
+        return landmarks_in_view_plain(views)
+    starts, indices = in_view_on_device(views, points_on_device(views.points, device), device)
     return LandmarkSets(starts, indices.numpy())
 
 
@@ -175,40 +158,27 @@ def sets_on_device(sets: LandmarkSets, device: str) -> tuple[Any, Any]:
     return wp.array(sets.starts, dtype=wp.int32, device=device), wp.array(sets.indices, dtype=wp.int32, device=device)
 
 
-def views_on_device(
-    camera: PinholeCamera,
-    cam_from_world: Float,
-    points: Any,
-    unoccluded: tuple[Any, Any],
-    location_rows: NDArray[np.integer[Any]],
-    device: str,
-) -> Any:
-    """`Views` as the kernels take them, of poses (B, 3, 4); points and sets are already on the device."""
-    rotations, centers = split_poses(cam_from_world)
-    views: Any = Views()
-    views.sides = wp.array(frustum_sides(camera, rotations), dtype=wp.vec3, device=device)
-    views.centers = wp.array(centers, dtype=wp.vec3d, device=device)
-    views.location_rows = wp.array(np.asarray(location_rows, dtype=np.int32), dtype=wp.int32, device=device)
-    views.points, views.min_depth = points, MIN_DEPTH_M
-    views.starts, views.unoccluded = unoccluded
-    return views
+def views_on_device(views: PosedViews, rows: slice, points: Any, unoccluded: tuple[Any, Any], device: str) -> Any:
+    """`Views` as the kernels take them, of some of the views; points and sets are already on the device."""
+    assert isinstance(views.camera, PinholeCamera)
+    rotations, centers = split_poses(views.cam_from_world[rows])
+    there: Any = Views()
+    there.sides = wp.array(frustum_sides(views.camera, rotations), dtype=wp.vec3, device=device)
+    there.centers = wp.array(centers, dtype=wp.vec3d, device=device)
+    location_rows = np.asarray(views.location_rows[rows], dtype=np.int32)
+    there.location_rows = wp.array(location_rows, dtype=wp.int32, device=device)
+    there.points, there.min_depth = points, MIN_DEPTH_M
+    there.starts, there.unoccluded = unoccluded
+    return there
 
 
-def in_view_on_device(
-    camera: PinholeCamera,
-    cam_from_world: Float,
-    points: Any,
-    unoccluded: LandmarkSets,
-    location_rows: NDArray[np.integer[Any]],
-    device: str = "cpu",
-) -> tuple[NDArray[np.int32], Any]:
+def in_view_on_device(posed: PosedViews, points: Any, device: str = "cpu") -> tuple[NDArray[np.int32], Any]:
     """What `landmarks_in_view` gives for a pinhole: the starts (B + 1,), and the indices as a Warp array of int32.
 
     The points are those of `points_on_device`.
     """
-    device = start_warp(device)
-    rows = np.asarray(location_rows)
-    views = views_on_device(camera, cam_from_world, points, sets_on_device(unoccluded, device), rows, device)
+    device, rows, unoccluded = start_warp(device), posed.location_rows, posed.unoccluded
+    views = views_on_device(posed, slice(None), points, sets_on_device(unoccluded, device), device)
     lengths: Any = wp.empty(len(rows), dtype=wp.int32, device=device)
     # A single view is collected at once, with room for all its candidates; several are counted first.
     once = len(rows) == 1
@@ -224,17 +194,12 @@ def in_view_on_device(
     return starts, indices
 
 
-def landmarks_in_view_plain(
-    camera: Camera,
-    cam_from_world: Float,
-    points: Float,
-    unoccluded: LandmarkSets,
-    location_rows: NDArray[np.integer[Any]],
-) -> LandmarkSets:
+def landmarks_in_view_plain(views: PosedViews) -> LandmarkSets:
     """What `landmarks_in_view` computes, in NumPy."""
     sets = []
-    for rotation, center, row in zip(*split_poses(cam_from_world), location_rows, strict=True):
-        candidates = unoccluded[row]
-        sets.append(candidates[in_view(camera, rotation[None], offsets_from(center, points[candidates]))[0]])
+    for rotation, center, row in zip(*split_poses(views.cam_from_world), views.location_rows, strict=True):
+        candidates = views.unoccluded[row]
+        offsets = offsets_from(center, views.points[candidates])
+        sets.append(candidates[in_view(views.camera, rotation[None], offsets)[0]])
     lengths = np.array([len(rows) for rows in sets], dtype=np.int64)
     return LandmarkSets(_starts(lengths), np.concatenate([np.empty(0, np.int32), *sets]))

@@ -14,9 +14,7 @@ from wheretolook.utils.errors import ConfigError, MapError, SceneError
 from wheretolook.visibility.config import DEFAULT_RADIUS
 from wheretolook.visibility.occlusion import OcclusionModel
 
-TOUCHING_M = 1e-6
-"""A landmark this close to a location is in the same place, and has no direction as seen from it."""
-
+TOUCHING_M = 1e-6  # a landmark this close to a location is in the same place, and has no direction as seen from it
 _FLAT = 1e-12  # least mean square of the directions along an axis; below it, all lie in the plane across that axis
 _NO_LENGTH = 1e-12  # keeps facets through the origin, which no direction leaves by, from dividing by zero
 
@@ -60,10 +58,7 @@ class HiddenPointRemoval(OcclusionModel):
         self.radius, self.margin_m, self.threads = float(radius), float(margin_m), threads
 
     def unoccluded(self, locations: Float, points: Float) -> NDArray[np.bool_]:
-        """(L, N), True where no surface that the landmarks suggest stands between location and landmark.
-
-        Landmarks in exactly the same place get the same answer. Raises what `check` raises.
-        """
+        """(L, N), True where no surface that the landmarks suggest stands between; raises what `check` raises."""
         at, landmarks = np.asarray(locations, dtype=np.float64), np.asarray(points, dtype=np.float64)
         self.check(at, landmarks)
         places, place = np.unique(landmarks, axis=0, return_inverse=True)
@@ -73,8 +68,7 @@ class HiddenPointRemoval(OcclusionModel):
             free[row] = self._free_from(at[row], places)[place]
 
         with ThreadPoolExecutor(self.threads or len(os.sched_getaffinity(0))) as pool:
-            for _ in pool.map(fill, range(len(at))):  # raises what a thread raised
-                pass
+            list(pool.map(fill, range(len(at))))  # raises what a thread raised
         return free
 
     def check(self, locations: Float, points: Float) -> None:
@@ -107,15 +101,9 @@ class HiddenPointRemoval(OcclusionModel):
 
 
 def on_hull(directions: Float, lengths: Float, margin: float = 0.0) -> NDArray[np.bool_]:
-    """Which points lie on the convex hull of all of them and the origin, or less than a margin inside.
+    """Which points (N,) lie on the convex hull of all and the origin, or less than a margin below it.
 
-    Args:
-        directions: (N, 3) unit vectors from the origin.
-        lengths: (N,) positive.
-        margin: how far below the hull, along its direction, a point may lie.
-
-    Returns:
-        (N,) bool.
+    They are given by unit vectors (N, 3) from the origin and positive lengths (N,).
     """
     points = directions * lengths[:, None]
     hull = ConvexHull(np.concatenate([points, np.zeros((1, 3)), _missing_axes(directions)]))
@@ -127,18 +115,12 @@ def on_hull(directions: Float, lengths: Float, margin: float = 0.0) -> NDArray[n
 
 
 def hull_length(hull: ConvexHull, directions: Float) -> Float:
-    """Distance from the origin to where each direction leaves a convex hull that holds the origin.
+    """Distance (N,) from the origin to where each of directions (N, 3) leaves a 3D convex hull that holds the origin.
 
     Along u, a facet's plane n x = d is met at d / (n u), and the hull's boundary at the least of these, that is, at the
     facet with the greatest u (n / d). The n / d are the corners of a convex polyhedron, the hull's dual. So moving from
-    facet to better neighbouring facet ends at the best one, as in the simplex method.
-
-    Args:
-        hull: in three dimensions.
-        directions: (N, 3) unit vectors that point into the hull.
-
-    Returns:
-        (N,).
+    facet to better neighbouring facet ends at the best one, as in the simplex method. Directions are unit vectors that
+    point into the hull.
     """
     dual = hull.equations[:, :3] / np.maximum(-hull.equations[:, 3:], _NO_LENGTH)
     centers = hull.points[hull.simplices].mean(axis=1)

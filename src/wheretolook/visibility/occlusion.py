@@ -6,6 +6,7 @@ Occlusion depends on the location only, so one answer serves every direction a c
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,29 +19,67 @@ from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import Float
 from wheretolook.utils.errors import ConfigError, MapError, SceneError, TableError
 from wheretolook.utils.npz_files import load_npz, save_npz
-from wheretolook.visibility.device_points import DevicePoints
+from wheretolook.utils.warp import start_warp, vec3_array
 
 if TYPE_CHECKING:
     from wheretolook.rendering.raycasting import MeshRaycaster
 
+MORTON_BITS = 10  # bits along each axis of the curve that landmarks are ordered by
 MATCH_M = 1e-4  # locations closer than this are taken for the same stored location
 ON_SURFACE_M = 1e-3  # a location this close to a triangle is on it
+
+
+class DevicePoints:
+    """Landmarks (N, 3) m on a device along a Morton curve, so that threads side by side have landmarks side by side.
+
+    `positions` (N, 3) are in the map's order, `order` (N,) are rows of the map in the order of the device's arrays, and
+    `double` (N,) is a Warp array of vec3d.
+    """
+
+    def __init__(self, positions: ArrayLike, device: str = "cpu") -> None:
+        self.positions = np.asarray(positions, dtype=np.float64).reshape(-1, 3)
+        self.device = start_warp(device)
+        self.order = np.argsort(morton_codes(self.positions), kind="stable")
+        self.double: Any = wp.array(self.positions[self.order], dtype=wp.vec3d, device=self.device)
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    @cached_property
+    def single(self) -> Any:
+        """(N,) Warp array of vec3."""
+        return vec3_array(self.positions[self.order], self.device)
+
+    @cached_property
+    def rank(self) -> Any:
+        """(N,) Warp array of int32: where the map's landmarks lie in the device's arrays, the inverse of `order`."""
+        return wp.array(np.argsort(self.order).astype(np.int32), dtype=wp.int32, device=self.device)
+
+
+def morton_codes(positions: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Place (N,) of points (N, 3) along a Morton curve through their bounding box; points not finite come first."""
+    finite = np.isfinite(positions).all(1)
+    codes = np.zeros(len(positions), dtype=np.int64)
+    if not finite.any():
+        return codes
+    low, high = positions[finite].min(0) / 2, positions[finite].max(0) / 2  # halves: their difference is finite
+    share = (positions[finite] / 2 - low) / np.maximum(high - low, 1e-12)
+    cells = (share * ((1 << MORTON_BITS) - 1)).astype(np.int64)
+    for bit in range(MORTON_BITS):
+        for axis in range(3):
+            codes[finite] |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
+    return codes
 
 
 class OcclusionModel(ABC):
     """Tells which landmarks nothing stands in front of.
 
     Callers ask for as many locations at once as their memory allows, so a model need not divide its work.
-
-    Attributes:
-        name: of the model, as in `OcclusionConfig`.
-        uses_all_cores: whether `unoccluded` occupies all cores of a CPU by itself.
-        landmarks_hide: whether landmarks occlude one another, so that added landmarks change the mask of the others.
     """
 
-    name: str = "custom"
-    uses_all_cores: bool = False
-    landmarks_hide: bool = False
+    name: str = "custom"  # as in `OcclusionConfig`
+    uses_all_cores: bool = False  # `unoccluded` occupies all cores of a CPU by itself
+    landmarks_hide: bool = False  # landmarks occlude one another: added ones change the mask of the others
 
     @abstractmethod
     def unoccluded(self, locations: Float, points: Float) -> NDArray[np.bool_]:
@@ -95,14 +134,9 @@ class NoOcclusion(OcclusionModel):
 class MeshOcclusion(OcclusionModel):
     """Exact occlusion by the scene's mesh: one ray for each location and landmark.
 
-    Args:
-        raycaster: the mesh.
-        margin_m: a surface this close in front of a landmark is the landmark's own.
-        two_sided: whether the backs of triangles are surfaces too, which `FreeSpace.two_sided` finds out. If not, a
-            location from which mostly backs are seen lies inside geometry.
-
-    Raises:
-        ConfigError: the margin is negative or not finite.
+    A surface `margin_m` in front of a landmark is the landmark's own; ConfigError if that is negative or not finite.
+    `two_sided` says whether the backs of triangles are surfaces too, which `FreeSpace.two_sided` finds out. If not, a
+    location from which mostly backs are seen lies inside geometry.
     """
 
     name = "mesh"
@@ -142,12 +176,8 @@ class MeshOcclusion(OcclusionModel):
 class StoredOcclusion(OcclusionModel):
     """Occlusion computed once for the locations of a dataset and stored, so that the mesh is no longer needed.
 
-    Args:
-        locations: (L, 3) metres.
-        packed: (L, ceil(N / 8)) uint8, the mask as `numpy.packbits` packs it: a bit is set where the line of sight is
-            free. Columns are in the order of the map's landmarks.
-        n_landmarks: N.
-        model: name of the occlusion model it was computed with.
+    Of L locations and N landmarks in the map's order, `packed` (L, ceil(N / 8)) uint8 is the mask as `numpy.packbits`
+    packs it: a bit is set where the line of sight is free. `model` names the occlusion model it was computed with.
     """
 
     def __init__(self, locations: ArrayLike, packed: NDArray[np.uint8], n_landmarks: int, model: str = "mesh") -> None:
@@ -193,11 +223,7 @@ class StoredOcclusion(OcclusionModel):
 
     @classmethod
     def load(cls, path: Path) -> StoredOcclusion:
-        """Read what `save` wrote.
-
-        Raises:
-            TableError: the file is missing or damaged.
-        """
+        """Read what `save` wrote. Raises TableError if the file is missing or damaged."""
         try:
             data = load_npz(path)
             return cls(data["locations"], data["mask"], int(data["n_landmarks"]), str(data.get("model", "mesh")))

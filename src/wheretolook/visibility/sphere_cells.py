@@ -16,18 +16,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wheretolook.geometry.colmap_camera import Camera, ColmapCamera
+from wheretolook.geometry.camera import Camera, ColmapCamera
 from wheretolook.geometry.poses import Float
-from wheretolook.visibility.field_of_view import FieldOfView
+from wheretolook.visibility import counting_kernel as kernels
+from wheretolook.visibility.field_of_view import cell_centers, octahedral_directions, tabulate
 from wheretolook.visibility.frustum import frustum_sides
-from wheretolook.visibility.octahedral_map import cell_centers, octahedral_directions
-from wheretolook.visibility.sphere_cells_kernel import (
-    BORDER,
-    INSIDE,
-    classify_field_kernel,
-    classify_pinhole_kernel,
-    runs_kernel,
-)
 
 ROUNDING = 1e-5  # least relative distance of a cell's corners from a plane, since rounding may move landmarks into it
 
@@ -63,19 +56,19 @@ class SphereCells:
             return wp.array(np.asarray(values, dtype=np.float32), dtype=dtype, device=device)
 
         if isinstance(camera, ColmapCamera):
-            field = FieldOfView.of(camera)
+            field = tabulate(camera)
             centers, radii = cell_centers(size)
             arrays = [upload(rotations, wp.mat33), upload(centers, wp.vec3), upload(field.depth_rad, wp.float32)]
             inputs = [*arrays, field.size, float(radii.max()) + ROUNDING]
-            wp.launch(classify_field_kernel, shape, inputs, [classes], device=device)
+            wp.launch(kernels.classify_field_kernel, shape, inputs, [classes], device=device)
         else:
             edge = np.arange(size + 1) / size * 2 - 1
             corners = octahedral_directions(edge[None, :], edge[:, None]).reshape(-1, 3)
             sides = frustum_sides(camera, rotations)
             margin = float(ROUNDING * np.linalg.norm(sides, axis=-1).max(initial=0))
             inputs = [upload(sides, wp.vec3), upload(corners, wp.vec3), size, margin]
-            wp.launch(classify_pinhole_kernel, shape, inputs, [classes], device=device)
-        return cls(size, _runs(classes, size, INSIDE), _runs(classes, size, BORDER))
+            wp.launch(kernels.classify_pinhole_kernel, shape, inputs, [classes], device=device)
+        return cls(size, _runs(classes, size, kernels.INSIDE), _runs(classes, size, kernels.BORDER))
 
 
 def _runs(classes: Any, size: int, wanted: int) -> CellRuns:
@@ -83,9 +76,9 @@ def _runs(classes: Any, size: int, wanted: int) -> CellRuns:
     n_rows = rows[0] * rows[1]
     numbers: Any = wp.zeros(n_rows + 1, dtype=wp.int32, device=device)
     none: list[Any] = [wp.empty(0, dtype=dtype, device=device) for dtype in (wp.int32, wp.vec2i)]
-    wp.launch(runs_kernel, rows, [classes, size, wanted, False, none[0]], [numbers, none[1]], device=device)
+    wp.launch(kernels.runs_kernel, rows, [classes, size, wanted, False, none[0]], [numbers, none[1]], device=device)
     starts: Any = wp.empty(n_rows + 1, dtype=wp.int32, device=device)
     wp.utils.array_scan(numbers, starts, inclusive=False)
     cells: Any = wp.empty(int(starts[n_rows:].numpy()[0]), dtype=wp.vec2i, device=device)
-    wp.launch(runs_kernel, rows, [classes, size, wanted, True, starts], [numbers, cells], device=device)
+    wp.launch(kernels.runs_kernel, rows, [classes, size, wanted, True, starts], [numbers, cells], device=device)
     return CellRuns(starts, cells)

@@ -13,12 +13,11 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
-from wheretolook.geometry.colmap_camera import Camera
+from wheretolook.geometry.camera import Camera
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.visibility.counting import FrustumCounter
 from wheretolook.visibility.counting_kernel import pack_kernel
-from wheretolook.visibility.device_points import DevicePoints
-from wheretolook.visibility.occlusion import OcclusionModel, StoredOcclusion
+from wheretolook.visibility.occlusion import DevicePoints, OcclusionModel, StoredOcclusion
 
 CPU_BLOCK_BYTES = 1 << 24  # on a CPU a block of locations should fit into the cache
 
@@ -46,33 +45,20 @@ def survey(
     device: str = "cpu",
     threads: int = 0,
     memory_bytes: int = 2 << 30,
-    counter: FrustumCounter | None = None,
     progress: str | None = None,
 ) -> Survey:
-    """Find the landmarks that are unoccluded from every location, and count those in view (paper, Sec. 3.2).
+    """Find the landmarks (N, 3) m that are unoccluded from each of locations (L, 3) m, and count those in view.
 
-    Works through the locations in blocks, so that memory does not grow with their number (except for the result: a bit
-    for each location and landmark, if occlusion is kept).
-
-    Args:
-        camera: pinhole, or any COLMAP model.
-        rotations: (D, 3, 3) cam_from_world.
-        locations: (L, 3) camera centres in the world, metres.
-        points: (N, 3) landmarks in metres, or the same on the device already.
-        occlusion: which landmarks have a free line of sight from a location.
-        keep: K, how many of the best directions to return for each location; 0 for all.
-        distinct_pixels: count pixels that see a landmark instead of landmarks.
-        keep_occlusion: whether to return the masks.
-        device: "cpu" or a CUDA device.
-        threads: threads on a CPU, 0 for all cores.
-        memory_bytes: bound on the memory of all blocks that are worked on at a time, on the device.
-        counter: a counter of the same camera, rotations and rule, to be used again.
-        progress: text of a progress bar; None shows none.
+    They are counted (paper, Sec. 3.2) for each of rotations (D, 3, 3) cam_from_world, or with `distinct_pixels` the
+    pixels that see one; of the directions the best `keep` are returned for each location, 0 for all. Works through the
+    locations in blocks, which take at most `memory_bytes` on the device at a time, so that memory does not grow with
+    their number (except for the result: a bit for each location and landmark, if occlusion is kept). On a CPU with as
+    many threads as said, 0 for all cores. The progress bar has a text; None shows none.
 
     Raises:
         MapError: there are no landmarks.
         SceneError: there are no locations, or what `OcclusionModel.check` refuses.
-        ConfigError: a single location takes more memory than allowed, or the counter was made for something else.
+        ConfigError: a single location takes more memory than allowed.
     """
     at = np.asarray(locations, dtype=np.float64).reshape(-1, 3)
     if len(at) == 0:
@@ -85,12 +71,8 @@ def survey(
     n_points = len(landmarks)
     on_gpu = wp.get_device(landmarks.device).is_cuda
     workers = 1 if on_gpu or occlusion.uses_all_cores else (threads or len(os.sched_getaffinity(0)))
-    if counter is None:
-        scratch = max(1, memory_bytes // (4 * workers))
-        where = landmarks.device
-        counter = FrustumCounter(camera, np.asarray(rotations), n_points, where, distinct_pixels, scratch_bytes=scratch)
-    elif not counter.serves(camera, np.asarray(rotations), distinct_pixels, landmarks.device):
-        raise ConfigError("the counter is of another camera, other rotations, another rule or another device")
+    scratch, orientations = max(1, memory_bytes // (4 * workers)), np.asarray(rotations)
+    counter = FrustumCounter(camera, orientations, n_points, landmarks.device, distinct_pixels, scratch_bytes=scratch)
     n_directions = len(counter.rotations)
     keep = min(keep or n_directions, n_directions)
     per_location = counter.bytes_per_location(n_points) + n_points  # and its mask

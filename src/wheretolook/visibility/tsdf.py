@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from wheretolook.geometry.colmap_camera import Camera
+from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float
 from wheretolook.rendering.raycasting import MeshRaycaster
@@ -124,9 +124,7 @@ class TsdfVolume:
 
     Use `from_images` where all images are at hand: it also checks the memory beforehand.
 
-    Args:
-        config: voxel size, truncation and limits.
-        expected_blocks: number of blocks to allocate at the start; when they are used up, all are copied to more.
+    It starts with room for `expected_blocks`; when they are used up, all are copied to more.
     """
 
     def __init__(self, config: TsdfConfig | None = None, expected_blocks: int = 1 << 13) -> None:
@@ -161,11 +159,7 @@ class TsdfVolume:
         return int(self._grid.hashmap().size())
 
     def integrate(self, image: DepthImage) -> None:
-        """Average a depth image into the field; one without readings changes nothing.
-
-        Raises:
-            ConfigError: the volume has outgrown the memory.
-        """
+        """Average a depth image into the field. Raises ConfigError if the volume has outgrown the memory."""
         from open3d import core
         from open3d.t.geometry import Image
 
@@ -174,14 +168,9 @@ class TsdfVolume:
         if not depth[:rows:_TOUCH_STRIDE, :columns:_TOUCH_STRIDE].any():
             return  # Open3D would raise
         pose = np.vstack([np.asarray(image.cam_from_world, dtype=np.float64), (0, 0, 0, 1)])
-        view = (
-            Image(core.Tensor(np.ascontiguousarray(depth))),  # type: ignore[call-overload]
-            core.Tensor(image.camera.matrix),  # type: ignore[call-overload]
-            core.Tensor(pose),  # type: ignore[call-overload]
-            1.0,
-            float(self.config.max_depth_m),
-            float(self.config.truncation_voxels),
-        )
+        tensor: Any = core.Tensor
+        limits = 1.0, float(self.config.max_depth_m), float(self.config.truncation_voxels)
+        view = Image(tensor(np.ascontiguousarray(depth))), tensor(image.camera.matrix), tensor(pose), *limits
         blocks = self._grid.compute_unique_block_coordinates(*view)
         self._grid.integrate(blocks, *view)
         _check_memory(len(self), self.config, self._limit)
@@ -189,10 +178,8 @@ class TsdfVolume:
     def surface(self) -> TexturedMesh:
         """The zero crossing as triangles without colours, whose fronts face the cameras that saw them.
 
-        Several threads find the triangles, so their order may differ from run to run; the triangles do not.
-
-        Raises:
-            SceneError: there is none.
+        Several threads find the triangles, so their order may differ from run to run; the triangles do not. Raises
+        SceneError if there is none.
         """
         fix = "Check the poses, that depths are in metres, and that voxel_size_m is below the scene's size."
         nothing = SceneError("the depth images show no surface", value=f"{len(self)} blocks of voxels", fix=fix)
@@ -211,13 +198,9 @@ class TsdfVolume:
         if "indices" not in mesh.triangle or len(mesh.triangle.indices) == 0:
             raise nothing
         triangles = mesh.triangle.indices.numpy().astype(np.int32)
-        return TexturedMesh(
-            mesh.vertex.positions.numpy(),
-            triangles,
-            np.broadcast_to(np.float32(0), (len(triangles), 3, 2)),  # takes no memory
-            np.broadcast_to(np.int32(0), (len(triangles),)),
-            (np.full((1, 1, 3), 255, np.uint8),),
-        )
+        uvs = np.broadcast_to(np.float32(0), (len(triangles), 3, 2))  # takes no memory
+        texture, white = np.broadcast_to(np.int32(0), (len(triangles),)), (np.full((1, 1, 3), 255, np.uint8),)
+        return TexturedMesh(mesh.vertex.positions.numpy(), triangles, uvs, texture, white)
 
 
 class TsdfOcclusion(MeshOcclusion):
@@ -225,10 +208,8 @@ class TsdfOcclusion(MeshOcclusion):
 
     What no depth image has seen hides nothing.
 
-    Args:
-        volume: the fused depth images; no longer needed afterwards.
-        margin_m: a surface this close in front of a landmark is the landmark's own. Keep it above two voxels.
-        device: "cpu" or a CUDA device; casts the rays.
+    The volume of depth images is no longer needed afterwards. A surface `margin_m` in front of a landmark is the
+    landmark's own; keep it above two voxels.
 
     Raises:
         ConfigError: a negative margin, or no such device.
@@ -255,11 +236,7 @@ class TsdfOcclusion(MeshOcclusion):
 
 
 def estimate_blocks(images: Sequence[DepthImage], config: TsdfConfig) -> int:
-    """Blocks of voxels that the surfaces in the images will touch, from some pixels of up to 100 of the images.
-
-    Raises:
-        SceneError: there is no image, or none of those has a reading.
-    """
+    """Blocks of voxels that the images' surfaces will touch, from some pixels of up to 100; SceneError without any."""
     cell_m = max(config.block_m, _SURVEY_CELL_M)
     cells = np.empty(0, dtype=np.int64)
     number = np.array([1, 1 << 21, 1 << 42])  # one number a cell sorts faster than three
@@ -277,7 +254,6 @@ def estimate_blocks(images: Sequence[DepthImage], config: TsdfConfig) -> int:
 
 
 def _check_memory(n_blocks: int, config: TsdfConfig, limit_bytes: int) -> None:
-    """Raise ConfigError if so many blocks do not fit into the memory."""
     fits = min(limit_bytes // BYTES_PER_BLOCK, MAX_BLOCKS)
     if n_blocks <= fits:
         return

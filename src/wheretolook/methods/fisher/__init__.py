@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from wheretolook.methods.method import Method, MethodStyle, ScorerOptions, no_params
 
 if TYPE_CHECKING:
-    from wheretolook.geometry.colmap_camera import Camera
+    from wheretolook.geometry.camera import Camera
     from wheretolook.inputs.localization_map import LocalizationMap
     from wheretolook.methods.base import Scorer
 

@@ -24,7 +24,7 @@ from wheretolook.geometry.poses import Float, check_poses, split_poses
 from wheretolook.inputs.localization_map import LocalizationMap, shared_locations
 from wheretolook.methods.base import Scorer
 from wheretolook.methods.fisher import Approximation
-from wheretolook.visibility.frustum import LandmarkSets
+from wheretolook.visibility.frustum import LandmarkSets, PosedViews
 
 PROBE_AXES = 2000  # axes among which the worst view is sought
 
@@ -97,7 +97,7 @@ class PoseInformation:
         _, rows, mask = self._locations()
         if approximation == "exact":
             seen = LandmarkSets.from_mask(mask)
-            return exact_information(self.camera, self._poses, self.points, seen, rows, self.device)
+            return exact_information(PosedViews(self.camera, self._poses, self.points, seen, rows), self.device)
         field, _ = self.field(self._poses, approximation)
         return field.information_of_views(rows, self._poses[:, 2, :3])
 

@@ -19,7 +19,7 @@ from wheretolook.geometry.poses import Float, split_poses
 from wheretolook.inputs.localization_map import LocalizationMap, shared_locations
 from wheretolook.learning.config import SharedConfig
 from wheretolook.learning.data import Batch, TensorViews, ViewsDataModule, labelled_rows
-from wheretolook.mapping.cameras import CAMERAS_FILE
+from wheretolook.mapping.colmap_model import CAMERAS_FILE
 from wheretolook.methods.sphere.config import SphereConfig
 from wheretolook.utils.errors import MapError
 from wheretolook.viewpoints.table import is_good, poses

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from wheretolook.scenes.procedural.materials import Colour, Material, fill, mix, vary
-from wheretolook.scenes.procedural.noise import SIZE, Canvas, Image
+from wheretolook.scenes.procedural.materials import SIZE, Canvas, Colour, Image, Material, fill, mix, vary
 
 PALETTES: tuple[tuple[Colour, ...], ...] = (
     ((0.93, 0.88, 0.78), (0.80, 0.36, 0.22), (0.16, 0.25, 0.34), (0.88, 0.67, 0.28), (0.35, 0.48, 0.44)),
@@ -120,9 +119,8 @@ def picture(rng: np.random.Generator, mat: float = 0.0) -> Material:
         image = (_landscape, _abstract, _geometric, _poster)[kind](canvas, local, colours)
         border = round(mat * canvas.width)
         if border:
-            framed = np.full_like(image, 0.93)
-            framed[border:-border, border:-border] = image[border:-border, border:-border]
-            return framed
+            bare = image[border:-border, border:-border]
+            image = np.pad(bare, ((border, border), (border, border), (0, 0)), constant_values=0.93)
         return image
 
     return Material(paint)

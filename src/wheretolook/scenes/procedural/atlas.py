@@ -10,51 +10,37 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.scenes.procedural.materials import Material
-from wheretolook.scenes.procedural.noise import Canvas, Image, NoiseBank
+from wheretolook.scenes.procedural import artwork
+from wheretolook.scenes.procedural.materials import Canvas, Image, Material, NoiseBank
 from wheretolook.scenes.procedural.patches import Patch
 from wheretolook.utils.errors import SceneError
 
-LEVELS = 14
-"""Brightness steps of materials that share one piece of texture."""
+LEVELS = 14  # brightness steps of materials that share one piece of texture
 SHARED_TEXELS = (24, 16)
+PATTERNS = 6  # that repeat in one apartment; several surfaces have the same one
+LEAST_M = 0.7  # surfaces narrower than this do not repeat a pattern
 
 
 @dataclass(frozen=True, eq=False)
 class Chart:
-    """A rectangle of the atlas.
-
-    Attributes:
-        material: what is painted.
-        width, height: texels, without padding.
-        pad: texels of replicated border on each side.
-        texels_per_m: scale of the pattern.
-        offset_m: where the pattern starts.
-    """
+    """A rectangle of the atlas."""
 
     material: Material
-    width: int
+    width: int  # texels, without padding
     height: int
-    pad: int
-    texels_per_m: float
-    offset_m: tuple[float, float]
+    pad: int  # texels of replicated border on each side
+    texels_per_m: float  # scale of the pattern
+    offset_m: tuple[float, float]  # where the pattern starts
 
 
 @dataclass(frozen=True, eq=False)
 class AtlasPlan:
-    """Charts, their corners and the chart of each patch.
-
-    Attributes:
-        charts: all charts.
-        corners: (C, 2) x, y of the top-left texel inside the padding.
-        patch_chart: (P,) chart of each patch; for shared materials the darkest of LEVELS consecutive ones.
-        size: width and height of the texture.
-    """
+    """Charts, their corners and the chart of each patch."""
 
     charts: list[Chart]
-    corners: NDArray[np.int64]
-    patch_chart: NDArray[np.int64]
-    size: tuple[int, int]
+    corners: NDArray[np.int64]  # (C, 2) x, y of the top-left texel inside the padding
+    patch_chart: NDArray[np.int64]  # (P,) for shared materials the darkest of LEVELS consecutive charts
+    size: tuple[int, int]  # width and height of the texture
 
 
 def _charts(patches: Sequence[Patch], texels_per_m: float) -> tuple[list[Chart], NDArray[np.int64]]:
@@ -86,12 +72,10 @@ def _pack(charts: Sequence[Chart], size: int) -> tuple[NDArray[np.int64], int] |
     x = y = shelf = 0
     for k in np.lexsort((np.arange(len(charts)), -outer[:, 0], -outer[:, 1])):
         w, h = outer[k]
-        if w > size:
-            return None
         if x + w > size:
             x, y, shelf = 0, y + shelf, 0
         shelf = max(shelf, int(h))
-        if y + shelf > size:
+        if w > size or y + shelf > size:
             return None
         corners[k] = x + charts[k].pad, y + charts[k].pad
         x += int(w)
@@ -99,11 +83,7 @@ def _pack(charts: Sequence[Chart], size: int) -> tuple[NDArray[np.int64], int] |
 
 
 def plan_atlas(patches: Sequence[Patch], texels_per_m: float, size: int) -> AtlasPlan:
-    """Place all patches; the density is lowered until they fit.
-
-    Raises:
-        SceneError: the texture is too small even for a quarter of the density.
-    """
+    """Place all patches; the density is lowered until they fit, SceneError if not even a quarter of it does."""
     density = texels_per_m
     while density > texels_per_m / 4:
         charts, index = _charts(patches, density)
@@ -126,15 +106,38 @@ def paint_charts(plan: AtlasPlan, noise: NoiseBank) -> list[Image]:
     return [painted[id(chart)] for chart in plan.charts]
 
 
+def repeat_patterns(
+    plan: AtlasPlan, painted: Sequence[Image], share: float, rng: np.random.Generator, noise: NoiseBank
+) -> list[Image]:
+    """Albedo of each chart (height, width, 3), where a share (0 to 1) of the large surfaces repeats a pattern.
+
+    As in games, they have many features that look alike: the mean of the pattern and of what was painted, repeated too.
+    """
+    periods_m = rng.uniform(0.6, 2.0, PATTERNS)
+    materials = [artwork.picture(rng) for _ in range(PATTERNS)]
+    tiles: dict[tuple[int, float], Image] = {}
+    covered = list(painted)
+    for number, (chart, image) in enumerate(zip(plan.charts, painted, strict=True)):
+        unfit = chart.material.shared or chart.material.emissive
+        if unfit or min(chart.width, chart.height) < LEAST_M * chart.texels_per_m or rng.random() >= share:
+            continue
+        which = int(rng.integers(PATTERNS))
+        side = max(1, round(periods_m[which] * chart.texels_per_m))
+        key = (which, chart.texels_per_m)
+        if key not in tiles:
+            canvas = Canvas(side, side, chart.texels_per_m, 0.0, 0.0, noise)
+            tiles[key] = np.asarray(materials[which].paint(canvas), np.float32)
+        at = np.ix_(np.arange(chart.height) % side, np.arange(chart.width) % side)
+        covered[number] = 0.5 * image[at] + 0.5 * tiles[key][at]
+    return covered
+
+
 def compose(
     plan: AtlasPlan, painted: Sequence[Image], light: Sequence[NDArray[np.floating[Any]] | None]
 ) -> NDArray[np.uint8]:
     """Albedo times light, padded, in one (H, W, 3) sRGB texture.
 
-    Args:
-        plan: from `plan_atlas`.
-        painted: from `paint_charts`.
-        light: for each chart the factor on the albedo, (h, w, 3) on any coarser grid, or None for surfaces that glow.
+    `light` is each chart's factor on the albedo, (h, w, 3) on any coarser grid, or None for surfaces that glow.
     """
     width, height = plan.size
     atlas = np.zeros((height, width, 3), np.uint8)

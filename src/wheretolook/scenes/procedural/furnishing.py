@@ -1,16 +1,16 @@
-"""Puts furniture into rooms according to their kind."""
+"""Puts furniture into rooms according to their kind, then plants, pictures, shelves, radiators and lamps into all."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from itertools import product
+from typing import Any
 
 import numpy as np
 
 from wheretolook.scenes.procedural import artwork, decor, fixtures, furniture, materials
-from wheretolook.scenes.procedural.dressing import dress
-from wheretolook.scenes.procedural.layout import Lamp, Layout, Spot, overlap
-from wheretolook.scenes.procedural.patches import Patch, box, move
+from wheretolook.scenes.procedural.layout import Lamp, Layout, Size, Spot, overlap
+from wheretolook.scenes.procedural.patches import Patch, box, cylinder, lathe, move, tube
 from wheretolook.scenes.procedural.plan import Plan, outside_spans
 from wheretolook.scenes.procedural.style import Style
 
@@ -43,26 +43,13 @@ class Furnisher:
 
     def fill(self, layout: Layout) -> None:
         """Put the furniture of its kind into a room."""
-        {
-            "living": self._living,
-            "kitchen": self._kitchen,
-            "bedroom": self._bedroom,
-            "bathroom": self._bathroom,
-            "hall": self._hall,
-            "study": self._study,
-        }[layout.room.kind](layout)
+        wet = {"kitchen": self._kitchen, "bathroom": self._bathroom}
+        dry = {"living": self._living, "bedroom": self._bedroom, "hall": self._hall, "study": self._study}
+        (wet | dry)[layout.room.kind](layout)
 
-    def _stand(
-        self,
-        layout: Layout,
-        patches: list[Patch],
-        size: tuple[float, float, float],
-        place: str = "any",
-        front: float = 0.5,
-        sides: list[int] | None = None,
-    ) -> Spot | None:
+    def _stand(self, layout: Layout, patches: list[Patch], size: Size, place: str = "any", *where: Any) -> Spot | None:
         """Stand a piece of furniture at a wall, if there is a place; see `Layout.find_by_wall`."""
-        spot = layout.find_by_wall(size, place, front, sides)
+        spot = layout.find_by_wall(size, place, *where)
         if spot is not None:
             layout.put_by_wall(patches, spot)
         return spot
@@ -134,7 +121,7 @@ class Furnisher:
         spot = None
         for seats in (3, 2) if max(room.width, room.depth) > 4.2 else (2,):
             size = (0.62 * seats + 0.36, 0.92, 0.85)
-            spot = spot or self._stand(layout, furniture.sofa(style, seats), size, "middle", front=0.42)
+            spot = spot or self._stand(layout, furniture.sofa(style, seats), size, "middle", 0.42)
         tv = float(style.rng.uniform(1.4, 1.8))
         opposite = None if spot is None else [(spot.side + 2) % 4, (spot.side + 1) % 4, (spot.side + 3) % 4]
         self._stand(layout, furniture.media_unit(style, tv), (tv, 0.45, 1.3), "middle", 0.7, opposite)
@@ -191,10 +178,8 @@ class Furnisher:
         colour = materials.vary(rng, style.pick([(0.92, 0.92, 0.9), (0.55, 0.66, 0.66), (0.8, 0.74, 0.6)]), 0.03)
         brick, variation = size[0] != size[1], 0.02 + 0.05 * style.richness
         tile = materials.tiles(rng, colour, (0.6, 0.6, 0.58), size_m=size, brick=brick, variation=variation)
-        top = 1.45
-        if below_window:
-            low = min((o.z0 for o in layout.room.openings[spot.side] if o.kind == "window"), default=1.2)
-            top = min(1.2, low - 0.035)
+        low = min((o.z0 for o in layout.room.openings[spot.side] if o.kind == "window"), default=1.2)
+        top = min(1.2, low - 0.035) if below_window else 1.45
         tiled = box((-width / 2, 0, 0.9), (width / 2, 0.006, top), tile, hidden=("back", "bottom"))
         layout.put_on_wall(spot.side, spot.at, tiled)
 
@@ -283,3 +268,82 @@ class Furnisher:
             self._bookshelf(layout, 0.8, 2.0)
         length = min(max(room.width, room.depth) - 1.2, 2.6)
         self._rug(layout, room.centre, (length, 0.75), turned=room.width <= room.depth)
+
+
+def dress(style: Style, layout: Layout, height: float) -> None:
+    """Add all of it; `height` is that of the ceiling in metres."""
+    _plants(style, layout)
+    _wall_shelves(style, layout)
+    _pictures(style, layout)
+    _radiators(style, layout)
+    _ceiling_lamp(style, layout, height)
+
+
+def _plants(style: Style, layout: Layout) -> None:
+    if layout.room.kind in ("bathroom", "hall"):
+        return
+    for _ in range(int(style.rng.integers(0, 2 + round(style.clutter)))):
+        height = float(style.rng.uniform(0.7, 1.4))
+        spot = layout.find_by_wall((0.7, 0.7, 0.8), "corner", front=0.0)
+        if spot is not None:
+            plant = move(decor.plant(style, height, 30, 0.35), shift=(0, 0.35, 0))
+            layout.put_by_wall(plant, replace(spot, size=(0.7, 0.7, height)))
+
+
+def _pictures(style: Style, layout: Layout) -> None:
+    if layout.room.kind == "bathroom":
+        return
+    for side in range(4):
+        if not style.chance(0.45 + 0.5 * style.richness):
+            continue
+        for _ in range(int(style.rng.integers(1, 3 + round(1.5 * style.richness)))):
+            width, height = float(style.rng.uniform(0.35, 1.2)), float(style.rng.uniform(0.35, 0.85))
+            middle = float(style.rng.uniform(1.45, 1.65))
+            at = layout.hang(width, middle - height / 2, middle + height / 2, side)
+            if at is not None:
+                layout.put_on_wall(side, at, move(decor.picture_frame(style, width, height), shift=(0, 0, middle)))
+
+
+def _wall_shelves(style: Style, layout: Layout) -> None:
+    if layout.room.kind in ("bathroom", "hall"):
+        return
+    for side in range(4):
+        if style.chance(0.2 + 0.5 * style.clutter):
+            width, height = float(style.rng.uniform(0.7, 1.3)), float(style.rng.uniform(1.3, 1.6))
+            at = layout.hang(width, height - 0.05, height + 0.4, side, depth=0.25)
+            if at is not None:
+                layout.put_on_wall(side, at, move(furniture.wall_shelf(style, width), shift=(0, 0, height)))
+
+
+def _radiators(style: Style, layout: Layout) -> None:
+    room = layout.room
+    for side in range(4):
+        for o in room.openings[side]:
+            width = o.a1 - o.a0 - (0.2 if room.kind in ("kitchen", "bathroom") else 0.75)
+            middle = (o.a0 + o.a1) / 2
+            zone = layout.rectangle(side, middle - width / 2, middle + width / 2, 0, 0.2)
+            free = not any(overlap(zone, f) for f in layout.footprints)
+            if o.kind == "window" and o.z0 > 0.7 and width > 0.3 and free and not room.curtains_closed:
+                layout.put_on_wall(side, middle, fixtures.radiator(style, width, min(0.5, o.z0 - 0.25)))
+
+
+def _ceiling_lamp(style: Style, layout: Layout, top: float) -> None:
+    """One lamp in the middle of the ceiling, or two in a long room."""
+    room, lit, (x, y) = layout.room, layout.room.lamp_on, layout.room.centre
+    dx, dy = (room.width / 4, 0.0) if room.width > room.depth else (0.0, room.depth / 4)
+    centres = [(x - dx, y - dy), (x + dx, y + dy)] if max(room.width, room.depth) > 5.5 else [(x, y)]
+    pendant = room.kind in ("living", "kitchen", "bedroom", "study") and style.chance(0.5)
+    for x, y in centres:
+        glass = materials.glow((1.0, 0.96, 0.87)) if lit else materials.plain(style.rng, (0.86, 0.85, 0.82))
+        if pendant:
+            parts = tube([(0, 0, top), (0, 0, top - 0.2), (0, 0, top - 0.4)], 0.004, style.black, sides=6)
+            parts += decor.shade(style, 0.22, 0.2, top - 0.6, lit)
+            parts += cylinder(0.05, top - 0.02, top, style.small_white, sides=16)
+            height = top - 0.55
+        else:
+            profile = [(0, top), (0.2, top), (0.2, top - 0.03), (0.17, top - 0.075), (0, top - 0.085)]
+            parts = lathe(profile, glass, sides=28)
+            height = top - 0.16
+        layout.patches += move(parts, shift=(x, y, 0))
+        if lit:
+            layout.add_lamp(x, y, height, (0.5 + 0.11 * room.area) / len(centres))

@@ -33,8 +33,7 @@ def sofa(style: Style, seats: int) -> list[Patch]:
     rng, cloth, arm, depth = style.rng, style.upholstery, 0.17, 0.88
     seat = 0.62 if seats > 1 else 0.6
     width = seats * seat + 2 * arm
-    w = width / 2
-    inner = w - arm * 0.9
+    w, inner = width / 2, width / 2 - arm * 0.9
     patches = legs(width - 0.14, 0.1, depth - 0.1, 0.13, style.leg, radius=0.025)
     patches += cushion((-w, 0.02, 0.12), (w, depth, 0.3), cloth, radius_m=0.03, hidden=WALL_SIDE)
     patches += cushion((-inner, 0.02, 0.29), (inner, 0.24, 0.72), cloth, radius_m=0.06, hidden=WALL_SIDE)
@@ -156,8 +155,7 @@ def cabinet(
 def bookshelf(style: Style, width: float, height: float, depth: float = 0.28) -> list[Patch]:
     """Open shelves full of books, with vases and boxes between."""
     rng, wooden, board = style.rng, style.wood, 0.022
-    w = width / 2
-    inner = w - board
+    w, inner = width / 2, width / 2 - board
     patches = box((-w, 0, 0), (-inner, depth, height), wooden) + box((inner, 0, 0), (w, depth, height), wooden)
     patches += box((-inner, 0, 0.04), (inner, 0.008, height), wooden, hidden=WALL_SIDE)
     levels = np.linspace(0.05, height - board, max(2, round(height / 0.36)) + 1)
@@ -172,10 +170,8 @@ def bookshelf(style: Style, width: float, height: float, depth: float = 0.28) ->
                 books = decor.books_in_row(style, run, gap, depth - 0.03)
                 patches += move(books, shift=(x, 0.03, low + board))
             elif draw < 0.92 and run > 0.2:
-                if style.chance(0.5):
-                    item = decor.vase(style, min(gap * 0.85, 0.26))
-                else:
-                    item = decor.book_stack(style, int(rng.integers(1, 4)))
+                vase, gap_m = style.chance(0.5), min(gap * 0.85, 0.26)
+                item = decor.vase(style, gap_m) if vase else decor.book_stack(style, int(rng.integers(1, 4)))
                 patches += move(item, shift=(x + run / 2, depth / 2, low + board))
             x += run + 0.005
     return patches

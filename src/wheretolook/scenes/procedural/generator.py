@@ -12,15 +12,13 @@ from wheretolook.scenes.config import ApartmentConfig
 from wheretolook.scenes.procedural import atlas, lighting
 from wheretolook.scenes.procedural.furnishing import furnish
 from wheretolook.scenes.procedural.layout import Lamp
-from wheretolook.scenes.procedural.noise import NoiseBank
-from wheretolook.scenes.procedural.patches import Patch, Surface, join
+from wheretolook.scenes.procedural.materials import NoiseBank
+from wheretolook.scenes.procedural.patches import Patch, join
 from wheretolook.scenes.procedural.plan import Plan, draw_plan
-from wheretolook.scenes.procedural.repetition import repeat_patterns
 from wheretolook.scenes.procedural.shell import build_shell
 from wheretolook.scenes.procedural.style import Style
 
-BRIGHTNESS = np.geomspace(0.12, 1.06, atlas.LEVELS)
-"""Factors on the albedo of shared materials."""
+BRIGHTNESS = np.geomspace(0.12, 1.06, atlas.LEVELS)  # factors on the albedo of shared materials
 
 
 def furnish_apartment(config: ApartmentConfig, seed: int) -> tuple[Plan, list[Patch], list[Lamp], np.random.Generator]:
@@ -39,10 +37,7 @@ def generate_apartment(config: ApartmentConfig, seed: int, device: str = "cpu") 
     """A furnished apartment in metres, z up, floor at z = 0, centred on the origin; one texture with baked light.
 
     The same configuration and seed give the same bytes on the same device, "cpu" or a CUDA device for the light rays.
-
-    Raises:
-        ConfigError: there is no such device.
-        SceneError: the texture is too small for the apartment.
+    Raises ConfigError if there is no such device, SceneError if the texture is too small for the apartment.
     """
     config = config.of_seed(seed)
     floor_plan, patches, lamps, rng = furnish_apartment(config, seed)
@@ -51,7 +46,7 @@ def generate_apartment(config: ApartmentConfig, seed: int, device: str = "cpu") 
     noise = NoiseBank(rng)
     painted = atlas.paint_charts(plan, noise)
     if config.repetition:
-        painted = repeat_patterns(plan, painted, config.repetition, np.random.default_rng([seed, 1]), noise)
+        painted = atlas.repeat_patterns(plan, painted, config.repetition, np.random.default_rng([seed, 1]), noise)
     mean_colour = np.array([image[::2, ::2].mean((0, 1)) for image in painted])
     albedo = np.clip(mean_colour[plan.patch_chart], 0, 1) ** 2.2
 
@@ -60,10 +55,12 @@ def generate_apartment(config: ApartmentConfig, seed: int, device: str = "cpu") 
     windows = [(pane, floor_plan.rooms[pane.room].curtains_closed) for pane in panes]
     light = lighting.bake(patches, surface, samples, albedo, windows, lamps, device=device, rays=config.light_rays)
     chart, factors = _light_charts(plan, patches, samples, light)
+    size = np.array([(c.width, c.height) for c in plan.charts], float)[chart]
+    texels = plan.corners[chart].astype(float)[surface.patch][:, None] + surface.st * size[surface.patch][:, None]
     return TexturedMesh(
         vertices=(config.enlarged * surface.vertices).astype(np.float32),
         triangles=surface.triangles.astype(np.int32),
-        corner_uvs=_uvs(plan, chart, surface),
+        corner_uvs=(texels / np.array(plan.size, float)).astype(np.float32),
         triangle_texture=np.zeros(len(surface.triangles), np.int32),
         textures=(atlas.compose(plan, painted, factors),),
     )
@@ -90,9 +87,3 @@ def _light_charts(
         else:
             factors[chart[k]] = factor
     return chart, factors
-
-
-def _uvs(plan: atlas.AtlasPlan, chart: NDArray[np.int64], surface: Surface) -> NDArray[np.float32]:
-    size = np.array([(c.width, c.height) for c in plan.charts], float)[chart]
-    texel = plan.corners[chart].astype(float)[surface.patch][:, None] + surface.st * size[surface.patch][:, None]
-    return (texel / np.array(plan.size, float)).astype(np.float32)

@@ -11,16 +11,13 @@ from wheretolook.scenes.procedural.patches import Patch
 from wheretolook.scenes.procedural.plan import Room
 from wheretolook.scenes.procedural.shell import wall_items
 
-CELL_M = 0.1
-"""Side of the cells in which `Layout.passable` looks for ways."""
+CELL_M = 0.1  # side of the cells in which `Layout.passable` looks for ways
 WALKER_RADIUS_M = 0.25
-DOOR_ZONE_M = 0.95
-"""Depth of the floor before a door that stays free."""
+DOOR_ZONE_M = 0.95  # depth of the floor before a door that stays free
+WARM = (1.0, 0.80, 0.58)  # colour of a light bulb
 
 Rectangle = tuple[float, float, float, float]
-
-WARM = (1.0, 0.80, 0.58)
-"""Colour of a light bulb."""
+Size = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -39,48 +36,27 @@ def overlap(a: Rectangle, b: Rectangle, gap: float = 0.0) -> bool:
 
 @dataclass(frozen=True)
 class Spot:
-    """A place along a wall for a piece of furniture.
+    """A place along a wall for a piece of furniture, in metres."""
 
-    Attributes:
-        side: of the room.
-        at: wall coordinate of its middle, in metres.
-        size: width along the wall, depth into the room and height, in metres.
-        front: depth of the floor before it that must stay free, in metres.
-        footprint: in the world.
-    """
-
-    side: int
-    at: float
-    size: tuple[float, float, float]
-    front: float
-    footprint: Rectangle
+    side: int  # of the room
+    at: float  # wall coordinate of its middle
+    size: Size  # width along the wall, depth into the room and height
+    front: float  # depth of the floor before it that must stay free
+    footprint: Rectangle  # in the world
 
 
 @dataclass
 class Layout:
-    """What stands and hangs in one room, and where more can.
-
-    Attributes:
-        room: the room.
-        rng: source of the random choices.
-        footprints: of what stands on the floor.
-        keep_free: floor that nothing may stand on (before doors, wardrobes, the sofa); the doors' come first.
-        on_wall: for each wall, the covered rectangles (a0, a1, z0, z1).
-        patches: all that was put into the room.
-        doors: for each door, a point 0.4 m before it.
-        lamps: the lamps that are lit.
-    """
+    """What stands and hangs in one room, and where more can."""
 
     room: Room
     rng: np.random.Generator
-    footprints: list[Rectangle] = field(default_factory=list)
-    keep_free: list[Rectangle] = field(default_factory=list)
-    on_wall: tuple[list[Rectangle], list[Rectangle], list[Rectangle], list[Rectangle]] = field(
-        default_factory=lambda: ([], [], [], [])
-    )
+    footprints: list[Rectangle] = field(default_factory=list)  # of what stands on the floor
+    keep_free: list[Rectangle] = field(default_factory=list)  # floor before doors (first), wardrobes, the sofa
+    on_wall: list[list[Rectangle]] = field(default_factory=lambda: [[], [], [], []])  # covered (a0, a1, z0, z1)
     patches: list[Patch] = field(default_factory=list)
-    doors: list[tuple[float, float]] = field(default_factory=list)
-    lamps: list[Lamp] = field(default_factory=list)
+    doors: list[tuple[float, float]] = field(default_factory=list)  # for each door, a point 0.4 m before it
+    lamps: list[Lamp] = field(default_factory=list)  # that are lit
 
     def __post_init__(self) -> None:
         for side in range(4):
@@ -115,9 +91,8 @@ class Layout:
         nx, ny = int(room.width / CELL_M), int(room.depth / CELL_M)
         x = room.x0 + (np.arange(nx) + 0.5) * room.width / nx
         y = room.y0 + (np.arange(ny) + 0.5) * room.depth / ny
-        free = np.ones((nx, ny), bool)
         r = WALKER_RADIUS_M
-        free &= ((x > room.x0 + r) & (x < room.x1 - r))[:, None] & ((y > room.y0 + r) & (y < room.y1 - r))[None]
+        free = ((x > room.x0 + r) & (x < room.x1 - r))[:, None] & ((y > room.y0 + r) & (y < room.y1 - r))[None]
         for x0, y0, x1, y1 in [*self.footprints, extra]:
             free[np.ix_((x > x0 - r) & (x < x1 + r), (y > y0 - r) & (y < y1 + r))] = False
         labels, count = ndimage.label(free)
@@ -132,8 +107,7 @@ class Layout:
 
     def contains(self, footprint: Rectangle) -> bool:
         """Whether a footprint lies in the room."""
-        x0, y0, x1, y1 = footprint
-        room = self.room
+        (x0, y0, x1, y1), room = footprint, self.room
         return x0 > room.x0 - 1e-6 and y0 > room.y0 - 1e-6 and x1 < room.x1 + 1e-6 and y1 < room.y1 + 1e-6
 
     def is_clear(self, footprint: Rectangle, gap: float = 0.02) -> bool:
@@ -149,15 +123,11 @@ class Layout:
         return not any(a0 < b1 + gap and b0 < a1 + gap and z0 < h1 and h0 < z1 for b0, b1, h0, h1 in self.on_wall[side])
 
     def find_by_wall(
-        self, size: tuple[float, float, float], place: str = "any", front: float = 0.5, sides: list[int] | None = None
+        self, size: Size, place: str = "any", front: float = 0.5, sides: list[int] | None = None
     ) -> Spot | None:
-        """Spot along a wall for a piece of furniture, or None.
+        """Spot along a wall for a piece of furniture (see `Spot`), or None: at its `middle`, a `corner`, or `any`.
 
-        Args:
-            size: extent along the wall, depth into the room and height, in metres.
-            place: `middle` of the wall, `corner`, or `any`.
-            front: depth of the floor that must stay free before it.
-            sides: the walls to try, in order; all in random order if None.
+        `sides` are the walls to try, in order; all in random order if None.
         """
         width, depth, height = size
         order = [int(s) for s in self.rng.permutation(4)] if sides is None else sides
@@ -176,12 +146,10 @@ class Layout:
                 candidates = np.concatenate([self.rng.permutation([low, high]), self.rng.uniform(low, high, 8)])
             for at in candidates[(candidates >= low - 1e-9) & (candidates <= high + 1e-9)]:
                 a0, a1 = float(at) - width / 2, float(at) + width / 2
-                if not self.wall_is_clear(side, a0, a1, 0.0, height):
-                    continue
                 footprint = self.rectangle(side, a0, a1, 0.0, depth)
                 before = self.rectangle(side, a0, a1, depth, depth + front)
                 blocked = any(overlap(before, f, -0.01) for f in self.footprints)
-                if not blocked and self.is_clear(footprint):
+                if self.wall_is_clear(side, a0, a1, 0.0, height) and not blocked and self.is_clear(footprint):
                     return Spot(side, float(at), size, front, footprint)
         return None
 
@@ -201,8 +169,8 @@ class Layout:
 
     def add_lamp(self, x: float, y: float, height: float, strength: float) -> None:
         """Light a lamp with the colour of a light bulb at a world position."""
-        colour = (strength * WARM[0], strength * WARM[1], strength * WARM[2])
-        self.lamps.append(Lamp((x, y, height), self.room.index, colour))
+        red, green, blue = WARM
+        self.lamps.append(Lamp((x, y, height), self.room.index, (strength * red, strength * green, strength * blue)))
 
     def find_on_floor(self, width: float, depth: float, margin: float) -> tuple[float, float] | None:
         """Centre of a free rectangle (width in x, depth in y) with `margin` around it, or None."""
@@ -220,8 +188,7 @@ class Layout:
 
         What stands out from the wall by `depth` metres does not hang in a doorway.
         """
-        doorways = self.keep_free[: len(self.doors)]
-        length = self.room.wall_length(side)
+        doorways, length = self.keep_free[: len(self.doors)], self.room.wall_length(side)
         if length < width + 0.3:
             return None
         for at in self.rng.uniform(width / 2 + 0.12, length - width / 2 - 0.12, 6):

@@ -139,11 +139,8 @@ def gather_kernel(
                 which = triangle_patch[hit.face]
                 size = shape[which]
                 if size[0] > 0:
-                    st = (
-                        hit.u * triangle_st[hit.face, 0]
-                        + hit.v * triangle_st[hit.face, 1]
-                        + (1.0 - hit.u - hit.v) * triangle_st[hit.face, 2]
-                    )
+                    st = hit.u * triangle_st[hit.face, 0] + hit.v * triangle_st[hit.face, 1]
+                    st += (1.0 - hit.u - hit.v) * triangle_st[hit.face, 2]
                     column = wp.clamp(int(st[0] * float(size[1])), 0, size[1] - 1)
                     row = wp.clamp(int(st[1] * float(size[0])), 0, size[0] - 1)
                     total += wp.cw_mul(albedo[which], direct[start[which] + row * size[1] + column])

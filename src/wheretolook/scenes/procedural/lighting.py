@@ -24,33 +24,22 @@ from wheretolook.utils.warp import start_warp, vec3_array
 
 Float = NDArray[np.floating[Any]]
 
-SKY = (5.2, 5.7, 6.3)
-"""Radiance of a window pane per colour; lamps are in the same unit."""
+SKY = (5.2, 5.7, 6.3)  # radiance of a window pane per colour; lamps are in the same unit
 AMBIENT = (0.018, 0.019, 0.02)
-LATER_BOUNCES = 1.7
-"""Light of all bounces together, relative to that of the first."""
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-"""Weights of linear red, green and blue (ITU-R BT.709)."""
+LATER_BOUNCES = 1.7  # light of all bounces together, relative to that of the first
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # weights of linear red, green and blue (ITU-R BT.709)
 _BINOMIAL = np.array([0.25, 0.5, 0.25], np.float32)
 
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Points where light is computed.
+    """Points where light is computed."""
 
-    Attributes:
-        points: (S, 3) metres.
-        normals: (S, 3).
-        room: (S,) index.
-        start: (P,) first sample of each patch.
-        shape: (P, 2) rows and columns of each patch's grid.
-    """
-
-    points: Float
-    normals: Float
-    room: NDArray[np.int32]
-    start: NDArray[np.int32]
-    shape: NDArray[np.int32]
+    points: Float  # (S, 3) metres
+    normals: Float  # (S, 3)
+    room: NDArray[np.int32]  # (S,) index
+    start: NDArray[np.int32]  # (P,) first sample of each patch
+    shape: NDArray[np.int32]  # (P, 2) rows and columns of each patch's grid
 
 
 def place_samples(patches: Sequence[Patch], spacing_m: float) -> Samples:
@@ -93,17 +82,11 @@ def _evaluate(patch: Patch, s: Float, t: Float) -> tuple[Float, Float]:
 
 @dataclass(frozen=True, eq=False)
 class Light:
-    """Linear light per sample.
+    """Linear light per sample."""
 
-    Attributes:
-        sharp: (S, 3) from the room's own windows and lamps.
-        soft: (S, 3) reflected by surfaces, or come through doors and past curtains.
-        valid: (S,) False for samples inside a solid.
-    """
-
-    sharp: Float
-    soft: Float
-    valid: NDArray[np.bool_]
+    sharp: Float  # (S, 3) from the room's own windows and lamps
+    soft: Float  # (S, 3) reflected by surfaces, or come through doors and past curtains
+    valid: NDArray[np.bool_]  # (S,) False for samples inside a solid
 
     @property
     def luminance(self) -> Float:
@@ -122,17 +105,10 @@ def bake(
     device: str,
     rays: int,
 ) -> Light:
-    """Compute the light at all samples.
+    """The light at all samples, of windows (flat patches, and whether a curtain is drawn before them) and of lit lamps.
 
-    Args:
-        patches: all patches of the scene.
-        surface: their triangles; those of materials that cast no shadow are left out.
-        samples: where light is computed.
-        albedo: (P, 3) mean linear albedo of each patch.
-        windows: flat patches that let daylight in, and whether a curtain is drawn before them.
-        lamps: the lamps that are lit.
-        device: Warp device, such as "cpu" or "cuda".
-        rays: rays over the hemisphere per sample; each window and lamp gets a fraction of this number.
+    `surface` are the triangles of all patches; materials that cast no shadow are left out. `albedo` (P, 3) is linear,
+    the mean of each patch. `rays` go over the hemisphere of a sample; each window and lamp gets a fraction of them.
     """
     device = start_warp(device)
     kept = np.flatnonzero(np.array([p.material.casts_shadow for p in patches])[surface.patch])
@@ -149,22 +125,12 @@ def bake(
     count = len(samples.points)
     direct, soft, bounced = (wp.empty(count, dtype=wp.vec3, device=device) for _ in range(3))
     open_share, back_share = (wp.empty(count, dtype=wp.float32, device=device) for _ in range(2))
-    window_inputs = [
-        vectors([p.positions[0, 0] for p in panes]),
-        vectors([p.positions[0, -1] - p.positions[0, 0] for p in panes]),
-        vectors([p.positions[-1, 0] - p.positions[0, 0] for p in panes]),
-        integers([p.room for p in panes]),
-        integers([covered for _, covered in windows]),
-        max(4, rays // 2),
-        wp.vec3(*SKY),
-    ]
-    lamp_inputs = [
-        vectors([lamp.position for lamp in lamps]),
-        vectors([lamp.colour for lamp in lamps]),
-        integers([lamp.room for lamp in lamps]),
-        max(2, rays // 6),
-    ]
-    inputs = [*places, integers(samples.room), *window_inputs, *lamp_inputs]
+    corners, rights, downs = (np.array([p.positions[at] for p in panes]) for at in ((0, 0), (0, -1), (-1, 0)))
+    window_inputs = [vectors(corners), vectors(rights - corners), vectors(downs - corners)]
+    window_inputs += [integers([p.room for p in panes]), integers([covered for _, covered in windows])]
+    lamp_inputs = [vectors([lamp.position for lamp in lamps]), vectors([lamp.colour for lamp in lamps])]
+    lamp_inputs += [integers([lamp.room for lamp in lamps]), max(2, rays // 6)]
+    inputs = [*places, integers(samples.room), *window_inputs, max(4, rays // 2), wp.vec3(*SKY), *lamp_inputs]
     wp.launch(direct_kernel, count, inputs, [direct, soft], device=device)
     st: Any = wp.array(np.ascontiguousarray(surface.st[kept], np.float32), dtype=wp.vec2, device=device)
     shape: Any = wp.array(samples.shape, dtype=wp.vec2i, device=device)
@@ -173,27 +139,21 @@ def bake(
     wp.launch(gather_kernel, count, inputs, [bounced, open_share, back_share], device=device)
     through_doors = soft.numpy()
     ambient = np.array(AMBIENT, np.float32) * open_share.numpy()[:, None]
-    return Light(
-        sharp=direct.numpy() - through_doors,
-        soft=through_doors + LATER_BOUNCES * bounced.numpy() + ambient,
-        valid=back_share.numpy() < 0.4,
-    )
+    reflected = through_doors + LATER_BOUNCES * bounced.numpy() + ambient
+    return Light(direct.numpy() - through_doors, reflected, back_share.numpy() < 0.4)
 
 
 def light_grids(samples: Samples, light: Light) -> list[Float | None]:
     """Light per patch as (rows, columns, 3), smoothed, with samples inside solids filled from their neighbours."""
     grids: list[Float | None] = []
     for first, (ny, nx) in zip(samples.start, samples.shape, strict=True):
-        if nx == 0:
-            grids.append(None)
-            continue
         rows = slice(first, first + nx * ny)
         sharp, soft = (values[rows].reshape(ny, nx, 3) for values in (light.sharp, light.soft))
         valid = light.valid[rows].reshape(ny, nx, 1)
         if nx * ny > 1 and valid.any():
             # Light from all around varies slowly, so it is smoothed more.
             sharp, soft = _smooth(sharp, valid, 1), _smooth(soft, valid, 4)
-        grids.append(sharp + soft)
+        grids.append(sharp + soft if nx else None)
     return grids
 
 

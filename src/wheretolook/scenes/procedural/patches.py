@@ -17,35 +17,22 @@ from wheretolook.scenes.procedural.materials import Material
 
 Float = NDArray[np.floating[Any]]
 
-HIDDEN = 0.2
-"""Texel density, relative to other faces, of faces that stand against a wall or on the floor."""
+HIDDEN = 0.2  # texel density, relative to other faces, of faces that stand against a wall or on the floor
 
 
 @dataclass(frozen=True, eq=False)
 class Patch:
-    """A grid of (m, n) cells.
+    """A grid of (m, n) cells."""
 
-    Attributes:
-        positions: (m + 1, n + 1, 3) metres; row = t (down), column = s (right), seen from the front.
-        s: (n + 1,) texture coordinate of the columns, 0 to 1.
-        t: (m + 1,) texture coordinate of the rows, 0 to 1.
-        size_m: width and height of the surface in metres, which set the number of texels.
-        material: what is painted on it.
-        room: index of the room whose lamps and windows light it best.
-        density: texels per metre relative to the apartment's.
-        mask: (m, n) False for cells that are holes, or None for no holes.
-        offset_m: where the painted pattern starts, metres right and down.
-    """
-
-    positions: Float
-    s: Float
-    t: Float
-    size_m: tuple[float, float]
+    positions: Float  # (m + 1, n + 1, 3) metres; row = t (down), column = s (right), seen from the front
+    s: Float  # (n + 1,) texture coordinate of the columns, 0 to 1
+    t: Float  # (m + 1,) texture coordinate of the rows, 0 to 1
+    size_m: tuple[float, float]  # width and height of the surface, which set the number of texels
     material: Material
-    room: int = 0
-    density: float = 1.0
-    mask: NDArray[np.bool_] | None = None
-    offset_m: tuple[float, float] = (0.0, 0.0)
+    room: int = 0  # index of the room whose lamps and windows light it best
+    density: float = 1.0  # texels per metre relative to the apartment's
+    mask: NDArray[np.bool_] | None = None  # (m, n) False for cells that are holes
+    offset_m: tuple[float, float] = (0.0, 0.0)  # where the painted pattern starts, right and down
 
     def triangles(self) -> tuple[NDArray[np.int64], Float]:
         """Triangles as indices into the flattened grid (T, 3) and the (s, t) of their corners (T, 3, 2)."""
@@ -60,8 +47,7 @@ class Patch:
         corners = self.positions.reshape(-1, 3)[triangles]
         area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
         triangles = triangles[area > 1e-9]  # the poles of closed surfaces of revolution
-        st = np.stack([self.s[triangles % (n + 1)], self.t[triangles // (n + 1)]], -1)
-        return triangles, st
+        return triangles, np.stack([self.s[triangles % (n + 1)], self.t[triangles // (n + 1)]], -1)
 
 
 def grid_patch(positions: Float, material: Material, size_m: tuple[float, float], **options: Any) -> Patch:
@@ -80,19 +66,12 @@ def plane(origin: ArrayLike, right: ArrayLike, down: ArrayLike, material: Materi
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Triangles of many patches.
+    """Triangles of many patches."""
 
-    Attributes:
-        vertices: (V, 3) metres.
-        triangles: (T, 3) vertex indices.
-        patch: (T,) the patch each triangle belongs to.
-        st: (T, 3, 2) patch coordinates of the corners.
-    """
-
-    vertices: Float
-    triangles: NDArray[np.int64]
-    patch: NDArray[np.int64]
-    st: Float
+    vertices: Float  # (V, 3) metres
+    triangles: NDArray[np.int64]  # (T, 3) vertex indices
+    patch: NDArray[np.int64]  # (T,) the patch each triangle belongs to
+    st: Float  # (T, 3, 2) patch coordinates of the corners
 
 
 def join(patches: Sequence[Patch]) -> Surface:
@@ -108,8 +87,9 @@ def join(patches: Sequence[Patch]) -> Surface:
     )
 
 
+# Faces of a box in the furniture frame: y points from the wall into the room (front = +y), z up. For each, the corner
+# it starts at, right and down, as signs on the half extents.
 FACES: dict[str, tuple[tuple[int, int, int], tuple[int, int, int], tuple[int, int, int]]] = {
-    # face: (corner it starts at, right, down), as signs on the half extents
     "front": ((1, 1, 1), (-1, 0, 0), (0, 0, -1)),
     "back": ((-1, -1, 1), (1, 0, 0), (0, 0, -1)),
     "right": ((1, -1, 1), (0, 1, 0), (0, 0, -1)),
@@ -117,7 +97,6 @@ FACES: dict[str, tuple[tuple[int, int, int], tuple[int, int, int], tuple[int, in
     "top": ((-1, 1, 1), (1, 0, 0), (0, -1, 0)),
     "bottom": ((-1, -1, -1), (1, 0, 0), (0, 1, 0)),
 }
-"""Faces of a box in the furniture frame: y points from the wall into the room (front = +y), z up."""
 
 
 def _face_options(number: int, hidden: bool, density: float, offset_m: tuple[float, float]) -> dict[str, Any]:
@@ -190,19 +169,13 @@ def cushion(
 
 
 def lathe(
-    profile: Sequence[tuple[float, float]],
-    material: Material,
-    *,
-    sides: int = 16,
-    centre: ArrayLike = (0, 0, 0),
-    density: float = 1.0,
+    profile: ArrayLike, material: Material, *, sides: int = 16, centre: ArrayLike = (0, 0, 0), density: float = 1.0
 ) -> list[Patch]:
     """Surface of revolution about z; `profile` lists (radius, z) downwards, radius 0 at both ends closes it."""
     rz, angle = np.asarray(profile, float), _full_turn(sides)
     ring = np.stack([np.cos(angle), np.sin(angle)], -1)
     positions = np.empty((len(rz), sides + 1, 3))
-    positions[..., :2] = rz[:, None, :1] * ring[None]
-    positions[..., 2] = rz[:, None, 1]
+    positions[..., :2], positions[..., 2] = rz[:, None, :1] * ring[None], rz[:, None, 1]
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(rz, axis=0), axis=1))])
     size, s, t = (2 * np.pi * float(rz[:, 0].max()), float(arc[-1])), np.linspace(0, 1, sides + 1), arc / arc[-1]
     return [Patch(positions + np.asarray(centre, float), s, t, size, material, density=density)]

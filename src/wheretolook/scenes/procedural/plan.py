@@ -11,52 +11,37 @@ from wheretolook.geometry.poses import Float
 
 INNER_WALL_M = 0.12
 DOOR_HEIGHT_M = 2.05
+# Doors are preferably between rooms of low cost.
+_COST = {"hall": 0.0, "living": 1.0, "kitchen": 3.0, "study": 5.0, "bedroom": 5.0, "bathroom": 9.0}
+# Least width in metres and greatest ratio of the sides, for kinds of rooms.
+_SHAPES = {"hall": (1.15, 6.5), "bathroom": (1.6, 2.2), "living": (3.2, 2.0), "kitchen": (2.2, 2.0)}
 
 
 @dataclass(frozen=True)
 class Opening:
-    """A door or window in a wall.
+    """A door or window in a wall, in metres."""
 
-    Attributes:
-        kind: `door`, `wide` (a wide opening without a frame or door) or `window`.
-        a0, a1: left and right end along the wall in metres, seen from inside the room.
-        z0, z1: lower and upper edge above the floor in metres.
-        other: index of the room behind it, -1 for outside.
-        owner: whether this room's side carries the jambs and the threshold.
-    """
-
-    kind: str
-    a0: float
-    a1: float
-    z0: float
-    z1: float
-    other: int = -1
-    owner: bool = True
+    kind: str  # `door`, `wide` (a wide opening without a frame or door) or `window`
+    a0: float  # left end along the wall, seen from inside the room
+    a1: float  # right end
+    z0: float  # lower edge above the floor
+    z1: float  # upper edge
+    other: int = -1  # index of the room behind it, -1 for outside
+    owner: bool = True  # whether this room's side carries the jambs and the threshold
 
 
 @dataclass
 class Room:
-    """An axis-aligned room, inside measures.
-
-    Attributes:
-        index: its number.
-        x0, y0, x1, y1: west, south, east and north wall, in metres.
-        kind: `living`, `kitchen`, `bedroom`, `bathroom`, `hall` or `study`.
-        openings: doors and windows of each side (south, east, north, west).
-        lamp_on: whether its ceiling lamp is lit.
-        curtains_closed: whether its windows are covered.
-    """
+    """An axis-aligned room, inside measures in metres."""
 
     index: int
-    x0: float
-    y0: float
-    x1: float
-    y1: float
-    kind: str = ""
-    openings: tuple[list[Opening], list[Opening], list[Opening], list[Opening]] = field(
-        default_factory=lambda: ([], [], [], [])
-    )
-    lamp_on: bool = True
+    x0: float  # west wall
+    y0: float  # south wall
+    x1: float  # east wall
+    y1: float  # north wall
+    kind: str = ""  # `living`, `kitchen`, `bedroom`, `bathroom`, `hall` or `study`
+    openings: list[list[Opening]] = field(default_factory=lambda: [[], [], [], []])  # of south, east, north, west
+    lamp_on: bool = True  # on the ceiling
     curtains_closed: bool = False
 
     @property
@@ -131,12 +116,8 @@ def shared_wall(a: Room, b: Room) -> tuple[int, float, float] | None:
     """Side of `a` that faces `b` and the common interval in world x or y, or None if they do not touch."""
     common_x = max(a.x0, b.x0), min(a.x1, b.x1)
     common_y = max(a.y0, b.y0), min(a.y1, b.y1)
-    for side, lower, upper, (low, high) in (
-        (0, b.y1, a.y0, common_x),
-        (2, a.y1, b.y0, common_x),
-        (1, a.x1, b.x0, common_y),
-        (3, b.x1, a.x0, common_y),
-    ):
+    walls = (0, b.y1, a.y0, common_x), (2, a.y1, b.y0, common_x), (1, a.x1, b.x0, common_y), (3, b.x1, a.x0, common_y)
+    for side, lower, upper, (low, high) in walls:
         if high - low > 1e-6 and abs(lower + INNER_WALL_M - upper) < 1e-4:
             return side, low, high
     return None
@@ -166,10 +147,6 @@ def _name(rooms: list[Room], corridor: bool) -> None:
         room.kind = kind
 
 
-_COST = {"hall": 0.0, "living": 1.0, "kitchen": 3.0, "study": 5.0, "bedroom": 5.0, "bathroom": 9.0}
-"""Doors are preferably between rooms of low cost."""
-
-
 def _spanning_doors(rooms: list[Room]) -> list[tuple[int, int]] | None:
     """Doors, as pairs of rooms, that make a minimum spanning tree of the rooms (Kruskal).
 
@@ -194,10 +171,6 @@ def _spanning_doors(rooms: list[Room]) -> list[tuple[int, int]] | None:
     return None if any(degree[r.index] > 1 for r in private) else doors
 
 
-_SHAPES = {"hall": (1.15, 6.5), "bathroom": (1.6, 2.2), "living": (3.2, 2.0), "kitchen": (2.2, 2.0)}
-"""Least width in metres and greatest ratio of the sides, for kinds of rooms."""
-
-
 def _fits(room: Room) -> bool:
     short, long = sorted((room.width, room.depth))
     least, slenderness = _SHAPES.get(room.kind, (2.5, 2.0))
@@ -207,10 +180,9 @@ def _fits(room: Room) -> bool:
 def _add_doors(rng: np.random.Generator, rooms: list[Room], doors: list[tuple[int, int]], height: float) -> None:
     for i, j in doors:
         a, b = rooms[i], rooms[j]
-        wall = shared_wall(a, b)
+        wall, kinds = shared_wall(a, b), {a.kind, b.kind}
         assert wall is not None
         side, low, high = wall
-        kinds = {a.kind, b.kind}
         wide = kinds == {"living", "kitchen"} or (kinds == {"living", "hall"} and rng.random() < 0.4)
         wide = wide and high - low - 0.3 > 1.3
         width = float(min(rng.uniform(1.3, 2.0), high - low - 0.3) if wide else rng.uniform(0.86, 0.95))
@@ -239,9 +211,7 @@ def outside_spans(room: Room, rooms: list[Room], side: int) -> list[tuple[float,
 
 
 def _add_windows(rng: np.random.Generator, rooms: list[Room]) -> None:
-    for room in rooms:
-        if room.kind == "hall":
-            continue
+    for room in (room for room in rooms if room.kind != "hall"):
         spans = [(high - low, side, low, high) for side in range(4) for low, high in outside_spans(room, rooms, side)]
         for span, side, low, high in sorted(spans, reverse=True)[: 2 if room.kind == "living" else 1]:
             small = room.kind == "bathroom"
@@ -261,8 +231,7 @@ def draw_plan(rng: np.random.Generator, n_rooms: int, area_m2: float, dark_rooms
     """
     height = float(rng.uniform(2.5, 2.8))
     for attempt in range(5000):
-        corridor = n_rooms >= 5 or (n_rooms == 4 and rng.random() < 0.5)
-        corridor = corridor and rng.random() < 0.6
+        corridor = (n_rooms >= 5 or (n_rooms == 4 and rng.random() < 0.5)) and rng.random() < 0.6
         grown = area_m2 * (1 + attempt / 5000)
         ratio = rng.uniform(0.65, 1.0)
         width, depth = float(np.sqrt(grown / ratio)), float(np.sqrt(grown * ratio))
@@ -271,9 +240,7 @@ def draw_plan(rng: np.random.Generator, n_rooms: int, area_m2: float, dark_rooms
             room.x0, room.x1 = room.x0 - width / 2, room.x1 - width / 2
             room.y0, room.y1 = room.y0 - depth / 2, room.y1 - depth / 2
         _name(rooms, corridor)
-        if not all(_fits(r) for r in rooms):
-            continue
-        doors = _spanning_doors(rooms)
+        doors = _spanning_doors(rooms) if all(_fits(r) for r in rooms) else None
         if doors is None:
             continue
         _add_doors(rng, rooms, doors, height)

@@ -13,15 +13,14 @@ from wheretolook.scenes.procedural.plan import INNER_WALL_M, Opening, Plan, Room
 from wheretolook.scenes.procedural.style import ACCENTS, WALLS, Style
 
 WALL_ENDS = ("back", "bottom", "left", "right")
-REVEAL_M = 0.16
-"""How deep a window sits in the wall."""
+REVEAL_M = 0.16  # how deep a window sits in the wall
 
 
 @dataclass(frozen=True, eq=False)
 class Finish:
     """Surface materials of one room: four walls, floor, ceiling."""
 
-    walls: tuple[Material, Material, Material, Material]
+    walls: list[Material]
     floor: Material
     ceiling: Material
 
@@ -59,24 +58,22 @@ def choose_finish(style: Style, room: Room) -> Finish:
             walls[side] = paper
     if room.kind == "bedroom" and style.chance(0.4):
         floor = materials.plain(rng, materials.vary(rng, (0.62, 0.57, 0.50)), speckle=0.03 + 0.07 * style.richness)
-    return Finish((walls[0], walls[1], walls[2], walls[3]), floor, ceiling)
+    return Finish(walls, floor, ceiling)
 
 
 def _bathroom_tiles(style: Style) -> Material:
     rng, richness = style.rng, style.richness
     size = style.pick([(0.3, 0.6), (0.2, 0.2), (0.3, 0.3), (0.15, 0.15)])
     tile = materials.vary(rng, style.pick([(0.90, 0.91, 0.90), (0.72, 0.80, 0.82), (0.84, 0.80, 0.72)]), 0.02)
-    brick = style.chance(0.3)
+    brick, grout = style.chance(0.3), (0.62, 0.62, 0.60)
     every = int(rng.integers(3, 8)) if style.chance(0.3 + 0.6 * richness) else 0
-    grout = (0.62, 0.62, 0.60)
     return materials.tiles(rng, tile, grout, size_m=size, brick=brick, veins=0.5 * richness, decor_every=every)
 
 
 def _wall(room: Room, side: int, height: float, material: Material) -> Patch:
     """A wall with holes for its openings."""
     corner, right, _ = room.wall_frame(side)
-    length = room.wall_length(side)
-    openings = room.openings[side]
+    length, openings = room.wall_length(side), room.openings[side]
     a = np.unique([0.0, length, *(x for o in openings for x in (o.a0, o.a1))])
     z = np.unique([0.0, height, *(x for o in openings for x in (o.z0, o.z1))])[::-1]
     mask = np.ones((len(z) - 1, len(a) - 1), bool)
@@ -148,9 +145,8 @@ def build_shell(style: Style, plan: Plan) -> list[Patch]:
     else:
         cloth = materials.fabric(style.rng, materials.vary(style.rng, (0.80, 0.76, 0.68), 0.05), weave=0.02)
     for room, finish in zip(plan.rooms, finishes, strict=True):
-        x0, y0, y1 = room.x0, room.y0, room.y1
-        right, down, offset = (room.width, 0, 0), (0, room.depth, 0), (x0 + 20, 20 - y1)
-        up = (0, -room.depth, 0)
+        x0, y0, y1, right = room.x0, room.y0, room.y1, (room.width, 0, 0)
+        up, down, offset = (0, -room.depth, 0), (0, room.depth, 0), (x0 + 20, 20 - y1)
         patches.append(plane((x0, y1, 0), right, up, finish.floor, room=room.index, offset_m=offset))
         patches.append(plane((x0, y0, plan.height), right, down, finish.ceiling, room=room.index, density=0.7))
         for side in range(4):

@@ -15,24 +15,16 @@ T = TypeVar("T")
 WALLS = ((0.90, 0.88, 0.84), (0.87, 0.87, 0.86), (0.88, 0.84, 0.76), (0.80, 0.84, 0.82), (0.82, 0.85, 0.89))
 ACCENTS = ((0.45, 0.55, 0.52), (0.36, 0.45, 0.56), (0.72, 0.52, 0.42), (0.62, 0.60, 0.54), (0.75, 0.67, 0.50))
 WOODS = ((0.78, 0.62, 0.44), (0.68, 0.49, 0.32), (0.50, 0.34, 0.23), (0.84, 0.74, 0.60), (0.58, 0.44, 0.33))
-TEXTILES = (
-    (0.48, 0.52, 0.56),
-    (0.62, 0.56, 0.48),
-    (0.30, 0.40, 0.46),
-    (0.70, 0.64, 0.55),
-    (0.46, 0.50, 0.40),
-    (0.58, 0.36, 0.32),
-)
+_GREYS = (0.48, 0.52, 0.56), (0.62, 0.56, 0.48), (0.30, 0.40, 0.46)
+TEXTILES = (*_GREYS, (0.70, 0.64, 0.55), (0.46, 0.50, 0.40), (0.58, 0.36, 0.32))
 FRONTS = ((0.88, 0.88, 0.85), (0.52, 0.58, 0.55), (0.80, 0.76, 0.68), (0.42, 0.48, 0.56))
 
 
 class Style:
-    """Materials that one apartment is furnished with.
+    """Materials that one apartment is furnished with; its `rng` makes all random choices.
 
-    Args:
-        rng: source of all random choices.
-        richness: 0 to 1, how much texture surfaces have and how much hangs on the walls.
-        clutter: 0 to 1, the number of small things.
+    From 0 to 1, `richness` is how much texture surfaces have and how much hangs on the walls, `clutter` how many small
+    things there are.
     """
 
     def __init__(self, rng: np.random.Generator, richness: float, clutter: float) -> None:
@@ -69,9 +61,8 @@ class Style:
 
     def patterned(self) -> Material:
         """Cloth with a pattern, for pillows, throws and bed covers."""
-        pattern = "plain"
-        if self.chance(self.richness + 0.35):
-            pattern = self.pick(["plain", "stripes", "checks", "dots", "zigzag"])
+        patterns = ["plain", "stripes", "checks", "dots", "zigzag"]
+        pattern = self.pick(patterns) if self.chance(self.richness + 0.35) else "plain"
         colours = self.pick(artwork.PALETTES)
         first, second = (colours[k] for k in self.rng.permutation(5)[:2])
         period_m = float(self.rng.uniform(0.05, 0.14))

@@ -1,0 +1,78 @@
+"""A scene opened once."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from box_scenes import furnished_room
+from planning.rooms import CAMERA, room_landmarks
+from wheretolook.dataset.folders import SceneFolder
+from wheretolook.dataset.scene import Scene, SceneConfig
+from wheretolook.geometry.lattices import ViewLattice
+from wheretolook.rendering import raycasting
+from wheretolook.scenes import loading
+from wheretolook.scenes.loading import save_glb
+from wheretolook.utils.errors import ConfigError, MapError, SceneError
+from wheretolook.utils.files import write_json
+from wheretolook.visibility.config import OcclusionConfig
+from wheretolook.visibility.hidden_points import HiddenPointRemoval
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> SceneFolder:
+    files = SceneFolder(tmp_path / "room", "test")
+    files.map.mkdir(parents=True)
+    save_glb(furnished_room(), files.mesh)
+    room_landmarks(50).save(files.landmarks)
+    return files
+
+
+def test_a_mesh_is_loaded_once_and_rays_are_cast_against_one_tree(
+    files: SceneFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loaded, trees = [], []
+    load, build = loading.load_mesh, raycasting.MeshRaycaster.__init__
+    monkeypatch.setattr(loading, "load_mesh", lambda *args, **options: loaded.append(args) or load(*args, **options))
+    monkeypatch.setattr(raycasting.MeshRaycaster, "__init__", lambda *args: trees.append(args) or build(*args))
+    scene = Scene(files, CAMERA)
+    assert not loaded
+    views = ViewLattice((5, 4, 3), directions=10)
+    grid, free = scene.free_voxels(views, scene.space)
+    assert 0 < len(free) < len(grid) and scene.space is scene.sampled_space
+    assert scene.renderer.render(scene.camera, np.eye(4)[None, :3]).rgb.shape[0] == 1
+    assert scene.localization_map.occlusion is scene.occlusion and scene.localization_map.camera == CAMERA
+    assert (len(loaded), len(trees)) == (1, 1)
+
+
+def test_without_a_mesh_landmarks_hide_one_another_and_metres_are_needed(files: SceneFolder) -> None:
+    files.mesh.unlink()
+    with pytest.raises(SceneError, match="needs the scene's mesh"):
+        _ = Scene(files, CAMERA).occlusion
+    write_json(files.map / "report.json", {"scale": {"source": "unknown"}})
+    scene = Scene(files, CAMERA)
+    assert scene.is_photographed and isinstance(scene.occlusion, HiddenPointRemoval)
+    none = SceneConfig(OcclusionConfig(model="none"))
+    assert Scene(files, CAMERA, none).occlusion_config.model == "none"
+    with pytest.raises(MapError, match="no scale, and this needs metres"):
+        _ = scene.space
+    with pytest.raises(MapError, match="poses of the map's photographs are missing"):
+        _ = Scene(files, CAMERA, replace(none, assume_metric=True)).space
+
+
+@pytest.mark.parametrize("wrong", [{"grid": (8, 0, 8)}, {"directions": 0}, {"lattice": "spiral"}])
+def test_views_that_cannot_be_are_refused(wrong: dict[str, object]) -> None:
+    with pytest.raises(ConfigError):
+        ViewLattice(**wrong)  # type: ignore[arg-type]
+
+
+def test_stages_load_nothing_heavy_until_there_is_work() -> None:
+    heavy = ["torch", "lightning", "warp", "mlflow", "matplotlib", "pycolmap", "open3d", "sklearn", "scipy", "cv2"]
+    code = f"import sys, wheretolook.stages; print([name for name in {heavy} if name in sys.modules])"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "[]"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from math import ceil
-from typing import NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import pandas as pd
@@ -38,7 +38,29 @@ class Batch(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class LabelledViews:
+class TensorViews:
+    """Labelled viewpoints, known by tensors of one device and by arrays."""
+
+    def _tensors(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if isinstance(value, Tensor)}
+
+    def to(self, device: torch.device | str) -> Self:
+        """The same views with their tensors on a device."""
+        return replace(self, **{name: value.to(device) for name, value in self._tensors().items()})
+
+    @property
+    def device(self) -> torch.device:
+        """Where the tensors are."""
+        return next(value.device for value in self._tensors().values())
+
+    @property
+    def n_bytes(self) -> int:
+        """Memory the tensors take."""
+        return sum(value.nbytes for value in self._tensors().values())
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledViews(TensorViews):
     """Labelled viewpoints of some scenes, binned.
 
     With `CHANNELS` a view takes about 19 kB at 30 x 30 bins: 0.6 GB for 30,000 views, 6.4 GB for 340,000; with
@@ -54,16 +76,6 @@ class LabelledViews:
 
     def __len__(self) -> int:
         return len(self.labels)
-
-    def to(self, device: torch.device | str) -> LabelledViews:
-        """The same views with their tensors on a device."""
-        means, filled, labels = (tensor.to(device) for tensor in (self.means, self.filled, self.labels))
-        return replace(self, means=means, filled=filled, labels=labels)
-
-    @property
-    def n_bytes(self) -> int:
-        """Memory the tensors take."""
-        return sum(tensor.nbytes for tensor in (self.means, self.filled, self.labels))
 
 
 def has_room(device: torch.device | str, n_bytes: int) -> bool:
@@ -193,18 +205,15 @@ def validation_views(
     return hold_out_locations(scene, location, config.val_fraction, config.seed)
 
 
-def check_classes(split: str, labels: NDArray[np.bool_], dataset: Dataset, config: SharedConfig) -> None:
-    """Raise a TableError if the labels (B,) of the views for "training" or "validation" are of one class."""
-    if labels.any() and not labels.all():
-        return
-    limits = f"{config.max_error_m:g} m and {config.max_error_deg:g} deg"
-    raise TableError(
-        f"the {split} labels are of one class: {labels.sum()} of {len(labels)} viewpoints localize within {limits}",
-        path=dataset.root,
-        fix="Label more locations or scenes, loosen max_error_m and max_error_deg, or map more of the scene."
-        if split == "training"
-        else "Label more locations, raise val_fraction, or add a val scene.",
-    )
+def check_classes(dataset: Dataset, config: SharedConfig, train: NDArray[np.bool_], val: NDArray[np.bool_]) -> None:
+    """Raise a TableError if the labels (B,) of the views for training or of those for validation are of one class."""
+    to_train = "Label more locations or scenes, loosen max_error_m and max_error_deg, or map more of the scene."
+    to_validate = "Label more locations, raise val_fraction, or add a val scene."
+    for split, labels, fix in (("training", train, to_train), ("validation", val, to_validate)):
+        if labels.all() or not labels.any():
+            limits = f"{config.max_error_m:g} m and {config.max_error_deg:g} deg"
+            found = f"{labels.sum()} of {len(labels)} viewpoints localize within {limits}"
+            raise TableError(f"the {split} labels are of one class: {found}", path=dataset.root, fix=fix)
 
 
 def hold_out_locations(
@@ -282,38 +291,40 @@ class BatchLoader:
             yield Batch((binned, filled.index_select(0, share)), labels.index_select(0, share), len(batch))
 
 
-class ViewpointDataModule(LightningDataModule):
-    """The labelled viewpoints of a dataset, split by scene.
+class ViewsDataModule(LightningDataModule):
+    """Labelled viewpoints of train and val scenes, some to learn from and some to tell which epoch was best."""
+
+    views: Any  # `TensorViews`
+    train_rows: Any  # rows of the views to learn from, (n,) int64
+    val_rows: Any  # rows of the views for validation
+
+    def setup(self, stage: str | None = None) -> None:
+        """Bring the views to the device that trains, if it has room for them."""
+        if self.trainer is not None:
+            device = self.trainer.strategy.root_device
+            if device != self.views.device and has_room(device, self.views.n_bytes):
+                self.views = self.views.to(device)
+
+    @property
+    def share(self) -> tuple[int, int]:
+        """Number of this process, and number of all that train."""
+        return (0, 1) if self.trainer is None else (self.trainer.global_rank, self.trainer.world_size)
+
+
+class ViewpointDataModule(ViewsDataModule):
+    """The labelled viewpoints of a dataset, binned and split by scene.
 
     Batches hold means that are not standardized yet: the network does that. So the views are binned once, whichever
-    networks train on them.
-
-    Args:
-        dataset: its train scenes are learnt from; its val scenes, or else held-out locations of the train scenes, tell
-            which epoch was best.
-        config: label limits, share held out, devices, seed.
-        options: batch size, balance.
-        bins: along each side of the image.
-        device: where the binning runs, and where the views are kept if one device trains and it has room for them.
-        progress: show progress bars.
-        landmark_channels: whether the views also tell what landmarks are like, for about three times the memory.
-
-    Attributes:
-        channels: channels that batches hold; all that the views have unless set otherwise.
-
-    Attributes (after `setup`):
-        views: the views of train and val scenes.
-        train_rows: rows of `views` to learn from, (n,) int64.
-        val_rows: rows of `views` for validation.
-        statistics: of all channels over the training views.
-        class_weights: weights of the negative and the positive class, from the training labels.
+    networks train on them; see `load_views` for where. The train scenes are learnt from; val scenes, or else held-out
+    locations of the train scenes, tell which epoch was best. Batches hold all `channels` that the views have unless
+    these are set otherwise; those of what landmarks are like take about three times the memory.
     """
 
     views: LabelledViews
     train_rows: Tensor
     val_rows: Tensor
-    statistics: InputStatistics
-    class_weights: tuple[float, float]
+    statistics: InputStatistics  # of all channels over the training views, known after `setup`
+    class_weights: tuple[float, float]  # of the negative and the positive class, by the training labels after `setup`
 
     def __init__(
         self,
@@ -326,23 +337,19 @@ class ViewpointDataModule(LightningDataModule):
         landmark_channels: bool = False,
     ) -> None:
         super().__init__()
-        self.dataset, self.config, self.options, self.bins = dataset, config, options, bins
-        self.device, self.progress = device, progress
-        self.landmark_channels = landmark_channels
+        self.dataset, self.config, self.options = dataset, config, options
+        self._how = bins, device, progress, landmark_channels
         self.channels: tuple[str, ...] = ALL_CHANNELS if landmark_channels else CHANNELS
 
     def setup(self, stage: str | None = None) -> None:
         """Read, bin and split the views, once; in a process that trains, bring them to its device.
 
-        Raises:
-            TableError: there is no train scene, or the labels of a split are of one class.
+        Raises a TableError if there is no train scene, or the labels of a split are of one class.
         """
         if not hasattr(self, "views"):
-            self._load()
-        if self.trainer is not None:
-            device = self.trainer.strategy.root_device
-            if device != self.views.means.device and has_room(device, self.views.n_bytes):
-                self.views = self.views.to(device)
+            views = load_views(self.dataset, training_scenes(self.dataset), self.config, *self._how)
+            self.use(views, validation_views(self.dataset, views.scene, views.location, self.config))
+        super().setup(stage)
 
     def train_dataloader(self) -> BatchLoader:
         """Shuffled batches of the training views."""
@@ -352,13 +359,6 @@ class ViewpointDataModule(LightningDataModule):
         """Batches of the validation views, in order."""
         return self._loader(self.val_rows, 8 * self.options.batch_size)
 
-    def _load(self) -> None:
-        scenes = training_scenes(self.dataset)
-        views = load_views(
-            self.dataset, scenes, self.config, self.bins, self.device, self.progress, self.landmark_channels
-        )
-        self.use(views, validation_views(self.dataset, views.scene, views.location, self.config))
-
     def use(self, views: LabelledViews, held_out: NDArray[np.bool_]) -> None:
         """Train on these views instead of those of the dataset, without those held out (B,).
 
@@ -366,8 +366,7 @@ class ViewpointDataModule(LightningDataModule):
         """
         self.train_rows, self.val_rows = (torch.from_numpy(np.flatnonzero(side)) for side in (~held_out, held_out))
         labels = views.labels.cpu()
-        for name, rows in (("training", self.train_rows), ("validation", self.val_rows)):
-            check_classes(name, labels[rows].numpy() > 0, self.dataset, self.config)
+        check_classes(self.dataset, self.config, *((labels[r] > 0).numpy() for r in (self.train_rows, self.val_rows)))
         if self.options.balance:
             self.train_rows = self.train_rows[balance_classes(labels[self.train_rows], self.config.seed)]
         self.class_weights = class_weights(labels[self.train_rows])
@@ -375,8 +374,7 @@ class ViewpointDataModule(LightningDataModule):
         self.views = views
 
     def _loader(self, rows: Tensor, batch_size: int, shuffle_seed: int | None = None) -> BatchLoader:
-        rank, world_size = (0, 1) if self.trainer is None else (self.trainer.global_rank, self.trainer.world_size)
-        return BatchLoader(self.views, rows, batch_size, shuffle_seed, self.channels, rank, world_size)
+        return BatchLoader(self.views, rows, batch_size, shuffle_seed, self.channels, *self.share)
 
 
 def class_weights(labels: Tensor) -> tuple[float, float]:

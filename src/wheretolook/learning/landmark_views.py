@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import ceil, log
-from typing import Any
 
 import numpy as np
 import pandas as pd
 import torch
-from lightning.pytorch import LightningDataModule
 from numpy.typing import NDArray
 from torch import Tensor
 from tqdm.auto import tqdm
@@ -18,7 +16,14 @@ from tqdm.auto import tqdm
 from wheretolook.dataset.folders import Dataset, SceneFolder
 from wheretolook.inputs.landmarks_in_view import ATTRIBUTES, LandmarkDescriber, ViewLandmarks
 from wheretolook.learning.config import SharedConfig
-from wheretolook.learning.data import Batch, has_room, labelled_rows, training_scenes, validation_views
+from wheretolook.learning.data import (
+    Batch,
+    TensorViews,
+    ViewsDataModule,
+    labelled_rows,
+    training_scenes,
+    validation_views,
+)
 from wheretolook.learning.fit import home_device
 from wheretolook.learning.learner import Task
 from wheretolook.viewpoints.table import LOCALIZED, is_good, poses
@@ -51,7 +56,7 @@ class AttributeStatistics:
 
 
 @dataclass(frozen=True, eq=False)
-class LandmarkViews:
+class LandmarkViews(TensorViews):
     """Labelled viewpoints of some scenes, by the landmarks they see.
 
     A view's landmarks are in random order, and at most `most` of them are kept: any first few are a random sample.
@@ -70,18 +75,6 @@ class LandmarkViews:
 
     def __len__(self) -> int:
         return len(self.labels)
-
-    def to(self, device: torch.device | str) -> LandmarkViews:
-        """The same views with their tensors on a device."""
-        moved: dict[str, Any] = {
-            name: value.to(device) for name, value in vars(self).items() if isinstance(value, Tensor)
-        }
-        return replace(self, **moved)
-
-    @property
-    def n_bytes(self) -> int:
-        """Memory the tensors take."""
-        return sum(value.nbytes for value in vars(self).values() if isinstance(value, Tensor))
 
 
 def load_landmark_views(
@@ -231,22 +224,15 @@ class LandmarkLoader:
             yield Batch((values, taken, views.visible[share], views.axis_height[share]), labels, len(part))
 
 
-class LandmarkDataModule(LightningDataModule):
-    """What `LandmarkViews` of a dataset have in common for learning: their split, and where they are kept.
+class LandmarkDataModule(ViewsDataModule):
+    """The `LandmarkViews` of a task's dataset and statistics over the landmarks of those to learn from.
 
-    Args:
-        task: what to learn from.
-        most: landmarks kept of a view.
-        matches: whether to tell which landmarks were found.
-
-    Attributes:
-        views: of train and val scenes.
-        train_rows, val_rows: rows of `views`, (n,).
-        statistics: over the training views' landmarks.
-
-    Raises:
-        TableError: no train scene, no labels, or no stored matches where they are asked for.
+    See `load_landmark_views` for the landmarks kept of a view, for matches, and for what is raised.
     """
+
+    views: LandmarkViews
+    train_rows: Tensor
+    val_rows: Tensor
 
     def __init__(self, task: Task, most: int, matches: bool = False) -> None:
         super().__init__()
@@ -258,15 +244,3 @@ class LandmarkDataModule(LightningDataModule):
         self.train_rows, self.val_rows = (torch.nonzero(side)[:, 0] for side in (~held_out, held_out))
         of_train = (~held_out).repeat_interleave(self.views.starts.diff())
         self.statistics = AttributeStatistics.of(self.views.values[of_train].float())
-
-    def setup(self, stage: str | None = None) -> None:
-        """Bring the views to the device that trains, if it has room for them."""
-        if self.trainer is not None:
-            device = self.trainer.strategy.root_device
-            if device != self.views.labels.device and has_room(device, self.views.n_bytes):
-                self.views = self.views.to(device)
-
-    @property
-    def share(self) -> tuple[int, int]:
-        """Number of this process, and number of all that train."""
-        return (0, 1) if self.trainer is None else (self.trainer.global_rank, self.trainer.world_size)

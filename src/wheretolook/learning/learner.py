@@ -6,10 +6,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
+import numpy as np
 import pandas as pd
 import torch
 from lightning.pytorch import LightningDataModule
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from torch import nn
 
 from wheretolook.dataset.folders import Dataset
@@ -78,3 +79,19 @@ def class_counts(**sides: NDArray[Any]) -> dict[str, Any]:
     """Number of views of each side, and share of positives, by the names in which runs have them."""
     counts: dict[str, Any] = {f"n_{name}": len(labels) for name, labels in sides.items()}
     return counts | {f"positives_{name}": round(float(labels.mean()), 4) for name, labels in sides.items()}
+
+
+def fit_platt(logits: ArrayLike, labels: ArrayLike) -> tuple[float, float]:
+    """Scale and offset with which scale * logits + offset are the likeliest log-odds of labels (B,) (Platt 1999).
+
+    Temperature scaling has no offset, so it mends how sure a model is, but not a level that is off. They are 1 and 0
+    where a scale would turn the order round or the labels are of one class.
+    """
+    from sklearn.linear_model import LogisticRegression
+
+    values, truth = np.asarray(logits, dtype=np.float64), np.asarray(labels).astype(bool)
+    if truth.all() or not truth.any():
+        return 1.0, 0.0
+    line = LogisticRegression(C=1e6).fit(values[:, None], truth)
+    scale, offset = float(line.coef_[0, 0]), float(line.intercept_[0])
+    return (scale, offset) if scale > 0 else (1.0, 0.0)

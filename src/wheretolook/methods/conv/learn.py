@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from wheretolook.learning.data import ViewpointDataModule
 from wheretolook.learning.fit import home_device
-from wheretolook.learning.learner import Learnt, Task, class_counts, fit_network, predict
-from wheretolook.learning.platt import fit_platt
+from wheretolook.learning.learner import Learnt, Task, class_counts, fit_network, fit_platt, predict
 from wheretolook.learning.trained_network import TrainedNetwork
 from wheretolook.methods.conv.network import ConvNetwork, ConvSpec
 

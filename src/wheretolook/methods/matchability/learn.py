@@ -10,8 +10,7 @@ from torch import Tensor
 
 from wheretolook.learning.data import Batch
 from wheretolook.learning.landmark_views import DISTANCES, LandmarkDataModule
-from wheretolook.learning.learner import Learnt, Task, class_counts, fit_network, predict
-from wheretolook.learning.platt import fit_platt
+from wheretolook.learning.learner import Learnt, Task, class_counts, fit_network, fit_platt, predict
 from wheretolook.learning.trained_network import TrainedNetwork
 from wheretolook.methods.matchability.network import MatchabilityNetwork
 

@@ -9,8 +9,7 @@ from torch import Tensor
 
 from wheretolook.learning.data import check_classes
 from wheretolook.learning.landmark_views import LandmarkDataModule, LandmarkLoader
-from wheretolook.learning.learner import Learnt, Task, class_counts, fit_network, predict
-from wheretolook.learning.platt import fit_platt
+from wheretolook.learning.learner import Learnt, Task, class_counts, fit_network, fit_platt, predict
 from wheretolook.learning.provenance import weights_path
 from wheretolook.learning.trained_network import TrainedNetwork
 from wheretolook.methods.matchability.network import MatchabilityNetwork
@@ -23,8 +22,8 @@ class SetData(LandmarkDataModule):
 
     def __init__(self, task: Task) -> None:
         super().__init__(task, MOST_OF_WINDOW * task.options.landmarks)
-        for name, rows in (("training", self.train_rows), ("validation", self.val_rows)):
-            check_classes(name, self.views.labels[rows].numpy() > 0, task.dataset, self.config)
+        positive = (self.views.labels > 0).numpy()
+        check_classes(task.dataset, self.config, positive[self.train_rows], positive[self.val_rows])
 
     def train_dataloader(self) -> LandmarkLoader:
         """Shuffled views, another sample of each one's landmarks every time."""

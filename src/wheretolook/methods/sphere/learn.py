@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from wheretolook.learning.data import check_classes, training_scenes, validation_views
 from wheretolook.learning.fit import home_device
-from wheretolook.learning.learner import Learnt, Task, class_counts, fit_network, predict
-from wheretolook.learning.platt import fit_platt
+from wheretolook.learning.learner import Learnt, Task, class_counts, fit_network, fit_platt, predict
 from wheretolook.learning.trained_network import TrainedNetwork
 from wheretolook.methods.sphere.network import SphereNetwork
 from wheretolook.methods.sphere.views import SphereDataModule, load_sphere_views
@@ -23,8 +22,7 @@ def learn_sphere(task: Task) -> Learnt:
     )
     held_out = validation_views(dataset, views.scene, views.location, config)
     labels = views.labels.numpy() > 0
-    for name, side in (("training", ~held_out), ("validation", held_out)):
-        check_classes(name, labels[side], dataset, config)
+    check_classes(dataset, config, labels[~held_out], labels[held_out])
     data = SphereDataModule(views, held_out, task.options.batch_size, config.seed)
     network = SphereNetwork(task.options)
     metrics, history = fit_network(network, data, task)

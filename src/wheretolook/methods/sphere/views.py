@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import ceil
 from pathlib import Path
 
 import numpy as np
 import torch
-from lightning.pytorch import LightningDataModule
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
@@ -19,7 +18,7 @@ from wheretolook.dataset.folders import Dataset, SceneFolder
 from wheretolook.geometry.poses import Float, split_poses
 from wheretolook.inputs.localization_map import LocalizationMap, shared_locations
 from wheretolook.learning.config import SharedConfig
-from wheretolook.learning.data import Batch, has_room, labelled_rows
+from wheretolook.learning.data import Batch, TensorViews, ViewsDataModule, labelled_rows
 from wheretolook.mapping.colmap_model import CAMERAS_FILE
 from wheretolook.methods.sphere.config import SphereConfig
 from wheretolook.utils.errors import MapError
@@ -87,7 +86,7 @@ def _spread(rows: Float, at_most: int) -> Float:
 
 
 @dataclass(frozen=True, eq=False)
-class SphereViews:
+class SphereViews(TensorViews):
     """Labelled viewpoints and the locations that they share: about 33 kB a location at 640 tokens."""
 
     tokens: Tensor  # (L, T, len(FEATURES)) float32, zero where there is none
@@ -97,16 +96,6 @@ class SphereViews:
     labels: Tensor  # (B,) float32, 1 where it localizes
     scene: NDArray[np.int64]  # (B,) int64, number of each view's scene in the order given
     location: NDArray[np.int64]  # (B,) int64, location_id of each view, unique only within its scene
-
-    def to(self, device: torch.device | str) -> SphereViews:
-        """The same views with what a network takes on a device."""
-        on_device = {name: getattr(self, name).to(device) for name in ("tokens", "padding", "axes", "labels")}
-        return replace(self, **on_device)
-
-    @property
-    def n_bytes(self) -> int:
-        """Memory the tensors take."""
-        return sum(tensor.nbytes for tensor in (self.tokens, self.padding, self.axes, self.labels))
 
 
 def load_sphere_views(
@@ -166,7 +155,7 @@ class LocationLoader:
         world_size: int = 1,
     ) -> None:
         self.views, self.shuffle_seed, self.rank, self.world_size = views, shuffle_seed, rank, world_size
-        rows = views.rows.numpy()[chosen]
+        rows = views.rows.cpu().numpy()[chosen]
         self._by_location = chosen[np.argsort(rows, kind="stable")]
         self._locations, self._counts = np.unique(rows, return_counts=True)
         self._starts = np.cumsum(self._counts) - self._counts
@@ -195,20 +184,13 @@ class LocationLoader:
             yield Batch(inputs, self.views.labels[views], int(self._counts[batch].sum()))
 
 
-class SphereDataModule(LightningDataModule):
+class SphereDataModule(ViewsDataModule):
     """Views of a dataset in batches of whole locations, without those held out (B,) to learn from."""
 
     def __init__(self, views: SphereViews, held_out: NDArray[np.bool_], batch_size: int, seed: int = 0) -> None:
         super().__init__()
         self.views, self.batch_size, self.seed = views, batch_size, seed
         self.train_rows, self.val_rows = np.flatnonzero(~held_out), np.flatnonzero(held_out)
-
-    def setup(self, stage: str | None = None) -> None:
-        """Bring the views to the device that trains, if it has room for them."""
-        if self.trainer is not None:
-            device = self.trainer.strategy.root_device
-            if device != self.views.tokens.device and has_room(device, self.views.n_bytes):
-                self.views = self.views.to(device)
 
     def train_dataloader(self) -> LocationLoader:
         """Shuffled batches of the training views."""
@@ -219,5 +201,4 @@ class SphereDataModule(LightningDataModule):
         return self._loader(self.val_rows)
 
     def _loader(self, chosen: NDArray[np.int64], shuffle_seed: int | None = None) -> LocationLoader:
-        rank, world_size = (0, 1) if self.trainer is None else (self.trainer.global_rank, self.trainer.world_size)
-        return LocationLoader(self.views, chosen, self.batch_size, shuffle_seed, rank, world_size)
+        return LocationLoader(self.views, chosen, self.batch_size, shuffle_seed, *self.share)

@@ -18,8 +18,7 @@ from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.inputs.landmarks_in_view import POOLED, LandmarkDescriber, pool
 from wheretolook.learning.data import check_classes, labelled_rows, training_scenes, validation_views
 from wheretolook.learning.fit import home_device
-from wheretolook.learning.learner import Learnt, Task, class_counts
-from wheretolook.learning.platt import fit_platt
+from wheretolook.learning.learner import Learnt, Task, class_counts, fit_platt
 from wheretolook.learning.weights import check_serves, read_weights, write_weights
 from wheretolook.methods.trees.config import TreesConfig
 from wheretolook.utils.errors import ConfigError, WeightsError
@@ -196,8 +195,7 @@ def learn_trees(task: Task) -> Learnt:
     views = load_pooled(dataset, training_scenes(dataset), limits, home_device(config), task.progress)
     held_out = validation_views(dataset, views.scene, views.location, config)
     train, val = views.only(~held_out), views.only(held_out)
-    for name, side in (("training", train), ("validation", val)):
-        check_classes(name, side.labels, dataset, config)
+    check_classes(dataset, config, train.labels, val.labels)
     trees, metrics = fit_trees(train, val, dataset.camera, task.options, config.seed)
     return Learnt(trees, metrics, class_counts(train=train.labels, val=val.labels))
 

@@ -74,11 +74,7 @@ def label_viewpoints(
     progress: bool = True,
     description: str = "label",
 ) -> pd.DataFrame:
-    """`label_scenes` for one scene: the table with its labels, see `LabelledScene`.
-
-    `SceneJob` describes the mesh, landmarks, camera, extractor and device, `LabelTask` the table and folder of shards.
-    `description` is the title of the progress bar.
-    """
+    """`label_scenes` for one scene, of the parts of a `SceneJob` and a `LabelTask`: the table with its labels."""
     config, extractor = config or LabelConfig(), extractor or ExtractorConfig()
     job = SceneJob(mesh, landmarks, camera, config.localizer, extractor, device, config.store_matches)
     (scene,) = label_scenes([LabelTask(description, job, table, shards)], config, progress, description)
@@ -92,13 +88,8 @@ def label_scenes(
 
     Work is cut into shards. A finished shard is a file named by a hash of all that decides its labels (viewpoints,
     mesh, landmarks, settings, versions). A run that was interrupted or killed therefore goes on where it stopped and
-    ends with the same table, for any engine and any number of workers.
-
-    Args:
-        tasks: the scenes; workers go from one to the next without pause.
-        config: settings of labelling.
-        progress: show one progress bar for all scenes.
-        description: the bar's title.
+    ends with the same table, for any engine and any number of workers, which go from one scene to the next without
+    pause. `description` is the title of the progress bar, one for all scenes.
 
     Yields:
         Scenes as they are finished; the caller stores their tables, and may then remove their shards.
@@ -163,15 +154,10 @@ class _SceneInProgress:
         if Landmarks.load(job.landmarks).descriptors is None:
             fix = "Build the map again."
             raise MapError("landmarks without descriptors cannot be matched", path=job.landmarks, fix=fix)
-        settings: dict[str, Any] = {
-            "versions": versions(),
-            "localizer": asdict(job.localizer),
-            "extractor": asdict(job.extractor),
-            "camera": asdict(job.camera),
-            "renderer": _renderer_name(job.device),
-            "mesh": fingerprint(job.mesh),
-            "landmarks": fingerprint(job.landmarks),
-        }
+        settings: dict[str, Any] = {"versions": versions()}
+        settings |= {name: asdict(getattr(job, name)) for name in ("localizer", "extractor", "camera")}
+        settings |= {"renderer": _renderer_name(job.device)}
+        settings |= {"mesh": fingerprint(job.mesh), "landmarks": fingerprint(job.landmarks)}
         if job.store_matches:  # only then, so that shards without matches keep their names from earlier versions
             settings["store_matches"] = True
         text = json.dumps(settings, sort_keys=True).encode()
@@ -188,11 +174,8 @@ class _SceneInProgress:
         return scene
 
     def manifest(self) -> dict[str, Any]:
-        return {
-            **self.settings,
-            "n_viewpoints": len(self.task.table),
-            "shards": {shard.path.name: len(shard.rows) for shard in self.shards},
-        }
+        shards = {shard.path.name: len(shard.rows) for shard in self.shards}
+        return {**self.settings, "n_viewpoints": len(self.task.table), "shards": shards}
 
     def result(self) -> LabelledScene:
         parts = []

@@ -29,15 +29,9 @@ class _Worker:
 def run_local(
     shards: Sequence[Shard], workers: int, tick: Callable[[int], None] = lambda n: None
 ) -> Iterator[tuple[Shard, LabelledShard]]:
-    """Label shards in processes.
+    """Label shards in processes, begun in this order, and yield them as they are finished.
 
-    Args:
-        shards: begun in this order.
-        workers: number of processes.
-        tick: called with the number of viewpoints just finished, negative when a worker died and they are redone.
-
-    Yields:
-        Shards as they are finished.
+    `tick` is called with the number of viewpoints just finished, negative when a worker died and they are redone.
 
     Raises:
         SceneError, MapError, WorkerError: from a worker.
@@ -64,12 +58,9 @@ def run_local(
                     deaths[shard] += 1
                     if deaths[shard] == MAX_DEATHS:
                         problem = f"{MAX_DEATHS} labelling processes were killed at the same viewpoints"
-                        raise WorkerError(
-                            f"{problem}, probably for lack of memory",
-                            path=shard.job.mesh,
-                            value=f"{workers} workers",
-                            fix="Lower label.workers and run again: finished shards are kept.",
-                        ) from None
+                        problem, value = f"{problem}, probably for lack of memory", f"{workers} workers"
+                        fix = "Lower label.workers and run again: finished shards are kept."
+                        raise WorkerError(problem, path=shard.job.mesh, value=value, fix=fix) from None
                     waiting.appendleft(shard)
                     worker.process.join()
                     number = team.index(worker)

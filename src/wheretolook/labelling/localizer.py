@@ -44,17 +44,8 @@ class Localizer:
     """Localizes images against landmarks (paper, Sec. 3.3 "Self-supervision").
 
     Keypoints are extracted and matched to the landmarks' mean descriptors with Lowe's ratio test; pycolmap estimates
-    the pose by PnP in LO-RANSAC and refines it.
-
-    Args:
-        landmarks: with descriptors.
-        camera: intrinsics of the images.
-        config: matching and RANSAC settings.
-        extractor: must be what the map was made with.
-        device: where keypoints are extracted and descriptors matched, "cpu" or a CUDA device.
-
-    Raises:
-        MapError: the landmarks have no descriptors.
+    the pose by PnP in LO-RANSAC and refines it. The extractor must be what the map was made with; it and matching run
+    on the device, "cpu" or a CUDA device. Raises MapError if the landmarks have no descriptors.
     """
 
     def __init__(
@@ -98,13 +89,9 @@ class Localizer:
         n_matches = len(keypoint_rows)
         if n_matches < self.config.min_matches:
             return Localization(TOO_FEW_MATCHES, None, n_matches, matched_rows=landmark_rows)
-        estimate = pycolmap.estimate_and_refine_absolute_pose(
-            keypoints.pixels[keypoint_rows].astype(np.float64),
-            self.landmarks.points[landmark_rows],
-            self._camera,
-            self._estimation,
-            self._refinement,
-        )
+        pixels, points = keypoints.pixels[keypoint_rows].astype(np.float64), self.landmarks.points[landmark_rows]
+        options = (self._camera, self._estimation, self._refinement)
+        estimate = pycolmap.estimate_and_refine_absolute_pose(pixels, points, *options)
         if estimate is None:
             return Localization(NO_POSE, None, n_matches, matched_rows=landmark_rows)
         pose = np.asarray(estimate["cam_from_world"].matrix())

@@ -15,12 +15,7 @@ _END = object()
 
 @dataclass(frozen=True)
 class Step:
-    """One step of a pipeline.
-
-    Args:
-        name: under which its time is counted.
-        run: takes an item of the step before, returns one for the step after.
-    """
+    """A step of a pipeline: the name its time is counted under, and a function of what the step before returned."""
 
     name: str
     run: Callable[[Any], Any]
@@ -31,19 +26,10 @@ def run_pipeline(
 ) -> Iterator[Any]:
     """Pass items through steps; while one item is in the second step, the next is in the first.
 
-    Steps that wait for a GPU, or that release Python's lock, overlap.
-
-    Args:
-        items: read in a thread of their own.
-        steps: at least one.
-        seconds: the time spent in each step is added to it, by the step's name.
-        depth: items under way for each step and for the source, which bounds the memory.
-
-    Yields:
-        What the last step returns, in the order of the items.
-
-    Raises:
-        BaseException: whatever a step or the source of items raised; the other threads are stopped then.
+    Steps that wait for a GPU, or that release Python's lock, overlap; items are read in a thread of their own. The time
+    spent in each step is added to `seconds`, by the step's name. `depth` bounds the memory: how many items are under
+    way for each step and for the source. Yields what the last step returns, in the order of the items; raises whatever
+    a step or the source raised, and stops the other threads then.
     """
     iterator, seconds = iter(items), {} if seconds is None else seconds
     under_way: deque[Future[Any]] = deque()

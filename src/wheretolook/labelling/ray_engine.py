@@ -38,13 +38,8 @@ def run_ray(
 ) -> Iterator[tuple[Shard, LabelledShard]]:
     """Label shards on a Ray cluster, each on one core and, with device "cuda", `1 / WORKERS_A_GPU` of a GPU.
 
-    Args:
-        shards: begun in this order.
-        address: of the cluster; empty uses the one this process is connected to, or starts one on this machine.
-        tick: called with the number of viewpoints just finished.
-
-    Yields:
-        Shards as they are finished.
+    They are begun in this order and yielded as they are finished. An empty address uses the cluster that this process
+    is connected to, or starts one on this machine. `tick` is called with the number of viewpoints just finished.
 
     Raises:
         ConfigError: Ray is not installed, or there is no cluster at the address.
@@ -80,11 +75,11 @@ def _connect(ray: Any, address: str) -> None:
 
 def _check_resources(resources: Mapping[str, float], needs_gpu: bool) -> None:
     """Raise ConfigError if the cluster lacks a CPU or GPU: Ray would wait for one silently."""
-    for name, needed, fix in (
-        ("CPU", True, "Add a machine."),
-        ("GPU", needs_gpu, "Add a machine that has one, or give --device cpu."),
-    ):
-        if needed and resources.get(name, 0) == 0:
+    fixes = {"CPU": "Add a machine."}
+    if needs_gpu:
+        fixes["GPU"] = "Add a machine that has one, or give --device cpu."
+    for name, fix in fixes.items():
+        if resources.get(name, 0) == 0:
             raise ConfigError(f"the Ray cluster has no {name}", value=dict(resources), fix=fix)
 
 

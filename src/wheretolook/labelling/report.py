@@ -76,14 +76,9 @@ class LabelSummary:
 
 
 def label_summary(tables: Mapping[str, pd.DataFrame], splits: Mapping[str, Split]) -> LabelSummary:
-    """Summarize the labels of scenes.
+    """Summarize the labels of scenes: viewpoints and split of each by its name; at least one, none empty.
 
-    Args:
-        tables: viewpoints of each scene by its name, see `viewpoints.table.SCHEMA`; at least one, none empty.
-        splits: split of each scene.
-
-    Raises:
-        TableError: some viewpoint has no label yet.
+    Raises TableError if some viewpoint has no label yet.
     """
     views = pd.concat([_views(name, table, splits[name]) for name, table in tables.items()], ignore_index=True)
     groups = [(name, splits[name], views[views["scene"] == name]) for name in tables]
@@ -169,13 +164,10 @@ def threshold_sentence(summary: LabelSummary) -> str:
         verdict = "The thresholds differ little"
     else:
         verdict = "The thresholds differ"
-    finer = [
-        f"{_percent(row[name] / row[POSITIVE[-1]])} % are within {label}"
-        for name, label in zip(POSITIVE[:-1], labels[:-1], strict=True)
-    ]
-    within, beyond = (
-        _median_error(row[f"median_{name}_m"], row[f"median_{name}_deg"]) for name in ("within", "beyond")
-    )
+    shares = [_percent(row[name] / row[POSITIVE[-1]]) for name in POSITIVE[:-1]]
+    finer = [f"{share} % are within {label}" for share, label in zip(shares, labels[:-1], strict=True)]
+    medians = [(row[f"median_{name}_m"], row[f"median_{name}_deg"]) for name in ("within", "beyond")]
+    within, beyond = (_median_error(*median) for median in medians)
     errors = f"Their median errors are {within}"
     if pd.notna(row["median_beyond_m"]):
         errors += f"; those of the other poses found are {beyond}"
@@ -212,14 +204,12 @@ def label_markdown(summary: LabelSummary, title: str = "Labels") -> str:
         f"In % of all viewpoints; {_percent(row['without_pose'])} % have no pose at all. Disbelieved poses have too "
         "few inliers and count as not localized. Errors beyond the first and the last row count there.",
     ]
-    sections += [
-        markdown_table([name, "localized", "disbelieved"], _error_lines(bins, row["n_views"])) for name, bins in errors
-    ]
+    for name, bins in errors:
+        sections.append(markdown_table([name, "localized", "disbelieved"], _error_lines(bins, row["n_views"])))
     return "\n\n".join(sections) + "\n"
 
 
 def _height_label(low: float, high: float) -> str:
-    """Name of a height band, in metres."""
     return f"{low:g}–{high:g}"
 
 
@@ -236,10 +226,11 @@ def _labels() -> list[str]:
 
 
 def _band_lines(bands: pd.DataFrame, name: Any) -> list[list[str]]:
-    return [
-        [name(band["low"], band["high"]), f"{band['n_views']:,}", *[_percent(band[column]) for column in POSITIVE]]
-        for band in bands.to_dict("records")
-    ]
+    lines = []
+    for band in bands.to_dict("records"):
+        shares = [_percent(band[column]) for column in POSITIVE]
+        lines.append([name(band["low"], band["high"]), f"{band['n_views']:,}", *shares])
+    return lines
 
 
 def _error_lines(errors: pd.DataFrame, n_views: int) -> list[list[str]]:
@@ -247,17 +238,13 @@ def _error_lines(errors: pd.DataFrame, n_views: int) -> list[list[str]]:
     starts = np.arange(0, len(errors), BINS_A_DECADE)
     lows, highs = errors["low"].to_numpy()[starts], [*errors["low"].to_numpy()[starts[1:]], None]
     counts = np.add.reduceat(errors[["localized", "disbelieved"]].to_numpy(), starts, axis=0)
-    return [
-        [f"≥ {low:g}" if high is None else f"{low:g}–{high:g}", *[_percent(count / n_views) for count in row]]
-        for low, high, row in zip(lows, highs, counts, strict=True)
-    ]
+    names = [f"≥ {low:g}" if high is None else f"{low:g}–{high:g}" for low, high in zip(lows, highs, strict=True)]
+    return [[name, *[_percent(count / n_views) for count in row]] for name, row in zip(names, counts, strict=True)]
 
 
 def _median_error(error_m: float, error_deg: float) -> str:
-    if error_m < 0.01:
-        distance = f"{1000 * error_m:.1f} mm"
-    else:
-        distance = f"{100 * error_m:.1f} cm" if error_m < 1 else f"{error_m:.1f} m"
+    unit, scale = ("mm", 1000) if error_m < 0.01 else ("cm", 100) if error_m < 1 else ("m", 1)
+    distance = f"{scale * error_m:.1f} {unit}"
     return f"{distance}, {error_deg:.2f}°" if error_deg < 1 else f"{distance}, {error_deg:.0f}°"
 
 

@@ -31,26 +31,15 @@ Tick = Callable[[int], None]
 
 @dataclass(frozen=True)
 class SceneJob:
-    """All that a worker needs to label viewpoints of a scene.
-
-    Attributes:
-        mesh: file of the scene's mesh.
-        landmarks: file of the map's landmarks, with descriptors.
-        camera: intrinsics of the viewpoints.
-        localizer: matching and pose estimation.
-        extractor: what the map was made with.
-        device: where images are rendered, keypoints extracted and descriptors matched; with "cuda", workers spread over
-            all GPUs.
-        store_matches: whether labelled rows get the columns of `wheretolook.viewpoints.table.MATCH_FIELDS`.
-    """
+    """All that a worker needs to label viewpoints of a scene; files of its mesh, and of landmarks with descriptors."""
 
     mesh: Path
     landmarks: Path
     camera: PinholeCamera = PinholeCamera()
     localizer: LocalizerConfig = LocalizerConfig()
-    extractor: ExtractorConfig = ExtractorConfig()
-    device: str = "cpu"
-    store_matches: bool = False
+    extractor: ExtractorConfig = ExtractorConfig()  # what the map was made with
+    device: str = "cpu"  # with "cuda", workers spread over all GPUs
+    store_matches: bool = False  # whether labelled rows get the columns of `viewpoints.table.MATCH_FIELDS`
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,8 +62,7 @@ class LabelledShard:
 class ShardWorker:
     """Labels shards in this process; the renderer and map stay loaded until a shard of another scene comes.
 
-    Args:
-        number: of this worker among its engine's, from 0, which decides the GPU it uses.
+    Its number among its engine's workers, from 0, decides the GPU that it uses.
     """
 
     def __init__(self, number: int = 0) -> None:
@@ -112,8 +100,11 @@ class ShardWorker:
         from wheretolook.scenes.loading import load_mesh
 
         if self._scene is None or self._scene[0] != job:
-            self._scene = None  # free its memory first
-            device = _device(job.device, self.number)
+            import torch
+
+            self._scene, device = None, job.device  # free its memory first
+            if device == "cuda":
+                device = f"cuda:{self.number % max(1, torch.cuda.device_count())}"
             renderer = WarpRenderer(load_mesh(job.mesh), device)
             localizer = Localizer(Landmarks.load(job.landmarks), job.camera, job.localizer, job.extractor, device)
             self._scene = job, renderer, localizer
@@ -132,11 +123,8 @@ def label_rows(
     """Render viewpoints, localize the images and measure the errors, in batched steps that overlap in this process.
 
     The time spent in each step (render, extract, match, pose) is added to `seconds`, and `tick` is called with the
-    number of viewpoints just finished.
-
-    Returns:
-        The table with status, error_m, error_deg and n_inliers filled in. It has the columns of
-        `wheretolook.viewpoints.table.MATCH_FIELDS` only with `store_matches`; those of earlier labels are dropped.
+    number of viewpoints just finished. Returns the table with status, error_m, error_deg and n_inliers filled in, and
+    with `viewpoints.table.MATCH_FIELDS` if `store_matches`; those of earlier labels are dropped.
     """
     true_poses = poses(table)
     steps = [
@@ -165,11 +153,3 @@ def label_rows(
         matched_rows=[np.sort(result.matched_rows).astype(np.int32) for result in results],
         inlier_rows=[np.sort(result.inlier_rows).astype(np.int32) for result in results],
     )
-
-
-def _device(device: str, number: int) -> str:
-    if device != "cuda":
-        return device
-    import torch
-
-    return f"cuda:{number % max(1, torch.cuda.device_count())}"

@@ -80,8 +80,7 @@ def evaluate_methods(
 
 
 def write_results(folder: Path, table: pd.DataFrame, calibration: pd.DataFrame, title: str) -> None:
-    """Write tables (all occlusion models and candidate sets, one below the other), reliability curves of learned
-    methods, if there are any, and figures, under a title; what belongs to an earlier evaluation goes."""
+    """Write tables, report, calibration curves (if any) and figures; those of an earlier evaluation go."""
     from wheretolook.evaluation import results
     from wheretolook.evaluation.paper_tables import write_paper_tables
     from wheretolook.evaluation.report import score_markdown

@@ -192,7 +192,10 @@ def test_debug_shows_the_traceback(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.parametrize("stage", cli.STAGES)
-def test_every_stage_explains_itself(stage: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_stage_explains_itself(
+    stage: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "120")
     assert main([stage, "--help-all", "--config", str(CONFIGS / "demo.yaml")]) == 0
     text = capsys.readouterr().out
     for group in cli.STAGES[stage].groups:

@@ -330,7 +330,7 @@ def test_bad_input_is_named(dataset: Dataset, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"reference.*'mlp-2d'.*random, visible, bins"):
         evaluate(dataset, replace(RULES, reference="mlp-2d"), tracking, progress=False)
     untrained = make_dataset(tmp_path / "untrained", ("test",), n_locations=2, n_directions=4)
-    with pytest.raises(WeightsError, match="leave methods that have learnt out"):
+    with pytest.raises(WeightsError, match="leave mlp out"):
         evaluate(untrained, CONFIG, tracking, progress=False)
     scene = untrained.scenes[0]
     write_table(scene.read_table().assign(status=UNLABELLED), scene.table)

@@ -435,6 +435,6 @@ def test_paths_keep_clear_of_what_depth_images_saw(copy: Path, tmp_path: Path) -
     assert run("plan", copy, *tsdf, *ends, *rest) == 0
     path = pd.read_csv(tmp_path / "way" / "path.csv")[["x_m", "y_m", "z_m"]].to_numpy()
     # on the way it is looked, a voxel apart, whether all is clear and seen, not what is below
-    assert len(path) > 1 and (space._raycaster.distance_to_surface(path, 1.0) > space.config.clearance_m - 1e-3).all()
+    assert len(path) > 1 and (space.raycaster.distance_to_surface(path, 1.0) > space.config.clearance_m - 1e-3).all()
     space.config = replace(space.config, clearance_m=space.config.clearance_m - experiment.occlusion.voxel_m / 2)
     assert space._is_known_at(path).all()

@@ -437,4 +437,4 @@ def test_paths_keep_clear_of_what_depth_images_saw(copy: Path, tmp_path: Path) -
     # on the way it is looked, a voxel apart, whether all is clear and seen, not what is below
     assert len(path) > 1 and (space.raycaster.distance_to_surface(path, 1.0) > space.config.clearance_m - 1e-3).all()
     space.config = replace(space.config, clearance_m=space.config.clearance_m - experiment.occlusion.voxel_m / 2)
-    assert space._is_known_at(path).all()
+    assert space._is_off_unseen(path).all()

@@ -23,8 +23,8 @@ help:
 demo: $(READY)
 	@$(BIN)/wheretolook demo
 
-# Slow are Ray, processes that are killed, all notebooks but one, and the like. mypy runs beside the tests, which wait for
-# nothing, and speaks after them if it found something; their status is that of the target.
+# Slow are Ray, worker processes that are killed, the notebooks, planned paths that are rendered, and the like. mypy runs
+# beside the tests, which wait for nothing, and speaks after them if it found something; their status is the target's.
 test: TESTS := -m 'not slow'
 test test-all: $(READY)
 	$(BIN)/ruff check . && $(BIN)/ruff format --check .

@@ -87,9 +87,8 @@ def test_notebooks_say_what_they_show(path: Path) -> None:
             assert len(lines) <= 6, cell.source
 
 
-@pytest.mark.parametrize(
-    "name", ["05_tables", *(pytest.param(name, marks=pytest.mark.slow) for name in FROM_RUNS if name != "05_tables")]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FROM_RUNS)
 def test_notebooks_of_runs_draw_them(name: str, environment: Path) -> None:
     notebook = nbformat.read(FOLDER / f"{name}.ipynb", as_version=4)
     NotebookClient(notebook, timeout=120, resources={"metadata": {"path": str(FOLDER)}}).execute()

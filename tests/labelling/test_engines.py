@@ -23,9 +23,8 @@ from wheretolook.utils.errors import ConfigError, SceneError
 SLOW = pytest.mark.slow
 
 
-@pytest.mark.parametrize(
-    ("workers", "shard_size"), [(2, 5), pytest.param(1, 24, marks=SLOW), pytest.param(4, 3, marks=SLOW)]
-)
+@SLOW
+@pytest.mark.parametrize(("workers", "shard_size"), [(2, 5), (1, 24), (4, 3)])
 def test_workers_and_shards_do_not_change_the_table(
     room: MappedRoom, views: pd.DataFrame, expected: bytes, tmp_path: Path, workers: int, shard_size: int
 ) -> None:
@@ -33,6 +32,7 @@ def test_workers_and_shards_do_not_change_the_table(
     assert not multiprocessing.active_children()
 
 
+@SLOW
 def test_a_run_that_was_left_goes_on_where_it_stopped(
     room: MappedRoom, views: pd.DataFrame, expected: bytes, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
@@ -71,7 +71,7 @@ def test_what_no_machine_of_the_cluster_has_is_named(resources: dict[str, float]
     ray_engine._check_resources({"CPU": 1.0}, needs_gpu=False)
 
 
-@pytest.mark.slow
+@SLOW
 def test_an_address_without_a_cluster_is_refused_at_once(room: MappedRoom) -> None:
     """Without the check, Ray would try for many minutes."""
     pytest.importorskip("ray")
@@ -102,7 +102,7 @@ def cluster() -> Iterator[Any]:
             cluster.shutdown()
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_cluster_gives_the_same_table(
     cluster: Any, room: MappedRoom, views: pd.DataFrame, expected: bytes, tmp_path: Path
 ) -> None:
@@ -120,7 +120,7 @@ def test_a_cluster_gives_the_same_table(
     assert not ray.is_initialized()
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_machine_that_is_removed_loses_nothing(
     cluster: Any, room: MappedRoom, views: pd.DataFrame, expected: bytes, tmp_path: Path
 ) -> None:

@@ -90,6 +90,7 @@ def test_a_shard_that_kills_its_worker_every_time_is_given_up(
     assert not multiprocessing.active_children()
 
 
+@pytest.mark.slow
 def test_a_worker_that_dies_in_the_middle_of_a_message_counts_as_killed(
     room: MappedRoom, views: pd.DataFrame, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

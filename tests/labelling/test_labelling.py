@@ -35,6 +35,7 @@ def test_a_plain_wall_never_localizes_and_a_poster_wall_always_does(room: Mapped
             assert (labelled["n_inliers"] >= 10).all() and labelled["error_m"].max() < 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("in_this_process")
 def test_a_repeated_texture_localizes_at_the_wrong_copy_and_is_labelled_so(tmp_path: Path) -> None:
     """On the 4 m long wall the texture repeats after 2.5 m: some poses are wrong by 2.5 m, with many inliers."""
@@ -65,6 +66,7 @@ def test_errors_are_measured_against_the_true_pose(room: MappedRoom) -> None:
     np.testing.assert_allclose(labelled["error_deg"], 3.0, atol=0.2)
 
 
+@pytest.mark.slow
 def test_an_error_in_a_worker_keeps_its_type(room: MappedRoom, tmp_path: Path) -> None:
     broken = tmp_path / "broken.glb"
     broken.write_bytes(b"no mesh")

@@ -134,6 +134,7 @@ def test_report_is_on_disk(built):
     assert report.config["extractor"]["method"] == "opencv"
 
 
+@pytest.mark.slow
 def test_same_seed_same_bytes_whatever_the_workers(built, room, room_free_space, renderer, tmp_path, monkeypatch):
     monkeypatch.setattr(triangulation, "_PAIRS_AT_A_TIME", 16)  # so that both workers match
     folder, report = built
@@ -148,6 +149,7 @@ def test_same_seed_same_bytes_whatever_the_workers(built, room, room_free_space,
             assert (folder / name).read_bytes() == (again / name).read_bytes(), name
 
 
+@pytest.mark.slow
 def test_no_two_threads_match_in_one_process(room, room_free_space, renderer, tmp_path, monkeypatch):
     """pycolmap's BLAS would give them the same buffer once in many maps."""
     threads, match = [], pycolmap.match_image_pairs

@@ -224,6 +224,7 @@ np.savez(out, **scores)
 """
 
 
+@pytest.mark.slow
 def test_a_new_attribute_leaves_shipped_weights_as_they_are(tmp_path: Path) -> None:
     """Two files are touched to add one; scores of the weights that ship stay the same to the last bit."""
     changed = tmp_path / "changed"

@@ -103,6 +103,7 @@ def test_chosen_items_are_made_alone(store: tuple[Dataset, TrackingConfig], tmp_
         write_items(*store, FiguresConfig(tmp_path, ("calibrations",)), quiet)
 
 
+@pytest.mark.slow
 def test_the_command_says_what_is_missing(
     store: tuple[Dataset, TrackingConfig], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

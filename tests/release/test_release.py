@@ -190,6 +190,7 @@ def test_the_best_on_validation_ships(finished: Path) -> None:
     assert models[0].reused
 
 
+@pytest.mark.slow
 def test_what_is_best_of_all_ships_beside_the_network(folder: Path, tmp_path: Path) -> None:
     root = folder / "data" / "release"
     release, tracking = Dataset.load(root), TrackingConfig(str(folder / "mlruns"))

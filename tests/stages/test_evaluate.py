@@ -226,6 +226,7 @@ def test_scores_that_are_not_finite_are_named(
         evaluate(dataset, RULES, TrackingConfig(str(tmp_path / "mlruns")), progress=False)
 
 
+@pytest.mark.slow
 def test_the_papers_tables_have_networks_that_do_not_ship(dataset: Dataset, tmp_path: Path) -> None:
     tracking, results = TrackingConfig(str(tmp_path / "mlruns")), dataset.root / "results"
     both = train(

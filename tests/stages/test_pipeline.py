@@ -118,7 +118,8 @@ def test_all_methods_are_trained_and_compared(copy: Path) -> None:
     assert {*learned, *rules} <= {*scores["method"]}
 
 
-@pytest.mark.parametrize("workers", ["1", pytest.param("2", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", ["1", "2"])
 def test_the_same_seed_gives_the_same_bytes(
     demo: Path, tmp_path: Path, workers: str, request: pytest.FixtureRequest
 ) -> None:
@@ -143,6 +144,7 @@ def test_a_changed_setting_remakes_what_depends_on_it(copy: Path) -> None:
     pd.testing.assert_frame_equal(scene.read_table(), table)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("in_this_process", "no_pictures_here")
 def test_matches_are_stored_when_asked_for_and_go_with_the_labels_they_belong_to(copy: Path) -> None:
     scenes = Dataset.load(copy / "data" / "tiny").scenes
@@ -195,6 +197,7 @@ def test_what_a_table_says_is_what_its_features_hold(demo: Path) -> None:
         assert np.abs(binned.n_visible - table["n_visible"]).max() <= 1  # single precision at the border
 
 
+@pytest.mark.slow
 def test_every_occlusion_model_scores_the_same_viewpoints(copy: Path) -> None:
     root = copy / "data" / "tiny"
     stored = pd.read_csv(root / "results" / "scores.csv")
@@ -293,6 +296,7 @@ def test_labels_of_different_settings_are_not_used_together(
         assert "Run `wheretolook label`" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("in_this_process", "no_pictures_here")
 def test_a_report_that_could_not_be_logged_is_logged_the_next_time(
     copy: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -357,6 +361,7 @@ def test_stages_are_plain_functions(demo: Path) -> None:
     assert dataset.name == "tiny"
 
 
+@pytest.mark.slow
 def test_planned_paths_are_rendered_and_localized(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = ["--paths.pairs", "2", "--paths.methods", "[forward,visible]", "--paths.grid", "[4, 4, 2]",
                "--paths.directions", "40", "--paths.min_distance_m", "1", "--paths.planner.time_s", "1",
@@ -380,6 +385,7 @@ def test_planned_paths_are_rendered_and_localized(copy: Path, capsys: pytest.Cap
     assert "There are" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_path_is_planned_and_shown(
     copy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -414,6 +420,7 @@ def test_a_path_is_planned_and_shown(
     assert "the start is not in free space" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_paths_keep_clear_of_what_depth_images_saw(copy: Path, tmp_path: Path) -> None:
     """With the occlusion model tsdf; locations are sampled by the mesh all the same."""
     tsdf = ["--occlusion.model", "tsdf", "--occlusion.voxel_m", "0.04"]

@@ -297,8 +297,7 @@ def _run(command: str, arguments: list[str]) -> int:
 def parse_experiment(command: str, arguments: list[str]) -> Experiment | None:
     """The experiment that a YAML file and the command line's overrides describe; None if only help was asked for.
 
-    Raises:
-        ConfigError: a file is missing, or a key or value does not fit.
+    Raises ConfigError if a file is missing, or a key or value does not fit.
     """
     from wheretolook.config import MOVED, Experiment
 

@@ -152,8 +152,7 @@ class Experiment:
     def warp_device(self) -> str:
         """The device kernels run on, with "auto" resolved.
 
-        Raises:
-            ConfigError: there is no such device here. Of a Ray cluster only its machines know which they have.
+        Raises ConfigError if there is no such device here. Of a Ray cluster only its machines know which they have.
         """
         if self.label.engine == "ray" and self.device != "auto":
             return self.device

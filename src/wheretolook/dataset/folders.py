@@ -23,11 +23,8 @@ from wheretolook.viewpoints.table import read_table
 if TYPE_CHECKING:
     from wheretolook.inputs.localization_map import LocalizationMap
 
-RELEASE = "release"
-"""Name of the dataset, beside all others, that ships with its weights."""
-
-RELEASE_FILE = "release.json"
-"""What a release was made from; the file that makes a dataset one."""
+RELEASE = "release"  # name of the dataset, beside all others, that ships with its weights
+RELEASE_FILE = "release.json"  # what a release was made from; the file that makes a dataset one
 
 
 @dataclass(frozen=True)
@@ -86,8 +83,7 @@ class SceneFolder:
     def is_photographed(self) -> bool:
         """Whether the scene is known from photographs alone.
 
-        Raises:
-            MapError: it has no mesh, and its map's report is damaged.
+        Raises MapError if it has no mesh, and its map's report is damaged.
         """
         return not self.mesh.is_file() and read_scale(self.map) is not None
 
@@ -98,10 +94,8 @@ class SceneFolder:
     def mapping_poses(self) -> Float | None:
         """Poses cam_from_world (M, 3, 4) float32 of the mapping images; None if neither their file nor a model is left.
 
-        Maps made before there was such a file have a COLMAP model, which tells the same.
-
-        Raises:
-            MapError: the file or the model is damaged.
+        Maps made before there was such a file have a COLMAP model, which tells the same. Raises MapError if the file or
+        the model is damaged.
         """
         if self.mapping_cameras.is_file():
             return load_mapping_poses(self.mapping_cameras)
@@ -141,11 +135,7 @@ class Dataset:
         return tuple(scene for scene in self.scenes if scene.split == split)
 
     def scene(self, name: str) -> SceneFolder:
-        """The scene of a name.
-
-        Raises:
-            ConfigError: there is none.
-        """
+        """The scene of a name. Raises ConfigError if there is none."""
         for scene in self.scenes:
             if scene.name == name:
                 return scene
@@ -170,11 +160,7 @@ class Dataset:
 
     @classmethod
     def load(cls, root: Path) -> Dataset:
-        """Read a dataset folder.
-
-        Raises:
-            TableError: there is no valid `dataset.json`.
-        """
+        """Read a dataset folder. Raises TableError if there is no valid `dataset.json`."""
         path = root / "dataset.json"
         try:
             content = json.loads(path.read_text())

@@ -10,8 +10,7 @@ from typing import Any
 from wheretolook.dataset.folders import SceneFolder
 from wheretolook.utils.files import write_json
 
-STAGES = ("scenes", "map", "sample", "label")
-"""Stages that work scene by scene, in order."""
+STAGES = ("scenes", "map", "sample", "label")  # stages that work scene by scene, in order
 
 
 def stage_key(stage: str, parts: list[Any]) -> str:

@@ -81,8 +81,7 @@ def methods_figure(paths: Mapping[str, Sequence[PathView]], landmarks: Float) ->
 def save_film(frames: Iterator[Pixels], path: Path, frames_per_second: float = FRAMES_PER_SECOND) -> None:
     """Write frames, all of one size, as an animated GIF or an MP4, by the file's ending; atomically.
 
-    Raises:
-        ConfigError: another ending, or MP4 cannot be written here.
+    Raises ConfigError for another ending, or if MP4 cannot be written here.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".partial-{path.name}")

@@ -20,11 +20,8 @@ from wheretolook.figures.style import INK, RC, new_figure
 from wheretolook.methods.styles import ORACLE, method_group, method_style, rows_by_group
 from wheretolook.viewpoints.thresholds import ALL, threshold_label
 
-_OTHER_MARKERS = ("o", "D", "s", "^")
-"""Markers of the second and further N."""
-
-_WRAP = 36
-"""Longer names of methods are broken into two lines."""
+_OTHER_MARKERS = ("o", "D", "s", "^")  # markers of the second and further N
+_WRAP = 36  # longer names of methods are broken into two lines
 
 _WHISKERS = "whiskers: 95 % bootstrap interval over locations"
 
@@ -112,10 +109,8 @@ def regret_figure(scores: pd.DataFrame) -> Figure:
     """What each method loses against the oracle and against the reference, at the finest threshold, for each N.
 
     Rows and `scores` are as in `score_figure`. Left the regret, right the paired difference to the reference if the
-    table has one, with bootstrap intervals, in percentage points of the chosen views.
-
-    Raises:
-        ValueError: the table is of an older version, without regret.
+    table has one, with bootstrap intervals, in percentage points of the chosen views. Raises ValueError if the table is
+    of an older version, without regret.
     """
     scores = main_rows(scores)
     pooled, key = scores[scores["scene"] == ALL], threshold_keys(scores)[0]

@@ -99,11 +99,7 @@ def save_figure(figure: Figure, path: Path, note: str = "") -> None:
 
 
 def note_of(path: Path) -> str:
-    """What `save_figure` kept in a figure's metadata; empty if nothing.
-
-    Raises:
-        ConfigError: another kind of file than PNG, PDF or SVG.
-    """
+    """What `save_figure` kept in a figure's metadata; empty if nothing. Raises ConfigError for other kinds of files."""
     kind = path.suffix[1:].lower()
     if kind == "png":
         from PIL import Image

@@ -14,8 +14,7 @@ from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.scenes.cutting import cut_above
 
-FRUSTUM_M = 0.25
-"""Depth of the cameras that are drawn."""
+FRUSTUM_M = 0.25  # depth of the cameras that are drawn
 
 _POINT_PX = 3
 

@@ -77,10 +77,8 @@ class ColmapCamera:
 
     Beyond the field of view that they were fitted to, distortion polynomials turn back and map points far outside of it
     into the image. So a point counts as seen only if the ray of its pixel, by COLMAP's own inverse, leads back to it.
-    COLMAP's fisheye models see nothing at 90 degrees from the axis and beyond.
-
-    Raises:
-        ConfigError: COLMAP has no such model, or the model takes other parameters.
+    COLMAP's fisheye models see nothing at 90 degrees from the axis and beyond. Raises ConfigError if COLMAP has no such
+    model, or the model takes other parameters.
     """
 
     model: str  # COLMAP's name, such as "OPENCV" or "OPENCV_FISHEYE"

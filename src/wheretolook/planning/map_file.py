@@ -32,8 +32,7 @@ ARRAYS = {
 }
 """Type, little-endian, and shape of each array; each is a file `<name>.npy`."""
 
-_OLD = "old"
-"""Name of a map that is being replaced, in the hidden folder where the new one is written."""
+_OLD = "old"  # name of a map that is being replaced, in the hidden folder where the new one is written
 
 REBUILD = "Build it anew with `wheretolook viewpoint-map`, or get the folder again."
 
@@ -110,10 +109,8 @@ def write_map(
     folder beside it, `.<name>.<some letters>`, into which the old one is moved until the new one is in place. A process
     killed in between leaves both there, and `read_map` says where.
 
-    `origin` has the fields of `MapOrigin` but `derived`, `arrays` those of `ARRAYS` by name.
-
-    Raises:
-        MapFormatError: the folder holds anything that is not part of a viewpoint map.
+    `origin` has the fields of `MapOrigin` but `derived`, `arrays` those of `ARRAYS` by name. Raises MapFormatError if
+    the folder holds anything that is not part of a viewpoint map.
     """
     folder = Path(folder).resolve()  # so that "." has a name too
     _refuse_something_else(folder)
@@ -175,10 +172,8 @@ def read_map(folder: str | Path, mmap: bool = False) -> tuple[VoxelGrid, dict[st
     """Read what `write_map` wrote: grid, origin and arrays.
 
     With `mmap` the files are mapped into memory, read-only, and read where they are used. Sizes and types are still
-    checked, but not the checksums, for which every byte would have to be read.
-
-    Raises:
-        MapFormatError: there is no map, it is damaged, or of another version.
+    checked, but not the checksums, for which every byte would have to be read. Raises MapFormatError if there is no
+    map, or it is damaged or of another version.
     """
     folder = Path(folder)
     path = folder / DESCRIPTION

@@ -33,10 +33,8 @@ def plan_by_methods(
 
     What a method thinks of the views is its own map's scores. Methods are "forward", or names of scorers; empty for
     that of the weights, or bins without. `config` has weights for methods that have learnt, if they are of their kind
-    (`weights_for`). Returns paths by the names of their methods, in the order given.
-
-    Raises:
-        ConfigError: a method needs weights, or there is none of that name. PlanningError: no path can be found.
+    (`weights_for`). Returns paths by the names of their methods, in the order given. Raises ConfigError if a method
+    needs weights or there is none of that name, PlanningError if no path can be found.
     """
     methods, space = tuple(methods), scene.space
     check_methods(methods)

@@ -25,8 +25,7 @@ from wheretolook.space.mapped_space import MappedSpace
 from wheretolook.utils.errors import PlanningError, SceneError
 from wheretolook.viewpoints.table import pose_columns
 
-FORWARD = "forward"
-"""The method that needs no map: the shortest path, looking ahead."""
+FORWARD = "forward"  # the method that needs no map: the shortest path, looking ahead
 
 PLANNED, GIVEN = "planned", "given"
 """What a method may choose: places and views, or the views along a path that is given."""
@@ -36,8 +35,7 @@ Rule = Callable[[Float, TurnLimit], ViewSequence]
 RULES: dict[str, Rule] = {"": best_sequence, "greedy": greedy_sequence}
 """How the views along a given path are chosen, exactly and by ActLoc's rule, by what is added to a method's name."""
 
-DRAWS = 50
-"""Pairs drawn for each one wanted, before a scene is said to have too little room."""
+DRAWS = 50  # pairs drawn for each one wanted, before a scene is said to have too little room
 
 WAYS_M, MOST = 0.25, 200_000
 """Grid of places by which to find out whether there is a way from a start to a goal, and their largest number."""
@@ -63,10 +61,8 @@ class ComparedPaths:
 def draw_pairs(space: FreeSpace | MappedSpace, config: PathsConfig) -> Float:
     """Starts and goals (P, 2, 3) m in free space, far enough from each other, with a way between them.
 
-    Above floors, heights are those asked for; without a mesh, they are drawn.
-
-    Raises:
-        SceneError: there is too little room.
+    Above floors, heights are those asked for; without a mesh, they are drawn. Raises SceneError if there is too little
+    room.
     """
     rng = np.random.default_rng(config.seed)
     low, high = space.bounds
@@ -149,10 +145,8 @@ def plan_pairs(
 ) -> ComparedPaths:
     """Plan between pairs by every method; then choose views along the shortest paths by every method.
 
-    `pairs` are starts and goals (P, 2, 3) m, `maps` those of each method but "forward", with scores in [0, 1].
-
-    Raises:
-        PlanningError: no path was found at all.
+    `pairs` are starts and goals (P, 2, 3) m, `maps` those of each method but "forward", with scores in [0, 1]. Raises
+    PlanningError if no path was found at all.
     """
     paths: list[dict[str, Any]] = []
     tables: list[pd.DataFrame] = []

@@ -20,8 +20,7 @@ from wheretolook.viewpoints.table import LOCALIZED
 PATHS_CSV, PATHS_MD, PATHS_PNG = "paths.csv", "paths.md", "paths.png"
 """Files of a comparison, in `<dataset>/results/` and as artifacts of its run."""
 
-ALL = "all"
-"""Name of the rows over all scenes."""
+ALL = "all"  # name of the rows over all scenes
 
 Tags = Mapping[str, str] | None
 

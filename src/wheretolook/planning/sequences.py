@@ -43,8 +43,7 @@ class TurnLimit:
     def of(cls, directions: ArrayLike, max_turn_deg: float = MAX_TURN_DEG, pan_tilt: bool = False) -> TurnLimit:
         """For a lattice of unit vectors (D, 3), such as `direction_lattice` gives.
 
-        Raises:
-            ValueError: directions of another shape or not of unit length, or a limit that is negative or NaN.
+        Raises ValueError for directions of another shape or not of unit length, or a limit that is negative or NaN.
         """
         axes = np.asarray(directions, dtype=np.float64)
         if axes.ndim != 2 or axes.shape[1] != 3 or not np.allclose(np.linalg.norm(axes, axis=1), 1, atol=1e-6):
@@ -152,10 +151,8 @@ def greedy_sequence(
 def resample_path(points: ArrayLike, spacing_m: float = SPACING_M) -> Float:
     """Waypoints (W, 3) m along a polyline (P, 3) m: its first point, one every `spacing_m` along it, and its last.
 
-    The last leg may be shorter than the others.
-
-    Raises:
-        ValueError: fewer than one point, another shape, not finite, or a spacing that is not positive.
+    The last leg may be shorter than the others. Raises ValueError for no point, another shape, values that are not
+    finite, or a spacing that is not positive.
     """
     path = np.asarray(points, dtype=np.float64)
     if path.ndim != 2 or path.shape[1:] != (3,) or len(path) < 1 or not np.isfinite(path).all():

@@ -30,8 +30,7 @@ CARD = "README.md"
 SHELF = "others"
 """Folder beside the shipped weights for those of other methods. Only their records ship."""
 
-MAX_BYTES = 16_000_000
-"""A release is smaller than this."""
+MAX_BYTES = 16_000_000  # a release is smaller than this
 
 
 def is_release(dataset: Dataset) -> bool:
@@ -156,10 +155,8 @@ def ship_weights(release: Dataset) -> Choice:
 def sizes(root: Path, weights: bool = True) -> dict[str, int]:
     """Bytes of what ships of the release at `root`, by kind of file. Figures and shelved weights do not ship.
 
-    Before it is chosen which weights do, there may be several: they can be left out.
-
-    Raises:
-        StorageError: it is not smaller than `MAX_BYTES`.
+    Before it is chosen which weights do, there may be several: they can be left out. Raises StorageError if it is not
+    smaller than `MAX_BYTES`.
     """
     kinds = {"viewpoints.parquet": "tables", "landmarks.npz": "landmarks", CAMERAS_FILE: "cameras"}
     kinds["occlusion.npz"] = "occlusion"
@@ -184,8 +181,7 @@ def size_text(parts: Mapping[str, int]) -> str:
 def read_about(release: Dataset) -> dict[str, Any]:
     """What a release was made from: source, source_fingerprint, code_version and settings.
 
-    Raises:
-        ConfigError: the file is missing or damaged.
+    Raises ConfigError if the file is missing or damaged.
     """
     path = release.root / RELEASE_FILE
     try:

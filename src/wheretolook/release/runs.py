@@ -34,8 +34,7 @@ from wheretolook.viewpoints.thresholds import ALL
 LEARNERS_CSV = "learners.csv"
 """In a release's `results/`: how all learners do on scenes of validation, test and others, a row for each seed."""
 
-TAGS = {"logged_from": "release"}
-"""Of runs that were not computed where they are logged."""
+TAGS = {"logged_from": "release"}  # of runs that were not computed where they are logged
 
 Say = Callable[[str], None]
 

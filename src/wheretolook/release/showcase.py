@@ -30,11 +30,8 @@ from wheretolook.viewpoints.table import instructive_location, is_good
 from wheretolook.visibility.config import OcclusionConfig
 from wheretolook.visibility.occlusion import StoredOcclusion
 
-EYE_M = 1.45
-"""Height of the locations that figures show, unless told otherwise: about that of the mapping cameras."""
-
-SAME_OCCLUSION = 0.999
-"""Share of the lines of sight that must be as stored; what differs is rounding."""
+EYE_M = 1.45  # height of the locations that figures show, unless told otherwise: about that of the mapping cameras
+SAME_OCCLUSION = 0.999  # share of the lines of sight that must be as stored; what differs is rounding
 
 _CHECKED = 16  # locations whose lines of sight are compared
 

@@ -61,11 +61,8 @@ def draw_overview(experiment: Experiment, weights: Path) -> None:
     """Draw `<dataset>/results/overview.png`: the last scene's map, and what a network thinks of one place in it.
 
     The place is one where to look matters (`wheretolook.viewpoints.table.instructive_location`). The weights are a
-    file, or a folder of files of which the best is taken, for a camera of the dataset's field of view.
-
-    Raises:
-        TableError: there is no dataset, or its last scene is not labelled.
-        WeightsError: the weights cannot be used.
+    file, or a folder of files of which the best is taken, for a camera of the dataset's field of view. Raises
+    TableError if there is no dataset or its last scene is not labelled, WeightsError if the weights cannot be used.
     """
     from wheretolook.figures.overview import overview_figure
     from wheretolook.figures.style import save_figure

@@ -19,8 +19,7 @@ from wheretolook.utils.options import recorded
 if TYPE_CHECKING:
     from wheretolook.features.keypoints import ExtractorConfig
 
-Say = Callable[[str], None]
-"""Told in a line what a stage has done."""
+Say = Callable[[str], None]  # told in a line what a stage has done
 
 Tick = Callable[[float], None]
 """Told how much of a stage's work is done: 1 a scene, or 1 in all for stages that do not go scene by scene."""
@@ -29,9 +28,8 @@ Tick = Callable[[float], None]
 def dataset_after(experiment: Experiment, needs: str) -> Dataset:
     """The dataset, once the stage that is needed has been through all of its scenes with what they now hold.
 
-    Raises:
-        ConfigError: it was made with another camera, or is a release where meshes and maps are needed.
-        TableError: there is none, or the stage has not been run.
+    Raises ConfigError if it was made with another camera, or is a release where meshes and maps are needed; TableError
+    if there is none, or the stage has not been run.
     """
     dataset = Dataset.load(experiment.root)
     if needs != "label":

@@ -29,8 +29,7 @@ QUICK = (
 def log_release(experiment: Experiment, say: Say = print, attach: bool = True) -> Dataset:
     """Log what a release holds as MLflow runs, as far as the store lacks them, on request with figures and tables.
 
-    Raises:
-        ConfigError: the dataset is no release. TableError: there is none.
+    Raises ConfigError if the dataset is no release, TableError if there is none.
     """
     from wheretolook.release.catalog import write_items
     from wheretolook.release.copy import is_release

@@ -16,10 +16,8 @@ from wheretolook.utils.errors import SceneError
 def make_maps(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> Dataset:
     """Stage 2: a COLMAP model of every scene with its landmarks' attributes, `<scene>/map/`.
 
-    With `map.photographs.images`, of a scene made of the photographs there; see `map_photograph_scene`.
-
-    Raises:
-        SceneError, MapError: a mesh cannot be read, or no landmark could be triangulated.
+    With `map.photographs.images`, of a scene made of the photographs there; see `map_photograph_scene`. Raises
+    SceneError or MapError if a mesh cannot be read, or no landmark could be triangulated.
     """
     if experiment.map.photographs.images is not None:
         refuse_release(experiment.root)

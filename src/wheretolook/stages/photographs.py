@@ -19,10 +19,8 @@ from wheretolook.utils.files import fingerprint
 def map_photograph_scene(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> Dataset:
     """Map the photographs in `map.photographs.images`: `<scene>/map/`, with finished steps in `<scene>/photographs/`.
 
-    The scene joins those of the dataset that are made of photographs too.
-
-    Raises:
-        MapError, ConfigError: see `map_photographs`; or the dataset holds scenes with meshes.
+    The scene joins those of the dataset that are made of photographs too. Raises what `map_photographs` does, and
+    ConfigError if the dataset holds scenes with meshes.
     """
     from wheretolook.mapping.photographs import list_photographs
 

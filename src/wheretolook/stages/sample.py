@@ -18,10 +18,8 @@ def sample(experiment: Experiment, say: Say = print, tick: Tick = lambda work: N
 
     Every voxel's free location is looked from in every direction; the landmarks it sees are counted exactly.
 
-    A scene of photographs is free near where these were taken, and occluded by hidden-point removal.
-
-    Raises:
-        SceneError: no location is free. MapError: there is no map, or one without a scale.
+    A scene of photographs is free near where these were taken, and occluded by hidden-point removal. Raises SceneError
+    if no location is free, MapError if there is no map, or one without a scale.
     """
     dataset, config = dataset_after(experiment, "map"), experiment.sample
     for files in dataset.scenes:

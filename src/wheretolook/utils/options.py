@@ -21,8 +21,7 @@ from wheretolook.utils.errors import ConfigError
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-WIDTH = 118
-"""Columns of help, where the terminal has so many."""
+WIDTH = 118  # columns of help, where the terminal has so many
 
 _NAME_WIDTH = 36
 
@@ -69,8 +68,7 @@ def all_options(settings: type, prefix: str = "") -> dict[str, Option]:
 def recorded(settings: type[T], values: Mapping[str, Any]) -> T:
     """Settings as `dataclasses.asdict` recorded them with a result.
 
-    Raises:
-        ConfigError: the record has another value of what is a constant.
+    Raises ConfigError if the record has another value of what is a constant.
     """
     fixed = {field.name for field in dataclasses.fields(settings) if not field.init}
     for name in fixed & {*values}:
@@ -122,8 +120,7 @@ def nearest(name: str, names: Iterable[str]) -> str | None:
 def names_in(content: Any, options: Mapping[str, Option], prefix: str = "") -> Iterator[str]:
     """Names of the options that a file's content sets, (nested) mappings as a YAML file holds them.
 
-    Raises:
-        ConfigError: a group is given something else than a mapping.
+    Raises ConfigError if the value of a group is no mapping.
     """
     for key, value in content.items():
         name = f"{prefix}{key}"

@@ -33,14 +33,9 @@ if TYPE_CHECKING:
 STAGE_TAG = "stage"
 """Tag of every run this package logs: "label", "train", "evaluate", "plan", "paths", "learners" or "benchmark"."""
 
-PARENT_TAG = "mlflow.parentRunId"
-"""Tag by which MLflow knows what run another is nested in."""
-
-AT_ONCE = 800
-"""Metrics logged at a time: MLflow takes 1000 of metrics and parameters together."""
-
-PAGE = 50
-"""Runs searched at a time."""
+PARENT_TAG = "mlflow.parentRunId"  # tag by which MLflow knows what run another is nested in
+AT_ONCE = 800  # metrics logged at a time: MLflow takes 1000 of metrics and parameters together
+PAGE = 50  # runs searched at a time
 
 
 def client(tracking: TrackingConfig) -> MlflowClient:

@@ -23,7 +23,6 @@ from wheretolook.utils.tracking import ui_command
 SECONDS = {"scenes": 5.0, "map": 15.0, "sample": 1.0, "label": 75.0, "train": 25.0, "evaluate": 6.0}
 """Rough cost of a stage on two cores (the first four for each scene), from which the share done is estimated."""
 
-
 OVERVIEW = "overview.png"
 
 
@@ -48,8 +47,7 @@ def run_demo(experiment: Experiment) -> None:
     with tqdm(total=sum(cost.values()), desc="demo", bar_format=layout, smoothing=0) as bar:
         for number, (name, step) in enumerate(steps.items(), 1):
             bar.set_description_str(f"demo {number}/{len(steps)} {name}")
-            say, tick = partial(_say, name), partial(_tick, bar, SECONDS[name])
-            step(experiment, say=say, tick=tick)
+            step(experiment, say=partial(_say, name), tick=partial(_tick, bar, SECONDS[name]))
         given, own = experiment.evaluate.weights, experiment.root / "weights"
         if given or any(own.glob("*.safetensors")):
             draw_overview(experiment, given[-1] if given else own)

@@ -40,9 +40,7 @@ def dataset_after(experiment: Experiment, needs: str) -> Dataset:
         raise ConfigError(problem, path=experiment.root, value=dataset.camera, fix=fix)
     for scene in dataset.scenes:
         if read_stamp(scene, needs) is None:
-            problem = (
-                f"the {needs} stage has not been run for this scene, or not since an earlier stage remade its input"
-            )
+            problem = f"the {needs} stage has not been run for this scene since its input was made"
             raise TableError(problem, path=scene.folder, fix=f"Run `wheretolook {needs}`.")
     return dataset
 

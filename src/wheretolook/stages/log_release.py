@@ -12,17 +12,8 @@ from wheretolook.stages.inputs import Say
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.tracking import ui_command
 
-QUICK = (
-    "top_n",
-    "table_vs_others",
-    "table_input_variants",
-    "training",
-    "calibration",
-    "scores",
-    "regret",
-    "paths",
-    "runtimes",
-)
+_TABLES = ("table_vs_others", "table_input_variants")
+QUICK = ("top_n", *_TABLES, "training", "calibration", "scores", "regret", "paths", "runtimes")
 """Figures and tables that need no scene, and so only seconds."""
 
 

@@ -17,9 +17,6 @@ from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.cutting import cut_above
 from wheretolook.utils.errors import ConfigError, SceneError
 
-BLUE, SKY, GREEN, ORANGE, VERMILION, PURPLE = "#0072B2", "#56B4E9", "#009E73", "#E69F00", "#D55E00", "#CC79A7"
-"""The colours of Okabe and Ito (2008), which colour-blind people can tell apart."""
-
 FAR = 25.0  # distance of the eye in diagonals of the scene: so far that parallel lines stay parallel in the picture
 
 

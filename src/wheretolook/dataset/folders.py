@@ -136,10 +136,10 @@ class Dataset:
 
     def scene(self, name: str) -> SceneFolder:
         """The scene of a name. Raises ConfigError if there is none."""
-        for scene in self.scenes:
-            if scene.name == name:
-                return scene
-        fix = f"There are {', '.join(scene.name for scene in self.scenes)}."
+        known = {scene.name: scene for scene in self.scenes}
+        if name in known:
+            return known[name]
+        fix = f"There are {', '.join(known)}."
         raise ConfigError("there is no such scene", path=self.root, value=name, fix=fix)
 
     def fingerprint(self) -> str:
@@ -152,11 +152,8 @@ class Dataset:
 
     def save(self) -> None:
         """Write `dataset.json`, which makes the folder a dataset."""
-        content = {
-            "camera": asdict(self.camera),
-            "scenes": [{"name": scene.name, "split": scene.split} for scene in self.scenes],
-        }
-        write_json(self.root / "dataset.json", content)
+        scenes = [{"name": scene.name, "split": scene.split} for scene in self.scenes]
+        write_json(self.root / "dataset.json", {"camera": asdict(self.camera), "scenes": scenes})
 
     @classmethod
     def load(cls, root: Path) -> Dataset:
@@ -169,6 +166,5 @@ class Dataset:
         except FileNotFoundError as error:
             raise TableError("this folder is no dataset", path=path, fix="Run the scenes stage first.") from error
         except (ValueError, KeyError, TypeError) as error:
-            raise TableError(
-                f"damaged dataset description: {error}", path=path, fix="Run the scenes stage again."
-            ) from error
+            problem, fix = f"damaged dataset description: {error}", "Run the scenes stage again."
+            raise TableError(problem, path=path, fix=fix) from error

@@ -91,9 +91,8 @@ class ColmapCamera:
 
         names = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
         if self.model not in names:
-            raise ConfigError(
-                "COLMAP has no such camera model", value=self.model, fix=f"Use one of {', '.join(names)}."
-            )
+            fix = f"Use one of {', '.join(names)}."
+            raise ConfigError("COLMAP has no such camera model", value=self.model, fix=fix)
         expected = pycolmap.Camera.create_from_model_name(1, self.model, 1.0, 1, 1).params_info
         if len(self.params) != len(expected.split(",")) or self.width < 1 or self.height < 1:
             problem = f"camera model {self.model} needs a positive size and the parameters {expected}"

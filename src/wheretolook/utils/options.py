@@ -25,7 +25,6 @@ WIDTH = 118  # columns of help, where the terminal has so many
 
 _NAME_WIDTH = 36
 
-
 T = TypeVar("T", bound="DataclassInstance")
 
 
@@ -79,16 +78,11 @@ def recorded(settings: type[T], values: Mapping[str, Any]) -> T:
 
 
 def check_names(names: Iterable[str], options: Mapping[str, Option], moved: Mapping[str, str], flag: str = "") -> None:
-    """Raise unless every name is one of an option that can be set.
+    """Raise ConfigError unless every name, with groups and dots, is one of an option that can be set.
 
-    Args:
-        names: with groups and dots, as in a file or on the command line.
-        options: what there is.
-        moved: options there were: where each has gone, as another's name or in a sentence.
-        flag: what stands before a name where it was given, "--" on the command line.
-
-    Raises:
-        ConfigError: a name is unknown, with the one that was probably meant; or it has moved, or is a constant.
+    The error tells which option was probably meant, or that it has moved, or is a constant. `moved` says where options
+    there were have gone, by another's name or in a sentence; `flag` is what stands before names, "--" on the command
+    line.
     """
     for name in names:
         if name in moved:
@@ -169,9 +163,8 @@ def _row(flag: str, text: str) -> str:
 
 def _filled(text: str, start: str = "", indent: str = "") -> str:
     width = max(60, min(WIDTH, shutil.get_terminal_size((WIDTH, 0)).columns))
-    return textwrap.fill(
-        text, width, initial_indent=start, subsequent_indent=indent, break_on_hyphens=False, break_long_words=False
-    )
+    breaks: dict[str, Any] = {"break_on_hyphens": False, "break_long_words": False}
+    return textwrap.fill(text, width, initial_indent=start, subsequent_indent=indent, **breaks)
 
 
 def _default(option: Option) -> str:

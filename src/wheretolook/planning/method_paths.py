@@ -57,12 +57,11 @@ def path_views(
     camera, points = localization_map.camera, localization_map.landmarks.points
     assert isinstance(camera, PinholeCamera)
     cam_from_world = poses_looking_along(path.positions, path.axes)
-    visible = localization_map.landmarks_in_view(cam_from_world)
-    images: Any = [None] * len(visible) if renderer is None else renderer.render(camera, cam_from_world).rgb
+    seen = localization_map.landmarks_in_view(cam_from_world)
+    images: Any = [None] * len(seen) if renderer is None else renderer.render(camera, cam_from_world).rgb
     views, size = [], (camera.width, camera.height)
     for number, (pose, image) in enumerate(zip(cam_from_world, images, strict=True)):
-        pixels = camera.project(points[visible[number]] @ pose[:, :3].T + pose[:, 3])
-        views.append(
-            PathView(path.positions[number], path.axes[number], float(path.scores[number]), pixels, size, image)
-        )
+        pixels = camera.project(points[seen[number]] @ pose[:, :3].T + pose[:, 3])
+        view = (path.positions[number], path.axes[number], float(path.scores[number]))
+        views.append(PathView(*view, pixels, size, image))
     return views

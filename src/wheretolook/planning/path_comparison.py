@@ -77,11 +77,9 @@ def draw_pairs(space: FreeSpace | MappedSpace, config: PathsConfig) -> Float:
         if ways.joins(ends[0], ends[1]):  # not in parts of the scene between which there is no way
             found.append(ends)
     if len(found) < config.pairs:
-        raise SceneError(
-            f"found only {len(found)} starts and goals {config.min_distance_m:g} m apart with a way between them",
-            value=config.pairs,
-            fix="Lower paths.min_distance_m or paths.pairs.",
-        )
+        apart = f"{config.min_distance_m:g} m apart with a way between them"
+        fix = "Lower paths.min_distance_m or paths.pairs."
+        raise SceneError(f"found only {len(found)} starts and goals {apart}", value=config.pairs, fix=fix)
     return np.array(found)
 
 

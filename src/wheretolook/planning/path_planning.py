@@ -97,7 +97,10 @@ def plan_path(
         if viewpoint_map is None:
             assert route is not None
             bar.update(max(0.0, bar.total - bar.n))
-            return _looking_ahead(route, config)
+            samples = RouteSamples.of(route, config.spacing_m)
+            axes = _forward(samples.positions, np.radians(config.pitch_deg))
+            unknown = np.full(len(samples.positions), np.nan)
+            return PlannedPath(samples.positions, axes, unknown, float(samples.corners[-1]), SHORT_ROUTE)
         axis = None if start_axis is None else axes_of_angles(np.degrees(orientations[0]))
         views = RouteViews(viewpoint_map, config, axis)
         found: dict[float, tuple[PlannedPath, Float]] = {}
@@ -142,14 +145,6 @@ def check_ends(ends: Float, space: Space, bounds: Float) -> None:
     if np.linalg.norm(ends[1] - ends[0]) < SAME_M:
         fix = "Ask the map for the best view there."
         raise PlanningError("the start is the goal", value=tuple(ends[0].tolist()), fix=fix)
-
-
-def _looking_ahead(route: Float, config: PathConfig) -> PlannedPath:
-    """The path along a route (S, 3) m whose camera looks forward."""
-    samples = RouteSamples.of(route, config.spacing_m)
-    axes = _forward(samples.positions, np.radians(config.pitch_deg))
-    unknown = np.full(len(samples.positions), np.nan)
-    return PlannedPath(samples.positions, axes, unknown, float(samples.corners[-1]), SHORT_ROUTE)
 
 
 def _length(places: Float) -> float:

@@ -16,11 +16,10 @@ from wheretolook.utils.markdown import markdown_table
 from wheretolook.utils.tracking import NestedRun, log_nested, start_run
 from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import LOCALIZED
+from wheretolook.viewpoints.thresholds import ALL
 
 PATHS_CSV, PATHS_MD, PATHS_PNG = "paths.csv", "paths.md", "paths.png"
 """Files of a comparison, in `<dataset>/results/` and as artifacts of its run."""
-
-ALL = "all"  # name of the rows over all scenes
 
 Tags = Mapping[str, str] | None
 

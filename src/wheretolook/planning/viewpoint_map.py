@@ -126,12 +126,11 @@ class ViewpointMap:
             del origin["inputs"]
         try:
             return cls(grid=grid, origin=MapOrigin(**origin), **arrays)
-        except TypeError as error:
-            problem, path = f"damaged description: {error}", Path(folder) / DESCRIPTION
+        except (TypeError, ValueError) as error:
+            problem, path = f"the arrays do not fit together: {error}", Path(folder)
+            if isinstance(error, TypeError):
+                problem, path = f"damaged description: {error}", path / DESCRIPTION
             raise MapFormatError(problem, path=path, fix=REBUILD) from error
-        except ValueError as error:
-            problem = f"the arrays do not fit together: {error}"
-            raise MapFormatError(problem, path=Path(folder), fix=REBUILD) from error
 
     def save(self, folder: str | Path) -> None:
         """Write a folder that needs no Python to be read, see `wheretolook.planning.map_file.write_map`.
@@ -255,9 +254,8 @@ class ViewpointMap:
         return self._choice(row, ranked.item(allowed[ranked].argmax()))
 
     def _choice(self, row: int, direction: int) -> ViewChoice:
-        return ViewChoice(
-            direction, self._axes[direction], self.scores.item(row, direction), self.n_visible.item(row, direction)
-        )
+        score, n_visible = self.scores.item(row, direction), self.n_visible.item(row, direction)
+        return ViewChoice(direction, self._axes[direction], score, n_visible)
 
     @cached_property
     def _hash(self) -> tuple[Any, ...]:

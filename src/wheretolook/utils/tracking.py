@@ -220,7 +220,7 @@ def ui_command(tracking: TrackingConfig) -> str:
 def code_version() -> dict[str, str]:
     """Version of this package and, in a checkout, the git commit ("+" appended when files differ from it)."""
     version = {"code_version": VERSION}
-    here = Path(__file__).resolve().parent
+    here = Path(__file__).resolve().parents[1]
 
     def git(*arguments: str) -> str:
         command = ["git", "-C", str(here), *arguments]

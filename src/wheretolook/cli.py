@@ -24,27 +24,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Stage:
-    """What the command line knows of a stage.
+    """What the command line knows of a stage."""
 
-    Args:
-        function: in `wheretolook.stages`.
-        text: what it does.
-        matter: the options that matter, which `--help` shows, with blanks between; one without a dot may be short.
-        groups: the options it reads, which `--help-all` shows: those in these groups; none for all.
-        example: arguments to try.
-        short: flags that may be given without their group.
-        config: name of the file in configs/ that is read unless --config names one.
-        notes: what else to know.
-    """
-
-    function: str
-    text: str
-    matter: str
-    groups: tuple[str, ...] = ()
-    example: str = "--config configs/demo.yaml"
-    short: Mapping[str, str] = field(default_factory=dict)
-    config: str = ""
-    notes: str = ""
+    function: str  # in `wheretolook.stages`
+    text: str  # what it does
+    matter: str  # options that `--help` shows, with blanks between; one without a dot may be short
+    groups: tuple[str, ...] = ()  # `--help-all` shows the options in these groups; none for all
+    example: str = "--config configs/demo.yaml"  # arguments to try
+    short: Mapping[str, str] = field(default_factory=dict)  # flags that may be given without their group
+    config: str = ""  # name of the file in configs/ that is read unless --config names one
+    notes: str = ""  # what else to know
 
 
 _SPACE = ("occlusion", "scenes.free_space", "scenes.mapped_space", "map.photographs.assume_metric")

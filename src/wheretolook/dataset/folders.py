@@ -29,15 +29,10 @@ RELEASE_FILE = "release.json"  # what a release was made from; the file that mak
 
 @dataclass(frozen=True)
 class SceneFolder:
-    """Files of one scene.
+    """Files of one scene."""
 
-    Attributes:
-        folder: `<data>/<dataset>/<scene>`.
-        split: the split the whole scene belongs to.
-    """
-
-    folder: Path
-    split: Split
+    folder: Path  # `<data>/<dataset>/<scene>`
+    split: Split  # the whole scene belongs to it
 
     @property
     def name(self) -> str:
@@ -113,17 +108,11 @@ class SceneFolder:
 
 @dataclass(frozen=True)
 class Dataset:
-    """A folder of scenes with one camera.
+    """A folder of scenes with one camera."""
 
-    Attributes:
-        root: `<data>/<dataset>`.
-        camera: intrinsics of every viewpoint.
-        scenes: all scenes in the order they were made.
-    """
-
-    root: Path
-    camera: PinholeCamera
-    scenes: tuple[SceneFolder, ...]
+    root: Path  # `<data>/<dataset>`
+    camera: PinholeCamera  # intrinsics of every viewpoint
+    scenes: tuple[SceneFolder, ...]  # in the order they were made
 
     @property
     def name(self) -> str:

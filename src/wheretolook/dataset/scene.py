@@ -35,19 +35,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SceneConfig:
-    """How a scene is looked at.
+    """How a scene is looked at."""
 
-    Args:
-        occlusion: what hides landmarks.
-        free_space: where a camera can be in a scene with a mesh.
-        mapped_space: where it can be in a scene of photographs.
-        assume_metric: whether the unit of a map without a scale is taken for a metre.
-    """
-
-    occlusion: OcclusionConfig = field(default_factory=OcclusionConfig)
-    free_space: FreeSpaceConfig = field(default_factory=FreeSpaceConfig)
-    mapped_space: MappedSpaceConfig = field(default_factory=MappedSpaceConfig)
-    assume_metric: bool = False
+    occlusion: OcclusionConfig = field(default_factory=OcclusionConfig)  # what hides landmarks
+    free_space: FreeSpaceConfig = field(default_factory=FreeSpaceConfig)  # where a camera can be, by a mesh
+    mapped_space: MappedSpaceConfig = field(default_factory=MappedSpaceConfig)  # and by photographs
+    assume_metric: bool = False  # whether the unit of a map without a scale is taken for a metre
 
 
 class Scene:

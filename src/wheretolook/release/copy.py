@@ -80,19 +80,12 @@ def copy_dataset(dataset: Dataset, root: Path, settings: Mapping[str, Any]) -> D
 
 @dataclass(frozen=True)
 class Choice:
-    """What of the weights in a release's folder ships.
+    """What of the weights in a release's folder ships, by the validation average precision of each."""
 
-    Attributes:
-        network: of the paper's networks that with the best validation average precision.
-        best: the weights with the best one of all, which a user gets who names none; may be the network.
-        shelved: the rest.
-        precision: validation average precision of all by their file's name without its ending.
-    """
-
-    network: Path
-    best: Path
-    shelved: tuple[Path, ...]
-    precision: dict[str, float]
+    network: Path  # the best of the paper's networks
+    best: Path  # the best of all, which a user gets who names none; may be the network
+    shelved: tuple[Path, ...]  # the rest
+    precision: dict[str, float]  # of all, by their file's name without its ending
 
 
 def trained_weights(release: Dataset) -> dict[Path, Method]:
@@ -104,11 +97,8 @@ def trained_weights(release: Dataset) -> dict[Path, Method]:
 
 
 def choose_weights_to_ship(release: Dataset) -> Choice:
-    """Choose by the best validation average precision.
-
-    Raises:
-        WeightsError: there are no weights of the paper's network, or weights or their record do not fit the release.
-    """
+    """Choose by the best validation average precision. Raises WeightsError if the paper's network has no weights, or if
+    weights or their record do not fit the release."""
     from wheretolook.learning.provenance import was_trained_on
     from wheretolook.learning.weights import read_record, read_training
 

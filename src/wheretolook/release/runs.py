@@ -37,6 +37,7 @@ LEARNERS_CSV = "learners.csv"
 TAGS = {"logged_from": "release"}  # of runs that were not computed where they are logged
 
 Say = Callable[[str], None]
+Values = dict[str, Any]
 
 
 @dataclass
@@ -159,16 +160,15 @@ def _log_others(name: str, table: pd.DataFrame, dataset: Dataset, tracking: Trac
         return _log_evaluation(name, table, params, {}, [path], tracking)
 
 
-def _choices(table: pd.DataFrame) -> dict[str, Any]:
+def _choices(table: pd.DataFrame) -> Values:
     """What of an evaluation's options its table tells."""
     choices = {name: tuple(table[name].unique().tolist()) for name in ("top_n", "occlusion", "candidates")}
     return {**choices, "reference": table["reference"].iloc[0]}
 
 
 def _log_evaluation(
-    name: str, table: pd.DataFrame, params: dict[str, Any], metrics: dict[str, float], files: list[Path],
-    tracking: TrackingConfig,
-) -> str:  # fmt: skip
+    name: str, table: pd.DataFrame, params: Values, metrics: Values, files: list[Path], tracking: TrackingConfig
+) -> str:
     tags = {**TAGS, "dataset": name}
     metrics |= {"n_locations": float(table.loc[table["scene"] == ALL, "n_locations"].iloc[0])}
     with start_run(tracking, f"evaluate {name}", "evaluate", params, tags=tags) as (mlflow, run):

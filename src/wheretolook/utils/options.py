@@ -32,18 +32,13 @@ T = TypeVar("T", bound="DataclassInstance")
 class Option:
     """One option, or a group of them.
 
-    Attributes:
-        name: with those of the groups it is in: "sample.grid".
-        text: what its class's docstring says of it.
-        default: its default as the command line takes it; empty for a group, and for a default that is worked out.
-        is_group: whether further options lie in it.
-        is_fixed: whether it is a constant, a field that `__init__` does not take: it stands among the options since
-            what is recorded of a result must name it, and no one needs to turn it.
+    One that is fixed is a constant, a field that `__init__` does not take: it stands among the options since what is
+    recorded of a result must name it, and no one needs to turn it.
     """
 
-    name: str
-    text: str
-    default: str = ""
+    name: str  # with those of the groups it is in: "sample.grid"
+    text: str  # what its class's docstring says of it
+    default: str = ""  # as the command line takes it; empty for a group, and for a default that is worked out
     is_group: bool = False
     is_fixed: bool = False
 

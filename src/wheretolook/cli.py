@@ -307,7 +307,7 @@ def _check_file(path: Path, options: Mapping[str, Option]) -> None:
         raise ConfigError(f"this is no YAML: {' '.join(str(error).split())}", path=path) from error
     try:
         if not isinstance(content, dict):
-            raise ConfigError("a file of settings is a mapping", fix="Write such as `name: demo`.")
+            raise ConfigError("a file of settings is a mapping", fix="Write settings, such as `name: demo`.")
         check_names(names_in(content, options), options, MOVED)
     except ConfigError as error:
         raise ConfigError(error.problem, path=path, value=error.value, fix=error.fix) from error

@@ -37,7 +37,7 @@ def check_folder_name(whose: str, name: str, taken: tuple[str, ...] = ()) -> Non
 
 @dataclass(frozen=True)
 class MeshSource:
-    """A mesh of one's own as a scene.
+    """A scene from a mesh file.
 
     Args:
         path: GLB, PLY or OBJ file with textures, in metres, or a Habitat-Matterport folder `<id>-<name>`.
@@ -152,7 +152,8 @@ class Experiment:
     def warp_device(self) -> str:
         """The device kernels run on, with "auto" resolved.
 
-        Raises ConfigError if there is no such device here. Of a Ray cluster only its machines know which they have.
+        Raises ConfigError if there is no such device here. With a Ray cluster a name is not checked:
+        only its machines know which devices they have.
         """
         if self.label.engine == "ray" and self.device != "auto":
             return self.device

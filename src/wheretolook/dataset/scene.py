@@ -110,14 +110,14 @@ class Scene:
 
     @cached_property
     def mesh_space(self) -> FreeSpace:
-        """Where a camera can be by the mesh."""
+        """Where a camera can be according to the mesh."""
         from wheretolook.space.free_space import FreeSpace
 
         return FreeSpace(self.mesh, self.config.free_space, self.device)
 
     @cached_property
     def mapped_space(self) -> MappedSpace:
-        """Where a camera can be by the photographs."""
+        """Where a camera can be according to the photographs."""
         from wheretolook.space.mapped_space import MappedSpace
 
         self.require_metres()
@@ -134,7 +134,7 @@ class Scene:
 
     @cached_property
     def space(self) -> FreeSpace | MappedSpace:
-        """Where a camera can be by what it knows: with occlusion by "tsdf", the depth images and not the mesh."""
+        """Where a camera can be: with occlusion by "tsdf" according to depth images, else as `sampled_space`."""
         if self.is_photographed or self.config.occlusion.model != "tsdf":
             return self.sampled_space
         from wheretolook.space.tsdf_space import TsdfSpace
@@ -184,7 +184,7 @@ class Scene:
 
     @cached_property
     def occlusion(self) -> OcclusionModel:
-        """Which landmarks nothing stands in front of, seen from any location."""
+        """Tells which landmarks are unoccluded from any location."""
         from wheretolook.visibility.hidden_points import HiddenPointRemoval
         from wheretolook.visibility.occlusion import MeshOcclusion, NoOcclusion
         from wheretolook.visibility.tsdf import TsdfOcclusion

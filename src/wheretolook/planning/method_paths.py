@@ -45,7 +45,7 @@ def plan_by_methods(
         if method != FORWARD:
             views = planner_map(scene, dataset, config, method, weights_for(method, dataset, config.weights))
             name = method or views.origin.scorer
-        paths.pop(name, None)  # named twice, it is what was asked for last
+        paths.pop(name, None)  # a method named twice stands where it was named last
         paths[name] = plan_path(start, goal, space, space.bounds, views, config.planner)
     return paths
 

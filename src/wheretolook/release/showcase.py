@@ -39,12 +39,9 @@ _SEEDED = re.compile(r"apartment-(\d+)")
 
 
 class Showcase(Scene):
-    """A scene of a release, with everything that figures ask for; its lines of sight are found by the mesh.
+    """A scene of a release with everything that figures need; its mesh tells what is occluded."""
 
-    `sampling` is how its viewpoints were sampled.
-    """
-
-    sampling: SampleConfig
+    sampling: SampleConfig  # how its viewpoints were sampled
 
     @cached_property
     def table(self) -> pd.DataFrame:
@@ -63,7 +60,7 @@ class Showcase(Scene):
 
     @cached_property
     def directions(self) -> Float:
-        """Optical axes that each location was looked from, (D, 3) unit vectors."""
+        """Optical axes sampled at each location, (D, 3) unit vectors."""
         return self.sampling.axes()
 
     @property

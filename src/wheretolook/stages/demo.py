@@ -37,7 +37,7 @@ def run_demo(experiment: Experiment) -> None:
     functions = (stages.make_scenes, stages.make_maps, stages.sample, stages.label, stages.train, stages.evaluate)
     steps: dict[str, Callable[..., object]] = dict(zip(SECONDS, functions, strict=True))
     if config.train == 0 and not any(mesh.split == "train" for mesh in config.meshes):
-        del steps["train"], cost["train"]  # meshes of one's own, evaluated with weights from elsewhere
+        del steps["train"], cost["train"]  # all scenes are evaluated, with weights from elsewhere
         asked = methods_named(experiment.evaluate.methods, scorers())
         if any(method.weights for method in asked) and not experiment.evaluate.weights:
             fix = "Name weights in evaluate.weights, or leave methods that have learnt out of evaluate.methods."

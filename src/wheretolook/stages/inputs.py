@@ -26,7 +26,7 @@ Tick = Callable[[float], None]
 
 
 def dataset_after(experiment: Experiment, needs: str) -> Dataset:
-    """The dataset, once the stage that is needed has been through all of its scenes with what they now hold.
+    """The dataset, if the stage that is needed has been run for all of its scenes as they are now.
 
     Raises ConfigError if it was made with another camera, or is a release where meshes and maps are needed; TableError
     if there is none, or the stage has not been run.

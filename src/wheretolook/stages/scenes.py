@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 def make_scenes(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> Dataset:
     """Stage 1: a textured mesh for every scene, `<scene>/mesh.glb`, and the dataset's description.
 
-    Raises SceneError if a mesh of one's own cannot be used or two scenes have the same name, ConfigError if the
+    Raises SceneError if a mesh in `scenes.meshes` cannot be used or two scenes have the same name, ConfigError if the
     dataset's folder holds a release.
     """
     config, root = experiment.scenes, experiment.root

@@ -73,16 +73,15 @@ def start_run(
     name: str,
     stage: str,
     params: Mapping[str, Any] | None = None,
-    parent: str | None = None,
     tags: Mapping[str, str] | None = None,
 ) -> Iterator[tuple[MlflowClient, str]]:
     """Open a run, and close it as finished, failed (any exception) or killed (Ctrl-C).
 
-    The stage, such as "train", is stored as a tag beside `tags`; `parent` is the id of the run this one is nested
-    under. Yields the client and the run's id, for `client.log_metric(run_id, ...)` and its kin.
+    The stage, such as "train", is stored as a tag beside `tags`. Yields the client and the run's id, for
+    `client.log_metric(run_id, ...)` and its kin.
     """
     mlflow_client = client(tracking)
-    all_tags = {STAGE_TAG: stage, **code_version(), **(tags or {}), **({PARENT_TAG: parent} if parent else {})}
+    all_tags = {STAGE_TAG: stage, **code_version(), **(tags or {})}
     with _open_run(mlflow_client, experiment_id(mlflow_client, tracking), name, all_tags) as run_id:
         log(mlflow_client, run_id, params)
         yield mlflow_client, run_id

@@ -30,6 +30,7 @@ FORWARD = "forward"  # the method that needs no map: the shortest path, looking 
 PLANNED, GIVEN = "planned", "given"
 """What a method may choose: places and views, or the views along a path that is given."""
 
+Space = FreeSpace | MappedSpace
 Rule = Callable[[Float, TurnLimit], ViewSequence]
 
 RULES: dict[str, Rule] = {"": best_sequence, "greedy": greedy_sequence}
@@ -58,7 +59,7 @@ class ComparedPaths:
     views: pd.DataFrame
 
 
-def draw_pairs(space: FreeSpace | MappedSpace, config: PathsConfig) -> Float:
+def draw_pairs(space: Space, config: PathsConfig) -> Float:
     """Starts and goals (P, 2, 3) m in free space, far enough from each other, with a way between them.
 
     Above floors, heights are those asked for; without a mesh, they are drawn. Raises SceneError if there is too little
@@ -83,7 +84,7 @@ def draw_pairs(space: FreeSpace | MappedSpace, config: PathsConfig) -> Float:
     return np.array(found)
 
 
-def _free_points(space: FreeSpace | MappedSpace, points: Float, config: PathsConfig, rng: np.random.Generator) -> Float:
+def _free_points(space: Space, points: Float, config: PathsConfig, rng: np.random.Generator) -> Float:
     points = points[space.is_free(points)]
     if isinstance(space, FreeSpace) and len(points):
         points[:, 2] = space.floor_below(points) + rng.uniform(*config.height_m, len(points))
@@ -98,7 +99,7 @@ class Ways:
     would be more than `MOST` places.
     """
 
-    def __init__(self, space: FreeSpace | MappedSpace, step_m: float) -> None:
+    def __init__(self, space: Space, step_m: float) -> None:
         self.space = space
         low, high = np.asarray(space.bounds, dtype=np.float64)
         step_m = max(step_m, float(np.prod(high - low) / MOST) ** (1 / 3))
@@ -135,11 +136,7 @@ class Ways:
 
 
 def plan_pairs(
-    pairs: Float,
-    space: FreeSpace | MappedSpace,
-    maps: Mapping[str, ViewpointMap],
-    config: PathsConfig,
-    progress: str | None = None,
+    pairs: Float, space: Space, maps: Mapping[str, ViewpointMap], config: PathsConfig, progress: str | None = None
 ) -> ComparedPaths:
     """Plan between pairs by every method; then choose views along the shortest paths by every method.
 

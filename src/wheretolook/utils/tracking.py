@@ -30,6 +30,9 @@ if TYPE_CHECKING:
     from mlflow import MlflowClient
     from mlflow.entities import Run
 
+Values = Mapping[str, Any] | None  # parameters or metrics by name
+Tags = Mapping[str, str] | None  # tags by name, or the texts that MLflow keeps of parameters
+
 STAGE_TAG = "stage"
 """Tag of every run this package logs: "label", "train", "evaluate", "plan", "paths", "learners" or "benchmark"."""
 
@@ -69,11 +72,7 @@ def experiment_id(mlflow_client: MlflowClient, tracking: TrackingConfig) -> str:
 
 @contextmanager
 def start_run(
-    tracking: TrackingConfig,
-    name: str,
-    stage: str,
-    params: Mapping[str, Any] | None = None,
-    tags: Mapping[str, str] | None = None,
+    tracking: TrackingConfig, name: str, stage: str, params: Values = None, tags: Tags = None
 ) -> Iterator[tuple[MlflowClient, str]]:
     """Open a run, and close it as finished, failed (any exception) or killed (Ctrl-C).
 
@@ -101,13 +100,7 @@ def _open_run(mlflow_client: MlflowClient, experiment: str, name: str, tags: Map
         mlflow_client.set_terminated(run_id, status=status)
 
 
-def log(
-    mlflow_client: MlflowClient,
-    run_id: str,
-    params: Mapping[str, Any] | None = None,
-    metrics: Mapping[str, float] | None = None,
-    step: int = 0,
-) -> None:
+def log(mlflow_client: MlflowClient, run_id: str, params: Values = None, metrics: Values = None, step: int = 0) -> None:
     """Log parameters and metrics of a run, in few transactions. Metrics that are not finite are left out."""
     from mlflow.entities import Metric, Param
 
@@ -128,9 +121,7 @@ class NestedRun:
     files: Sequence[Path] = ()
 
 
-def log_nested(
-    tracking: TrackingConfig, parent: str, stage: str, runs: Iterable[NestedRun], tags: Mapping[str, str] | None = None
-) -> None:
+def log_nested(tracking: TrackingConfig, parent: str, stage: str, runs: Iterable[NestedRun], tags: Tags = None) -> None:
     """Log finished runs of a stage within another one, whose id is `parent`; all get the same tags.
 
     MLflow needs 25 ms for a run and 0.3 ms for a metric (`tests/benchmarks/bench_tracking.py`): hundreds of runs take
@@ -147,11 +138,7 @@ def log_nested(
 
 
 def newest_run(
-    tracking: TrackingConfig,
-    stage: str,
-    tags: Mapping[str, str] | None = None,
-    params: Mapping[str, str] | None = None,
-    file: str = "",
+    tracking: TrackingConfig, stage: str, tags: Tags = None, params: Tags = None, file: str = ""
 ) -> Run | None:
     """The newest finished top-level run of a stage, or None. Does not create a store.
 
@@ -161,11 +148,7 @@ def newest_run(
 
 
 def finished_runs(
-    tracking: TrackingConfig,
-    stage: str,
-    tags: Mapping[str, str] | None = None,
-    params: Mapping[str, str] | None = None,
-    file: str = "",
+    tracking: TrackingConfig, stage: str, tags: Tags = None, params: Tags = None, file: str = ""
 ) -> Iterator[Run]:
     """All finished top-level runs of a stage, the newest first; see `newest_run`."""
     if not (tracking.root / "mlflow.db").is_file():

@@ -25,7 +25,8 @@ from wheretolook.space.mapped_space import MappedSpace
 from wheretolook.utils.errors import PlanningError, SceneError
 from wheretolook.viewpoints.table import pose_columns
 
-FORWARD = "forward"  # the method that needs no map: the shortest path, looking ahead
+FORWARD = "forward"
+"""The method that needs no map: the shortest path, looking ahead."""
 
 PLANNED, GIVEN = "planned", "given"
 """What a method may choose: places and views, or the views along a path that is given."""

@@ -174,12 +174,14 @@ def rendered_views(
 
 
 PLANNED_BY = ("forward", "fisher-trace-gp", "set")
-PLANNED_ON = PlanConfig(grid=(8, 8, 4), directions=200)
-"""Methods in the figure of planned paths, by their names on the command line, and the views that they choose from."""
+"""Methods in the figure of planned paths, by their names on the command line."""
 
 
 def planned_views(
-    showcase: Showcase, dataset: Dataset, methods: Sequence[str] = PLANNED_BY, config: PlanConfig = PLANNED_ON
+    showcase: Showcase,
+    dataset: Dataset,
+    methods: Sequence[str] = PLANNED_BY,
+    config: PlanConfig = PlanConfig(grid=(8, 8, 4), directions=200),
 ) -> dict[str, list[PathView]]:
     """The views along several methods' paths, by the dataset's weights, between the farthest of ten random pairs."""
     pairs = draw_pairs(showcase.space, PathsConfig(pairs=10))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pandas as pd
 
@@ -13,6 +15,9 @@ from wheretolook.stages.inputs import Say, Tick, dataset_after
 from wheretolook.utils.files import write_text
 from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.visibility.config import OcclusionConfig
+
+if TYPE_CHECKING:
+    from wheretolook.learning.provenance import TrainedModel
 
 
 def evaluate(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> pd.DataFrame:
@@ -28,6 +33,7 @@ def evaluate_methods(
     dataset: Dataset,
     config: EvaluateConfig = EvaluateConfig(),
     tracking: TrackingConfig = TrackingConfig(),
+    models: Sequence[TrainedModel | Path] | None = None,
     progress: bool = True,
     device: str = "cpu",
     occlusion: OcclusionConfig = OcclusionConfig(),
@@ -42,9 +48,10 @@ def evaluate_methods(
     The temperatures of learned methods are fitted on the labelled views of the val scenes, seen by the first occlusion
     model, and hold for all rows; without val scenes, or when these are evaluated, they are not known.
 
-    The scenes need not be of the dataset the weights were trained on. `progress` shows a bar, and prints the table at
-    the end; `occlusion` has the settings of the models that `config.occlusions` names. Returns the tables of
-    `wheretolook.evaluation.scores.score_table`, one below the other, with columns `occlusion` and `candidates`.
+    The scenes need not be of the dataset the models were trained on. `models` are compared instead of those that
+    `config.weights` tells; `progress` shows a bar, and prints the table at the end; `occlusion` has the settings of the
+    models that `config.occlusions` names. Returns the tables of `wheretolook.evaluation.scores.score_table`, one below
+    the other, with columns `occlusion` and `candidates`.
 
     Raises:
         TableError: there is no scene of the split, a viewpoint has no label, or all labels of a candidate set are of
@@ -57,7 +64,7 @@ def evaluate_methods(
     from wheretolook.evaluation.results import log_evaluation, results_folder
     from wheretolook.evaluation.run import compare_methods
 
-    found = compare_methods(dataset, config, progress=progress, device=device, occlusion=occlusion)
+    found = compare_methods(dataset, config, models, progress, device, occlusion)
     title = f"Localization score on {dataset.name}" + (f", {config.split} scenes" if config.split != "test" else "")
     folder = results_folder(dataset, config)
     write_results(folder, found.table, found.calibration, title)

@@ -43,11 +43,12 @@ def train_methods(
     config: TrainConfig = TrainConfig(),
     tracking: TrackingConfig = TrackingConfig(),
     progress: bool = True,
+    force: bool = False,
 ) -> list[TrainedModel]:
     """Train methods on labelled train scenes, and val scenes if there are any: one MLflow run and model for each.
 
     Writes `<dataset>/weights/<method>.safetensors` and, beside it, a JSON file that tells what it was trained on. A
-    method already trained with the same options on the same train and val scenes is not trained again.
+    method already trained with the same options on the same train and val scenes is not trained again, unless forced.
 
     Raises:
         TableError: no train scene, no labels, or labels of one class only; or a dataset of `config.also` is missing.
@@ -63,7 +64,7 @@ def train_methods(
     models = []
     for method in config.chosen():
         about = about_training(dataset, method.name, config, config.options_of(method))
-        known = trained_before(weights_path(dataset, method.name), about)
+        known = None if force else trained_before(weights_path(dataset, method.name), about)
         models.append(known or _train(method, dataset, config, about, tracking, shared))
     return models
 

@@ -23,24 +23,16 @@ from wheretolook.viewpoints.table import read_table
 if TYPE_CHECKING:
     from wheretolook.inputs.localization_map import LocalizationMap
 
-RELEASE = "release"
-"""Name of the dataset, beside all others, that ships with its weights."""
-
-RELEASE_FILE = "release.json"
-"""What a release was made from; the file that makes a dataset one."""
+RELEASE = "release"  # name of the dataset, beside all others, that ships with its weights
+RELEASE_FILE = "release.json"  # what a release was made from; the file that makes a dataset one
 
 
 @dataclass(frozen=True)
 class SceneFolder:
-    """Files of one scene.
+    """Files of one scene."""
 
-    Attributes:
-        folder: `<data>/<dataset>/<scene>`.
-        split: the split the whole scene belongs to.
-    """
-
-    folder: Path
-    split: Split
+    folder: Path  # `<data>/<dataset>/<scene>`
+    split: Split  # the whole scene belongs to it
 
     @property
     def name(self) -> str:
@@ -86,8 +78,7 @@ class SceneFolder:
     def is_photographed(self) -> bool:
         """Whether the scene is known from photographs alone.
 
-        Raises:
-            MapError: it has no mesh, and its map's report is damaged.
+        Raises MapError if it has no mesh, and its map's report is damaged.
         """
         return not self.mesh.is_file() and read_scale(self.map) is not None
 
@@ -98,10 +89,8 @@ class SceneFolder:
     def mapping_poses(self) -> Float | None:
         """Poses cam_from_world (M, 3, 4) float32 of the mapping images; None if neither their file nor a model is left.
 
-        Maps made before there was such a file have a COLMAP model, which tells the same.
-
-        Raises:
-            MapError: the file or the model is damaged.
+        Maps made before there was such a file have a COLMAP model, which tells the same. Raises MapError if the file or
+        the model is damaged.
         """
         if self.mapping_cameras.is_file():
             return load_mapping_poses(self.mapping_cameras)
@@ -119,17 +108,11 @@ class SceneFolder:
 
 @dataclass(frozen=True)
 class Dataset:
-    """A folder of scenes with one camera.
+    """A folder of scenes with one camera."""
 
-    Attributes:
-        root: `<data>/<dataset>`.
-        camera: intrinsics of every viewpoint.
-        scenes: all scenes in the order they were made.
-    """
-
-    root: Path
-    camera: PinholeCamera
-    scenes: tuple[SceneFolder, ...]
+    root: Path  # `<data>/<dataset>`
+    camera: PinholeCamera  # intrinsics of every viewpoint
+    scenes: tuple[SceneFolder, ...]  # in the order they were made
 
     @property
     def name(self) -> str:
@@ -141,15 +124,11 @@ class Dataset:
         return tuple(scene for scene in self.scenes if scene.split == split)
 
     def scene(self, name: str) -> SceneFolder:
-        """The scene of a name.
-
-        Raises:
-            ConfigError: there is none.
-        """
-        for scene in self.scenes:
-            if scene.name == name:
-                return scene
-        fix = f"There are {', '.join(scene.name for scene in self.scenes)}."
+        """The scene of a name. Raises ConfigError if there is none."""
+        known = {scene.name: scene for scene in self.scenes}
+        if name in known:
+            return known[name]
+        fix = f"There are {', '.join(known)}."
         raise ConfigError("there is no such scene", path=self.root, value=name, fix=fix)
 
     def fingerprint(self) -> str:
@@ -162,19 +141,12 @@ class Dataset:
 
     def save(self) -> None:
         """Write `dataset.json`, which makes the folder a dataset."""
-        content = {
-            "camera": asdict(self.camera),
-            "scenes": [{"name": scene.name, "split": scene.split} for scene in self.scenes],
-        }
-        write_json(self.root / "dataset.json", content)
+        scenes = [{"name": scene.name, "split": scene.split} for scene in self.scenes]
+        write_json(self.root / "dataset.json", {"camera": asdict(self.camera), "scenes": scenes})
 
     @classmethod
     def load(cls, root: Path) -> Dataset:
-        """Read a dataset folder.
-
-        Raises:
-            TableError: there is no valid `dataset.json`.
-        """
+        """Read a dataset folder. Raises TableError if there is no valid `dataset.json`."""
         path = root / "dataset.json"
         try:
             content = json.loads(path.read_text())
@@ -183,6 +155,5 @@ class Dataset:
         except FileNotFoundError as error:
             raise TableError("this folder is no dataset", path=path, fix="Run the scenes stage first.") from error
         except (ValueError, KeyError, TypeError) as error:
-            raise TableError(
-                f"damaged dataset description: {error}", path=path, fix="Run the scenes stage again."
-            ) from error
+            problem, fix = f"damaged dataset description: {error}", "Run the scenes stage again."
+            raise TableError(problem, path=path, fix=fix) from error

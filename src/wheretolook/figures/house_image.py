@@ -17,11 +17,7 @@ from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.cutting import cut_above
 from wheretolook.utils.errors import ConfigError, SceneError
 
-BLUE, SKY, GREEN, ORANGE, VERMILION, PURPLE = "#0072B2", "#56B4E9", "#009E73", "#E69F00", "#D55E00", "#CC79A7"
-"""The colours of Okabe and Ito (2008), which colour-blind people can tell apart."""
-
-FAR = 25.0
-"""Distance of the eye in diagonals of the scene: so far that parallel lines stay parallel in the picture."""
+FAR = 25.0  # distance of the eye in diagonals of the scene: so far that parallel lines stay parallel in the picture
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,11 +57,8 @@ def dollhouse(
 
     The azimuth of the eye counts counter-clockwise from +x. Its elevation is in (0, 90]; 90 gives a plan with +x to the
     right and +y up, whatever the azimuth. What lies above the world height `cut_m` is cut off. With `one_sided`, for
-    meshes that are wound reliably, triangles that turn their backs to the eye are left out, such as ceilings.
-
-    Raises:
-        ConfigError: the elevation or width is out of range.
-        SceneError: no triangle is left.
+    meshes that are wound reliably, triangles that turn their backs to the eye are left out, such as ceilings. Raises
+    ConfigError if the elevation or width is out of range, SceneError if no triangle is left.
     """
     if not 0 < elevation_deg <= 90 or width_px < 2:
         raise ConfigError("the eye must be above the scene, and the picture wide", value=(elevation_deg, width_px))

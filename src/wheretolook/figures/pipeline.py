@@ -14,9 +14,6 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from wheretolook.figures.house_image import (
-    BLUE,
-    ORANGE,
-    VERMILION,
     Dollhouse,
     draw_house,
     draw_points,
@@ -25,7 +22,7 @@ from wheretolook.figures.house_image import (
     frustum_segments,
 )
 from wheretolook.figures.inputs import frame
-from wheretolook.figures.style import INK, ONE_COLUMN_IN, PRINT, TWO_COLUMNS_IN, new_figure
+from wheretolook.figures.style import BLUE, INK, ONE_COLUMN_IN, ORANGE, PRINT, TWO_COLUMNS_IN, VERMILION, new_figure
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import Float

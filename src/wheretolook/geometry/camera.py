@@ -77,10 +77,8 @@ class ColmapCamera:
 
     Beyond the field of view that they were fitted to, distortion polynomials turn back and map points far outside of it
     into the image. So a point counts as seen only if the ray of its pixel, by COLMAP's own inverse, leads back to it.
-    COLMAP's fisheye models see nothing at 90 degrees from the axis and beyond.
-
-    Raises:
-        ConfigError: COLMAP has no such model, or the model takes other parameters.
+    COLMAP's fisheye models see nothing at 90 degrees from the axis and beyond. Raises ConfigError if COLMAP has no such
+    model, or the model takes other parameters.
     """
 
     model: str  # COLMAP's name, such as "OPENCV" or "OPENCV_FISHEYE"
@@ -93,9 +91,8 @@ class ColmapCamera:
 
         names = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
         if self.model not in names:
-            raise ConfigError(
-                "COLMAP has no such camera model", value=self.model, fix=f"Use one of {', '.join(names)}."
-            )
+            fix = f"Use one of {', '.join(names)}."
+            raise ConfigError("COLMAP has no such camera model", value=self.model, fix=fix)
         expected = pycolmap.Camera.create_from_model_name(1, self.model, 1.0, 1, 1).params_info
         if len(self.params) != len(expected.split(",")) or self.width < 1 or self.height < 1:
             problem = f"camera model {self.model} needs a positive size and the parameters {expected}"

@@ -131,7 +131,7 @@ class PlanConfig(ViewLattice):
         method: method that scores the views; forward for the shortest path, looking ahead. Empty as for the viewpoint
             map.
         weights: file of weights, for a method that has learnt; by default the best there are.
-        against: further methods to plan by, drawn beside it. As `methods.png`, such as "forward" and "fisher-trace-gp".
+        against: further methods to plan by, drawn beside it. In `methods.png`; forward or fisher-trace-gp, say.
         film: kind of film to make: gif, mp4 or none.
         rerun: write a recording for the Rerun viewer too (needs `pip install rerun-sdk`).
         planner: costs and limits of the path, time to plan.

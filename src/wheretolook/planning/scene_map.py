@@ -21,8 +21,7 @@ from wheretolook.planning.path_planning import Space
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.utils.errors import ConfigError, WeightsError
 
-REACH = 2
-"""A voxel borrows from voxels at most this many away along each axis."""
+REACH = 2  # a voxel borrows from voxels at most this many away along each axis
 
 INSIDE = np.stack(np.meshgrid(*[(-1 / 3, 0.0, 1 / 3)] * 3, indexing="ij"), -1).reshape(-1, 3)
 """Points of a voxel that are tested for free space (27, 3), relative to its centre in units of its size."""
@@ -51,10 +50,8 @@ def weights_for(
     """The weights that a method scores with: those given if they are of its kind, or else the best there are.
 
     An empty `method` stands for whatever the weights are of; `say` is told of files that cannot be used, and why. None
-    for a method that has learnt nothing, or if there are no weights (`default_weights`).
-
-    Raises:
-        WeightsError: the file given is missing or damaged.
+    for a method that has learnt nothing, or if there are no weights (`default_weights`). Raises WeightsError if the
+    file given is missing or damaged.
     """
     kinds = {known.weights for known in members(method, scorers())}
     if "" in kinds or (method and not kinds):
@@ -97,10 +94,8 @@ def planner_map(
     """The map that a planner is given: scores in [0, 1], and something to go by wherever a camera can be.
 
     Scores are the method's probabilities, or ranks of scores that are none; views are borrowed where needed. `weights`
-    are those of `weights_for`; the dataset is named where they are missing.
-
-    Raises:
-        ConfigError: the method needs weights. Else as `scene_viewpoint_map`.
+    are those of `weights_for`; the dataset is named where they are missing. Raises ConfigError if the method needs
+    weights, else as `scene_viewpoint_map`.
     """
     if weights is None and any(known.weights for known in members(method, scorers())):
         raise ConfigError(f"{method} needs weights", path=dataset.root, fix="Train it, or name weights.")

@@ -28,10 +28,8 @@ def label(experiment: Experiment, say: Say = print, tick: Tick = lambda work: No
     """Stage 4: every viewpoint rendered and localized; status and errors into `<scene>/viewpoints.parquet`.
 
     Resumes after an interruption, see `wheretolook.labelling.labeller.label_scenes`. How the labels came out goes to
-    `<dataset>/results/labels.*` and an MLflow run.
-
-    Raises:
-        SceneError: a mesh is missing, or a scene is known from photographs alone.
+    `<dataset>/results/labels.*` and an MLflow run. Raises SceneError if a mesh is missing, or a scene is known from
+    photographs alone.
     """
     dataset, config = dataset_after(experiment, "sample"), experiment.label
     for files in dataset.scenes:
@@ -116,10 +114,8 @@ def log_labels(
     """Summarize the labels of a dataset, write `<dataset>/results/labels.csv`, `.md` and `.png`, and log an MLflow run.
 
     The run is of stage "label"; its metrics are the numbers of `LabelSummary.shares` over all scenes and, with the
-    split's name in front, over each split, and the seconds that each step took, `seconds_<name>`.
-
-    Raises:
-        TableError: there is no scene, a scene has no viewpoints, or one of them has no label.
+    split's name in front, over each split, and the seconds that each step took, `seconds_<name>`. Raises TableError if
+    there is no scene, a scene has no viewpoints, or one of them has no label.
     """
     from wheretolook.figures.labels import label_figure
     from wheretolook.figures.style import save_figure

@@ -83,13 +83,9 @@ def _log(
     experiment: Experiment, dataset: Dataset, scene: str, methods: list[str], path: PlannedPath, files: list[Path]
 ) -> None:
     config = experiment.plan
-    params: dict[str, object] = {
-        "dataset": dataset.name,
-        "scene": scene,
-        "method": methods[-1],
-        "methods": " ".join(methods),
-    }
-    params |= {"start": config.start, "goal": config.goal, "score_weight": config.planner.score_weight}
+    params: dict[str, object] = {"dataset": dataset.name, "scene": scene, "method": methods[-1]}
+    params |= {"methods": " ".join(methods), "start": config.start, "goal": config.goal}
+    params["score_weight"] = config.planner.score_weight
     metrics = {"length_m": path.length_m, "turn_deg": path.turn_deg, "score": float(path.scores.mean())}
     tags = {"dataset": dataset.name}
     with start_run(experiment.tracking, f"plan {scene}", "plan", params, tags=tags) as (client, run):

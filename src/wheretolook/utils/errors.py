@@ -8,11 +8,8 @@ from os import PathLike
 class WhereToLookError(Exception):
     """Base of every error this package raises on bad input. The command line exits with code 2 on it.
 
-    Args:
-        problem: what is wrong, in one sentence.
-        path: the offending file or folder, if there is one.
-        value: the offending value, if there is one.
-        fix: what the user can do about it.
+    It says in a sentence what the problem is, the offending file or folder and value, if there are such, and what the
+    user can do about it.
     """
 
     def __init__(

@@ -8,8 +8,7 @@ from typing import Literal, get_args
 from wheretolook.geometry.lattices import ViewLattice
 from wheretolook.utils.errors import ConfigError
 
-Split = Literal["train", "val", "test"]
-"""What a scene is for: to learn from, to choose by, to report on."""
+Split = Literal["train", "val", "test"]  # what a scene is for: to learn from, to choose by, to report on
 
 
 @dataclass(frozen=True)

@@ -48,11 +48,8 @@ def sample_viewpoints(
 
     At every location all directions of the lattice are ranked by the number of landmarks in view (descending, then by
     direction id), and the best K are kept. Some options differ by the scene's split. The progress bar has a text; None
-    shows none.
-
-    Returns:
-        The table of viewpoints, unlabelled, in the order of their ids (location id times the number of directions, plus
-        direction id), and the occlusion of the table's locations, for later stages.
+    shows none. Returns the table of viewpoints, unlabelled, in the order of their ids (location id times the number of
+    directions, plus direction id), and the occlusion of the table's locations, for later stages.
 
     Raises:
         SceneError: no viewpoint sees enough landmarks, or a location lies inside geometry.

@@ -143,10 +143,8 @@ def read_table(path: Path, matches: bool = False) -> pd.DataFrame:
     """Read the columns of `SCHEMA` of a table of viewpoints, compact or not.
 
     With `matches` also those of `MATCH_FIELDS`: in each row two int32 arrays, (M,) of the landmarks matched and (I,) of
-    the inliers among them.
-
-    Raises:
-        TableError: the file is missing, truncated, not a Parquet file, or lacks columns that were asked for.
+    the inliers among them. Raises TableError if the file is missing, truncated, not a Parquet file, or lacks columns
+    that were asked for.
     """
     if not path.is_file():
         raise TableError("there is no table of viewpoints", path=path, fix="Run the sample stage first.")

@@ -24,10 +24,8 @@ from wheretolook.methods.sphere.config import SphereConfig
 from wheretolook.utils.errors import MapError
 from wheretolook.viewpoints.table import is_good, poses
 
-FEATURES = (
-    *(f"offset_{axis}" for axis in "xyz"), *(f"towards_{axis}" for axis in "xyz"), *(f"looks_{axis}" for axis in "xyz"),
-    "log_distance", "log_landmarks", "is_landmark", "is_camera",
-)  # fmt: skip
+_VECTORS = tuple(f"{name}_{axis}" for name in ("offset", "towards", "looks") for axis in "xyz")
+FEATURES = (*_VECTORS, "log_distance", "log_landmarks", "is_landmark", "is_camera")
 """Of a token: the offset from the location, world axes, in units of `OFFSET_M`, and its unit direction; the viewing
 direction of a camera; log(1 + distance in metres); log(1 + landmarks with a free line of sight from the location); and
 what it is. The first token of a location is neither: it stands for all landmarks and holds their number."""
@@ -49,10 +47,8 @@ class LocationDescriber:
         self, localization_map: LocalizationMap, config: SphereConfig, path: Path = Path("map") / CAMERAS_FILE
     ) -> None:
         if localization_map.mapping_poses is None:
-            raise MapError(
-                "it is not known where the map's images were taken from", path=path,
-                fix="Run the map stage again, copy the release anew, or use `LocalizationMap.from_colmap`.",
-            )  # fmt: skip
+            fix = "Run the map stage again, copy the release anew, or use `LocalizationMap.from_colmap`."
+            raise MapError("it is not known where the map's images were taken from", path=path, fix=fix)
         self.localization_map, self.config = localization_map, config
         rotations, self._centers = split_poses(_spread(localization_map.mapping_poses, config.cameras))
         self._looks = rotations[:, 2]

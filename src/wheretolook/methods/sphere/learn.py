@@ -22,7 +22,7 @@ def learn_sphere(task: Task) -> Learnt:
     held_out = validation_views(dataset, views.scene, views.location, config)
     labels = views.labels.numpy() > 0
     check_classes(dataset, config, labels[~held_out], labels[held_out])
-    data = SphereDataModule(views, held_out, task.options.batch_size, config.seed)
+    data = SphereDataModule(views, held_out, task.options.batch_size, config)
     network = SphereNetwork(task.options)
     metrics, history = fit_network(network, data, task)
     model = TrainedNetwork(task.method, network, dataset.camera, *fit_platt(*predict(network, data)))

@@ -19,15 +19,10 @@ if TYPE_CHECKING:
 class ForwardScorer(Scorer):
     """Views by how near they look to a heading: the classical camera that knows nothing of the map (paper, Sec. 4.3).
 
-    Args:
-        localization_map: not looked at.
-        heading: where the robot drives to, in the world: (3,) everywhere, of any length but zero; or (W, 3) waypoints
-            of a path in metres, W > 1, for the direction of the leg that is nearest to the camera. None for a
-            horizontal heading drawn for each location.
-        seed: of the headings that are drawn.
-
-    Raises:
-        ValueError: a heading is zero or not finite, or two waypoints in a row are the same.
+    The heading is where the robot drives to, in the world: (3,) everywhere, of any length but zero; or (W, 3) waypoints
+    of a path in metres, W > 1, for the direction of the leg that is nearest to the camera. None is for a horizontal
+    heading drawn for each location, by the seed. Raises a ValueError if a heading is zero or not finite, or two
+    waypoints in a row are the same.
     """
 
     name = "forward"

@@ -105,8 +105,7 @@ class RunLog:
 
 
 class EpochRecord(Checkpoint):
-    """Keeps each epoch's metrics (`rows`) and the weights that the options ask for (of the epoch `kept`), and shows and
-    logs them.
+    """Keeps, shows and logs each epoch's metrics (`rows`), and keeps the weights of the epoch asked for (`kept`).
 
     In `file` a process that trains leaves the record for the one that started it; None if they are the same.
     """

@@ -48,9 +48,7 @@ def read_training(path: str | Path) -> dict[str, Any]:
 
 
 def read_record(path: str | Path) -> dict[str, Any]:
-    """What the train stage wrote beside weights: "about", "weights_sha256", "run_id" and "metrics"; a WeightsError if
-    it is missing or damaged.
-    """
+    """The record beside weights: "about", "weights_sha256", "run_id", "metrics". WeightsError if missing or damaged."""
     beside = Path(path).with_suffix(".json")
     try:
         record = dict(json.loads(beside.read_text()))

@@ -40,7 +40,7 @@ class StandardBins(nn.Module):
     """Standardizes the channels of binned views by the mean and deviation of their kind (paper, Sec. 3.3 "Data").
 
     Empty bins are exactly zero afterwards, that is, the mean of their kind; so are landmark channels where a value is
-    not known. Where landmarks lie, in the first channels, is always known: a NaN there is an error to be seen.
+    not known. Where landmarks lie, in the first channels, is always known: a NaN there is an error that must show.
     """
 
     mean: Tensor

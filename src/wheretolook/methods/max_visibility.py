@@ -53,7 +53,7 @@ class MaxVisibilityScorer(Scorer):
 class SwappedMaxVisibilityScorer(Scorer):
     """What the benchmark's code does: the best of 6 x 18 pitches and yaws, with the two exchanged in what it returns.
 
-    Views by how near they look to what it returns.
+    A view scores the higher, the nearer its optical axis is to the direction returned.
     """
 
     name = "max-visibility-swapped"

@@ -10,9 +10,7 @@ from wheretolook.methods.conv.network import ConvNetwork, ConvSpec
 
 
 def learn_conv(task: Task) -> Learnt:
-    """A convolutional network from a dataset's train scenes, calibrated on the validation views; raises as
-    `load_views`.
-    """
+    """A convolutional network from a dataset's train scenes, calibrated on validation views; raises as `load_views`."""
     options, device = task.options, home_device(task.config)
     data = ViewpointDataModule(task.dataset, task.config, options, options.bins, device, task.progress, True)
     data.setup()

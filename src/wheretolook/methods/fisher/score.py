@@ -1,5 +1,4 @@
-"""Fisher information of the pose (Zhang and Scaramuzza, Fisher Information Field, 2020): the paper's nine rows, and two
-probes of the field that its tables list among them."""
+"""Scores by the Fisher information of the pose, and by probes of the Fisher Information Field, see the package."""
 
 from __future__ import annotations
 

@@ -16,8 +16,7 @@ from wheretolook.methods.matchability.network import MatchabilityNetwork
 
 
 class LandmarkBatches:
-    """Batches of landmarks (E, len(ATTRIBUTES)) in `rows` (n,), and whether each was found; processes share out each
-    batch.
+    """Batches of landmarks (E, len(ATTRIBUTES)) in `rows` (n,), and whether each was found; processes share each batch.
 
     A `shuffle_seed` of None goes through them in order; shuffled landmarks come from 1 / enlarged to enlarged times as
     far, see `wheretolook.learning.landmark_views.LandmarkLoader`.

@@ -19,9 +19,9 @@ LIKELY = -2.0
 
 
 class LandmarkNetwork(StoredNetwork):
-    """A network over single landmarks, which takes what is known of them by name.
+    """A network over single landmarks. It takes those of their attributes that its statistics name, in that order.
 
-    The attributes of its statistics are what it is told of a landmark, in order; by its options it can be built anew.
+    With its statistics and options it can be built anew.
     """
 
     def __init__(self, statistics: AttributeStatistics, **options: Any) -> None:

@@ -38,7 +38,7 @@ class Expectation:
 
     @classmethod
     def of_map(cls, localization_map: LocalizationMap, weights: str | Path) -> Expectation:
-        """What a map's views can be expected to find by a file of weights, made once for both.
+        """What a map's views can be expected to find by a file of weights, made once for each map and file.
 
         Raises a WeightsError if the file cannot be used, or was trained for another field of view than the camera's.
         """

@@ -37,7 +37,7 @@ BLOCK = 256  # locations whose lines of sight are asked for at a time
 
 
 class LocationDescriber:
-    """Tells a network of locations: their landmarks with a free line of sight, and the mapping cameras.
+    """Describes locations to a network: their landmarks with a free line of sight, and the mapping cameras.
 
     Of more landmarks or cameras than the configuration wants, evenly spread ones are taken, in the order of their ids.
     Raises a MapError, which names the path, if the map has no mapping cameras.

@@ -78,8 +78,8 @@ def candidate_sets(
         if len(np.unique(labels)) < 2:
             metres, degrees = config.thresholds[0]
             which = f" among the {candidates_label(best)} candidates of each location" if best else ""
-            found = f"of {len(labels)} viewpoints all or none are within {metres:g} m and {degrees:g} degrees"
-            problem, value = f"labels of one class only{which}: {found}", bool(labels.any())
+            counted = f"of {len(labels)} viewpoints all or none are within {metres:g} m and {degrees:g} degrees"
+            problem, value = f"labels of one class only{which}: {counted}", bool(labels.any())
             fix = "Label more viewpoints, or give other evaluate.thresholds or evaluate.candidates."
             raise TableError(problem, path=scenes[0].table, value=value, fix=fix)
         kept = np.unique(views.location[mask])

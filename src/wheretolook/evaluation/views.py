@@ -54,8 +54,8 @@ def views_of(
         location_id.append(ids)
         location_scene.append(np.full(len(ids), number))
     viewpoint_id = np.concatenate([table["viewpoint_id"].to_numpy(np.int64) for table in tables])
-    scene, block = np.concatenate(location_scene), np.concatenate(location_block)
-    views = TestViews(np.concatenate(location), viewpoint_id, np.concatenate(good), scene, block)
+    scene_of, block_of = np.concatenate(location_scene), np.concatenate(location_block)
+    views = TestViews(np.concatenate(location), viewpoint_id, np.concatenate(good), scene_of, block_of)
     return views, np.concatenate(location_id)
 
 

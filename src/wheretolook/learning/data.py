@@ -121,8 +121,8 @@ def load_views(
                 filled[rows] = torch.from_numpy(binned.counts > 0)
                 start += len(binned)
                 bar.update(len(binned))
-    labels, scene, location = labels_of(tables, config)
-    return LabelledViews(means, filled, labels.to(home), scene, location, channels)
+    labels, scene_of, location_of = labels_of(tables, config)
+    return LabelledViews(means, filled, labels.to(home), scene_of, location_of, channels)
 
 
 def labels_of(

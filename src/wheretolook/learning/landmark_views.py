@@ -113,9 +113,9 @@ def load_landmark_views(
                 starts, kept = _some_of_each(described, most, generator)
                 values, counts = described.values[kept].to("cpu", torch.float16), described.counts.cpu()
                 found = None if found is None else found[kept.cpu()]
-                scene_of = np.full(len(described), number)
-                views: Any = starts.cpu(), values, counts, *torch.from_numpy(of_views[:, rows])
-                blocks.append(LandmarkViews(*views, scene_of, location[rows], found))
+                scene_of, at = np.full(len(described), number), location[rows]
+                height, label, off_m = torch.from_numpy(of_views[:, rows])
+                blocks.append(LandmarkViews(starts.cpu(), values, counts, height, label, off_m, scene_of, at, found))
                 bar.update(len(described))
     return _joined(blocks)
 

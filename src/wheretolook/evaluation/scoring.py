@@ -52,9 +52,8 @@ def choose_weights(dataset: Dataset, config: EvaluateConfig, models: Sequence[Tr
         # who asks for all methods gets those that have been trained
         if "" not in kinds and not kinds & {*served.values()} and config.methods != EvaluateConfig().methods:
             fix = f"Run the train stage first, name weights, or leave {name} out of the methods."
-            raise WeightsError(
-                f"there are no weights of {' or '.join(sorted(kinds))} to evaluate", path=folder, fix=fix
-            )
+            problem = f"there are no weights of {' or '.join(sorted(kinds))} to evaluate"
+            raise WeightsError(problem, path=folder, fix=fix)
     return {path: kind for path, kind in served.items() if kind in wanted}
 
 
@@ -65,10 +64,10 @@ def _own_weights(dataset: Dataset) -> list[Path]:
     for name, path in found.items():
         # compact tables hold no matches: what has learnt from these has learnt from the dataset they were copied from
         if name in scorers() and not was_trained_on(dataset, read_training(path)):
+            fix = "Run the train stage again, remove the file, or name weights in evaluate.weights."
             raise WeightsError(
-                "these weights were trained on other data than the dataset now holds", path=path,
-                fix="Run the train stage again, remove the file, or name weights in evaluate.weights.",
-            )  # fmt: skip
+                "these weights were trained on other data than the dataset now holds", path=path, fix=fix
+            )
     return list(found.values())
 
 
@@ -78,10 +77,9 @@ def check_unseen(scenes: Sequence[SceneFolder], weights: Weights) -> None:
     for path in weights:
         for seen in read_training(path).get("landmarks", {}).values():
             if seen in landmarks:
-                raise WeightsError(
-                    "these weights have learnt from a scene of the test split", path=path, value=landmarks[seen],
-                    fix="Train again without that scene, or evaluate on others.",
-                )  # fmt: skip
+                problem = "these weights have learnt from a scene of the test split"
+                fix = "Train again without that scene, or evaluate on others."
+                raise WeightsError(problem, path=path, value=landmarks[seen], fix=fix)
 
 
 def score_scenes(
@@ -94,8 +92,7 @@ def score_scenes(
     progress: bool,
     occlusion: OcclusionConfig | None,
 ) -> tuple[dict[str, Float], str]:
-    """Scores (B,) by method of the views in the tables of scenes, and the name of the occlusion model. They are binned
-    once.
+    """Scores (B,) by method of the views in scenes' tables, which are binned once, and the occlusion model's name.
 
     The occlusion model is that to see the landmarks by; None for the one that is stored with the sampled locations.
 
@@ -123,10 +120,9 @@ def score_scenes(
                 for method, scorer in scorers.items():
                     values = scorer.score_binned(block, binned)
                     if not np.isfinite(values).all():
-                        raise TableError(
-                            "a method gives scores that are not finite", path=scene.folder, value=method,
-                            fix="Check the scene's landmarks and poses, and the weights; or leave the method out.",
-                        )  # fmt: skip
+                        problem = "a method gives scores that are not finite"
+                        fix = "Check the scene's landmarks and poses, and the weights; or leave the method out."
+                        raise TableError(problem, path=scene.folder, value=method, fix=fix)
                     scores.setdefault(method, []).append(values)
                 bar.update(len(block))
     return {method: np.concatenate(parts) for method, parts in scores.items()}, " ".join(sorted(used))

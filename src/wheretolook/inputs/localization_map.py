@@ -15,13 +15,8 @@ from wheretolook.geometry.poses import Float, camera_centers, check_poses
 from wheretolook.inputs.bins import BinnedViews, bin_views, count_bins
 from wheretolook.mapping.colmap_model import colmap_poses, read_model
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
-from wheretolook.visibility.frustum import (
-    LandmarkSets,
-    PosedViews,
-    in_view_on_device,
-    landmarks_in_view,
-    points_on_device,
-)
+from wheretolook.visibility import frustum
+from wheretolook.visibility.frustum import LandmarkSets, PosedViews
 from wheretolook.visibility.occlusion import NoOcclusion, OcclusionModel
 
 if TYPE_CHECKING:
@@ -94,7 +89,7 @@ class LocalizationMap:
 
     def landmarks_in_view(self, cam_from_world: Float) -> LandmarkSets:
         """The landmarks that each of the views (B, 3, 4) sees."""
-        return landmarks_in_view(self._views(cam_from_world), self.device)
+        return frustum.landmarks_in_view(self._views(cam_from_world), self.device)
 
     def in_view_on_device(self, cam_from_world: Float) -> tuple[NDArray[np.int64], Tensor]:
         """What `landmarks_in_view` gives, starts (B + 1,) int64 and indices int32; the latter on the map's device."""
@@ -103,14 +98,14 @@ class LocalizationMap:
 
         views = self._views(cam_from_world)
         if isinstance(self.camera, ColmapCamera):
-            seen = landmarks_in_view(views)
+            seen = frustum.landmarks_in_view(views)
             return seen.starts.astype(np.int64), torch.from_numpy(seen.indices).to(self.device)
-        starts, indices = in_view_on_device(views, self._points_on_device, self.device)
+        starts, indices = frustum.in_view_on_device(views, self._points_on_device, self.device)
         return starts.astype(np.int64), wp.to_torch(indices)
 
     @cached_property
     def _points_on_device(self) -> Any:
-        return points_on_device(self.landmarks.points, self.device)
+        return frustum.points_on_device(self.landmarks.points, self.device)
 
     def _views(self, cam_from_world: Float) -> PosedViews:
         poses, points = check_poses(cam_from_world), self.landmarks.points

@@ -76,9 +76,7 @@ class ShardWorker:
     def label(self, job: SceneJob, rows: pd.DataFrame, tick: Tick = lambda n: None) -> LabelledShard:
         """Label viewpoints of a scene; `tick` is called with the number of viewpoints just finished.
 
-        Raises:
-            SceneError, MapError: the mesh or the landmarks cannot be used.
-            WorkerError: anything else went wrong, such as a failure of the renderer.
+        Raises a SceneError or MapError if mesh or landmarks cannot be used, a WorkerError if anything else fails.
         """
         try:
             seconds: dict[str, float] = {}

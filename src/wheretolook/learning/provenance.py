@@ -41,12 +41,11 @@ def about_training(dataset: Dataset, method: str, config: SharedConfig, options:
     a dataclass. What training starts from (`FittingConfig.starts_from`) decides, too.
     """
     shared = {name: value for name, value in asdict(config).items() if name in DECIDING}
+    seen = [scene for scene in dataset.scenes if scene.split != "test"]
     about: dict[str, Any] = {
         "dataset": dataset.name,
         "dataset_fingerprint": training_fingerprint(dataset),
-        "landmarks": {
-            _name(scene, dataset): fingerprint(scene.landmarks) for scene in dataset.scenes if scene.split != "test"
-        },
+        "landmarks": {_name(scene, dataset): fingerprint(scene.landmarks) for scene in seen},
         "code_version": VERSION,
         "method": method,
         "camera": asdict(dataset.camera),

@@ -132,15 +132,9 @@ def load_colmap_landmarks(
     if database is not None:
         descriptors = _mean_descriptors(model, read_descriptors(database, model_dir, reconstruction, model))
         ambiguity = nearest_other_cosine(descriptors, device)
-    return Landmarks(
-        ids=model.point_ids,
-        points=model.points,
-        track_length=np.diff(model.observation_start).astype(np.int32),
-        reprojection_error_px=model.errors_px.astype(np.float32),
-        **_viewing_geometry(model),
-        descriptors=descriptors,
-        ambiguity=ambiguity,
-    )
+    track_length, errors_px = np.diff(model.observation_start).astype(np.int32), model.errors_px.astype(np.float32)
+    attributes: Any = {**_viewing_geometry(model), "descriptors": descriptors, "ambiguity": ambiguity}
+    return Landmarks(model.point_ids, model.points, track_length, errors_px, **attributes)
 
 
 def nearest_other_cosine(descriptors: NDArray[np.uint8], device: str = "cpu") -> NDArray[np.float32]:

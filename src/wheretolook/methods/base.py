@@ -8,14 +8,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import Float
 from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS
+from wheretolook.utils.errors import WeightsError
 
 if TYPE_CHECKING:
     from wheretolook.inputs.bins import BinnedViews
     from wheretolook.inputs.localization_map import LocalizationMap
 
 BLOCK = 4096  # views scored at a time: about 80 MB of bins
+FIELD_OF_VIEW_TOLERANCE = 1e-3  # relative difference in width / focal length up to which fields of view are the same
 
 
 class Scorer(ABC):
@@ -41,16 +44,12 @@ class Scorer(ABC):
         """Score poses (B, 3, 4). Returns (B,) float64, finite."""
 
     def score_binned(self, cam_from_world: Float, binned: BinnedViews) -> Float:
-        """The same as `score` gives, (B,), for poses that `localization_map.bin_views` has binned already, with all of
-        `CHANNELS`.
-        """
+        """What `score` gives, (B,), for poses that the map's `bin_views` has binned already, with all `CHANNELS`."""
         return self.score(cam_from_world)
 
 
 class BinnedScorer(Scorer):
-    """A method that scores a view by its binned landmarks alone, by `ALL_CHANNELS` or by `CHANNELS`, of `bins` x `bins`
-    bins.
-    """
+    """Scores a view by its binned landmarks alone: `CHANNELS` or `ALL_CHANNELS` of `bins` x `bins` bins."""
 
     def __init__(self, localization_map: LocalizationMap, bins: int = 30, landmark_channels: bool = False) -> None:
         super().__init__(localization_map)
@@ -91,3 +90,26 @@ class CountingScorer(BinnedScorer):
     @abstractmethod
     def score_counts(self, n_visible: NDArray[np.int32], n_filled: NDArray[np.int32]) -> Float:
         """Score views by their landmarks and filled bins, (B,) each. Returns (B,) float64, finite."""
+
+
+def check_field_of_view(trained: PinholeCamera, camera: Camera) -> None:
+    """Raise a WeightsError if a camera's field of view is not that of the camera of the training views."""
+    if not same_field_of_view(trained, camera):
+        problem = f"the network was trained for a camera of {_describe(trained)}"
+        fix = "Use a pinhole camera with that field of view, or train with this one."
+        raise WeightsError(problem, value=_describe(camera), fix=fix)
+
+
+def same_field_of_view(trained: PinholeCamera, camera: Camera) -> bool:
+    """Whether weights trained for one camera serve another: image and focal length of the same proportions."""
+    if isinstance(camera, ColmapCamera):
+        return False
+    spans = np.array([(one.width / one.focal_px, one.height / one.focal_px) for one in (trained, camera)])
+    return bool(np.allclose(spans[0], spans[1], rtol=FIELD_OF_VIEW_TOLERANCE, atol=0))
+
+
+def _describe(camera: Camera) -> str:
+    if isinstance(camera, ColmapCamera):
+        return f"{camera.width} x {camera.height} px, {camera.model}"
+    across, down = (2 * np.degrees(np.arctan(side / 2 / camera.focal_px)) for side in (camera.width, camera.height))
+    return f"{camera.width} x {camera.height} px, {across:.1f} x {down:.1f} degrees"

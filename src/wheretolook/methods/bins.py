@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from wheretolook.geometry.poses import Float
 from wheretolook.methods.base import CountingScorer
-from wheretolook.methods.method import Method, MethodStyle
+from wheretolook.methods.method import MethodStyle, rule
 
 
 class BinsScorer(CountingScorer):
@@ -25,11 +25,4 @@ class BinsScorer(CountingScorer):
         return (n_filled + visible / (1 + visible)) / (self.bins**2 + 1)
 
 
-METHODS = (
-    Method(
-        name=BinsScorer.name,
-        about='Share of the image\'s bins with a visible landmark in them (paper, Sec. 4.1, "reprojection with bins").',
-        style=MethodStyle("reprojections with bins", "#009E73", "D", "-."),
-        build=lambda localization_map, options: BinsScorer(localization_map),
-    ),
-)
+METHODS = (rule(BinsScorer, MethodStyle("reprojections with bins", "#009E73", "D", "-.")),)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from inspect import getdoc
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, Literal
 
 if TYPE_CHECKING:
@@ -77,3 +79,33 @@ class Method:
     ships: Literal["best", "network", "never"] = "best"
     # what an evaluation logs about it as parameters, by the camera
     params: Callable[[Camera], dict[str, Any]] = no_params
+
+
+def rule(scorer: type[Scorer], style: MethodStyle, **fields: Any) -> Method:
+    """The record of a method that is built of a map alone, unless `build` is given; its docstring says what it is."""
+    about = " ".join((getdoc(scorer) or "").partition("\n\n")[0].split())
+    return Method(scorer.name, about, style, **{"build": lambda map, options: scorer(map), **fields})
+
+
+def imported(reference: str) -> Callable[..., Any]:
+    """The function or class `module:name` of this package, imported when called: PyTorch takes seconds to load."""
+
+    def call(*given: Any) -> Any:
+        return resolve_name(f"wheretolook.methods.{reference}")(*given)
+
+    return call
+
+
+def network_scorer(scorer: str, network: str, *methods: str) -> Callable[[LocalizationMap, ScorerOptions], Scorer]:
+    """Builds a scorer from the weights of a network that serves one of these methods; both classes as in `imported`."""
+
+    def build(localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
+        from wheretolook.learning.trained_network import TrainedNetwork
+
+        assert options.weights is not None
+        network_class: Any = resolve_name(f"wheretolook.methods.{network}")
+        trained = TrainedNetwork.load(options.weights, network_class, *methods, device=localization_map.device)
+        built: Scorer = imported(scorer)(localization_map, trained)
+        return built
+
+    return build

@@ -19,10 +19,8 @@ if TYPE_CHECKING:
     from wheretolook.inputs.localization_map import LocalizationMap
     from wheretolook.methods.base import Scorer
 
-MODULES = (
-    "random", "forward", "visible", "bins", "max_visibility", "fisher", "mlp", "matchability", "trees", "conv", "set",
-    "sphere",
-)  # fmt: skip
+_RULES = ("random", "forward", "visible", "bins", "max_visibility", "fisher")
+MODULES = (*_RULES, "mlp", "matchability", "trees", "conv", "set", "sphere")
 """Modules of `wheretolook.methods` whose `METHODS` are the package's own, in the order of tables."""
 
 GROUP = "wheretolook.methods"  # entry points of this group give a `Method`, or several, of another package
@@ -90,9 +88,8 @@ def members(name: str, among: Mapping[str, Method]) -> list[Method]:
     """The methods that a name stands for: one, or those of a family; empty if there are none among these."""
     if name in among:
         return [among[name]]
-    return (
-        [] if not name else [method for method in among.values() if method.family == name and not method.only_if_named]
-    )
+    family = [method for method in among.values() if method.family == name and not method.only_if_named]
+    return family if name else []
 
 
 def methods_named(names: Iterable[str], among: Mapping[str, Method]) -> list[Method]:

@@ -14,7 +14,7 @@ from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import ViewLattice
 from wheretolook.learning.provenance import was_trained_on
 from wheretolook.learning.weights import method_of_weights, read_record, read_training, read_weights
-from wheretolook.methods.field_of_view import same_field_of_view
+from wheretolook.methods.base import same_field_of_view
 from wheretolook.methods.registry import find, load_scorer, make_scorer, members, methods_named, scorers
 from wheretolook.planning.map_building import build_viewpoint_map
 from wheretolook.planning.path_planning import Space

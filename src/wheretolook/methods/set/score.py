@@ -9,8 +9,7 @@ from wheretolook.geometry.poses import Float, check_poses
 from wheretolook.inputs.landmarks_in_view import LandmarkDescriber
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.learning.trained_network import TrainedNetwork
-from wheretolook.methods.base import Scorer
-from wheretolook.methods.field_of_view import check_field_of_view
+from wheretolook.methods.base import Scorer, check_field_of_view
 from wheretolook.methods.set.network import SetNetwork
 
 MOST = 1024

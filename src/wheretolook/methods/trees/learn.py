@@ -67,8 +67,7 @@ class BoostedTrees:
             if not is_leaf:
                 nodes += [node["left_child"], node["right_child"]]
                 depths += [depths[number] + 1] * 2
-        reals, flags = ("threshold", "value"), ("missing_left",)
-        kinds = {**dict.fromkeys(reals, torch.float64), **dict.fromkeys(flags, torch.bool)}
+        kinds = {"threshold": torch.float64, "value": torch.float64, "missing_left": torch.bool}
         arrays: dict[str, Any] = {
             name: torch.tensor(part, dtype=kinds.get(name, torch.int64)) for name, part in parts.items()
         }
@@ -94,22 +93,16 @@ class BoostedTrees:
 
     def save(self, path: Path, training: dict[str, Any] | None = None) -> None:
         """Write one safetensors file, atomically, with JSON values on the training; the same trees, the same bytes."""
-        header = {
-            "features": list(POOLED), "camera": asdict(self.camera),
-            **{name: getattr(self, name) for name in _NUMBERS}, "training": training or {},
-        }  # fmt: skip
-        narrow = {"roots": torch.int32, "left": torch.int32, "right": torch.int32, "feature": torch.uint8}
-        narrow["missing_left"] = torch.uint8
+        header = {"features": list(POOLED), "camera": asdict(self.camera)}
+        header |= {**{name: getattr(self, name) for name in _NUMBERS}, "training": training or {}}
         arrays = {name: getattr(self, name) for name in _ARRAYS}
-        write_weights(
-            path, "trees", {name: one.to(narrow.get(name, one.dtype)) for name, one in arrays.items()}, header
-        )
+        arrays |= {name: arrays[name].int() for name in ("roots", "left", "right")}
+        arrays |= {name: arrays[name].to(torch.uint8) for name in ("feature", "missing_left")}
+        write_weights(path, "trees", arrays, header)
 
     @classmethod
     def load(cls, path: str | Path) -> BoostedTrees:
-        """Read what `save` wrote; a WeightsError if it is missing, damaged, foreign, of another kind, or its trees are
-        none.
-        """
+        """Read what `save` wrote; a WeightsError if it is missing, damaged, foreign or of another kind."""
         tensors, header = read_weights(Path(path))
         check_serves(path, header, "trees")
         fix = "Train again, or give weights of trees."
@@ -124,12 +117,8 @@ class BoostedTrees:
         arrays |= {name: arrays[name].long() for name in ("roots", "feature", "left", "right")}
         arrays["missing_left"] = arrays["missing_left"].bool()
         n_nodes = len(arrays["value"])
-        inside = all(
-            len(one) == 0 or (int(one.min()) >= 0 and int(one.max()) < bound)
-            for one, bound in (
-                *((arrays[name], n_nodes) for name in ("roots", "left", "right")), (arrays["feature"], len(POOLED)),
-            )
-        )  # fmt: skip
+        bounds = {"roots": n_nodes, "left": n_nodes, "right": n_nodes, "feature": len(POOLED)}
+        inside = all(bool(((arrays[name] >= 0) & (arrays[name] < bound)).all()) for name, bound in bounds.items())
         if not inside or len({len(arrays[name]) for name in _ARRAYS if name != "roots"}) != 1:
             raise WeightsError("the trees lead out of their own arrays", path=path, fix=fix)
         return cls(camera, **arrays, **numbers)
@@ -169,9 +158,8 @@ def load_pooled(
     labels: list[NDArray[np.bool_]] = []
     location: list[NDArray[np.int64]] = []
     tables = [(scene, labelled_rows(scene)) for scene in scenes]
-    with tqdm(
-        total=sum(len(table) for _, table in tables), desc="pool views", unit="view", disable=not progress
-    ) as bar:
+    total = sum(len(table) for _, table in tables)
+    with tqdm(total=total, desc="pool views", unit="view", disable=not progress) as bar:
         for scene, table in tables:
             describer = LandmarkDescriber(scene.localization_map(dataset.camera, device))
             cam_from_world = poses(table)
@@ -203,19 +191,16 @@ def learn_trees(task: Task) -> Learnt:
 def fit_trees(
     train: PooledViews, val: PooledViews, camera: PinholeCamera, config: TreesConfig, seed: int = 0
 ) -> tuple[BoostedTrees, dict[str, float]]:
-    """Boost trees, keep as many as order the validation views best, and calibrate their sum on these; the trees and
-    metrics.
+    """Boost trees, keep as many as order the validation views best, and calibrate their sum on these.
 
-    LightGBM samples views by the seed to choose bins.
+    Returns the trees and metrics. LightGBM samples views by the seed to choose bins.
     """
     import lightgbm
     from sklearn.metrics import average_precision_score, log_loss, roc_auc_score
 
-    options = {
-        "objective": "binary", "learning_rate": config.learning_rate, "num_leaves": config.max_leaves,
-        "min_data_in_leaf": config.min_leaf, "lambda_l2": config.l2, "seed": seed, "verbosity": -1,
-        "deterministic": True, "force_col_wise": True,  # the same trees for any number of threads
-    }  # fmt: skip
+    leaves = {"num_leaves": config.max_leaves, "min_data_in_leaf": config.min_leaf, "lambda_l2": config.l2}
+    options = {"objective": "binary", "learning_rate": config.learning_rate, **leaves, "seed": seed, "verbosity": -1}
+    options |= {"deterministic": True, "force_col_wise": True}  # the same trees for any number of threads
     views = lightgbm.Dataset(train.values.astype(np.float64), train.labels.astype(np.float64))
     booster = lightgbm.train(options, views, config.max_trees)
     every, values, raw = max(1, config.max_trees // 40), val.values.astype(np.float64), np.zeros(len(val.labels))
@@ -229,10 +214,7 @@ def fit_trees(
     scale, offset = fit_platt(raw, val.labels)
     trees = replace(trees, scale=scale, offset=offset)
     logits = trees.logits(torch.from_numpy(val.values))
-    probabilities = logits.sigmoid().numpy()
-    return trees, {
-        "n_trees": float(kept),
-        "val_average_precision": precision[kept],
-        "val_roc_auc": float(roc_auc_score(val.labels, raw)),
-        "val_bce": float(log_loss(val.labels, probabilities)),
-    }
+    bce, auc = float(log_loss(val.labels, logits.sigmoid().numpy())), float(roc_auc_score(val.labels, raw))
+    kept_precision = precision[kept]
+    metrics = {"n_trees": float(kept), "val_average_precision": kept_precision, "val_roc_auc": auc, "val_bce": bce}
+    return trees, metrics

@@ -7,8 +7,7 @@ import numpy as np
 from wheretolook.geometry.poses import Float, check_poses
 from wheretolook.inputs.landmarks_in_view import LandmarkDescriber, pool
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.methods.base import BLOCK, Scorer
-from wheretolook.methods.field_of_view import check_field_of_view
+from wheretolook.methods.base import BLOCK, Scorer, check_field_of_view
 from wheretolook.methods.trees.learn import BoostedTrees
 
 

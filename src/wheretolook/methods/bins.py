@@ -31,5 +31,7 @@ METHODS = (
         about='Share of the image\'s bins with a visible landmark in them (paper, Sec. 4.1, "reprojection with bins").',
         style=MethodStyle("reprojections with bins", "#009E73", "D", "-."),
         build=lambda localization_map, options: BinsScorer(localization_map),
+        of_the_few=True,
+        fallback=True,
     ),
 )

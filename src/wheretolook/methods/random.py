@@ -57,5 +57,6 @@ METHODS = (
         style=MethodStyle("random", "#999999", "x", ":"),
         build=lambda localization_map, options: RandomScorer(localization_map, options.seed),
         by_chance=True,
+        of_the_few=True,
     ),
 )

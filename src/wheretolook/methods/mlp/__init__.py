@@ -40,6 +40,7 @@ def _network(inputs: str, style: MethodStyle, channels: tuple[str, ...], **field
         weights=f"mlp-{inputs}",
         family="mlp",
         probability=True,
+        of_the_few=True,
         learn=learn,
         config=MlpConfig,
         folder="mlp",

@@ -40,6 +40,7 @@ METHODS = (
         weights="set",
         probability=True,
         reference=2,
+        of_the_few=True,
         learn=_learn,
         config=SetConfig,
         folder="set",

@@ -137,7 +137,7 @@ class PlanConfig(ViewLattice):
         weights: file of weights, for a method that has learnt; by default the best there are.
         against: further methods to plan by, drawn beside it. As `methods.png`, such as "forward" and "fisher-trace-gp".
         film: kind of film to make: gif, mp4 or none.
-        rerun: write a recording for the Rerun viewer too (needs `pip install rerun-sdk`).
+        rerun: write a recording for the Rerun viewer too. Needs `pip install rerun-sdk`.
         planner: costs and limits of the path, time to plan.
     """
 

@@ -71,10 +71,9 @@ class Model:
 
 
 def learn(task):
-    from wheretolook.learning.data import training_scenes
     from wheretolook.learning.learner import Learnt
 
-    counts = np.concatenate([scene.read_table()["n_visible"] for scene in training_scenes(task.dataset)])
+    counts = np.concatenate([scene.read_table()["n_visible"] for scene in task.dataset.split("train")])
     metrics = {"val_average_precision": 0.5}
     return Learnt(Model(task.dataset.camera, task.options.slope, float(np.median(counts))), metrics, {"n": len(counts)})
 
@@ -106,11 +105,14 @@ METHODS = (
 
 PROGRAM = """
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from box_scenes import box_quads, quads_mesh, random_texture
+from planning.rooms import patiently
 from synthetic_dataset import make_dataset
 from wheretolook.cli import parse_experiment
 from wheretolook.evaluation.config import EvaluateConfig
@@ -123,6 +125,7 @@ from wheretolook.utils.files import write_json
 from wheretolook.utils.tracking import newest_run
 from wheretolook.utils.tracking_config import TrackingConfig
 
+Figure.savefig = lambda figure, path, **options: Path(path).write_bytes(b"")  # figures are built, which is enough here
 folder = Path(sys.argv[1])
 dataset = make_dataset(folder / "tiny", ("train", "test"), n_locations=8, n_directions=12)
 room = box_quads((-3.1, -3.1, -0.1), (3.1, 3.1, 2.6), inward=True)
@@ -143,9 +146,17 @@ assert labels[0] == "line" and "fewest landmarks" in labels, labels
 options = ["--data", str(folder), "--name", "tiny", "--tracking.folder", tracking.folder, "--device", "cpu",
            "--camera.width", "160", "--camera.height", "120", "--camera.focal_px", "80",
            "--scene", dataset.split("test")[0].name, "--start", "[-1, -1, 1]", "--goal", "[1, 1, 1]",
-           "--method", "linear", "--plan.against", "[fewest]", "--film", "none", "--plan.planner.time_s", "0.5",
+           "--method", "linear", "--plan.against", "[fewest]", "--film", "none",
            "--plan.grid", "[3, 3, 2]", "--plan.directions", "20"]
-path = plan(parse_experiment("plan", options))
+experiment = parse_experiment("plan", options)
+
+
+def plan_within(seconds):
+    planner = replace(experiment.plan.planner, time_s=seconds)
+    return plan(replace(experiment, plan=replace(experiment.plan, planner=planner)))
+
+
+path = patiently(plan_within)
 assert path.scores.max() > 0.5 and path.scores.max() <= 1, path.scores
 assert newest_run(tracking, "plan").data.params["methods"] == "fewest linear"
 print("learnt, compared, drawn and planned with")

@@ -32,14 +32,14 @@ DIRECTIONS = direction_lattice(60)
 T = TypeVar("T")
 
 
-def patiently(plan: Callable[[float], T]) -> T:
+def patiently(plan: Callable[[float], T], seconds: float = 0.6) -> T:
     """What is planned in the seconds that an idle machine needs, or else, on a busy one, in many more."""
-    for seconds in (0.6, 5.0):
+    for times in (1, 8):
         try:
-            return plan(seconds)
+            return plan(times * seconds)
         except PlanningError:
             pass
-    return plan(30.0)
+    return plan(40 * seconds)
 
 
 def room_landmarks(n: int, seed: int = 0, first_id: int = 0) -> Landmarks:

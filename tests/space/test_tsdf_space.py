@@ -107,7 +107,8 @@ def test_an_image_sees_up_to_its_readings() -> None:
 def test_a_path_is_planned_in_it(space: TsdfSpace) -> None:
     start, goal = (0.7, 0.7, 1.2), (3.3, 0.7, 1.2)  # either side of the wall
     path = patiently(
-        lambda seconds: plan_path(start, goal, space, space.bounds, config=PathConfig(time_s=seconds), progress=False)
+        lambda seconds: plan_path(start, goal, space, space.bounds, config=PathConfig(time_s=seconds), progress=False),
+        seconds=1.0,
     )
     np.testing.assert_allclose(path.positions[[0, -1]], [start, goal])
     clear = MeshRaycaster(room()).segments_are_clear(path.positions[:-1], path.positions[1:], CLEARANCE_M - VOXEL_M)

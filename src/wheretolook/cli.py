@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from wheretolook.utils.errors import ConfigError, WhereToLookError
-from wheretolook.utils.options import Option, all_options, check_names, grouped, names_in, nearest, one_line
+from wheretolook.utils.options import Option, all_options, check_names, grouped, names_in, nearest, short_lines
 from wheretolook.utils.version import VERSION
 
 if TYPE_CHECKING:
@@ -37,7 +37,6 @@ class Stage:
 
 
 _SPACE = ("occlusion", "scenes.free_space", "scenes.mapped_space", "map.photographs.assume_metric")
-_OF_MAPS = "occlusion.model scenes.free_space.clearance_m map.photographs.assume_metric"
 
 STAGES = {
     "scenes": Stage(
@@ -61,7 +60,7 @@ STAGES = {
         "sample",
         "Choose viewpoints by the landmarks they see.",
         "sample.grid sample.directions sample.lattice sample.keep sample.min_visible sample.max_locations "
-        f"sample.max_directions sample.seed {_OF_MAPS}",
+        "sample.max_directions sample.seed occlusion.model scenes.free_space.clearance_m",
         ("sample", *_SPACE),
         "--config configs/demo.yaml --sample.max_locations 100",
     ),
@@ -93,7 +92,7 @@ STAGES = {
     "viewpoint-map": Stage(
         "viewpoint_map",
         "Score every direction at every free voxel of a scene, for planners to look up. Needs no labels.",
-        "scene method weights out viewpoint_map.grid viewpoint_map.directions viewpoint_map.lattice " + _OF_MAPS,
+        "scene method weights out viewpoint_map.grid viewpoint_map.directions viewpoint_map.lattice occlusion.model",
         ("viewpoint_map", *_SPACE),
         """--config configs/demo.yaml --scene apartment-000 \\
       --weights data/release/weights/mlp-2d+z.safetensors --out apartment.map""",
@@ -111,7 +110,7 @@ ship, score the views. The folder holds plain arrays and LAYOUT.txt, which says 
         "plan",
         "Plan a path on which the camera sees what it needs to know where it is; a table, a picture and a film of it.",
         "scene start goal method weights out film plan.against plan.rerun plan.planner.time_s "
-        f"plan.planner.score_weight {_OF_MAPS}",
+        "plan.planner.score_weight occlusion.model",
         ("plan", *_SPACE, "tracking"),
         """--config configs/demo.yaml --scene apartment-000 --start '[-4, -3, 1.4]' --goal '[4, 3, 1.4]' \\
       --plan.against '[forward]' --film mp4 --out way""",
@@ -352,12 +351,12 @@ def _help(command: str, options: Mapping[str, Option], everything: bool) -> str:
                 read.append(option)
         parts.append(grouped(read))
     else:
-        lines = [one_line(Option("config", "YAML file of an experiment, such as configs/demo.yaml"))]
+        shown = {"--config": Option("config", "YAML file of options, such as configs/demo.yaml")}
         for name in f"{_COMMON} {stage.matter}".split():
             long = {**_SHORT, **stage.short}.get(f"--{name}", name).removeprefix("--")
-            lines.append(one_line(options[long], f"--{name}"))
+            shown[f"--{name}"] = options[long]
         more = sum(not (option.is_group or option.is_fixed) for option in options.values())
-        parts.append("\n".join(lines))
+        parts.append(short_lines(shown))
         parts.append(f"wheretolook {command} --help-all explains every option it reads, of {more} in all.")
     parts.append(f"Example:\n  wheretolook {command} {stage.example}")
     return "\n\n".join([*parts, *([stage.notes] if stage.notes else [])])

@@ -96,7 +96,7 @@ class Experiment:
     """Settings of all stages. Each stage reads what it needs; results lie in `<data>/<name>/`.
 
     Args:
-        name: name of the dataset, and of its folder.
+        name: name of the dataset and its folder.
         data: folder of all datasets.
         release_name: folder of the dataset's release.
         device: where to compute: auto, cpu, cuda, or cuda:<index>.

@@ -28,7 +28,7 @@ class EvaluateConfig:
             if none is named, all but those that are compared only if named.
         weights: files of weights to evaluate; empty for all in the dataset's `weights` folder.
         split: whose scenes to evaluate on: "test", "val" or "train".
-        top_n: how many of a location's best-scored viewpoints count; every value gives a row of the table.
+        top_n: how many of a location's best-scored viewpoints count. Every value gives a row of the table.
         thresholds: limits in metres and degrees that both errors of a good viewpoint stay under. Pairs; strictly under;
             the first pair is the label.
         seed: seed of the random method, of the bootstrap and of the paired test.

@@ -25,4 +25,6 @@ class BinsScorer(CountingScorer):
         return (n_filled + visible / (1 + visible)) / (self.bins**2 + 1)
 
 
-METHODS = (rule(BinsScorer, MethodStyle("reprojections with bins", "#009E73", "D", "-.")),)
+METHODS = (
+    rule(BinsScorer, MethodStyle("reprojections with bins", "#009E73", "D", "-."), of_the_few=True, fallback=True),
+)

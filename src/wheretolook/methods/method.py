@@ -66,6 +66,9 @@ class Method:
     probability: bool = False  # whether its score is the probability that a view localizes
     by_chance: bool = False  # whether it is drawn at random: an evaluation then tells the exact expectation
     only_if_named: bool = False  # whether an evaluation has it only if it is named
+    # whether a figure of a few methods shows it: of a family, the first of those that are evaluated
+    of_the_few: bool = False
+    fallback: bool = False  # whether a viewpoint map has its scores where no method is named and there are no weights
     # of the learned methods evaluated, the one with the highest number is what others are compared with unless told
     # otherwise
     reference: int = 0

@@ -53,4 +53,6 @@ def _build(localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
     return RandomScorer(localization_map, options.seed)
 
 
-METHODS = (rule(RandomScorer, MethodStyle("random", "#999999", "x", ":"), build=_build, by_chance=True),)
+METHODS = (
+    rule(RandomScorer, MethodStyle("random", "#999999", "x", ":"), build=_build, by_chance=True, of_the_few=True),
+)

@@ -79,6 +79,11 @@ def scorers() -> dict[str, Method]:
     return {name: method for name, method in all_methods().items() if method.build is not None}
 
 
+def fallback() -> Method:
+    """What scores a viewpoint map where no method is named and there are no weights."""
+    return next(method for method in scorers().values() if method.fallback)
+
+
 def learned() -> dict[str, Method]:
     """What can be trained, by name."""
     return {name: method for name, method in all_methods().items() if method.learn is not None}

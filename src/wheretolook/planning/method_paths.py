@@ -13,8 +13,7 @@ from wheretolook.dataset.scene import Scene
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.planning.config import PlanConfig
-from wheretolook.planning.path_comparison import FORWARD
+from wheretolook.planning.config import FORWARD, PlanConfig
 from wheretolook.planning.path_planning import check_ends, plan_path
 from wheretolook.planning.route_views import PathView, PlannedPath
 from wheretolook.planning.scene_map import check_methods, planner_map, weights_for

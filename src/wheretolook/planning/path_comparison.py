@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from tqdm.auto import tqdm
 
 from wheretolook.geometry.poses import Float, poses_looking_along
-from wheretolook.planning.config import PathsConfig
+from wheretolook.planning.config import FORWARD, PathsConfig
 from wheretolook.planning.path_planning import plan_path
 from wheretolook.planning.route_views import PlannedPath
 from wheretolook.planning.sequences import TurnLimit, ViewSequence, best_sequence, greedy_sequence, resample_path
@@ -24,9 +24,6 @@ from wheretolook.space.free_space import FreeSpace
 from wheretolook.space.mapped_space import MappedSpace
 from wheretolook.utils.errors import PlanningError, SceneError
 from wheretolook.viewpoints.table import pose_columns
-
-FORWARD = "forward"
-"""The method that needs no map: the shortest path, looking ahead."""
 
 PLANNED, GIVEN = "planned", "given"
 """What a method may choose: places and views, or the views along a path that is given."""

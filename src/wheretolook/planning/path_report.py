@@ -10,8 +10,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from wheretolook.planning.config import PathsConfig
-from wheretolook.planning.path_comparison import FORWARD
+from wheretolook.planning.config import FORWARD, PathsConfig
 from wheretolook.utils.markdown import markdown_table
 from wheretolook.utils.tracking import NestedRun, Tags, log_nested, start_run
 from wheretolook.utils.tracking_config import TrackingConfig

@@ -15,7 +15,7 @@ from wheretolook.geometry.lattices import ViewLattice
 from wheretolook.learning.provenance import was_trained_on
 from wheretolook.learning.weights import method_of_weights, read_record, read_training, read_weights
 from wheretolook.methods.base import same_field_of_view
-from wheretolook.methods.registry import find, load_scorer, make_scorer, members, methods_named, scorers
+from wheretolook.methods.registry import fallback, find, load_scorer, make_scorer, members, methods_named, scorers
 from wheretolook.planning.map_building import build_viewpoint_map
 from wheretolook.planning.path_planning import Space
 from wheretolook.planning.viewpoint_map import ViewpointMap
@@ -40,7 +40,7 @@ def scene_viewpoint_map(
     if weights is not None and not method:
         scorer = load_scorer(weights, scene.localization_map)
     else:
-        scorer = make_scorer(method or "bins", scene.localization_map, weights=weights)
+        scorer = make_scorer(method or fallback().name, scene.localization_map, weights=weights)
     return build_viewpoint_map(scorer, grid, free, views.axes(), views.lattice, f"viewpoint map {scene.name}")
 
 

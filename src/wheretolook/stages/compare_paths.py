@@ -15,7 +15,7 @@ from wheretolook.config import Experiment
 from wheretolook.dataset.folders import Dataset, SceneFolder
 from wheretolook.dataset.scene import Scene
 from wheretolook.dataset.stamps import stage_key
-from wheretolook.planning.config import PathsConfig
+from wheretolook.planning.config import FORWARD, PathsConfig
 from wheretolook.stages.inputs import Say, Tick, dataset_after, extractor_of, open_scene
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.utils.files import fingerprint, write_json, write_text
@@ -66,7 +66,7 @@ def _chosen(dataset: Dataset, config: PathsConfig) -> list[SceneFolder]:
 def _plan(scene: Scene, dataset: Dataset, config: PathsConfig, say: Say) -> ComparedPaths:
     """The paths of a scene: those that are there if they were planned with the same settings."""
     from wheretolook.labelling.labeller import storing
-    from wheretolook.planning.path_comparison import FORWARD, ComparedPaths, draw_pairs, plan_pairs
+    from wheretolook.planning.path_comparison import ComparedPaths, draw_pairs, plan_pairs
     from wheretolook.planning.scene_map import planner_map, weights_for
 
     files, folder = scene.files, _folder(dataset, scene)

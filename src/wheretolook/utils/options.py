@@ -124,10 +124,14 @@ def names_in(content: Any, options: Mapping[str, Option], prefix: str = "") -> I
             yield name
 
 
-def one_line(option: Option, flag: str = "") -> str:
-    """An option, the first sentence of what it is, and its default."""
-    sentence = re.split(r"(?<!Sec)\. (?=[^a-z])|\.$", option.text, maxsplit=1)[0]
-    return _row(flag or f"--{option.name}", f"{sentence}{_default(option)}")
+def short_lines(options: Mapping[str, Option]) -> str:
+    """Options by their flags: of each the first sentence of what it is, and its default."""
+    width = min(_NAME_WIDTH, max(map(len, options)) + 4)
+    rows = []
+    for flag, option in options.items():
+        sentence = re.split(r"(?<!Sec)\. (?=[^a-z])|\.$", option.text, maxsplit=1)[0]
+        rows.append(_row(flag, f"{sentence}{_default(option)}", width))
+    return "\n".join(rows)
 
 
 def grouped(options: Iterable[Option]) -> str:
@@ -149,11 +153,11 @@ def grouped(options: Iterable[Option]) -> str:
     return re.sub(r"\n{3,}", "\n\n", text).strip("\n")
 
 
-def _row(flag: str, text: str) -> str:
-    start = f"  {flag:<{_NAME_WIDTH - 2}}"
-    if len(start) > _NAME_WIDTH or not start.endswith(" "):
+def _row(flag: str, text: str, name_width: int = _NAME_WIDTH) -> str:
+    start = f"  {flag:<{name_width - 2}}"
+    if len(start) > name_width or not start.endswith(" "):
         start = f"{start.rstrip()}  "
-    return _filled(text, start, " " * _NAME_WIDTH)
+    return _filled(text, start, " " * name_width)
 
 
 def _filled(text: str, start: str = "", indent: str = "") -> str:

@@ -20,7 +20,7 @@ class SampleConfig(ViewLattice):
         min_visible: directions that see fewer landmarks are dropped. In the paper, those with "none or only a minimal
             number" (Sec. 3.2).
         max_locations: a random subset of the free locations, 0 for all.
-        max_directions: a random subset of the kept directions of each location, 0 for all; one number, or one for
+        max_directions: a random subset of the kept directions of each location, 0 for all. One number, or one for
             each split, such as `{train: 50, val: 50, test: 100}`.
         seed: seed of the random subsets.
         distinct_pixels: rank by the number of distinct pixels with a landmark, as the released code counts, instead of

@@ -49,6 +49,7 @@ def _metric(metric: str, approximation: Approximation, about_origin: bool) -> Me
         build=build,
         family="fisher",
         only_if_named=about_origin,
+        of_the_few=(metric, approximation, about_origin) == ("trace", "exact", False),
         params=params if approximation == "gp" else no_params,
     )
 

@@ -16,6 +16,7 @@ METHODS = (
         weights="set",
         probability=True,
         reference=2,
+        of_the_few=True,
         learn=imported("set.learn:learn_set"),
         config=SetConfig,
         folder="set",

@@ -22,8 +22,9 @@ from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.fisher import information
 from wheretolook.inputs.landmarks_in_view import ATTRIBUTES, LandmarkDescriber, ViewLandmarks
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.learning.data import labelled_rows, training_scenes
+from wheretolook.learning.data import labelled_rows
 from wheretolook.learning.landmark_views import AttributeStatistics, LandmarkLoader, load_landmark_views
+from wheretolook.learning.scenes import training_scenes
 from wheretolook.learning.trained_network import StoredNetwork, TrainedNetwork
 from wheretolook.learning.weights import METADATA_KEY, method_of_weights
 from wheretolook.methods.matchability.config import MatchabilityConfig

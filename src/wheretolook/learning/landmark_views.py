@@ -17,16 +17,10 @@ from tqdm.auto import tqdm
 from wheretolook.dataset.folders import Dataset, SceneFolder
 from wheretolook.inputs.landmarks_in_view import ATTRIBUTES, LandmarkDescriber, ViewLandmarks
 from wheretolook.learning.config import SharedConfig
-from wheretolook.learning.data import (
-    Batch,
-    TensorViews,
-    ViewsDataModule,
-    labelled_rows,
-    training_scenes,
-    validation_views,
-)
+from wheretolook.learning.data import Batch, TensorViews, ViewsDataModule, labelled_rows, validation_views
 from wheretolook.learning.fit import home_device
 from wheretolook.learning.learner import Task
+from wheretolook.learning.scenes import training_scenes
 from wheretolook.viewpoints.table import LOCALIZED, is_good, poses
 
 DISTANCES = [ATTRIBUTES.index(name) for name in ("distance", "mapped_distance")]

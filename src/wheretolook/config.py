@@ -103,8 +103,8 @@ class Experiment:
         camera: the camera that will look, and with which the map's images are rendered.
         scenes: stage 1, meshes.
         map: stage 2, COLMAP maps, of meshes or of photographs.
-        occlusion: how stage 3 finds out which landmarks nothing stands in front of. Stage 6 takes its settings, but the
-            names of models from `evaluate.occlusions`.
+        occlusion: how stage 3 finds out which landmarks are unoccluded. Stage 6 takes the settings of occlusion models,
+            but not their names, from here; these are `evaluate.occlusions`.
         sample: stage 3, viewpoints and what they see.
         label: stage 4, localization errors.
         train: stage 5, the network.

@@ -45,14 +45,14 @@ class LabelConfig:
 
     Args:
         localizer: matching and pose estimation.
-        engine: where labels are made: local, in processes here, or ray, on a Ray cluster. Of the same shards (`pip
-            install ray`).
+        engine: where labels are made: local, in processes here, or ray, on a Ray cluster. Both give the same labels;
+            ray needs `pip install ray`.
         ray_address: address of the Ray cluster; empty starts one on this machine. Such as "auto" on one of its
             machines, or "ray://head:10001" from elsewhere (which needs `pip install 'ray[client]'`).
-        workers: worker processes on this machine; 0 for one a CPU core. Of those that may be used.
-        shard_size: viewpoints a shard, which is what an interruption can lose.
-        store_matches: keep which landmarks each view matched; needed to learn matchability. Their rows, and of those
-            that agree with the view's pose, in the columns matched_rows and inlier_rows.
+        workers: worker processes on this machine; 0 for one on each CPU core that it may use.
+        shard_size: viewpoints in a shard. An interruption loses at most the shards that were being labelled.
+        store_matches: keep which landmarks each view matched; needed to learn matchability. Their rows are in
+            the column matched_rows, those that agree with the view's pose in inlier_rows.
     """
 
     localizer: LocalizerConfig = field(default_factory=LocalizerConfig)

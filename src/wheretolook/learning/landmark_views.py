@@ -59,7 +59,7 @@ class LandmarkViews(TensorViews):
 
     starts: Tensor  # (B + 1,) int64; view b has entries `starts[b]` to `starts[b + 1]`
     values: Tensor  # (E, len(ATTRIBUTES)) float16
-    visible: Tensor  # (B,) int64, landmarks that each view sees
+    n_visible: Tensor  # (B,) int64, landmarks that each view sees
     axis_height: Tensor  # (B,) float32, z of the optical axis in the world
     labels: Tensor  # (B,) float32, 1 where the viewpoint localizes
     error_m: Tensor  # (B,) float32, error of its position, infinite where it is not localized or its orientation is off
@@ -142,7 +142,7 @@ def _joined(blocks: Sequence[LandmarkViews]) -> LandmarkViews:
     starts = torch.zeros(len(lengths) + 1, dtype=torch.int64)
     starts[1:] = lengths.cumsum(0)
     joined: dict[str, Any] = {"starts": starts}
-    for name in ("values", "visible", "axis_height", "labels", "error_m", "scene", "location", "found"):
+    for name in ("values", "n_visible", "axis_height", "labels", "error_m", "scene", "location", "found"):
         parts = [getattr(block, name) for block in blocks if getattr(block, name) is not None]
         if parts:
             joined[name] = torch.cat(parts) if isinstance(parts[0], Tensor) else np.concatenate(parts)
@@ -204,7 +204,7 @@ class LandmarkLoader:
             if growth is not None:
                 values[..., DISTANCES] += growth[:, None, None]
                 labels = (views.error_m[share] * growth.exp() < self.max_error_m).float()
-            yield Batch((values, taken, views.visible[share], views.axis_height[share]), labels, len(part))
+            yield Batch((values, taken, views.n_visible[share], views.axis_height[share]), labels, len(part))
 
 
 class LandmarkDataModule(ViewsDataModule):

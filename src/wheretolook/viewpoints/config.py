@@ -19,10 +19,10 @@ class SampleConfig(ViewLattice):
         keep: directions kept at each location, those that see most landmarks; 0 keeps all. The paper's K.
         min_visible: directions that see fewer landmarks are dropped. In the paper, those with "none or only a minimal
             number" (Sec. 3.2).
-        max_locations: a random subset of the free locations, 0 for all.
-        max_directions: a random subset of the kept directions of each location, 0 for all. One number, or one for
-            each split, such as `{train: 50, val: 50, test: 100}`.
-        seed: seed of the random subsets.
+        max_locations: free locations to keep at most, drawn at random; 0 keeps all.
+        max_directions: kept directions of each location to take at most, drawn at random; 0 takes all. One number, or
+            one for each split, such as `{train: 50, val: 50, test: 100}`.
+        seed: seed of what is drawn at random.
         distinct_pixels: rank by the number of distinct pixels with a landmark, as the released code counts, instead of
             the number of landmarks.
 

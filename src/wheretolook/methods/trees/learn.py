@@ -1,4 +1,4 @@
-"""Boosted trees on pooled statistics of the visible landmarks: the strong simple learner."""
+"""Boosted trees on pooled statistics of the landmarks in view: the strong simple learner."""
 
 from __future__ import annotations
 

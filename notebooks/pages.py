@@ -130,8 +130,9 @@ def main(arguments: list[str]) -> int:
     from nbclient.exceptions import CellExecutionError, CellTimeoutError, DeadKernelError
 
     folder, out = Path(arguments[0]), Path(arguments[1])
-    paths = sorted(path for path in folder.glob("*.py") if len(arguments) < 3 or path.stem in arguments[2:])
-    names = sorted(path.stem for path in folder.glob("*.py"))
+    notebooks = sorted(folder.glob("[0-9]*.py"))  # not this file
+    names = [path.stem for path in notebooks]
+    paths = [path for path in notebooks if len(arguments) < 3 or path.stem in arguments[2:]]
     failed = []
     out.mkdir(parents=True, exist_ok=True)
     for path in paths:

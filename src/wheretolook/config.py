@@ -107,7 +107,7 @@ class Experiment:
             but not their names, from here; these are `evaluate.occlusions`.
         sample: stage 3, viewpoints and what they see.
         label: stage 4, localization errors.
-        train: stage 5, the network.
+        train: stage 5, what is learnt from the labels.
         evaluate: stage 6, scores of all methods.
         viewpoint_map: what planners query.
         plan: one path to plan.

@@ -11,14 +11,16 @@ import pytest
 
 from labelling.rooms import CAMERA, PLAIN, POSTER, MappedRoom, facing, map_room
 from one_scene import label_viewpoints
-from wheretolook.labelling.config import LabelConfig
+from wheretolook.features.keypoints import Keypoints
+from wheretolook.geometry.poses import pose_error, transform
+from wheretolook.labelling.config import LabelConfig, LocalizerConfig
 from wheretolook.labelling.localizer import Localizer
 from wheretolook.labelling.shard import label_rows
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import load_mesh
 from wheretolook.utils.errors import MapError, SceneError
-from wheretolook.viewpoints.table import is_good
+from wheretolook.viewpoints.table import LOCALIZED, NO_POSE, is_good, poses
 
 
 @pytest.mark.usefixtures("in_this_process")
@@ -64,6 +66,34 @@ def test_errors_are_measured_against_the_true_pose(room: MappedRoom) -> None:
     labelled = label_rows(table, Elsewhere(load_mesh(room.mesh)), localizer, CAMERA)
     np.testing.assert_allclose(labelled["error_m"], 0.1, atol=0.02)
     np.testing.assert_allclose(labelled["error_deg"], 3.0, atol=0.2)
+
+
+def test_a_pose_is_found_where_seven_matches_in_eight_are_wrong(room: MappedRoom) -> None:
+    """And the same pose every time, which is not used where it has too few inliers."""
+    landmarks = Landmarks.load(room.landmarks)
+    true_pose = poses(facing(POSTER, 1, distance_m=1.5))[0]
+    in_camera = transform(true_pose, landmarks.points)
+    rows = np.flatnonzero(in_camera[:, 2] > 0.1)[:320]
+    pixels = CAMERA.project(in_camera[rows])
+    wrong = np.arange(len(rows)) % 8 > 0
+    rng = np.random.default_rng(0)
+    pixels[wrong] = rng.uniform(0, (CAMERA.width, CAMERA.height), (wrong.sum(), 2))
+    keypoints = replace(Keypoints.none(), pixels=pixels.astype(np.float32))
+    matches = np.arange(len(rows)), rows
+    found, again = (Localizer(landmarks, CAMERA).estimate(keypoints, *matches) for _ in range(2))
+    assert found.status == LOCALIZED and len(found.inlier_rows) >= (~wrong).sum() == 40
+    error_m, error_deg = pose_error(found.cam_from_world[None], true_pose[None])
+    assert error_m[0] < 0.01 and error_deg[0] < 0.2
+    np.testing.assert_array_equal(found.cam_from_world, again.cam_from_world)
+    strict = Localizer(landmarks, CAMERA, LocalizerConfig(min_inliers=len(found.inlier_rows) + 1))
+    assert strict.estimate(keypoints, *matches).status == NO_POSE
+
+
+def test_matches_with_one_landmark_determine_no_pose(room: MappedRoom) -> None:
+    keypoints = replace(Keypoints.none(), pixels=np.full((20, 2), 100.5, np.float32))
+    matches = np.arange(20), np.zeros(20, dtype=np.int64)
+    found = Localizer(Landmarks.load(room.landmarks), CAMERA).estimate(keypoints, *matches)
+    assert found.status == NO_POSE and found.cam_from_world is None and len(found.inlier_rows) == 0
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-import pycolmap
+import poselib
 from numpy.typing import NDArray
 
 from wheretolook.features.extraction import KeypointExtractor
@@ -43,9 +43,9 @@ class Localization:
 class Localizer:
     """Localizes images against landmarks (paper, Sec. 3.3 "Self-supervision").
 
-    Keypoints are extracted and matched to the landmarks' mean descriptors with Lowe's ratio test; pycolmap estimates
-    the pose by PnP in LO-RANSAC and refines it. The extractor must be what the map was made with; it and matching run
-    on the device, "cpu" or a CUDA device. Raises MapError if the landmarks have no descriptors.
+    Keypoints are extracted and matched to the landmarks' mean descriptors with Lowe's ratio test; PoseLib estimates the
+    pose by P3P in LO-RANSAC and refines it on the inliers. The extractor must be what the map was made with; it and
+    matching run on the device, "cpu" or a CUDA device. Raises MapError if the landmarks have no descriptors.
     """
 
     def __init__(
@@ -62,11 +62,18 @@ class Localizer:
         self.extractor = KeypointExtractor(extractor, device)
         self._matcher = DescriptorMatcher(landmarks.descriptors, device)
         params = [camera.focal_px, camera.cx, camera.cy]
-        self._camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=camera.width, height=camera.height, params=params)
-        self._estimation = pycolmap.AbsolutePoseEstimationOptions()
-        self._estimation.ransac.max_error = self.config.max_error_px
-        self._estimation.ransac.random_seed = self.config.seed
-        self._refinement = pycolmap.AbsolutePoseRefinementOptions()
+        self._camera = {"model": "SIMPLE_PINHOLE", "width": camera.width, "height": camera.height, "params": params}
+        self._ransac = {
+            "max_reproj_error": self.config.max_error_px,
+            "seed": self.config.seed,
+            "success_prob": self.config.confidence,
+            "min_iterations": self.config.min_trials,
+            "max_iterations": self.config.max_trials,
+            "dyn_num_trials_mult": 1.0,  # as many trials as the confidence asks for; PoseLib makes three times as many
+        }
+        # Keypoints are accurate to a fraction of a pixel. PoseLib's own scale is half of RANSAC's limit, as if outliers
+        # just within the limit were accurate, too: poses are then worse.
+        self._refinement = {"loss_type": "CAUCHY", "loss_scale": 1.0}
 
     def localize(self, rgb: NDArray[np.uint8]) -> Localization:
         """Localize one image (H, W, 3) uint8."""
@@ -90,11 +97,9 @@ class Localizer:
         if n_matches < self.config.min_matches:
             return Localization(TOO_FEW_MATCHES, None, n_matches, matched_rows=landmark_rows)
         pixels, points = keypoints.pixels[keypoint_rows].astype(np.float64), self.landmarks.points[landmark_rows]
-        options = (self._camera, self._estimation, self._refinement)
-        estimate = pycolmap.estimate_and_refine_absolute_pose(pixels, points, *options)
-        if estimate is None:
+        pose, found = poselib.estimate_absolute_pose(pixels, points, self._camera, self._ransac, self._refinement)
+        if found["num_inliers"] < 3 or not np.isfinite(pose.Rt).all():  # no three matches determine a pose
             return Localization(NO_POSE, None, n_matches, matched_rows=landmark_rows)
-        pose = np.asarray(estimate["cam_from_world"].matrix())
-        status = LOCALIZED if estimate["num_inliers"] >= self.config.min_inliers else NO_POSE
-        inlier_rows = landmark_rows[np.asarray(estimate["inlier_mask"], dtype=bool)]
-        return Localization(status, pose, n_matches, inlier_rows, landmark_rows)
+        status = LOCALIZED if found["num_inliers"] >= self.config.min_inliers else NO_POSE
+        inlier_rows = landmark_rows[np.asarray(found["inliers"], dtype=bool)]
+        return Localization(status, pose.Rt, n_matches, inlier_rows, landmark_rows)

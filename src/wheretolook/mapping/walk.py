@@ -36,9 +36,9 @@ class PartOfFloor:
     def is_free(self, points: Any) -> NDArray[np.bool_]:
         """Whether a camera can be at points (N, 3); (N,)."""
         at, part = np.asarray(points, dtype=np.float64)[:, None, :2], np.asarray(self.rectangles, dtype=np.float64)
-        free = ((at >= part[:, :2]) & (at <= part[:, 2:])).all(-1).any(-1)
+        free: NDArray[np.bool_] = np.any(((at >= part[:, :2]) & (at <= part[:, 2:])).all(-1), axis=-1)
         free[free] = self.space.is_free(np.asarray(points)[free])
-        return np.asarray(free, dtype=bool)
+        return free
 
     def segments_are_free(self, a: Any, b: Any) -> NDArray[np.bool_]:
         """Whether a camera can move straight from a (N, 3) to b (N, 3), both above this part; (N,)."""

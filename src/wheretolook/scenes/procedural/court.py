@@ -21,7 +21,8 @@ def court(config: ApartmentConfig, seed: int) -> Furnished:
     """A court of 12 to 40 m between facades of two to four storeys, drawn from the seed."""
     rng = np.random.default_rng([seed, 5])
     width, storey = float(rng.uniform(12, 40)), float(rng.uniform(2.9, 3.6))
-    height = storey * int(rng.integers(2, 5))
+    n_storeys = int(rng.integers(2, 5))
+    height = storey * n_storeys
     room = large.one_room(width, float(rng.uniform(0.5, 1)) * width)
     style = Style(rng, config.texture_richness, config.clutter)
     stone = materials.plain(rng, (0.78, 0.76, 0.71), shared=True)
@@ -34,11 +35,11 @@ def court(config: ApartmentConfig, seed: int) -> Furnished:
     for side in range(4):
         bay = float(rng.uniform(2.6, 4.5))
         opening = float(rng.uniform(0.3, 0.5)) * bay
-        for floor in np.arange(0 if style.chance(0.5) else storey, height, storey):
-            large.add_windows(room, side, bay, opening, floor + 0.9, floor + 0.8 * storey)
+        for floor in range(0 if style.chance(0.5) else 1, n_storeys):
+            large.add_windows(room, side, bay, opening, floor * storey + 0.9, (floor + 0.8) * storey)
         for o in room.openings[side]:
             windows += wall_items(room, side, (o.a0 + o.a1) / 2, _window(style, o, stone, style.pick(glass)))
-        for z in np.arange(storey, height + 0.1, storey):
+        for z in storey * np.arange(1, n_storeys + 1):
             half = room.wall_length(side) / 2
             windows += wall_items(room, side, half, box((-half, 0, z - 0.2), (half, 0.08, z - 0.05), stone))
     shell = build_shell(style, Plan([room], [], height), [finish], open_air=True)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from wheretolook.utils.errors import ConfigError
+
+SceneKind = Literal["apartment", "hall", "court", "office", "building"]
 
 
 @dataclass(frozen=True)

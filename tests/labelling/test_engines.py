@@ -55,6 +55,7 @@ def test_a_run_that_was_left_goes_on_where_it_stopped(
     assert (second.shards / MANIFEST).is_file()
 
 
+@SLOW
 def test_without_ray_the_extra_to_install_is_named(room: MappedRoom, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     shard = Shard(room.job, Path("shard.parquet"), facing(POSTER, 1, 1.5))

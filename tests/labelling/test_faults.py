@@ -109,6 +109,7 @@ def test_a_failing_renderer_is_named_with_the_mesh(room: MappedRoom, views: pd.D
     assert not multiprocessing.active_children() and not times(tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("in_this_process")
 def test_a_full_disk_keeps_what_is_finished(
     room: MappedRoom, views: pd.DataFrame, expected: bytes, tmp_path: Path
@@ -138,6 +139,7 @@ def test_a_full_disk_keeps_what_is_finished(
     assert finished.items() <= times(shards).items()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("in_this_process")
 def test_damaged_shards_are_made_anew_and_no_others(
     room: MappedRoom, views: pd.DataFrame, expected: bytes, tmp_path: Path

@@ -188,11 +188,13 @@ def experiment(mapped, photographs: Path, tmp_path_factory: pytest.TempPathFacto
     return experiment
 
 
+@pytest.mark.slow
 def test_sampling_needs_metres(experiment: Experiment) -> None:
     with pytest.raises(MapError, match=r"no scale, and this needs metres.*assume_metric"):
         stages.sample(experiment)
 
 
+@pytest.mark.slow
 def test_a_scene_of_photographs_is_sampled_and_scored_but_not_labelled(experiment: Experiment) -> None:
     scale = ScaleConfig(marker_size_m=MARKERS[0].size_m)
     photographs = replace(experiment.map.photographs, scale=scale)

@@ -169,6 +169,7 @@ def run_python(program: str, *arguments: str, path: list[Path]) -> subprocess.Co
     return subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
 
 
+@pytest.mark.slow
 def test_another_package_adds_a_learner_and_a_rule(tmp_path: Path) -> None:
     installed = tmp_path / "site"
     about = installed / "wheretolook_linear-1.0.dist-info"

@@ -157,6 +157,7 @@ def test_options_that_are_none(wrong: dict[str, float]) -> None:
         TreesConfig(**wrong)  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_trees_are_trained_and_evaluated(tmp_path: Path) -> None:
     dataset = make_dataset(tmp_path / "tiny", ("train", "train", "test", "val"), n_locations=14, n_directions=16)
     tracking = TrackingConfig(str(tmp_path / "mlruns"))

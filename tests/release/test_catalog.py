@@ -58,6 +58,7 @@ def test_the_catalog_names_the_papers_items() -> None:
     assert all(item.command and item.notebook[:2].isdigit() for item in ITEMS)
 
 
+@pytest.mark.slow
 def test_all_that_has_a_run_is_written_and_attached(store: tuple[Dataset, TrackingConfig], tmp_path: Path) -> None:
     release, tracking = store
     said: list[str] = []

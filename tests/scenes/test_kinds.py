@@ -31,9 +31,10 @@ from wheretolook.viewpoints.table import poses as poses_of
 
 FAST = ApartmentConfig(texels_per_m=20, texture_size=2048, light_rays=4, light_spacing_m=1.0)
 KINDS = tuple(kind for kind in get_args(SceneKind) if kind != "apartment")
+SLOW = pytest.mark.slow
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [pytest.param(kind, marks=[] if kind == "building" else SLOW) for kind in KINDS])
 def test_mesh_is_well_formed_and_follows_from_the_seed(kind: SceneKind) -> None:
     mesh, mapped = generate_scene(kind, FAST, 4)
     again, mapped_again = generate_scene(kind, FAST, 4)
@@ -58,6 +59,7 @@ def test_mesh_is_well_formed_and_follows_from_the_seed(kind: SceneKind) -> None:
     assert 60 < np.median(mesh.textures[0][row, column]) < 225  # neither black nor burnt
 
 
+@SLOW
 @pytest.mark.parametrize(
     ("furnish", "sides_m", "heights_m"),
     [(hall, (4, 40), (4, 9)), (court, (6, 40), (5, 15)), (office, (6, 24), (2.6, 3.3))],
@@ -82,7 +84,7 @@ def drawn_building(seed: int) -> tuple[Furnished, Module, list[Copy]]:
     return draw_building(ApartmentConfig(clutter=0.3), seed)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=SLOW) for seed in (1, 2, 3))])
 def test_copies_of_a_building_are_copies(seed: int) -> None:
     furnished, module, copies = drawn_building(seed)
     assert 2 <= len(copies) <= 8 and 1 <= sum(copy.mapped for copy in copies) <= len(copies)
@@ -147,7 +149,7 @@ label: {workers: 1}
 """
 
 
-@pytest.mark.slow
+@SLOW
 def test_views_of_unmapped_copies_localize_in_mapped_ones(tmp_path: Path) -> None:
     """Images are taken on the mapped floor only; views off it are found metres away, with many inliers."""
     (tmp_path / "small.yaml").write_text(SMALL)

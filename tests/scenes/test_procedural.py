@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ from wheretolook.scenes.procedural.plan import Plan, draw_plan
 from wheretolook.scenes.procedural.style import Style
 from wheretolook.utils.errors import ConfigError, SceneError
 
-SEEDS = (0, 1, 2)
+SEEDS = (0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2)))
 CONFIG = ApartmentConfig()
 FAST = ApartmentConfig(
     n_rooms=3, area_m2=26, texels_per_m=20, texture_size=1024, light_rays=4, light_spacing_m=0.5
@@ -34,13 +35,10 @@ def apartment() -> TexturedMesh:
     return generate_apartment(CONFIG, 1)
 
 
-@pytest.fixture(scope="module")
-def furnished() -> dict[int, tuple[Plan, patches_module.Surface]]:
-    scenes = {}
-    for seed in SEEDS:
-        plan, patches, _, _ = furnish_apartment(CONFIG, seed)
-        scenes[seed] = plan, patches_module.join(patches)
-    return scenes
+@cache
+def furnished(seed: int) -> tuple[Plan, patches_module.Surface]:
+    plan, patches, _, _ = furnish_apartment(CONFIG, seed)
+    return plan, patches_module.join(patches)
 
 
 def _raycasting_scene(surface: patches_module.Surface) -> Any:
@@ -63,6 +61,7 @@ def _cast(scene: Any, origins: NDArray[Any], directions: NDArray[Any]) -> dict[s
     return {k: v.numpy() for k, v in scene.cast_rays(_rays(origins, directions)).items()}
 
 
+@pytest.mark.slow
 def test_same_seed_gives_same_bytes_and_another_seed_another_home() -> None:
     first, again, other = (generate_apartment(FAST, seed) for seed in (7, 7, 8))
     for name in ("vertices", "triangles", "corner_uvs", "triangle_texture"):
@@ -89,8 +88,8 @@ def test_mesh_is_well_formed(apartment: TexturedMesh) -> None:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_triangle_count(furnished: dict[int, tuple[Plan, patches_module.Surface]], seed: int) -> None:
-    assert 50_000 <= len(furnished[seed][1].triangles) <= 300_000
+def test_triangle_count(seed: int) -> None:
+    assert 50_000 <= len(furnished(seed)[1].triangles) <= 300_000
 
 
 def test_texture_is_not_stretched(apartment: TexturedMesh) -> None:
@@ -129,8 +128,8 @@ def test_texture_has_plain_and_rich_regions(apartment: TexturedMesh) -> None:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_shell_is_closed(furnished: dict[int, tuple[Plan, patches_module.Surface]], seed: int) -> None:
-    plan, surface = furnished[seed]
+def test_shell_is_closed(seed: int) -> None:
+    plan, surface = furnished(seed)
     scene = _raycasting_scene(surface)
     directions = np.random.default_rng(seed).normal(size=(20_000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -146,9 +145,9 @@ def test_shell_is_closed(furnished: dict[int, tuple[Plan, patches_module.Surface
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_every_room_is_reached_on_foot(furnished: dict[int, tuple[Plan, patches_module.Surface]], seed: int) -> None:
+def test_every_room_is_reached_on_foot(seed: int) -> None:
     """Flood fill over the floor: where nothing stands between 0.05 m and 1.9 m, shrunk by a walker of 0.4 m width."""
-    plan, surface = furnished[seed]
+    plan, surface = furnished(seed)
     scene = _raycasting_scene(surface)
     step = 0.05
     low, high = surface.vertices.min(0)[:2], surface.vertices.max(0)[:2]
@@ -165,8 +164,8 @@ def test_every_room_is_reached_on_foot(furnished: dict[int, tuple[Plan, patches_
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_doors_are_wide_and_high_enough(furnished: dict[int, tuple[Plan, patches_module.Surface]], seed: int) -> None:
-    plan, surface = furnished[seed]
+def test_doors_are_wide_and_high_enough(seed: int) -> None:
+    plan, surface = furnished(seed)
     scene = _raycasting_scene(surface)
     count = 0
     for room in plan.rooms:
@@ -287,6 +286,7 @@ def test_patterns_repeat() -> None:
     assert 0.1 < np.mean([few[n] is not painted[n] for n in large]) < 0.5
 
 
+@pytest.mark.slow
 def test_an_enlarged_apartment_is_the_same_but_larger() -> None:
     small, large = (generate_apartment(replace(FAST, enlarged=by), 7) for by in (1.0, 2.5))
     np.testing.assert_allclose(large.vertices, 2.5 * small.vertices, rtol=1e-6)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import overload
 
-from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.visibility.tsdf import DepthImage
@@ -14,7 +14,7 @@ from wheretolook.visibility.tsdf import DepthImage
 class RenderedDepth(Sequence[DepthImage]):
     """Depth images of poses (B, 3, 4), each rendered when it is asked for."""
 
-    def __init__(self, renderer: WarpRenderer, camera: PinholeCamera, cam_from_world: Float) -> None:
+    def __init__(self, renderer: WarpRenderer, camera: Camera, cam_from_world: Float) -> None:
         self.renderer, self.camera, self.cam_from_world = renderer, camera, cam_from_world
 
     def __len__(self) -> int:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wheretolook.dataset.folders import SceneFolder
-from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.camera import Camera, cameras_of_map, only_camera
 from wheretolook.geometry.lattices import ViewLattice, VoxelGrid
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.mapping.scale import read_scale
@@ -55,7 +55,7 @@ class Scene:
 
     Args:
         files: its files.
-        camera: intrinsics of the camera that will look.
+        camera: the camera that will look; None for that of the scene.
         config: how it is looked at.
         device: where kernels run: "cpu", a CUDA device, or "auto" for the first GPU there is.
         mesh: its mesh, if there is no file of it; metres, z up.
@@ -70,13 +70,13 @@ class Scene:
     def __init__(
         self,
         files: SceneFolder,
-        camera: PinholeCamera,
+        camera: Camera | None = None,
         config: SceneConfig = SceneConfig(),
         device: str = "cpu",
         mesh: TexturedMesh | None = None,
         progress: bool = True,
     ) -> None:
-        self.files, self.camera, self.config, self.progress = files, camera, config, progress
+        self.files, self.camera, self.config, self.progress = files, camera or files.camera, config, progress
         self._device = device
         if mesh is not None:
             self.mesh = mesh
@@ -236,6 +236,7 @@ class Scene:
         from wheretolook.visibility.tsdf import TsdfConfig, TsdfVolume
 
         config = self.config.occlusion
-        images = RenderedDepth(self.renderer, self.camera, colmap_poses(self.files.map))
+        mapped = only_camera(cameras_of_map(self.files.map), self.files.map)
+        images = RenderedDepth(self.renderer, mapped, colmap_poses(self.files.map))
         tsdf = TsdfConfig(voxel_size_m=config.voxel_m, max_depth_m=config.max_depth_m)
         return TsdfVolume.from_images(images, tsdf, self.progress), images

@@ -68,7 +68,7 @@ def evaluation_params(dataset: Dataset, scenes: Sequence[SceneFolder], weights: 
     """Parameters of an evaluation's run that tell what was evaluated: a dataset's scenes, and files of weights."""
     return {
         "dataset": dataset.name,
-        "dataset_fingerprint": Dataset(dataset.root, dataset.camera, tuple(scenes)).fingerprint(),
+        "dataset_fingerprint": Dataset(dataset.root, tuple(scenes)).fingerprint(),
         "scenes": " ".join(scene.name for scene in scenes),
         "weights": " ".join(f"{path.stem}:{fingerprint(path)}" for path in weights),
     }

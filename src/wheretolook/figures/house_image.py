@@ -121,8 +121,9 @@ def draw_segments(axes: Axes, house: Dollhouse, segments: ArrayLike, **style: An
 
 def frustum_corners(camera: PinholeCamera, cam_from_world: ArrayLike, depth_m: float) -> Float:
     """Corners (B, 5, 3) m of cameras (B, 3, 4): centre, then the image's corners at a depth, from top left."""
-    half = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * (camera.cx, camera.cy) / camera.focal_px
-    corners = np.concatenate([np.zeros((1, 3)), depth_m * np.column_stack([half, np.ones(4)])])
+    pixels = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * (camera.width, camera.height)
+    at_depth_one = (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+    corners = np.concatenate([np.zeros((1, 3)), depth_m * np.column_stack([at_depth_one, np.ones(4)])])
     world_from_cam = invert_poses(np.asarray(cam_from_world, dtype=np.float64).reshape(-1, 3, 4))
     return corners @ np.swapaxes(world_from_cam[..., :3], -1, -2) + world_from_cam[:, None, :, 3]
 

@@ -181,7 +181,8 @@ def image_cells(landmarks: ViewLandmarks, camera: Camera, bins: int) -> Tensor:
         along = torch.cat([rays, torch.ones_like(rays[:, :1])], dim=1)
         pixels = torch.from_numpy(camera.project(along.cpu().double().numpy())).to(rays)
     else:
-        pixels = rays * camera.focal_px + torch.tensor([camera.cx, camera.cy]).to(rays)
+        focal, center = torch.tensor([[camera.fx, camera.fy], [camera.cx, camera.cy]]).to(rays)
+        pixels = rays * focal + center
     column = (pixels[:, 0] * (bins / camera.width)).long().clamp(0, bins - 1)
     row = (pixels[:, 1] * (bins / camera.height)).long().clamp(0, bins - 1)
     return row * bins + column

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from wheretolook.features.extraction import KeypointExtractor
 from wheretolook.features.keypoints import ExtractorConfig, Keypoints, quantize_descriptors
 from wheretolook.features.matching import DescriptorMatcher, Matches, match
-from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float
 from wheretolook.labelling.config import LocalizerConfig
 from wheretolook.mapping.landmarks import Landmarks
@@ -51,7 +51,7 @@ class Localizer:
     def __init__(
         self,
         landmarks: Landmarks,
-        camera: PinholeCamera,
+        camera: Camera,
         config: LocalizerConfig | None = None,
         extractor: ExtractorConfig | None = None,
         device: str = "cpu",
@@ -61,8 +61,7 @@ class Localizer:
         self.landmarks, self.config = landmarks, config or LocalizerConfig()
         self.extractor = KeypointExtractor(extractor, device)
         self._matcher = DescriptorMatcher(landmarks.descriptors, device)
-        params = [camera.focal_px, camera.cx, camera.cy]
-        self._camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=camera.width, height=camera.height, params=params)
+        self._camera = camera.colmap.pycolmap
         self._estimation = pycolmap.AbsolutePoseEstimationOptions()
         self._estimation.ransac.max_error = self.config.max_error_px
         self._estimation.ransac.random_seed = self.config.seed

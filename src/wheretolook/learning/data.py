@@ -170,7 +170,7 @@ def with_also(dataset: Dataset, names: Sequence[str]) -> Dataset:
         if other.camera != dataset.camera:
             fix = f"It must be {dataset.camera}, as that of {dataset.root}."
             raise ConfigError(f"{other.root} was made for another camera", value=other.camera, fix=fix)
-        scenes += training_scenes(Dataset(other.root, other.camera, other.split("train")))
+        scenes += training_scenes(Dataset(other.root, other.split("train")))
     if names:
         seen: dict[str, SceneFolder] = {}
         for scene in scenes:
@@ -179,7 +179,7 @@ def with_also(dataset: Dataset, names: Sequence[str]) -> Dataset:
                 fix = "Leave the dataset out of train.also: scenes must not cross splits."
                 raise ConfigError(f"this is the scene {seen[landmarks].folder} again", path=scene.folder, fix=fix)
             seen[landmarks] = scene
-    return Dataset(dataset.root, dataset.camera, tuple(scenes))
+    return Dataset(dataset.root, tuple(scenes))
 
 
 def training_scenes(dataset: Dataset) -> list[SceneFolder]:

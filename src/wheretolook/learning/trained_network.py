@@ -57,7 +57,7 @@ class TrainedNetwork(Generic[NetworkT]):
         """
         header = {
             **self.network.description(),
-            "camera": asdict(self.camera),
+            "camera": self.camera.record(),
             "scale": self.scale,
             "offset": self.offset,
             "training": dict(training or {}),

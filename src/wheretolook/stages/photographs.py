@@ -28,7 +28,7 @@ def map_photograph_scene(experiment: Experiment, say: Say = print, tick: Tick = 
 
     settings, root = experiment.map.photographs, experiment.root
     assert settings.images is not None
-    scene = SceneFolder(root / _scene_name(settings.images, settings.name), "test")
+    scene = SceneFolder(root / _scene_name(settings.images, settings.name), "test", experiment.camera.camera)
     dataset = _dataset_with(scene, experiment)
     files = [settings.images / name for name in list_photographs(settings.images)]
     tables = [path for path in (settings.scale.marker_table, settings.scale.positions) if path is not None]
@@ -79,7 +79,8 @@ def _dataset_with(scene: SceneFolder, experiment: Experiment) -> Dataset:
             problem = "this dataset holds scenes with meshes, which photographs do not join"
             names, fix = [other.name for other in known.scenes], "Give the photographs a dataset of their own: --name."
             raise ConfigError(problem, path=root, value=names, fix=fix)
-        if known.camera != experiment.camera:
-            for other in known.scenes:  # what was sampled with another camera is no longer valid
+        for other in known.scenes:
+            if other.camera != scene.camera:  # what was sampled with another camera is no longer valid
                 write_stamp(other, "map", read_stamp(other, "map") or "")
-    return Dataset(root, experiment.camera, tuple(sorted(scenes, key=lambda scene: scene.name)))
+        scenes = [replace(other, camera=scene.camera) for other in scenes]
+    return Dataset(root, tuple(sorted(scenes, key=lambda scene: scene.name)))

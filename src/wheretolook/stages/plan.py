@@ -126,7 +126,12 @@ def _record(rerun, seen: list[PathView], landmarks: np.ndarray, camera: PinholeC
         pose = poses_looking_along(view.position, view.axis)
         stream.log("world/camera", rerun.Transform3D(translation=view.position, mat3x3=pose[:, :3].T))
         size = {"width": camera.width, "height": camera.height}
-        pinhole = rerun.Pinhole(focal_length=camera.focal_px, camera_xyz=rerun.ViewCoordinates.RDF, **size)
+        pinhole = rerun.Pinhole(
+            focal_length=(camera.fx, camera.fy),
+            principal_point=(camera.cx, camera.cy),
+            camera_xyz=rerun.ViewCoordinates.RDF,
+            **size,
+        )
         stream.log("world/camera/image", pinhole)
         if view.rgb is not None:
             stream.log("world/camera/image", rerun.Image(view.rgb).compress(jpeg_quality=85))

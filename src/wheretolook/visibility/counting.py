@@ -146,7 +146,8 @@ class FrustumCounter:
         words = (camera.width * camera.height + 31) // 32
         block = min(n_views, max(1, self.scratch_bytes // (words * 4)))
         bits: Any = wp.empty((block, words), dtype=wp.uint32, device=self.device)
-        intrinsics = [camera.focal_px, camera.cx, camera.cy, camera.width, camera.height]
+        pinhole = [wp.vec2d(camera.fx, camera.fy), wp.vec2d(camera.cx, camera.cy)]
+        intrinsics = [*pinhole, camera.width, camera.height]
         inputs = [self._sides, self._axes, landmarks, *intrinsics, MIN_DEPTH_M]
         for first in range(0, n_views, block):
             bits.zero_()

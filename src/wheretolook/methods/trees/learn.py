@@ -95,7 +95,7 @@ class BoostedTrees:
     def save(self, path: Path, training: dict[str, Any] | None = None) -> None:
         """Write one safetensors file, atomically, with JSON values on the training; the same trees, the same bytes."""
         header = {
-            "features": list(POOLED), "camera": asdict(self.camera),
+            "features": list(POOLED), "camera": self.camera.record(),
             **{name: getattr(self, name) for name in _NUMBERS}, "training": training or {},
         }  # fmt: skip
         narrow = {"roots": torch.int32, "left": torch.int32, "right": torch.int32, "feature": torch.uint8}

@@ -52,7 +52,7 @@ def make_scene(
 ) -> SceneFolder:
     """Write one labelled scene. The errors fall with the number of filled bins, the median view just localizes."""
     rng = np.random.default_rng(seed)
-    scene = SceneFolder(folder, split)
+    scene = SceneFolder(folder, split, CAMERA)
     scene.map.mkdir(parents=True)
     landmarks = make_landmarks(rng, n_landmarks)
     landmarks.save(scene.landmarks)
@@ -92,6 +92,6 @@ def make_scene(
 def make_dataset(root: Path, splits: tuple[Split, ...] = ("train", "train", "test"), **options: int) -> Dataset:
     """Write a dataset with one scene for each split named."""
     scenes = [make_scene(root / f"scene-{index}", split, seed=index, **options) for index, split in enumerate(splits)]
-    dataset = Dataset(root, CAMERA, tuple(scenes))
+    dataset = Dataset(root, tuple(scenes))
     dataset.save()
     return dataset

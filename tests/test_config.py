@@ -202,6 +202,7 @@ def test_every_stage_explains_itself(
         assert f"--{group}" in text
     assert ("--label.shard_size" in text) == (stage in ("label", "compare-paths", "demo"))
     assert "--map.walk.cell_m" not in text  # a constant
+    monkeypatch.setenv("COLUMNS", "80")
     assert main([stage, "--help"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) <= 40 and max(map(len, lines)) <= 120

@@ -8,14 +8,14 @@ import sys
 import time
 import traceback
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from wheretolook.utils.errors import ConfigError, WhereToLookError
-from wheretolook.utils.options import Option, all_options, check_names, grouped, names_in, nearest, one_line
+from wheretolook.utils.options import Option, all_options, check_names, grouped, names_in, nearest, short_lines
 from wheretolook.utils.version import VERSION
 
 if TYPE_CHECKING:
@@ -24,83 +24,67 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Stage:
-    """What the command line knows of a stage.
+    """What the command line knows of a stage."""
 
-    Args:
-        function: in `wheretolook.stages`.
-        text: what it does.
-        matter: the options that matter, which `--help` shows; a word without a dot may be a short flag.
-        groups: the options it reads, which `--help-all` shows: those in these groups; none for all.
-        example: arguments to try.
-        short: flags that may be given without their group.
-        config: name of the file in configs/ that is read unless --config names one.
-        notes: what else to know.
-    """
-
-    function: str
-    text: str
-    matter: tuple[str, ...]
-    groups: tuple[str, ...] = ()
-    example: str = "--config configs/demo.yaml"
-    short: Mapping[str, str] = field(default_factory=dict)
-    config: str = ""
-    notes: str = ""
+    function: str  # in `wheretolook.stages`
+    text: str  # what it does
+    matter: str  # options that `--help` shows, with blanks between; one without a dot may be short
+    groups: tuple[str, ...] = ()  # `--help-all` shows the options in these groups; none for all
+    example: str = "--config configs/demo.yaml"  # arguments to try
+    short: Mapping[str, str] = field(default_factory=dict)  # flags that may be given without their group
+    config: str = ""  # name of the file in configs/ that is read unless --config names one
+    notes: str = ""  # what else to know
 
 
 _SPACE = ("occlusion", "scenes.free_space", "scenes.mapped_space", "map.photographs.assume_metric")
-_OF_MAPS = ("occlusion.model", "scenes.free_space.clearance_m", "map.photographs.assume_metric")
 
 STAGES = {
     "scenes": Stage(
         "make_scenes",
         "Make or load the textured meshes.",
-        ("scenes.train", "scenes.val", "scenes.test", "scenes.seed", "scenes.meshes", "scenes.apartment.n_rooms",
-         "scenes.apartment.area_m2", "scenes.apartment.texture_richness", "scenes.apartment.clutter",
-         "scenes.apartment.vary"),
+        "scenes.train scenes.val scenes.test scenes.seed scenes.meshes scenes.apartment.n_rooms "
+        "scenes.apartment.area_m2 scenes.apartment.texture_richness scenes.apartment.clutter scenes.apartment.vary",
         ("scenes",),
         "--config configs/demo.yaml --scenes.train 5",
     ),
     "map": Stage(
         "make_maps",
         "Build a COLMAP map of every scene from renders along a walk, or of a folder of photographs: --images FOLDER.",
-        ("map.n_images", "map.keep_images", "map.extractor.method", "images", "map.photographs.name",
-         "map.photographs.max_side_px", "map.photographs.camera_model", "map.photographs.camera_params",
-         "map.photographs.scale.marker_size_m", "map.photographs.scale.positions", "label.workers"),
+        "map.n_images map.keep_images map.extractor.method images map.photographs.name map.photographs.max_side_px "
+        "map.photographs.camera_model map.photographs.camera_params map.photographs.scale.marker_size_m "
+        "map.photographs.scale.positions label.workers",
         ("map", "scenes.free_space", "label.workers"),
         "--name photos --images FOLDER",
     ),
     "sample": Stage(
         "sample",
         "Choose viewpoints by the landmarks they see.",
-        ("sample.grid", "sample.directions", "sample.lattice", "sample.keep", "sample.min_visible",
-         "sample.max_locations", "sample.max_directions", "sample.seed", *_OF_MAPS),
+        "sample.grid sample.directions sample.lattice sample.keep sample.min_visible sample.max_locations "
+        "sample.max_directions sample.seed occlusion.model scenes.free_space.clearance_m",
         ("sample", *_SPACE),
         "--config configs/demo.yaml --sample.max_locations 100",
     ),
     "label": Stage(
         "label",
         "Render and localize every viewpoint, measure the pose error. Resumes.",
-        ("engine", "label.ray_address", "label.workers", "label.shard_size", "label.store_matches",
-         "label.localizer.max_ratio", "label.localizer.max_error_px", "label.localizer.min_inliers",
-         "tracking.folder"),
+        "engine label.ray_address label.workers label.shard_size label.store_matches label.localizer.max_ratio "
+        "label.localizer.max_error_px label.localizer.min_inliers tracking.folder",
         ("label", "tracking"),
         "--config configs/paper.yaml --engine ray",
     ),
     "train": Stage(
         "train",
         "Learn from the labels, one weights file for each method.",
-        ("train.methods", "train.also", "train.val_fraction", "train.seed", "train.accelerator", "train.devices",
-         "train.mlp.epochs", "train.mlp.batch_size", "train.mlp.balance", "train.set.epochs",
-         "tracking.folder"),
+        "train.methods train.also train.val_fraction train.seed train.accelerator train.devices train.mlp.epochs "
+        "train.mlp.batch_size train.mlp.balance train.set.epochs tracking.folder",
         ("train", "tracking"),
         "--config configs/demo.yaml --train.methods '[mlp-2d+z, set]'",
     ),
     "evaluate": Stage(
         "evaluate",
         "Score all methods on the test scenes.",
-        ("evaluate.methods", "evaluate.weights", "evaluate.split", "evaluate.top_n", "evaluate.thresholds",
-         "evaluate.occlusions", "evaluate.candidates", "evaluate.heading", "evaluate.reference", "evaluate.seed",
-         "tracking.folder"),
+        "evaluate.methods evaluate.weights evaluate.split evaluate.top_n evaluate.thresholds evaluate.occlusions "
+        "evaluate.candidates evaluate.heading evaluate.reference evaluate.seed tracking.folder",
         ("evaluate", "occlusion", "tracking"),
         "--config configs/demo.yaml --evaluate.methods '[random, visible, set]'",
         notes="What evaluate.methods may name: wheretolook evaluate --list-methods",
@@ -108,8 +92,7 @@ STAGES = {
     "viewpoint-map": Stage(
         "viewpoint_map",
         "Score every direction at every free voxel of a scene, for planners to look up. Needs no labels.",
-        ("scene", "method", "weights", "out", "viewpoint_map.grid", "viewpoint_map.directions",
-         "viewpoint_map.lattice", *_OF_MAPS),
+        "scene method weights out viewpoint_map.grid viewpoint_map.directions viewpoint_map.lattice occlusion.model",
         ("viewpoint_map", *_SPACE),
         """--config configs/demo.yaml --scene apartment-000 \\
       --weights data/release/weights/mlp-2d+z.safetensors --out apartment.map""",
@@ -119,15 +102,15 @@ Reads a scene's map and its mesh, as the scenes and map stages leave them; a sce
 free where scenes.mapped_space says. Without weights or a method, the best weights of the dataset, or else those that
 ship, score the views. The folder holds plain arrays and LAYOUT.txt, which says how to read them; in Python:
 
-  from wheretolook.planning import ViewpointMap
+  from wheretolook import ViewpointMap
   viewpoint_map = ViewpointMap.load("apartment.map", mmap=True)
   choice = viewpoint_map.best((1.0, 2.0, 1.5))    # None where no camera can be, else axis, score, n_visible""",
     ),
     "plan": Stage(
         "plan",
         "Plan a path on which the camera sees what it needs to know where it is; a table, a picture and a film of it.",
-        ("scene", "start", "goal", "method", "weights", "out", "film", "plan.against", "plan.rerun",
-         "plan.planner.time_s", "plan.planner.score_weight", *_OF_MAPS),
+        "scene start goal method weights out film plan.against plan.rerun plan.planner.time_s "
+        "plan.planner.score_weight occlusion.model",
         ("plan", *_SPACE, "tracking"),
         """--config configs/demo.yaml --scene apartment-000 --start '[-4, -3, 1.4]' --goal '[4, 3, 1.4]' \\
       --plan.against '[forward]' --film mp4 --out way""",
@@ -139,23 +122,22 @@ Without a mesh to keep clear of, by what depth images saw: --occlusion.model tsd
     "compare-paths": Stage(
         "compare_paths",
         "Plan paths between random places by several methods, render what the camera sees, localize it. Resumes.",
-        ("paths.scenes", "paths.pairs", "paths.methods", "paths.weights", "paths.seed", "paths.min_distance_m",
-         "paths.planner.time_s", "paths.planner.score_weight", "occlusion.model", "label.workers",
-         "tracking.folder"),
+        "paths.scenes paths.pairs paths.methods paths.weights paths.seed paths.min_distance_m paths.planner.time_s "
+        "paths.planner.score_weight occlusion.model label.workers tracking.folder",
         ("paths", "occlusion", "scenes.free_space", "label", "tracking"),
         "--config configs/demo.yaml --paths.methods '[forward, set]' --paths.pairs 5",
     ),
     "release": Stage(
         "release",
         "Make a compact copy, data/release; given that copy and weights trained on it, evaluate and write its card.",
-        ("release_name", "evaluate.methods", "evaluate.occlusions", "evaluate.candidates", "tracking.folder"),
+        "release_name evaluate.methods evaluate.occlusions evaluate.candidates tracking.folder",
         ("evaluate", "occlusion", "tracking"),
         "--config configs/release.yaml",
     ),
     "log-release": Stage(
         "log_release",
         "Log what a release ships as MLflow runs, as if it had been made here; once.",
-        ("tracking.folder", "tracking.experiment"),
+        "tracking.folder tracking.experiment",
         ("tracking",),
         "--tracking.folder elsewhere",
         config="release",
@@ -167,7 +149,7 @@ adds only what is new; `make ui` does it first. Without --config it is configs/r
     "figures": Stage(
         "figures",
         "Draw every figure and table of the paper, and others, from logged runs.",
-        ("out", "only", "kinds", "tracking.folder"),
+        "out only kinds tracking.folder",
         ("figures", "tracking"),
         "--only '[top_n, runtimes]' --kinds '[svg]'",
         {f"--{name}": f"--figures.{name}" for name in ("out", "only", "kinds")},
@@ -181,20 +163,18 @@ Without --config it is configs/release.yaml, whose runs are logged first. Tables
     "demo": Stage(
         "",
         "Run all stages on the embedded default and draw the score figure.",
-        ("scenes.train", "scenes.test", "scenes.meshes", "map.n_images", "sample.max_locations",
-         "sample.max_directions", "label.workers", "train.methods", "train.mlp.epochs", "evaluate.methods",
-         "evaluate.weights", "tracking.folder"),
+        "scenes.train scenes.test scenes.meshes map.n_images sample.max_locations sample.max_directions label.workers "
+        "train.methods train.mlp.epochs evaluate.methods evaluate.weights tracking.folder",
         example="--name small --scenes.train 2",
         config="demo",
         notes="Without --config it is configs/demo.yaml.",
     ),
-}  # fmt: skip
+}
 """The sub-commands, in the order of the line of stages."""
 
-_SHORT = {"--engine": "--label.engine", "--images": "--map.photographs.images"}
-"""Flags of every stage that may be given without their group."""
-
-_COMMON = ("name", "data", "device")
+_SHORT = {"--engine": "--label.engine", "--images": "--map.photographs.images"}  # flags of every stage
+_RUN_THERE = "Run in the project's folder, or give the path of a YAML file with --config."
+_COMMON = "name data device"  # the options that matter to every stage
 
 USAGE = """\
 wheretolook: where to point a camera so that it knows where it is
@@ -219,14 +199,12 @@ stages, in order; each reads what the one before it left in <data>/<name>/
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line. Returns the exit code: 0, 2 for bad input, 130 when interrupted."""
-    os.environ.setdefault(
-        "OMP_WAIT_POLICY", "PASSIVE"
-    )  # idle threads must not spin while other processes want the core
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # idle threads leave the core to other processes
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in arguments
     arguments = [argument for argument in arguments if argument != "--debug"]
     if not arguments or arguments[0] in ("-h", "--help", "help"):
-        print(_usage())
+        print(USAGE.format(stages="\n".join(f"  {name:<15}{stage.text}" for name, stage in STAGES.items())))
         return 0
     if arguments[0] == "--version":
         print(f"wheretolook {VERSION}")
@@ -235,32 +213,15 @@ def main(arguments: list[str] | None = None) -> int:
         _quieten()
     try:
         return _run(arguments[0], arguments[1:])
-    except WhereToLookError as error:
+    except (WhereToLookError, OSError) as error:
         if debug:
             traceback.print_exc()
-        print(f"wheretolook: error: {error}", file=sys.stderr)
-        return 2
-    except OSError as error:
-        if debug:
-            traceback.print_exc()
-        print(f"wheretolook: error: {error.filename or 'a file'}: {error.strerror or error}", file=sys.stderr)
+        text = f"{error.filename or 'a file'}: {error.strerror or error}" if isinstance(error, OSError) else str(error)
+        print(f"wheretolook: error: {text}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("\nwheretolook: interrupted; what is finished is kept, run the same command to go on", file=sys.stderr)
         return 130
-
-
-def _usage() -> str:
-    return USAGE.format(stages="\n".join(f"  {name:<15}{stage.text}" for name, stage in STAGES.items()))
-
-
-def _method_list() -> str:
-    """Every method that `evaluate.methods` may name, with what it is."""
-    from wheretolook.methods.registry import describe_methods
-
-    texts = describe_methods()
-    width = max(map(len, texts))
-    return "\n".join(f"{name:<{width}}  {text}" for name, text in texts.items())
 
 
 def _run(command: str, arguments: list[str]) -> int:
@@ -269,7 +230,11 @@ def _run(command: str, arguments: list[str]) -> int:
         fix = f"Did you mean {near}?" if near else f"Use one of {', '.join(STAGES)}."
         raise ConfigError("unknown stage", value=command, fix=fix)
     if command == "evaluate" and "--list-methods" in arguments:
-        print(_method_list())
+        from wheretolook.methods.registry import describe_methods
+
+        texts = describe_methods()
+        width = max(map(len, texts))
+        print("\n".join(f"{name:<{width}}  {text}" for name, text in texts.items()))
         return 0
     if command == "figures" and "--list" in arguments:
         from wheretolook.release.catalog import catalog_text
@@ -297,8 +262,7 @@ def _run(command: str, arguments: list[str]) -> int:
 def parse_experiment(command: str, arguments: list[str]) -> Experiment | None:
     """The experiment that a YAML file and the command line's overrides describe; None if only help was asked for.
 
-    Raises:
-        ConfigError: a file is missing, or a key or value does not fit.
+    Raises ConfigError if a file is missing, or a key or value does not fit.
     """
     from wheretolook.config import MOVED, Experiment
 
@@ -314,7 +278,10 @@ def parse_experiment(command: str, arguments: list[str]) -> Experiment | None:
     known |= {flag.removeprefix("--"): Option(flag, "") for flag in short}
     check_names(names, known, MOVED, "--")
     if "config" not in names and STAGES[command].config:
-        arguments = ["--config", str(_default_config(command)), *arguments]
+        path = Path(f"configs/{STAGES[command].config}.yaml")
+        if not path.is_file():
+            raise ConfigError("the default configuration is not here", path=path, fix=_RUN_THERE)
+        arguments = ["--config", str(path), *arguments]
     files = [value for flag, value in pairwise(arguments) if flag == "--config"]
     files += [argument.removeprefix("--config=") for argument in arguments if argument.startswith("--config=")]
     for name in files:
@@ -339,7 +306,7 @@ def _check_file(path: Path, options: Mapping[str, Option]) -> None:
         raise ConfigError(f"this is no YAML: {' '.join(str(error).split())}", path=path) from error
     try:
         if not isinstance(content, dict):
-            raise ConfigError("a file of settings is a mapping", fix="Write such as `name: demo`.")
+            raise ConfigError("a file of settings is a mapping", fix="Write settings, such as `name: demo`.")
         check_names(names_in(content, options), options, MOVED)
     except ConfigError as error:
         raise ConfigError(error.problem, path=path, value=error.value, fix=error.fix) from error
@@ -358,14 +325,14 @@ def _parsed(command: str, arguments: list[str], file: str | None) -> Experiment:
         settings.pop("config")
         return Experiment(**settings)
     except (ArgumentError, WhereToLookError) as error:
-        for cause in _causes(error):
+        cause: BaseException | None = error
+        while cause is not None:
             if isinstance(cause, WhereToLookError):
-                fix = (
-                    cause.fix
-                    or f"Correct it there or on the command line; `wheretolook {command} --help-all` explains it."
-                )
+                explained = f"`wheretolook {command} --help-all` explains it."
+                fix = cause.fix or f"Correct it there or on the command line; {explained}"
                 path = cause.path or file
                 raise type(cause)(cause.problem, path=path, value=cause.value, fix=fix) from error
+            cause = cause.__cause__ or cause.__context__
         problem = " ".join(str(error).split())
         path = None if problem.startswith("unrecognized arguments") else file
         raise ConfigError(problem, path=path, fix=f"`wheretolook {command} --help-all` lists the options.") from error
@@ -377,41 +344,22 @@ def _help(command: str, options: Mapping[str, Option], everything: bool) -> str:
     parts = [f"usage: wheretolook {command} [--config FILE.yaml] [--GROUP.OPTION VALUE ...]", stage.text]
     if everything:
         roots = {group.partition(".")[0] for other in STAGES.values() for group in other.groups}
-        read = [
-            option
-            for name, option in options.items()
-            if not stage.groups
-            or name.partition(".")[0] not in roots
-            or any(f"{name}.".startswith(f"{group}.") for group in stage.groups)
-        ]
+        read = []
+        for name, option in options.items():
+            within = any(f"{name}.".startswith(f"{group}.") for group in stage.groups)
+            if within or not stage.groups or name.partition(".")[0] not in roots:
+                read.append(option)
         parts.append(grouped(read))
     else:
-        lines = [one_line(Option("config", "YAML file of an experiment, such as configs/demo.yaml"))]
-        for name in (*_COMMON, *stage.matter):
+        shown = {"--config": Option("config", "YAML file of options, such as configs/demo.yaml")}
+        for name in f"{_COMMON} {stage.matter}".split():
             long = {**_SHORT, **stage.short}.get(f"--{name}", name).removeprefix("--")
-            lines.append(one_line(options[long], f"--{name}"))
+            shown[f"--{name}"] = options[long]
         more = sum(not (option.is_group or option.is_fixed) for option in options.values())
-        parts.append("\n".join(lines))
+        parts.append(short_lines(shown))
         parts.append(f"wheretolook {command} --help-all explains every option it reads, of {more} in all.")
     parts.append(f"Example:\n  wheretolook {command} {stage.example}")
     return "\n\n".join([*parts, *([stage.notes] if stage.notes else [])])
-
-
-def _causes(error: BaseException) -> Iterator[BaseException]:
-    cause: BaseException | None = error
-    while cause is not None:
-        yield cause
-        cause = cause.__cause__ or cause.__context__
-
-
-_RUN_THERE = "Run in the project's folder, or give the path of a YAML file with --config."
-
-
-def _default_config(command: str) -> Path:
-    path = Path(f"configs/{STAGES[command].config}.yaml")
-    if not path.is_file():
-        raise ConfigError("the default configuration is not here", path=path, fix=_RUN_THERE)
-    return path
 
 
 def _quieten() -> None:

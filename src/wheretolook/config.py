@@ -24,18 +24,20 @@ from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.config import SampleConfig
 from wheretolook.visibility.config import OcclusionConfig
 
+NOT_SCENES = ("weights", "results", "all")  # folders of a dataset that are no scenes, and what all scenes are called
 
-def _check_folder_name(whose: str, name: str, taken: tuple[str, ...] = ()) -> None:
+
+def check_folder_name(whose: str, name: str, taken: tuple[str, ...] = ()) -> None:
+    """Raise ConfigError unless a name can be a folder's and is not one of those taken."""
     if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9._-]*", name) or name in taken:
-        fix = "Give it a name of letters, digits, '.', '_' and '-'" + (
-            f", but not {', '.join(taken)}." if taken else "."
-        )
+        others = f", but not {', '.join(taken)}" if taken else ""
+        fix = f"Give it a name of letters, digits, '.', '_' and '-'{others}."
         raise ConfigError(f"{whose} becomes a folder's", value=name, fix=fix)
 
 
 @dataclass(frozen=True)
 class MeshSource:
-    """A mesh of one's own as a scene.
+    """A scene from a mesh file.
 
     Args:
         path: GLB, PLY or OBJ file with textures, in metres, or a Habitat-Matterport folder `<id>-<name>`.
@@ -50,7 +52,7 @@ class MeshSource:
     up: str = "z"
 
     def __post_init__(self) -> None:
-        _check_folder_name("a scene's name", self.scene_name, taken=("weights", "results", "all"))
+        check_folder_name("a scene's name", self.scene_name, NOT_SCENES)
 
     @property
     def scene_name(self) -> str:
@@ -84,11 +86,9 @@ class ScenesConfig:
 
     def __post_init__(self) -> None:
         if min(self.train, self.val, self.test) < 0 or self.train + self.val + self.test + len(self.meshes) == 0:
-            raise ConfigError(
-                "an experiment needs scenes",
-                value=(self.train, self.val, self.test, self.meshes),
-                fix="Set scenes.train and scenes.test, or name meshes in scenes.meshes.",
-            )
+            fix = "Set scenes.train and scenes.test, or name meshes in scenes.meshes."
+            value = (self.train, self.val, self.test, self.meshes)
+            raise ConfigError("an experiment needs scenes", value=value, fix=fix)
 
 
 @dataclass(frozen=True)
@@ -96,11 +96,11 @@ class Experiment:
     """Settings of all stages. Each stage reads what it needs; results lie in `<data>/<name>/`.
 
     Args:
-        name: name of the dataset, and of its folder.
+        name: name of the dataset and its folder.
         data: folder of all datasets.
         release_name: folder of the dataset's release.
         device: where to compute: auto, cpu, cuda, or cuda:<index>.
-        camera: the camera that will look, and with which the map's images are rendered unless `map.camera` says another.
+        camera: the camera that will look, and that maps unless `map.camera` names another.
         scenes: stage 1, meshes.
         map: stage 2, COLMAP maps, of meshes or of photographs.
         occlusion: how stage 3 finds out which landmarks nothing stands in front of. Stage 6 takes its settings, but the
@@ -136,7 +136,7 @@ class Experiment:
 
     def __post_init__(self) -> None:
         check_device_name(self.device)
-        _check_folder_name("a release's name", self.release_name)
+        check_folder_name("a release's name", self.release_name)
 
     @property
     def root(self) -> Path:
@@ -152,8 +152,8 @@ class Experiment:
     def warp_device(self) -> str:
         """The device kernels run on, with "auto" resolved.
 
-        Raises:
-            ConfigError: there is no such device here. Of a Ray cluster only its machines know which they have.
+        Raises ConfigError if there is no such device here. With a Ray cluster a name is not checked:
+        only its machines know which devices they have.
         """
         if self.label.engine == "ray" and self.device != "auto":
             return self.device

@@ -28,7 +28,9 @@ from tqdm.auto import tqdm
 from wheretolook.features.extraction import KeypointExtractor
 from wheretolook.features.keypoints import ExtractorConfig
 from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.labelling.labeller import label_viewpoints
+from wheretolook.labelling.config import LabelConfig
+from wheretolook.labelling.labeller import LabelTask, label_scenes
+from wheretolook.labelling.shard import SceneJob
 from wheretolook.mapping.building import build_map
 from wheretolook.mapping.config import MapConfig
 from wheretolook.rendering.warp_renderer import WarpRenderer
@@ -77,11 +79,10 @@ def label_with(
         folder / "map",
     )
     start = time.perf_counter()
-    labelled = label_viewpoints(
-        table, scene.file, folder / "map" / "landmarks.npz", camera, folder / "shards",
-        extractor=config, device=args.device,
-    )  # fmt: skip
-    return labelled, {
+    landmarks = folder / "map" / "landmarks.npz"
+    job = SceneJob(scene.file, landmarks, camera, extractor=config, device=args.device)
+    (labelled,) = label_scenes([LabelTask("scene", job, table, folder / "shards")], LabelConfig())
+    return labelled.table, {
         "n_landmarks": report.n_landmarks,
         "median_track_length": report.median_track_length,
         "landmark_to_mesh_cm": report.median_distance_to_mesh_cm,

@@ -18,10 +18,10 @@ import numpy as np
 import pandas as pd
 
 from mapping.conftest import ROOM_SIZE, BoxFreeSpace, box_room
+from one_scene import label_viewpoints
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.labelling.config import LabelConfig
-from wheretolook.labelling.labeller import label_viewpoints
 from wheretolook.labelling.shard import SceneJob
 from wheretolook.mapping.building import build_map
 from wheretolook.mapping.config import MapConfig

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from labelling.rooms import CAMERA, PLAIN, POSTER, MappedRoom, facing, map_room
+from one_scene import label_viewpoints
 from wheretolook.labelling.config import LabelConfig
-from wheretolook.labelling.labeller import label_viewpoints
 from wheretolook.labelling.localizer import Localizer
 from wheretolook.labelling.shard import label_rows
 from wheretolook.mapping.landmarks import Landmarks

@@ -194,7 +194,7 @@ def test_the_scorer_is_the_trees_on_pooled_views(tmp_path: Path) -> None:
     localization_map = scene.localization_map(dataset.camera)
     scorer = load_scorer(model.path, localization_map)
     assert isinstance(scorer, TreesScorer) and scorer.name == "trees"
-    views = load_pooled(Dataset(dataset.root, dataset.camera, (scene,)), [scene], (0.05, 0.4), progress=False)
+    views = load_pooled(Dataset(dataset.root, (scene,)), [scene], (0.05, 0.4), progress=False)
     table = scene.read_table()
     np.testing.assert_array_equal(views.labels, is_good(table))
     scores = scorer.score(poses(table))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from typing import TypeVar
 
 import numpy as np
 
@@ -19,11 +21,25 @@ from wheretolook.planning.map_building import build_viewpoint_map
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.space.free_space import FreeSpace
+from wheretolook.utils.errors import PlanningError
 from wheretolook.visibility.occlusion import MeshOcclusion, OcclusionModel
 
 CAMERA = PinholeCamera(160, 120, 80.0)
 GRID = VoxelGrid((0.0, 0.0, 0.0), ROOM, (5, 4, 3))
 DIRECTIONS = direction_lattice(60)
+
+
+T = TypeVar("T")
+
+
+def patiently(plan: Callable[[float], T], seconds: float = 0.6) -> T:
+    """What is planned in the seconds that an idle machine needs, or else, on a busy one, in many more."""
+    for times in (1, 8):
+        try:
+            return plan(times * seconds)
+        except PlanningError:
+            pass
+    return plan(40 * seconds)
 
 
 def room_landmarks(n: int, seed: int = 0, first_id: int = 0) -> Landmarks:

@@ -39,7 +39,7 @@ def content_of(folder: Path) -> dict[str, bytes]:
 @pytest.mark.parametrize("mmap", [False, True])
 def test_what_was_saved_comes_back(viewpoint_map: ViewpointMap, folder: Path, mmap: bool) -> None:
     loaded = ViewpointMap.load(folder, mmap)
-    for name, (kind, _) in ARRAYS.items():
+    for name, (kind, _, _) in ARRAYS.items():
         np.testing.assert_array_equal(getattr(loaded, name), getattr(viewpoint_map, name))
         assert getattr(loaded, name).dtype == np.dtype(kind)
         assert type(getattr(loaded, name)) is np.ndarray

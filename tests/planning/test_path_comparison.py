@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from box_scenes import furnished_room
-from planning.rooms import build, room_landmarks
+from planning.rooms import build, patiently, room_landmarks
 from wheretolook.figures.paths import paths_figure
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.planning.config import PathConfig, PathsConfig
@@ -17,7 +17,7 @@ from wheretolook.planning.path_comparison import ComparedPaths, Ways, draw_pairs
 from wheretolook.planning.path_report import summarize_paths
 from wheretolook.planning.scene_map import shares_below
 from wheretolook.space.free_space import FreeSpace
-from wheretolook.utils.errors import ConfigError, SceneError
+from wheretolook.utils.errors import ConfigError, PlanningError, SceneError
 from wheretolook.viewpoints.table import poses
 
 QUICK = PathsConfig(
@@ -34,7 +34,15 @@ def space() -> FreeSpace:
 @pytest.fixture(scope="module")
 def compared(space: FreeSpace) -> ComparedPaths:
     bins = shares_below(build(room_landmarks(200), directions=np.asarray(_lattice())))
-    return plan_pairs(draw_pairs(space, QUICK), space, {"bins": bins}, QUICK)
+
+    def compare(seconds: float) -> ComparedPaths:
+        config = replace(QUICK, planner=replace(QUICK.planner, time_s=seconds))
+        found = plan_pairs(draw_pairs(space, config), space, {"bins": bins}, config)
+        if not found.paths["planned"].all():
+            raise PlanningError("a path was not found in time")
+        return found
+
+    return patiently(compare)
 
 
 def _lattice() -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,26 +25,17 @@ from wheretolook.viewpoints.table import CAMERA_ID, read_table
 if TYPE_CHECKING:
     from wheretolook.inputs.localization_map import LocalizationMap
 
-RELEASE = "release"
-"""Name of the dataset, beside all others, that ships with its weights."""
-
-RELEASE_FILE = "release.json"
-"""What a release was made from; the file that makes a dataset one."""
+RELEASE = "release"  # name of the dataset, beside all others, that ships with its weights
+RELEASE_FILE = "release.json"  # what a release was made from; the file that makes a dataset one
 
 
 @dataclass(frozen=True)
 class SceneFolder:
-    """Files of one scene.
+    """Files of one scene."""
 
-    Attributes:
-        folder: `<data>/<dataset>/<scene>`.
-        split: the split the whole scene belongs to.
-        camera: the camera that looks, where a viewpoint names none of `cameras.txt`.
-    """
-
-    folder: Path
-    split: Split
-    camera: Camera = PinholeCamera()
+    folder: Path  # `<data>/<dataset>/<scene>`
+    split: Split  # the whole scene belongs to it
+    camera: Camera = PinholeCamera()  # the one that looks, where a viewpoint names none of `cameras.txt`
 
     @property
     def name(self) -> str:
@@ -103,8 +94,7 @@ class SceneFolder:
     def is_photographed(self) -> bool:
         """Whether the scene is known from photographs alone.
 
-        Raises:
-            MapError: it has no mesh, and its map's report is damaged.
+        Raises MapError if it has no mesh, and its map's report is damaged.
         """
         return not self.mesh.is_file() and read_scale(self.map) is not None
 
@@ -115,10 +105,8 @@ class SceneFolder:
     def mapping_poses(self) -> Float | None:
         """Poses cam_from_world (M, 3, 4) float32 of the mapping images; None if neither their file nor a model is left.
 
-        Maps made before there was such a file have a COLMAP model, which tells the same.
-
-        Raises:
-            MapError: the file or the model is damaged.
+        Maps made before there was such a file have a COLMAP model, which tells the same. Raises MapError if the file or
+        the model is damaged.
         """
         if self.mapping_cameras.is_file():
             return load_mapping_poses(self.mapping_cameras)
@@ -134,6 +122,9 @@ class SceneFolder:
         from wheretolook.visibility.occlusion import StoredOcclusion
 
         landmarks, occlusion = Landmarks.load(self.landmarks), StoredOcclusion.load(self.occlusion)
+        if landmarks.mapping_focal_px is None:  # before it was told, the camera that looks was the one that mapped
+            focal_px = np.full(len(landmarks), self.camera.mean_focal_px, dtype=np.float32)
+            landmarks = replace(landmarks, mapping_focal_px=focal_px)
         return LocalizationMap(landmarks, camera or self.camera, occlusion, device, self.mapping_poses())
 
 
@@ -166,27 +157,23 @@ def views_by_camera(
 
 @dataclass(frozen=True)
 class Dataset:
-    """A folder of scenes.
+    """A folder of scenes."""
 
-    Attributes:
-        root: `<data>/<dataset>`.
-        scenes: all scenes in the order they were made.
-    """
+    root: Path  # `<data>/<dataset>`
+    scenes: tuple[SceneFolder, ...]  # in the order they were made
 
-    root: Path
-    scenes: tuple[SceneFolder, ...]
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        """All that look in its scenes, each once."""
+        return tuple(dict.fromkeys(camera for scene in self.scenes for camera in scene.cameras().values()))
 
     @property
     def camera(self) -> Camera:
-        """The camera of all scenes.
-
-        Raises:
-            ConfigError: they have several, or there is no scene.
-        """
-        cameras = list(dict.fromkeys(scene.camera for scene in self.scenes))
-        if len(cameras) != 1:
-            raise ConfigError("the scenes of this dataset have not one camera", path=self.root, value=len(cameras))
-        return cameras[0]
+        """The camera that looks in all scenes. Raises ConfigError if there are several, or none."""
+        if len(self.cameras) != 1:
+            fix = "Use a method that serves every camera, such as set, or a dataset of one camera."
+            raise ConfigError("not one camera looks in this dataset", path=self.root, value=len(self.cameras), fix=fix)
+        return self.cameras[0]
 
     @property
     def name(self) -> str:
@@ -198,15 +185,11 @@ class Dataset:
         return tuple(scene for scene in self.scenes if scene.split == split)
 
     def scene(self, name: str) -> SceneFolder:
-        """The scene of a name.
-
-        Raises:
-            ConfigError: there is none.
-        """
-        for scene in self.scenes:
-            if scene.name == name:
-                return scene
-        fix = f"There are {', '.join(scene.name for scene in self.scenes)}."
+        """The scene of a name. Raises ConfigError if there is none."""
+        known = {scene.name: scene for scene in self.scenes}
+        if name in known:
+            return known[name]
+        fix = f"There are {', '.join(known)}."
         raise ConfigError("there is no such scene", path=self.root, value=name, fix=fix)
 
     def fingerprint(self) -> str:
@@ -234,11 +217,7 @@ class Dataset:
 
     @classmethod
     def load(cls, root: Path) -> Dataset:
-        """Read a dataset folder.
-
-        Raises:
-            TableError: there is no valid `dataset.json`.
-        """
+        """Read a dataset folder. Raises TableError if there is no valid `dataset.json`."""
         path = root / "dataset.json"
         try:
             content = json.loads(path.read_text())
@@ -250,6 +229,5 @@ class Dataset:
         except FileNotFoundError as error:
             raise TableError("this folder is no dataset", path=path, fix="Run the scenes stage first.") from error
         except (ConfigError, ValueError, KeyError, TypeError) as error:
-            raise TableError(
-                f"damaged dataset description: {error}", path=path, fix="Run the scenes stage again."
-            ) from error
+            problem, fix = f"damaged dataset description: {error}", "Run the scenes stage again."
+            raise TableError(problem, path=path, fix=fix) from error

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,6 @@ from wheretolook.utils.errors import MapError, SceneError
 from wheretolook.visibility.config import OcclusionConfig
 
 if TYPE_CHECKING:
-    from wheretolook.dataset.rendered_depth import RenderedDepth
     from wheretolook.geometry.mesh import TexturedMesh
     from wheretolook.inputs.localization_map import LocalizationMap
     from wheretolook.mapping.landmarks import Landmarks
@@ -30,36 +30,25 @@ if TYPE_CHECKING:
     from wheretolook.space.free_space import FreeSpace
     from wheretolook.space.mapped_space import MappedSpace
     from wheretolook.visibility.occlusion import OcclusionModel
-    from wheretolook.visibility.tsdf import TsdfVolume
+    from wheretolook.visibility.tsdf import DepthImage, TsdfVolume
 
 
 @dataclass(frozen=True)
 class SceneConfig:
-    """How a scene is looked at.
+    """How a scene is looked at."""
 
-    Args:
-        occlusion: what hides landmarks.
-        free_space: where a camera can be in a scene with a mesh.
-        mapped_space: where it can be in a scene of photographs.
-        assume_metric: whether the unit of a map without a scale is taken for a metre.
-    """
-
-    occlusion: OcclusionConfig = field(default_factory=OcclusionConfig)
-    free_space: FreeSpaceConfig = field(default_factory=FreeSpaceConfig)
-    mapped_space: MappedSpaceConfig = field(default_factory=MappedSpaceConfig)
-    assume_metric: bool = False
+    occlusion: OcclusionConfig = field(default_factory=OcclusionConfig)  # what hides landmarks
+    free_space: FreeSpaceConfig = field(default_factory=FreeSpaceConfig)  # where a camera can be, by a mesh
+    mapped_space: MappedSpaceConfig = field(default_factory=MappedSpaceConfig)  # and by photographs
+    assume_metric: bool = False  # whether the unit of a map without a scale is taken for a metre
 
 
 class Scene:
-    """A scene of a dataset with its camera. Each part is made when it is first asked for, and kept.
+    """A scene of a dataset with the camera that will look. Each part is made when it is first asked for, and kept.
 
-    Args:
-        files: its files.
-        camera: the camera that will look; None for that of the scene.
-        config: how it is looked at.
-        device: where kernels run: "cpu", a CUDA device, or "auto" for the first GPU there is.
-        mesh: its mesh, if there is no file of it; metres, z up.
-        progress: show progress bars where depth images are fused.
+    The camera is that of the scene unless another one is given. `device` is where kernels run: "cpu", a CUDA device, or
+    "auto" for the first GPU there is. A `mesh` (metres, z up) is given if there is no file of it. `progress` shows
+    progress bars where depth images are fused.
 
     Raises (each part, when it is made):
         SceneError: the mesh is missing or cannot be used.
@@ -122,14 +111,14 @@ class Scene:
 
     @cached_property
     def mesh_space(self) -> FreeSpace:
-        """Where a camera can be by the mesh."""
+        """Where a camera can be according to the mesh."""
         from wheretolook.space.free_space import FreeSpace
 
         return FreeSpace(self.mesh, self.config.free_space, self.device)
 
     @cached_property
     def mapped_space(self) -> MappedSpace:
-        """Where a camera can be by the photographs."""
+        """Where a camera can be according to the photographs."""
         from wheretolook.space.mapped_space import MappedSpace
 
         self.require_metres()
@@ -146,7 +135,7 @@ class Scene:
 
     @cached_property
     def space(self) -> FreeSpace | MappedSpace:
-        """Where a camera can be by what it knows: with occlusion by "tsdf", the depth images and not the mesh."""
+        """Where a camera can be: with occlusion by "tsdf" according to depth images, else as `sampled_space`."""
         if self.is_photographed or self.config.occlusion.model != "tsdf":
             return self.sampled_space
         from wheretolook.space.tsdf_space import TsdfSpace
@@ -158,23 +147,15 @@ class Scene:
         """Raise MapError if the map is not in metres, unless it is to be taken for one that is."""
         scale = read_scale(self.files.map)
         if scale is not None and not scale.is_metric and not self.config.assume_metric:
-            raise MapError(
-                "the map has no scale, and this needs metres",
-                path=self.files.map,
-                value=scale.source,
-                fix="Map it with marker sizes, a distance or positions (map.photographs.scale), or pass "
-                "--map.photographs.assume_metric true to take its unit for a metre.",
-            )
+            fix = "Map it with marker sizes, a distance or positions (map.photographs.scale), or pass "
+            fix += "--map.photographs.assume_metric true to take its unit for a metre."
+            problem = "the map has no scale, and this needs metres"
+            raise MapError(problem, path=self.files.map, value=scale.source, fix=fix)
 
     def free_voxels(self, views: ViewLattice, space: FreeSpace | MappedSpace) -> tuple[VoxelGrid, NDArray[np.int64]]:
         """The voxels of a lattice, and the ids of those where a camera can be, ascending.
 
-        Args:
-            views: the lattice.
-            space: `space` or `sampled_space`.
-
-        Raises:
-            SceneError: none is free.
+        `space` is the scene's `space` or `sampled_space`. Raises SceneError if no voxel is free.
         """
         from wheretolook.viewpoints.sampling import free_locations
 
@@ -204,7 +185,7 @@ class Scene:
 
     @cached_property
     def occlusion(self) -> OcclusionModel:
-        """Which landmarks nothing stands in front of, seen from any location."""
+        """Tells which landmarks are unoccluded from any location."""
         from wheretolook.visibility.hidden_points import HiddenPointRemoval
         from wheretolook.visibility.occlusion import MeshOcclusion, NoOcclusion
         from wheretolook.visibility.tsdf import TsdfOcclusion
@@ -231,7 +212,6 @@ class Scene:
     @cached_property
     def _fused(self) -> tuple[TsdfVolume, RenderedDepth]:
         """The volume that depth images fuse to, and these, rendered where the map's images were taken."""
-        from wheretolook.dataset.rendered_depth import RenderedDepth
         from wheretolook.mapping.colmap_model import colmap_poses
         from wheretolook.visibility.tsdf import TsdfConfig, TsdfVolume
 
@@ -240,3 +220,25 @@ class Scene:
         images = RenderedDepth(self.renderer, mapped, colmap_poses(self.files.map))
         tsdf = TsdfConfig(voxel_size_m=config.voxel_m, max_depth_m=config.max_depth_m)
         return TsdfVolume.from_images(images, tsdf, self.progress), images
+
+
+class RenderedDepth(Sequence["DepthImage"]):
+    """Depth images of poses (B, 3, 4), each rendered when it is asked for."""
+
+    def __init__(self, renderer: WarpRenderer, camera: Camera, cam_from_world: Float) -> None:
+        self.renderer, self.camera, self.cam_from_world = renderer, camera, cam_from_world
+
+    def __len__(self) -> int:
+        return len(self.cam_from_world)
+
+    @overload
+    def __getitem__(self, index: int) -> DepthImage: ...
+    @overload
+    def __getitem__(self, index: slice) -> RenderedDepth: ...
+    def __getitem__(self, index: int | slice) -> DepthImage | RenderedDepth:
+        if isinstance(index, slice):
+            return RenderedDepth(self.renderer, self.camera, self.cam_from_world[index])
+        from wheretolook.visibility.tsdf import DepthImage
+
+        pose = self.cam_from_world[index]
+        return DepthImage(self.renderer.render(self.camera, pose[None]).depth_m[0], self.camera, pose)

@@ -10,8 +10,7 @@ from typing import Any
 from wheretolook.dataset.folders import SceneFolder
 from wheretolook.utils.files import write_json
 
-STAGES = ("scenes", "map", "sample", "label")
-"""Stages that work scene by scene, in order."""
+STAGES = ("scenes", "map", "sample", "label")  # stages that work scene by scene, in order
 
 
 def stage_key(stage: str, parts: list[Any]) -> str:
@@ -27,23 +26,23 @@ def read_stamp(scene: SceneFolder, stage: str) -> str | None:
 
 def write_stamp(scene: SceneFolder, stage: str, key: str) -> None:
     """Record a finished stage. The scene's later stages worked on what is now replaced: their stamps go."""
-    earlier = STAGES[: STAGES.index(stage)]
-    stamps = {name: stamp for name, stamp in _read(scene).items() if name in earlier}
-    write_json(_path(scene), {**stamps, stage: key})
+    write_json(_path(scene), {**_before(stage, _read(scene)), stage: key})
 
 
 def forget_stamp(scene: SceneFolder, stage: str) -> None:
     """Take a stage's stamp away, and those of later ones."""
-    earlier = STAGES[: STAGES.index(stage)]
     stamps = _read(scene)
-    kept = {name: stamp for name, stamp in stamps.items() if name in earlier}
-    if kept != stamps:
+    if (kept := _before(stage, stamps)) != stamps:
         write_json(_path(scene), kept)
 
 
 def is_done(scene: SceneFolder, stage: str, key: str, *results: Path) -> bool:
     """Whether a stage was finished with this key and its results are still there."""
     return read_stamp(scene, stage) == key and all(result.exists() for result in results)
+
+
+def _before(stage: str, stamps: dict[str, str]) -> dict[str, str]:
+    return {name: stamp for name, stamp in stamps.items() if name in STAGES[: STAGES.index(stage)]}
 
 
 def _path(scene: SceneFolder) -> Path:

@@ -21,8 +21,7 @@ TEMPERATURES = (0.01, 100.0)  # range in which a temperature is sought
 
 
 def reliability(probability: Float, good: Good, bins: int = BINS) -> pd.DataFrame:
-    """The reliability curve: of views that were given about the same probability (B,), in [0, 1], how many are good
-    (B,).
+    """The reliability curve: how many of the views that were given about the same probability (B,) are good (B,).
 
     One row for each bin of equal width, which holds its lower end, the last one 1 as well: bin_low, bin_high,
     mean_predicted, share_good (both NaN where the bin is empty) and n (views).
@@ -32,20 +31,16 @@ def reliability(probability: Float, good: Good, bins: int = BINS) -> pd.DataFram
     n = np.bincount(rows, minlength=bins)
     predicted, observed = (np.bincount(rows, weights=values, minlength=bins) for values in (probability, good))
     unknown = np.full((2, bins), np.nan)
-    return pd.DataFrame(
-        {
-            "bin_low": edges[:-1],
-            "bin_high": edges[1:],
-            "mean_predicted": np.divide(predicted, n, out=unknown[0], where=n > 0),
-            "share_good": np.divide(observed, n, out=unknown[1], where=n > 0),
-            "n": n,
-        }
-    )
+    curve = pd.DataFrame({"bin_low": edges[:-1], "bin_high": edges[1:]})
+    for name, sums, out in (("mean_predicted", predicted, unknown[0]), ("share_good", observed, unknown[1])):
+        curve[name] = np.divide(sums, n, out=out, where=n > 0)
+    return curve.assign(n=n)
 
 
 def expected_calibration_error(probability: Float, good: Good, bins: int = BINS) -> float:
-    """Distance in [0, 1] between predicted and observed shares of the `reliability` curve, averaged over the views
-    (Naeini et al., AAAI 2015); NaN without views.
+    """Mean over the views of the distance between predicted and observed share of their bin of the `reliability` curve.
+
+    In [0, 1] (Naeini et al., AAAI 2015); NaN without views.
     """
     curve = reliability(probability, good, bins)
     if not len(probability):
@@ -67,10 +62,8 @@ def fit_temperature(probability: Float, good: Good) -> float:
     if not len(good) or good.all() or not good.any():
         return float("nan")
     logits = logit(np.clip(probability, TINY, 1 - TINY))
-    best = minimize_scalar(
-        lambda log_t: _mean_loss(logits / np.exp(log_t), good),
-        bounds=tuple(np.log(TEMPERATURES)), method="bounded", options={"xatol": 1e-6},
-    )  # fmt: skip
+    how: Any = {"bounds": tuple(np.log(TEMPERATURES)), "method": "bounded", "options": {"xatol": 1e-6}}
+    best = minimize_scalar(lambda log_t: _mean_loss(logits / np.exp(log_t), good), **how)
     return float(np.exp(best.x))
 
 

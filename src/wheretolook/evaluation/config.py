@@ -28,7 +28,7 @@ class EvaluateConfig:
             if none is named, all but those that are compared only if named.
         weights: files of weights to evaluate; empty for all in the dataset's `weights` folder.
         split: whose scenes to evaluate on: "test", "val" or "train".
-        top_n: how many of a location's best-scored viewpoints count; every value gives a row of the table.
+        top_n: how many of a location's best-scored viewpoints count. Every value gives a row of the table.
         thresholds: limits in metres and degrees that both errors of a good viewpoint stay under. Pairs; strictly under;
             the first pair is the label.
         seed: seed of the random method, of the bootstrap and of the paired test.
@@ -79,10 +79,8 @@ class EvaluateConfig:
         if self.resamples < 1:
             raise ConfigError("resamples must be at least 1", value=self.resamples)
         if not self.candidates or min(self.candidates) < 0 or len(set(self.candidates)) < len(self.candidates):
-            raise ConfigError(
-                "candidates needs different numbers of at least 0", value=self.candidates,
-                fix="0 is for all directions, 100 for the 100 that see most landmarks.",
-            )  # fmt: skip
+            fix = "0 is for all directions, 100 for the 100 that see most landmarks."
+            raise ConfigError("candidates needs different numbers of at least 0", value=self.candidates, fix=fix)
         check_occlusion_names(self.occlusions)
 
 
@@ -91,10 +89,11 @@ def check_heading(heading: Sequence[Sequence[float]]) -> None:
     values = np.asarray(heading, dtype=np.float64).reshape(-1, 3)
     steps = np.diff(values, axis=0) if len(values) > 1 else values
     if not np.isfinite(values).all() or (np.abs(steps).sum(1) == 0).any():
-        raise ConfigError(
-            "a heading is one direction, or waypoints that differ", value=tuple(map(tuple, values.tolist())),
-            fix="Give such as [[1, 0, 0]], or [[0, 0, 1], [2, 0, 1], [2, 3, 1]].",
-        )  # fmt: skip
+        given, fix = (
+            tuple(map(tuple, values.tolist())),
+            "Give such as [[1, 0, 0]], or [[0, 0, 1], [2, 0, 1], [2, 3, 1]].",
+        )
+        raise ConfigError("a heading is one direction, or waypoints that differ", value=given, fix=fix)
 
 
 def candidates_label(best: int) -> str:

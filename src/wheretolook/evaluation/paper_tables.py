@@ -113,9 +113,7 @@ def _is_network(method: str) -> bool:
 
 
 def write_paper_tables(scores: pd.DataFrame, folder: Path) -> list[Path]:
-    """Write `table_vs_others` and `table_input_variants` (`paper_tables`) as .csv, .tex and .md into a folder; the
-    files.
-    """
+    """Write `table_vs_others` and `table_input_variants` (`paper_tables`) into a folder as .csv, .tex and .md files."""
     paths = []
     for name, table in paper_tables(scores).items():
         texts = {
@@ -156,28 +154,28 @@ def paper_latex(table: pd.DataFrame, title: str, label: str) -> str:
     rules = " ".join(rf"\cmidrule(lr){{{2 + 3 * index}-{4 + 3 * index}}}" for index in range(len(KEYS)))
     kinds = " & ".join([f"ours & /{RELEASED_DIVISOR} & paper"] * len(KEYS))
     rows = [" & ".join([_escaped(line[1]), *line[2:]]) + r" \\" for line in _cells(table, KEYS, _with_indices, "--")]
-    return "\n".join([
-        f"% {NOTE}",
-        r"% Needs \usepackage{booktabs}.",
-        r"\begin{table*}",
-        r"\centering",
-        rf"\caption{{{_escaped(f'{title}. {_ABOUT} {NOTE}')}}}",
-        rf"\label{{{label}}}",
-        r"\footnotesize",
-        r"\setlength{\tabcolsep}{2pt}",
-        r"\renewcommand{\arraystretch}{1.4}",  # room for the indices
-        r"\smallskip",
-        rf"\begin{{tabular}}{{l{'ccc' * len(KEYS)}}}",
-        r"\toprule",
-        rf"& {groups} \\",
-        rules,
-        rf"method & {kinds} \\",
-        r"\midrule",
-        *rows,
-        r"\bottomrule",
-        r"\end{tabular}",
-        r"\end{table*}",
-    ]) + "\n"  # fmt: skip
+    caption, lines = _escaped(f"{title}. {_ABOUT} {NOTE}"), "\n".join(rows)
+    return rf"""% {NOTE}
+% Needs \usepackage{{booktabs}}.
+\begin{{table*}}
+\centering
+\caption{{{caption}}}
+\label{{{label}}}
+\footnotesize
+\setlength{{\tabcolsep}}{{2pt}}
+\renewcommand{{\arraystretch}}{{1.4}}
+\smallskip
+\begin{{tabular}}{{l{"ccc" * len(KEYS)}}}
+\toprule
+& {groups} \\
+{rules}
+method & {kinds} \\
+\midrule
+{lines}
+\bottomrule
+\end{{tabular}}
+\end{{table*}}
+"""
 
 
 def _cells(

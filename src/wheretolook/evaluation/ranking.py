@@ -50,9 +50,7 @@ class TopN:
 
 
 def rank_views(views: TestViews, scores: Float) -> NDArray[np.int64]:
-    """Rank (B,) of every view within its location by scores (B,): 0 is the highest; the smaller viewpoint_id wins a
-    tie.
-    """
+    """Rank (B,) of every view within its location by scores (B,), 0 the highest; of equals the smaller viewpoint_id."""
     order = np.lexsort((views.viewpoint_id, -scores, views.location))
     location = views.location[order]
     first = np.searchsorted(location, np.arange(views.n_locations))

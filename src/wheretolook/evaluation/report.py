@@ -23,8 +23,7 @@ SCENES_ABREAST = 8  # scenes in one table; more make another below
 
 
 def score_markdown(scores: pd.DataFrame, title: str = "Localization score") -> str:
-    """A score table (`wheretolook.evaluation.scores.score_table`, with `occlusion` and `candidates` or without) in
-    Markdown.
+    """A table of `wheretolook.evaluation.scores.score_table` in Markdown, with `occlusion` and `candidates` or without.
 
     The first N with all that is known; other N; the share of locations with a good view; by scene; by occlusion model
     and by set of candidates if there are several (the tables above are of the first); shares divided by the released
@@ -37,14 +36,11 @@ def score_markdown(scores: pd.DataFrame, title: str = "Localization score") -> s
     keys, counts = threshold_keys(scores), list(pooled["top_n"].unique())
     first = pooled[pooled["top_n"] == counts[0]]
     parts = [f"# {title}", _about(main), *_explained(first, keys[0])]
-    parts += [
-        f"## {_best(counts[0])} of each location ({first['n_views'].iloc[0]:,} in all)",
-        _table(first, [*_score_columns(keys, len(keys)), *_certainty_columns(first, keys[0]), *_RANKING]),
-    ]
-    for n in counts[1:]:
+    most = [*_score_columns(keys, len(keys)), *_certainty_columns(first, keys[0]), *_RANKING]
+    for n in counts:
         rows = pooled[pooled["top_n"] == n]
         parts += [f"## {_best(n)} of each location ({rows['n_views'].iloc[0]:,} in all)"]
-        parts += [_table(rows, _score_columns(keys, 1))]
+        parts += [_table(rows, most if n == counts[0] else _score_columns(keys, 1))]
     parts += _any_table(pooled, keys[0], counts)
     parts += _scene_tables(methods, keys[0], counts[0])
     parts += _comparison(scores, "occlusion", "occlusion model", "", keys[0])
@@ -104,9 +100,10 @@ def _score_columns(keys: Sequence[str], n_intervals: int) -> list[Column]:
 
 
 def _certainty_columns(first: pd.DataFrame, key: str) -> list[Column]:
+    difference = partial(_difference, key=key, reference=reference_of(first))
     return [
-        ("regret", f"regret_{key}", lambda row: _percent(row[f"regret_{key}"]) + _ends(row, "regret", key)),
-        ("difference", f"difference_{key}", partial(_difference, key=key, reference=reference_of(first))),
+        ("regret", f"regret_{key}", partial(_with_ends, name="regret", key=key)),
+        ("difference", f"difference_{key}", difference),
     ]
 
 
@@ -129,7 +126,8 @@ def _any_table(pooled: pd.DataFrame, key: str, counts: Sequence[int]) -> list[st
         return []
     by_key = {(row["method"], row["top_n"]): row for row in pooled.to_dict("records")}
     lines = [
-        [method_style(method).label, *(_any(by_key[method, n], key) for n in counts)] for method in methods_of(pooled)
+        [method_style(method).label, *(_with_ends(by_key[method, n], "any", key) for n in counts)]
+        for method in methods_of(pooled)
     ]
     return [
         "## At least one good",
@@ -137,10 +135,6 @@ def _any_table(pooled: pd.DataFrame, key: str, counts: Sequence[int]) -> list[st
         f"{threshold_label(key)}; the oracle's is that of locations that have such a viewpoint.",
         markdown_table(["method", *(f"best {n}" for n in counts)], lines),
     ]
-
-
-def _any(row: Row, key: str) -> str:
-    return _percent(row[f"any_{key}"]) + _ends(row, "any", key)
 
 
 def _scene_tables(methods: pd.DataFrame, key: str, n: int) -> list[str]:
@@ -197,7 +191,7 @@ def _released_table(first: pd.DataFrame, keys: Sequence[str]) -> list[str]:
     if f"released_{keys[0]}" not in first:
         return []
     columns: list[Column] = [
-        (threshold_label(key), f"released_{key}", partial(_share, name=f"released_{key}")) for key in keys
+        (threshold_label(key), f"released_{key}", partial(_with_ends, name="released", key=key)) for key in keys
     ]
     return [
         f"## Divided by {RELEASED_DIVISOR}",
@@ -229,12 +223,8 @@ def _best(n: int) -> str:
 
 
 def _score(row: Row, key: str, interval: bool) -> str:
-    text = _percent(row[f"normalized_{key}"]) + (_ends(row, "normalized", key) if interval else "")
+    text = _with_ends(row, "normalized", key) if interval else _percent(row[f"normalized_{key}"])
     return f"{text} ({_percent(row[f'raw_{key}'])})" if f"raw_{key}" in row else text
-
-
-def _share(row: Row, name: str) -> str:
-    return _percent(row[name])
 
 
 def _difference(row: Row, key: str, reference: str) -> str:
@@ -249,12 +239,16 @@ def _difference(row: Row, key: str, reference: str) -> str:
 
 def _counted(row: Row, key: str) -> str:
     """Score of a scene with the numbers behind it; an expected number has a decimal place."""
-    text = f"{_percent(row[f'normalized_{key}'])}{_ends(row, 'normalized', key)}"
+    text = _with_ends(row, "normalized", key)
     if f"raw_{key}" not in row or pd.isna(row[f"raw_{key}"]):
         return text
     good = row[f"raw_{key}"] * row["n_views"]
     digits = 0 if abs(good - round(good)) < 1e-6 else 1
     return f"{text}, {good:,.{digits}f} of {row['n_views']:,}"
+
+
+def _with_ends(row: Row, name: str, key: str) -> str:
+    return _percent(row[f"{name}_{key}"]) + _ends(row, name, key)
 
 
 def _ends(row: Row, name: str, key: str) -> str:

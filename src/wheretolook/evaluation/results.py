@@ -87,8 +87,7 @@ _OF_SCENE = re.compile("regret_(?!low_|high_)")  # beginning of the columns that
 
 
 def runs_of_rows(table: pd.DataFrame, params: Mapping[str, Any]) -> Iterator[NestedRun]:
-    """The runs that score tables, one below the other, are logged as: for each method, occlusion model and candidate
-    set one.
+    """The runs that score tables, one below the other, are logged as: one a method, occlusion model and candidate set.
 
     Their parameters are those given and the row's own. Metrics are named by N, the scene unless it is all of them, and
     the column, such as `top-1/regret_0.05m_0.4deg` and `top-5/apartment-210/regret_5m_10deg`, or by the column if N
@@ -106,9 +105,8 @@ def runs_of_rows(table: pd.DataFrame, params: Mapping[str, Any]) -> Iterator[Nes
                     numbers[f"{place}/{name}"] = float(value)
                 elif not pooled and _OF_SCENE.match(name):
                     numbers[f"{place}/{row['scene']}/{name}"] = float(value)
-        candidates = [own["candidates"]] if own["candidates"] != ALL else []
-        name = f"{own['method']} ({', '.join([own['occlusion'], *candidates])})"
-        yield NestedRun(name, {**params, **own}, numbers)
+        candidates = f", {own['candidates']}" if own["candidates"] != ALL else ""
+        yield NestedRun(f"{own['method']} ({own['occlusion']}{candidates})", {**params, **own}, numbers)
 
 
 def _runs_with_locations(
@@ -136,12 +134,9 @@ def location_table(
     random choice and the oracle, which choose by no score.
     """
     views, top = scored.candidates.views, scored.choices[method, n]
-    columns: dict[str, Any] = {
-        "scene": [scenes[number].name for number in views.location_scene],
-        "location_id": scored.candidates.location_id,
-        "top_n": n,
-        "chosen": top.chosen.astype(np.int64),
-    }
+    names = [scenes[number].name for number in views.location_scene]
+    columns: dict[str, Any] = {"scene": names, "location_id": scored.candidates.location_id, "top_n": n}
+    columns |= {"chosen": top.chosen.astype(np.int64)}
     for index, key in enumerate(map(threshold_key, config.thresholds)):
         columns |= {f"good_{key}": top.good[:, index], f"any_{key}": top.any_good[:, index]}
     best = np.full(views.n_locations, np.nan)
@@ -163,25 +158,16 @@ def log_evaluation(
     The settings of occlusion models are logged if the configuration names any.
     """
     views, scenes = evaluation.views, evaluation.scenes
-    params = {
-        **evaluation_params(dataset, scenes, evaluation.weights),
-        **{name: value for name, value in asdict(config).items() if name not in ("weights", "methods")},
-        **(
-            {f"occlusion_{name}": value for name, value in asdict(occlusion).items() if name != "model"}
-            if config.occlusions
-            else {}
-        ),
-    }
-    for method in methods_named(config.methods, scorers()):
+    params = evaluation_params(dataset, scenes, evaluation.weights)
+    params |= {name: value for name, value in asdict(config).items() if name not in ("weights", "methods")}
+    if config.occlusions:
+        params |= {f"occlusion_{name}": value for name, value in asdict(occlusion).items() if name != "model"}
+    for method in methods_named(config.methods, scorers()) if len(dataset.cameras) == 1 else []:
         params |= method.params(dataset.camera)
     positives = float(views.good[:, 0].mean())
     metrics = {"n_locations": views.n_locations, "n_views": len(views.good), "positives": positives}
-    with (
-        TemporaryDirectory() as folder,
-        start_run(
-            tracking, f"evaluate {dataset.name}", "evaluate", params, tags={"dataset": dataset.name}
-        ) as (client, run),
-    ):  # fmt: skip
+    name, tags = f"evaluate {dataset.name}", {"dataset": dataset.name}
+    with TemporaryDirectory() as folder, start_run(tracking, name, "evaluate", params, tags=tags) as (client, run):
         log(client, run, metrics=metrics)
         for file in results.iterdir():
             if file.is_file():

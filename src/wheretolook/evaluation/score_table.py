@@ -9,8 +9,9 @@ import pandas as pd
 
 def threshold_keys(scores: pd.DataFrame) -> list[str]:
     """Thresholds of a score table, by the names its columns use."""
-    return [name.removeprefix("normalized_") for name in scores.columns if name.startswith("normalized_")
-            and not name.startswith(("normalized_low_", "normalized_high_"))]  # fmt: skip
+    ends = ("normalized_low_", "normalized_high_")
+    shares = [name for name in scores.columns if name.startswith("normalized_") and not name.startswith(ends)]
+    return [name.removeprefix("normalized_") for name in shares]
 
 
 def main_rows(scores: pd.DataFrame, columns: Sequence[str] = ("occlusion", "candidates")) -> pd.DataFrame:

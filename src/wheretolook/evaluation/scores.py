@@ -141,11 +141,8 @@ def score_table(
 
 def _only(choices: Choices, n: int, locations: NDArray[np.bool_]) -> dict[str, TopN]:
     """What the methods choose for one N at some of the locations."""
-    return {
-        method: TopN(top.chosen[locations], top.good[locations], top.any_good[locations])
-        for (method, number), top in choices.items()
-        if number == n
-    }
+    tops = {method: top for (method, number), top in choices.items() if number == n}
+    return {name: TopN(t.chosen[locations], t.good[locations], t.any_good[locations]) for name, t in tops.items()}
 
 
 def _shares(
@@ -199,12 +196,10 @@ def _quotient(top: Float, bottom: Float | float) -> Float:
 
 
 def _ranking_metrics(good: NDArray[np.bool_], scores: Float) -> dict[str, float]:
+    measures = {"average_precision": average_precision_score, "roc_auc": roc_auc_score}
     if good.all() or not good.any():
-        return {"average_precision": float("nan"), "roc_auc": float("nan")}
-    return {
-        "average_precision": float(average_precision_score(good, scores)),
-        "roc_auc": float(roc_auc_score(good, scores)),
-    }
+        return dict.fromkeys(measures, float("nan"))
+    return {name: float(measure(good, scores)) for name, measure in measures.items()}
 
 
 def _calibration_metrics(

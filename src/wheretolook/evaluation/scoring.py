@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 from tqdm.auto import tqdm
 
-from wheretolook.dataset.folders import Dataset, SceneFolder
+from wheretolook.dataset.folders import Dataset, SceneFolder, views_by_camera
 from wheretolook.dataset.scene import Scene, SceneConfig
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.scores import reference_method
@@ -52,9 +52,8 @@ def choose_weights(dataset: Dataset, config: EvaluateConfig, models: Sequence[Tr
         # who asks for all methods gets those that have been trained
         if "" not in kinds and not kinds & {*served.values()} and config.methods != EvaluateConfig().methods:
             fix = f"Run the train stage first, name weights, or leave {name} out of the methods."
-            raise WeightsError(
-                f"there are no weights of {' or '.join(sorted(kinds))} to evaluate", path=folder, fix=fix
-            )
+            problem = f"there are no weights of {' or '.join(sorted(kinds))} to evaluate"
+            raise WeightsError(problem, path=folder, fix=fix)
     return {path: kind for path, kind in served.items() if kind in wanted}
 
 
@@ -65,10 +64,10 @@ def _own_weights(dataset: Dataset) -> list[Path]:
     for name, path in found.items():
         # compact tables hold no matches: what has learnt from these has learnt from the dataset they were copied from
         if name in scorers() and not was_trained_on(dataset, read_training(path)):
+            fix = "Run the train stage again, remove the file, or name weights in evaluate.weights."
             raise WeightsError(
-                "these weights were trained on other data than the dataset now holds", path=path,
-                fix="Run the train stage again, remove the file, or name weights in evaluate.weights.",
-            )  # fmt: skip
+                "these weights were trained on other data than the dataset now holds", path=path, fix=fix
+            )
     return list(found.values())
 
 
@@ -78,10 +77,9 @@ def check_unseen(scenes: Sequence[SceneFolder], weights: Weights) -> None:
     for path in weights:
         for seen in read_training(path).get("landmarks", {}).values():
             if seen in landmarks:
-                raise WeightsError(
-                    "these weights have learnt from a scene of the test split", path=path, value=landmarks[seen],
-                    fix="Train again without that scene, or evaluate on others.",
-                )  # fmt: skip
+                problem = "these weights have learnt from a scene of the test split"
+                fix = "Train again without that scene, or evaluate on others."
+                raise WeightsError(problem, path=path, value=landmarks[seen], fix=fix)
 
 
 def score_scenes(
@@ -94,8 +92,7 @@ def score_scenes(
     progress: bool,
     occlusion: OcclusionConfig | None,
 ) -> tuple[dict[str, Float], str]:
-    """Scores (B,) by method of the views in the tables of scenes, and the name of the occlusion model. They are binned
-    once.
+    """Scores (B,) by method of the views in scenes' tables, which are binned once, and the occlusion model's name.
 
     The occlusion model is that to see the landmarks by; None for the one that is stored with the sampled locations.
 
@@ -108,27 +105,31 @@ def score_scenes(
     text = f"score {scenes[0].split} views" + ("" if occlusion is None else f", {occlusion.model}")
     with tqdm(total=sum(map(len, tables)), desc=text, unit="view", disable=not progress) as bar:
         for scene, table in zip(scenes, tables, strict=True):
-            localization_map = scene.localization_map(dataset.camera, device)
+            localization_map = scene.localization_map(device=device)
             # a release has no mesh, but what each location sees by it
             if occlusion is not None and (scene.mesh.is_file() or occlusion.model != localization_map.occlusion.name):
-                opened = Scene(scene, dataset.camera, SceneConfig(occlusion), device, progress=progress)
+                opened = Scene(scene, config=SceneConfig(occlusion), device=device, progress=progress)
                 localization_map = replace(localization_map, occlusion=opened.occlusion)
             used.add(localization_map.occlusion.name)
-            scorers = _scorers(localization_map, config, weights)
-            reference_method(scorers, config.reference)  # an unknown one is told before the work
-            cam_from_world = poses(table)
-            for begin in range(0, len(table), BLOCK):
-                block = cam_from_world[begin : begin + BLOCK]
-                binned = localization_map.bin_views(block)
+            cam_from_world, looking = poses(table), None
+            of_scene: dict[str, Float] = {}
+            for camera, rows in views_by_camera(scene, table, BLOCK):
+                if camera != looking:
+                    looking, looked_at = camera, localization_map.of_camera(camera)
+                    scorers = _scorers(looked_at, config, weights)
+                    reference_method(scorers, config.reference)  # an unknown one is told before the work
+                block = cam_from_world[rows]
+                binned = looked_at.bin_views(block)
                 for method, scorer in scorers.items():
                     values = scorer.score_binned(block, binned)
                     if not np.isfinite(values).all():
-                        raise TableError(
-                            "a method gives scores that are not finite", path=scene.folder, value=method,
-                            fix="Check the scene's landmarks and poses, and the weights; or leave the method out.",
-                        )  # fmt: skip
-                    scores.setdefault(method, []).append(values)
+                        problem = "a method gives scores that are not finite"
+                        fix = "Check the scene's landmarks and poses, and the weights; or leave the method out."
+                        raise TableError(problem, path=scene.folder, value=method, fix=fix)
+                    of_scene.setdefault(method, np.empty(len(table)))[rows] = values
                 bar.update(len(block))
+            for method, values in of_scene.items():
+                scores.setdefault(method, []).append(values)
     return {method: np.concatenate(parts) for method, parts in scores.items()}, " ".join(sorted(used))
 
 

@@ -34,10 +34,7 @@ def views_of(
 
     Raises a TableError if a table is empty, or a viewpoint has no label.
     """
-    location: list[NDArray[np.int64]] = []
-    location_scene: list[NDArray[np.int64]] = []
-    location_id: list[NDArray[np.int64]] = []
-    location_block: list[NDArray[np.int64]] = []
+    location, location_scene, location_id, location_block = (list[NDArray[np.int64]]() for _ in range(4))
     good: list[NDArray[np.bool_]] = []
     for number, (scene, table) in enumerate(zip(scenes, tables, strict=True)):
         if table.empty:
@@ -57,10 +54,8 @@ def views_of(
         location_id.append(ids)
         location_scene.append(np.full(len(ids), number))
     viewpoint_id = np.concatenate([table["viewpoint_id"].to_numpy(np.int64) for table in tables])
-    views = TestViews(
-        np.concatenate(location), viewpoint_id, np.concatenate(good), np.concatenate(location_scene),
-        np.concatenate(location_block),
-    )  # fmt: skip
+    scene_of, block_of = np.concatenate(location_scene), np.concatenate(location_block)
+    views = TestViews(np.concatenate(location), viewpoint_id, np.concatenate(good), scene_of, block_of)
     return views, np.concatenate(location_id)
 
 
@@ -83,11 +78,10 @@ def candidate_sets(
         if len(np.unique(labels)) < 2:
             metres, degrees = config.thresholds[0]
             which = f" among the {candidates_label(best)} candidates of each location" if best else ""
-            raise TableError(
-                f"labels of one class only{which}: of {len(labels)} viewpoints all or none are within {metres:g} m and "
-                f"{degrees:g} degrees", path=scenes[0].table, value=bool(labels.any()),
-                fix="Label more viewpoints, or give other evaluate.thresholds or evaluate.candidates.",
-            )  # fmt: skip
+            counted = f"of {len(labels)} viewpoints all or none are within {metres:g} m and {degrees:g} degrees"
+            problem, value = f"labels of one class only{which}: {counted}", bool(labels.any())
+            fix = "Label more viewpoints, or give other evaluate.thresholds or evaluate.candidates."
+            raise TableError(problem, path=scenes[0].table, value=value, fix=fix)
         kept = np.unique(views.location[mask])
         found.append(CandidateSet(candidates_label(best), mask, views.only(mask), location_id[kept]))
     return found

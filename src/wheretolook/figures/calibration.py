@@ -20,11 +20,8 @@ def calibration_figure(table: pd.DataFrame) -> Figure:
     """Reliability diagram of each learned method before (open marks) and after temperature scaling (filled).
 
     One column for each method: above, the share of good views over the mean prediction of each bin; below, the number
-    of views in each bin.
-
-    Args:
-        table: `calibration.csv` of the evaluate stage: a row for each method, `when` ("before", "after") and
-            bin. Of several occlusion models or sets of candidates the first is drawn.
+    of views in each bin. `table` is `calibration.csv` of the evaluate stage: a row for each method, `when` ("before",
+    "after") and bin. Of several occlusion models or sets of candidates the first is drawn.
     """
     table = main_rows(table)
     methods = methods_of(table)

@@ -8,11 +8,8 @@ from typing import Any
 
 from wheretolook.utils.errors import ConfigError
 
-Look = dict[str, Any]
-"""Keyword arguments of Matplotlib's functions, such as colours and sizes."""
-
-KINDS = ("png", "pdf", "svg")
-"""Kinds of files that figures are written as."""
+Look = dict[str, Any]  # keyword arguments of Matplotlib's functions, such as colours and sizes
+KINDS = ("png", "pdf", "svg")  # kinds of files that figures are written as
 
 
 @dataclass(frozen=True)

@@ -10,18 +10,14 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.camera import Camera, PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float, invert_poses, poses_looking_along, rotation_looking_along, transform
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.cutting import cut_above
 from wheretolook.utils.errors import ConfigError, SceneError
 
-BLUE, SKY, GREEN, ORANGE, VERMILION, PURPLE = "#0072B2", "#56B4E9", "#009E73", "#E69F00", "#D55E00", "#CC79A7"
-"""The colours of Okabe and Ito (2008), which colour-blind people can tell apart."""
-
-FAR = 25.0
-"""Distance of the eye in diagonals of the scene: so far that parallel lines stay parallel in the picture."""
+FAR = 25.0  # distance of the eye in diagonals of the scene: so far that parallel lines stay parallel in the picture
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,11 +57,8 @@ def dollhouse(
 
     The azimuth of the eye counts counter-clockwise from +x. Its elevation is in (0, 90]; 90 gives a plan with +x to the
     right and +y up, whatever the azimuth. What lies above the world height `cut_m` is cut off. With `one_sided`, for
-    meshes that are wound reliably, triangles that turn their backs to the eye are left out, such as ceilings.
-
-    Raises:
-        ConfigError: the elevation or width is out of range.
-        SceneError: no triangle is left.
+    meshes that are wound reliably, triangles that turn their backs to the eye are left out, such as ceilings. Raises
+    ConfigError if the elevation or width is out of range, SceneError if no triangle is left.
     """
     if not 0 < elevation_deg <= 90 or width_px < 2:
         raise ConfigError("the eye must be above the scene, and the picture wide", value=(elevation_deg, width_px))
@@ -119,16 +112,18 @@ def draw_segments(axes: Axes, house: Dollhouse, segments: ArrayLike, **style: An
     return lines
 
 
-def frustum_corners(camera: PinholeCamera, cam_from_world: ArrayLike, depth_m: float) -> Float:
+def frustum_corners(camera: Camera, cam_from_world: ArrayLike, depth_m: float) -> Float:
     """Corners (B, 5, 3) m of cameras (B, 3, 4): centre, then the image's corners at a depth, from top left."""
     pixels = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * (camera.width, camera.height)
-    at_depth_one = (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
-    corners = np.concatenate([np.zeros((1, 3)), depth_m * np.column_stack([at_depth_one, np.ones(4)])])
+    rays = camera.unproject(pixels)
+    if isinstance(camera, PinholeCamera):  # a fisheye's corners can lie behind it: it is drawn to a distance
+        rays = rays / rays[:, 2:]
+    corners = np.concatenate([np.zeros((1, 3)), depth_m * rays])
     world_from_cam = invert_poses(np.asarray(cam_from_world, dtype=np.float64).reshape(-1, 3, 4))
     return corners @ np.swapaxes(world_from_cam[..., :3], -1, -2) + world_from_cam[:, None, :, 3]
 
 
-def frustum_segments(camera: PinholeCamera, cam_from_world: ArrayLike, depth_m: float) -> Float:
+def frustum_segments(camera: Camera, cam_from_world: ArrayLike, depth_m: float) -> Float:
     """The eight edges (B, 8, 2, 3) m of camera frusta down to a depth."""
     edges = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]])
     return frustum_corners(camera, cam_from_world, depth_m)[:, edges]

@@ -12,8 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.style import context
 from numpy.typing import NDArray
 
-from wheretolook.figures.house_image import ORANGE
-from wheretolook.figures.style import INK, PRINT, TWO_COLUMNS_IN, new_figure
+from wheretolook.figures.style import INK, ORANGE, PRINT, TWO_COLUMNS_IN, new_figure
 from wheretolook.geometry.poses import Float
 from wheretolook.inputs.channels import PAPER_VARIANTS
 

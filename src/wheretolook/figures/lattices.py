@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.style import context
 from scipy.spatial import ConvexHull, cKDTree
 
-from wheretolook.figures.style import GRID, INK, RC, new_figure
+from wheretolook.figures.style import BLUE, GREEN, GRID, INK, RC, VERMILION, new_figure
 from wheretolook.geometry.lattices import azimuth_elevation_lattice, fibonacci_sphere, released_lattice
 from wheretolook.geometry.poses import Float
 
@@ -35,9 +35,9 @@ def fibonacci_figure(n: int = 500) -> Figure:
     side pale.
     """
     lattices = (
-        ("spherical Fibonacci", fibonacci_sphere(n), "#D55E00"),
-        ("azimuth-elevation", azimuth_elevation_lattice(n), "#0072B2"),
-        ("released code of the paper", released_lattice(n), "#009E73"),
+        ("spherical Fibonacci", fibonacci_sphere(n), VERMILION),
+        ("azimuth-elevation", azimuth_elevation_lattice(n), BLUE),
+        ("released code of the paper", released_lattice(n), GREEN),
     )
     with context(RC):
         figure = new_figure(10.5, 4.2)

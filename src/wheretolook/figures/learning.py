@@ -13,9 +13,8 @@ from matplotlib.patches import ConnectionPatch
 from matplotlib.style import context
 
 from wheretolook.figures.config import Look
-from wheretolook.figures.house_image import BLUE, VERMILION
 from wheretolook.figures.inputs import BinnedImage, draw_counts, draw_landmarks, frame, n_landmarks
-from wheretolook.figures.style import INK, PRINT, TWO_COLUMNS_IN, new_figure
+from wheretolook.figures.style import BLUE, INK, PRINT, TWO_COLUMNS_IN, VERMILION, new_figure
 from wheretolook.geometry.poses import Float
 
 _COLUMNS = 12  # of a hidden layer's values

@@ -25,11 +25,9 @@ def occlusion_figure(scores: pd.DataFrame) -> Figure:
     """Average precision and share of good best views of each method, by occlusion model.
 
     The share is that at the finest threshold, in % of the oracle's, with bootstrap intervals. A row for each method, a
-    mark for each occlusion model; the random choice and the oracle are lines.
-
-    Args:
-        scores: tables of `wheretolook.evaluation.scores.score_table`, one below the other, with a column `occlusion`;
-            the rows over all scenes, of the first N and the first set of candidates, are drawn.
+    mark for each occlusion model; the random choice and the oracle are lines. `scores` are tables of
+    `wheretolook.evaluation.scores.score_table`, one below the other, with a column `occlusion`; the rows over all
+    scenes, of the first N and the first set of candidates, are drawn.
     """
     scores = main_rows(scores, ("candidates",))
     key, n = threshold_keys(scores)[0], scores["top_n"].iloc[0]
@@ -52,10 +50,8 @@ def occlusion_figure(scores: pd.DataFrame) -> Figure:
         left.set_ylim(max(y.values(), default=0) + 0.7, -0.7)
         for axes in (left, right):
             axes.tick_params(axis="y", length=0)
-        handles: list[Line2D] = []
-        for number, model in enumerate(models):
-            look = _mark(number, INK)
-            handles.append(Line2D([], [], linestyle="none", label=_LABELS.get(model, model), **look))
+        names = [_LABELS.get(model, model) for model in models]
+        handles = [Line2D([], [], linestyle="none", label=x, **_mark(n, INK)) for n, x in enumerate(names)]
         labels = [method_style(name).label for name in (ORACLE, *filter(by_chance, methods_of(pooled)))]
         handles += [line for line in right.lines if line.get_label() in labels]
         figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), columnspacing=1.4)

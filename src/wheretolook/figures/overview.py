@@ -12,11 +12,11 @@ from matplotlib.style import context
 from numpy.typing import NDArray
 
 from wheretolook.figures.config import Look
-from wheretolook.figures.style import INK, RC, new_figure
+from wheretolook.figures.style import INK, RC, VERMILION, new_figure
 from wheretolook.geometry.poses import Float
 from wheretolook.planning.turns import pan_tilt_angles
 
-STAR = "#D55E00"
+STAR = VERMILION
 
 
 @dataclass(frozen=True, eq=False)

@@ -78,11 +78,10 @@ def methods_figure(paths: Mapping[str, Sequence[PathView]], landmarks: Float) ->
         return figure
 
 
-def save_film(frames: Iterator[Pixels], path: Path, frames_per_second: float = FRAMES_PER_SECOND) -> None:
+def save_film(frames: Iterator[Pixels], path: Path) -> None:
     """Write frames, all of one size, as an animated GIF or an MP4, by the file's ending; atomically.
 
-    Raises:
-        ConfigError: another ending, or MP4 cannot be written here.
+    Raises ConfigError for another ending, or if MP4 cannot be written here.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".partial-{path.name}")
@@ -90,7 +89,7 @@ def save_film(frames: Iterator[Pixels], path: Path, frames_per_second: float = F
         from PIL import Image
 
         first, *rest = (Image.fromarray(frame).quantize(128) for frame in frames)
-        first.save(partial, save_all=True, append_images=rest, duration=round(1000 / frames_per_second), loop=0)
+        first.save(partial, save_all=True, append_images=rest, duration=round(1000 / FRAMES_PER_SECOND), loop=0)
     elif path.suffix == ".mp4":
         import cv2
 
@@ -99,7 +98,7 @@ def save_film(frames: Iterator[Pixels], path: Path, frames_per_second: float = F
             even = frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2]  # the codec needs even sides
             if writer is None:
                 codec = cv2.VideoWriter.fourcc(*"mp4v")
-                writer = cv2.VideoWriter(str(partial), codec, frames_per_second, even.shape[1::-1])
+                writer = cv2.VideoWriter(str(partial), codec, FRAMES_PER_SECOND, even.shape[1::-1])
                 if not writer.isOpened():
                     raise ConfigError("this OpenCV cannot write MP4", path=path, fix="Ask for a .gif.")
             writer.write(np.ascontiguousarray(even[..., ::-1]))

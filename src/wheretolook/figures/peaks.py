@@ -13,10 +13,9 @@ from matplotlib.style import context
 from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.figures.config import Look
-from wheretolook.figures.house_image import BLUE, VERMILION
 from wheretolook.figures.inputs import frame
 from wheretolook.figures.overview import View
-from wheretolook.figures.style import INK, PRINT, TWO_COLUMNS_IN, new_figure
+from wheretolook.figures.style import BLUE, INK, PRINT, TWO_COLUMNS_IN, VERMILION, new_figure
 from wheretolook.geometry.poses import Float
 from wheretolook.planning.turns import pan_tilt_angles
 

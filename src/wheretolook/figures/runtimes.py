@@ -17,7 +17,7 @@ from matplotlib.style import context
 from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter, NullLocator
 
 from wheretolook.figures.config import Look
-from wheretolook.figures.style import INK, RC, new_figure
+from wheretolook.figures.style import BLUE, GREEN, INK, PURPLE, RC, SKY, VERMILION, new_figure
 
 COUNTS, EVERYTHING = "counts alone", "occlusion, counts, best 100"
 TWIN = "NumPy twin, counts alone, scaled"
@@ -29,14 +29,12 @@ _PAPER, _RELEASED, _OURS = "from the paper", "authors' kernel, measured", "this 
 _LOOK: dict[str, dict[str, Any]] = {
     _PAPER: {"facecolor": "white", "edgecolor": "#7a7a7a", "hatch": "///", "linewidth": 0.8},
     _RELEASED: {"facecolor": "#dedede", "edgecolor": "#7a7a7a", "hatch": "...", "linewidth": 0.8},
-    _OURS: {"facecolor": "#56B4E9", "edgecolor": "#56B4E9", "linewidth": 0.8},
+    _OURS: {"facecolor": SKY, "edgecolor": SKY, "linewidth": 0.8},
 }
 """Looks of bars by the source of their number; hatches tell them apart in greyscale."""
 
-_PANELS = {
-    COUNTS: "counts alone: the work that the paper times",
-    EVERYTHING: "occlusion, counts and best 100 directions:\nmore than the paper times",
-}
+_PANELS = {COUNTS: "counts alone: the work that the paper times"}
+_PANELS[EVERYTHING] = "occlusion, counts and best 100 directions:\nmore than the paper times"
 
 
 @dataclass(frozen=True)
@@ -63,12 +61,10 @@ def runtime_figure(sizes: pd.DataFrame) -> Figure:
     """The paper's runtime figure with this project's times beside it, at the paper's 648 locations x 24,919 landmarks.
 
     Bars on a logarithmic axis in seconds, whiskers from the shortest to the longest run. Above the counts alone, which
-    the paper times; below, if there are such rows, with the work that its time leaves out.
-
-    Args:
-        sizes: one row for each machine, kind of work and number of threads, with `what`, `threads`, `median_s`,
-            `min_s`, `max_s`, `repeats`, `device` ("cpu" or Warp's CUDA device), `name` and `cores` of the machine. Rows
-            of other work are ignored, and the NumPy twin of a machine with a GPU if there is one of a CPU.
+    the paper times; below, if there are such rows, with the work that its time leaves out. `sizes` has a row for each
+    machine, kind of work and number of threads, with `what`, `threads`, `median_s`, `min_s`, `max_s`, `repeats`,
+    `device` ("cpu" or Warp's CUDA device), `name` and `cores` of the machine. Rows of other work are ignored, and the
+    NumPy twin of a machine with a GPU if there is one of a CPU.
     """
     measured = _measured_bars(sizes)
     bars = {COUNTS: [*_ELSEWHERE, *measured[COUNTS]], EVERYTHING: measured[EVERYTHING]}
@@ -177,7 +173,7 @@ def _ticked(seconds: float) -> str:
 
 
 _GROWING = ("landmarks", "locations", "directions")
-_MACHINES = (("#0072B2", "o"), ("#D55E00", "s"), ("#009E73", "D"), ("#CC79A7", "^"))
+_MACHINES = ((BLUE, "o"), (VERMILION, "s"), (GREEN, "D"), (PURPLE, "^"))
 _WORK: dict[str, tuple[Any, bool]] = {"with occlusion": ("-", True), COUNTS: ((0, (4, 1.5)), False)}
 """Dashes of a kind of work, and whether its markers are filled."""
 
@@ -185,12 +181,10 @@ _WORK: dict[str, tuple[Any, bool]] = {"with occlusion": ("-", True), COUNTS: ((0
 def scaling_figure(growth: pd.DataFrame) -> Figure:
     """How time (above) and memory (below) grow with the number of landmarks, locations or directions, each alone.
 
-    All axes are logarithmic; a dotted line shows proportional growth.
-
-    Args:
-        growth: one row for each run, with `axis` (which of the three grows), `landmarks`, `locations`, `directions`,
-            `what` ("with occlusion", "counts alone"), `median_s`, `min_s`, `max_s`, `peak_bytes` (0, not drawn, where
-            it was too little to measure), `device` and `name` of the machine.
+    All axes are logarithmic; a dotted line shows proportional growth. `growth` has a row for each run, with `axis`
+    (which of the three grows), `landmarks`, `locations`, `directions`, `what` ("with occlusion", "counts alone"),
+    `median_s`, `min_s`, `max_s`, `peak_bytes` (0, not drawn, where it was too little to measure), `device` and `name`
+    of the machine.
     """
     machines = list(dict.fromkeys(zip(growth["device"], growth["name"], strict=True)))
     shown = [axis for axis in _GROWING if (growth["axis"] == axis).any()]

@@ -15,17 +15,8 @@ from matplotlib.style import context
 from numpy.typing import NDArray
 
 from wheretolook.figures.config import Look
-from wheretolook.figures.house_image import (
-    BLUE,
-    ORANGE,
-    SKY,
-    VERMILION,
-    Dollhouse,
-    draw_house,
-    draw_points,
-    draw_segments,
-)
-from wheretolook.figures.style import INK, PRINT, TWO_COLUMNS_IN, new_figure
+from wheretolook.figures.house_image import Dollhouse, draw_house, draw_points, draw_segments
+from wheretolook.figures.style import BLUE, INK, ORANGE, PRINT, SKY, TWO_COLUMNS_IN, VERMILION, new_figure
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float
 from wheretolook.planning.turns import pan_tilt_angles

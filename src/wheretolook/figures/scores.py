@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import cycle, product
 
 import numpy as np
 import pandas as pd
@@ -20,11 +21,8 @@ from wheretolook.figures.style import INK, RC, new_figure
 from wheretolook.methods.styles import ORACLE, method_group, method_style, rows_by_group
 from wheretolook.viewpoints.thresholds import ALL, threshold_label
 
-_OTHER_MARKERS = ("o", "D", "s", "^")
-"""Markers of the second and further N."""
-
-_WRAP = 36
-"""Longer names of methods are broken into two lines."""
+_OTHER_MARKERS = ("o", "D", "s", "^")  # markers of the second and further N
+_WRAP = 36  # longer names of methods are broken into two lines
 
 _WHISKERS = "whiskers: 95 % bootstrap interval over locations"
 
@@ -41,11 +39,9 @@ class _Layout:
 
     def others(self) -> list[tuple[int, str, float]]:
         """The second and further N, their markers, and how far below the first they are drawn, in rows."""
-        others = self.top_n[1:]
-        return [
-            (n, _OTHER_MARKERS[number % len(_OTHER_MARKERS)], 0.3 + 0.5 * number / max(2, len(others)))
-            for number, n in enumerate(others)
-        ]
+        others, markers = self.top_n[1:], cycle(_OTHER_MARKERS)
+        places = 0.3 + 0.5 * np.arange(len(others)) / max(2, len(others))
+        return list(zip(others, markers, places.tolist(), strict=False))
 
     def value(self, method: str, n: int, column: str) -> float:
         """In percent; NaN where it is not known."""
@@ -58,29 +54,23 @@ class _Layout:
 
     def limits(self, columns: Sequence[str]) -> tuple[float, float]:
         """Ends of an axis that holds the columns, such as "regret_0.05m_0.4deg", and their intervals."""
-        values = [
-            value
-            for method in self.near
-            for n in self.top_n
-            for column in columns
-            for value in (self.value(method, n, column), *self.ends(method, n, column))
-        ]
-        known = [value for value in values if np.isfinite(value)]
+        known: list[float] = []
+        for method, n, column in product(self.near, self.top_n, columns):
+            values = (self.value(method, n, column), *self.ends(method, n, column))
+            known += [value for value in values if np.isfinite(value)]
         return min(known, default=0.0), max(known, default=0.0)
 
 
 def score_figure(scores: pd.DataFrame) -> Figure:
     """Localization score of each method at each threshold, for each N.
 
-    Args:
-        scores: a table of `wheretolook.evaluation.scores.score_table`; its rows over all scenes are drawn, those of the
-            first occlusion model and the first set of candidates if there are several.
+    One panel for each threshold, one row for each method, groups set apart: a filled mark for the first N, small open
+    ones below it for the others, with bootstrap intervals; the oracle a line at 100 %. The axis above a panel gives the
+    share before division by the oracle's, for the first N. The axes reach down to the methods that come at least
+    halfway from chance to the oracle; arrows and numbers stand for values beyond.
 
-    Returns:
-        One panel for each threshold, one row for each method, groups set apart: a filled mark for the first N, small
-        open ones below it for the others, with bootstrap intervals; the oracle a line at 100 %. The axis above a panel
-        gives the share before division by the oracle's, for the first N. The axes reach down to the methods that come
-        at least halfway from chance to the oracle; arrows and numbers stand for values beyond.
+    `scores` is a table of `wheretolook.evaluation.scores.score_table`; its rows over all scenes are drawn, those of the
+    first occlusion model and the first set of candidates if there are several.
     """
     scores = main_rows(scores)
     pooled, keys = scores[scores["scene"] == ALL], threshold_keys(scores)
@@ -100,10 +90,8 @@ def score_figure(scores: pd.DataFrame) -> Figure:
             if len(best) and best.iloc[0] > 0:
                 _add_raw_axis(axes, best.iloc[0])
         _name_rows(panels[0], layout)
-        figure.supxlabel(
-            f"% of the oracle's share; above each panel: % of the chosen views, {_best(layout.top_n[0])}\n{_WHISKERS}",
-            fontsize=9,
-        )
+        shares = f"% of the oracle's share; above each panel: % of the chosen views, {_best(layout.top_n[0])}"
+        figure.supxlabel(f"{shares}\n{_WHISKERS}", fontsize=9)
         _add_legend(figure, layout, [Line2D([], [], color=INK, linewidth=1, linestyle="--", label="oracle")])
         return figure
 
@@ -112,10 +100,8 @@ def regret_figure(scores: pd.DataFrame) -> Figure:
     """What each method loses against the oracle and against the reference, at the finest threshold, for each N.
 
     Rows and `scores` are as in `score_figure`. Left the regret, right the paired difference to the reference if the
-    table has one, with bootstrap intervals, in percentage points of the chosen views.
-
-    Raises:
-        ValueError: the table is of an older version, without regret.
+    table has one, with bootstrap intervals, in percentage points of the chosen views. Raises ValueError if the table is
+    of an older version, without regret.
     """
     scores = main_rows(scores)
     pooled, key = scores[scores["scene"] == ALL], threshold_keys(scores)[0]
@@ -155,12 +141,8 @@ def _layout(pooled: pd.DataFrame, key: str) -> _Layout:
     everything = _Layout(rows, y, top_n, methods)
     drawn = next(filter(by_chance, methods), "")
     chance = np.nan_to_num(everything.value(drawn, top_n[0], f"normalized_{key}"))
-    near = [
-        method
-        for method in methods
-        if everything.value(method, top_n[0], f"normalized_{key}") >= (100 + chance) / 2
-        and method_group(method) != "probes"
-    ]
+    halfway = [x for x in methods if everything.value(x, top_n[0], f"normalized_{key}") >= (100 + chance) / 2]
+    near = [method for method in halfway if method_group(method) != "probes"]
     return _Layout(rows, y, top_n, near or methods)
 
 
@@ -198,9 +180,8 @@ def _draw(axes: Axes, layout: _Layout, column: str) -> None:
 
 def _add_raw_axis(axes: Axes, best: float) -> None:
     """A second axis, above, of the shares before they are divided by the oracle's, `best`."""
-    above = axes.secondary_xaxis(
-        "top", functions=(lambda share: np.multiply(share, best), lambda share: np.divide(share, best))
-    )
+    both_ways = (lambda share: np.multiply(share, best), lambda share: np.divide(share, best))
+    above = axes.secondary_xaxis("top", functions=both_ways)
     above.tick_params(labelsize=8, length=2)
     above.spines["top"].set_visible(True)
 

@@ -18,49 +18,23 @@ ONE_COLUMN_IN, TWO_COLUMNS_IN = 3.5, 7.2
 """Widths of figures for one and for two columns of a paper, inches. Their letters are as large as they will be in
 print: `PRINT`. Figures for the screen are wider, with the letters of `RC`."""
 
-INK = "#333333"
-GRID = "#d9d9d9"
+INK, GRID = "#333333", "#d9d9d9"
 
-RC: dict[str, Any] = {
-    "font.size": 10,
-    "axes.titlesize": 11,
-    "axes.labelsize": 10,
-    "axes.edgecolor": INK,
-    "axes.labelcolor": INK,
-    "text.color": INK,
-    "xtick.color": INK,
-    "ytick.color": INK,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": GRID,
-    "grid.linewidth": 0.6,
-    "legend.frameon": False,
-    "legend.fontsize": 9,
-    "lines.linewidth": 1.6,
-    "hatch.linewidth": 0.7,
-    "figure.dpi": 100,
-    "savefig.dpi": 160,
-    "savefig.bbox": "tight",
-    "svg.hashsalt": "wheretolook",
-    "svg.fonttype": "none",
-    "pdf.fonttype": 42,
-}
+BLUE, SKY, GREEN, ORANGE, VERMILION, PURPLE = "#0072B2", "#56B4E9", "#009E73", "#E69F00", "#D55E00", "#CC79A7"
+"""The colours of Okabe and Ito (2008), which colour-blind people can tell apart."""
 
-PRINT: dict[str, Any] = {
-    **RC,
-    "font.size": 8,
-    "axes.titlesize": 8.5,
-    "axes.labelsize": 8,
-    "xtick.labelsize": 7,
-    "ytick.labelsize": 7,
-    "legend.fontsize": 7,
-    "axes.linewidth": 0.6,
-    "lines.linewidth": 1.2,
-    "lines.markersize": 4,
-    "hatch.linewidth": 0.5,
-}
+_INKED = ("axes.edgecolor", "axes.labelcolor", "text.color", "xtick.color", "ytick.color")
+RC: dict[str, Any] = {**dict.fromkeys(_INKED, INK), "grid.color": GRID}
+RC |= {"font.size": 10, "axes.titlesize": 11, "axes.labelsize": 10, "legend.fontsize": 9}
+RC |= {"axes.spines.top": False, "axes.spines.right": False, "axes.grid": True, "axes.axisbelow": True}
+RC |= {"grid.linewidth": 0.6, "lines.linewidth": 1.6, "hatch.linewidth": 0.7, "legend.frameon": False}
+RC |= {"figure.dpi": 100, "savefig.dpi": 160, "savefig.bbox": "tight"}
+RC |= {"svg.hashsalt": "wheretolook", "svg.fonttype": "none", "pdf.fonttype": 42}
+"""Matplotlib's parameters for figures on the screen."""
+
+PRINT = {**RC, "font.size": 8, "axes.titlesize": 8.5, "axes.labelsize": 8, "legend.fontsize": 7}
+PRINT |= {"xtick.labelsize": 7, "ytick.labelsize": 7, "axes.linewidth": 0.6, "hatch.linewidth": 0.5}
+PRINT |= {"lines.linewidth": 1.2, "lines.markersize": 4}
 """`RC` with the letters and lines of a printed column."""
 
 
@@ -76,13 +50,8 @@ _NOTE = {"png": "Description", "pdf": "Subject", "svg": "Description"}
 def save_figure(figure: Figure, path: Path, note: str = "") -> None:
     """Write a figure, atomically, the same figure as the same bytes; its folder is made when needed.
 
-    Args:
-        figure: what to write.
-        path: file, whose suffix says what kind: .png, .pdf or .svg, the latter two as vectors.
-        note: what to keep in the file's metadata, such as the runs that the figure was made from.
-
-    Raises:
-        ConfigError: another kind of file.
+    The path's suffix says what kind of file: .png, .pdf or .svg, the latter two as vectors. The note, such as the runs
+    that the figure was made from, is kept in the file's metadata. Raises ConfigError for other kinds of files.
     """
     kind = path.suffix[1:].lower()
     if kind not in KINDS:
@@ -99,11 +68,7 @@ def save_figure(figure: Figure, path: Path, note: str = "") -> None:
 
 
 def note_of(path: Path) -> str:
-    """What `save_figure` kept in a figure's metadata; empty if nothing.
-
-    Raises:
-        ConfigError: another kind of file than PNG, PDF or SVG.
-    """
+    """What `save_figure` kept in a figure's metadata; empty if nothing. Raises ConfigError for other kinds of files."""
     kind = path.suffix[1:].lower()
     if kind == "png":
         from PIL import Image

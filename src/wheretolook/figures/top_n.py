@@ -15,12 +15,9 @@ from wheretolook.evaluation.paper_tables import PAPER
 from wheretolook.evaluation.score_table import main_rows, methods_of, threshold_keys
 from wheretolook.figures.config import Look
 from wheretolook.figures.style import PRINT, TWO_COLUMNS_IN, new_figure
-from wheretolook.methods.registry import find
+from wheretolook.methods.registry import all_methods, find
 from wheretolook.methods.styles import ORACLE, method_style
 from wheretolook.viewpoints.thresholds import ALL, threshold_label
-
-SHOWN = ("set", "mlp", "fisher-trace-exact", "bins", "random")
-"""Methods that are drawn where no others are asked for; of a family, the first there is."""
 
 ROWS = {
     "normalized": "good ones among the best N\n(% of the oracle's share)",
@@ -41,11 +38,11 @@ def top_n_figure(scores: pd.DataFrame, methods: Sequence[str] = ()) -> Figure:
     the paper's numbers, which it prints for N = 1 only, on other scenes and divided by its released code's constant.
 
     `scores` is a table of `wheretolook.evaluation.scores.score_table`; its rows over all scenes are drawn, of the first
-    occlusion model and set of candidates; `SHOWN` if no methods are named.
+    occlusion model and set of candidates; without methods named, those that are `of_the_few`.
     """
     scores = main_rows(scores)
     pooled, keys = scores[scores["scene"] == ALL], threshold_keys(scores)
-    shown = _present(pooled, methods or SHOWN)
+    shown = _present(pooled, methods) if methods else _the_few(pooled)
     top_n = [int(n) for n in pooled["top_n"].unique()]
     with context(PRINT):
         figure = new_figure(TWO_COLUMNS_IN, 4.6)
@@ -80,10 +77,21 @@ def top_n_table(scores: pd.DataFrame, methods: Sequence[str] = ()) -> pd.DataFra
         for n in pooled["top_n"].unique():
             rows = pooled[pooled["top_n"] == n].set_index("method")
             columns[name, f"N = {n}"] = 100 * rows[f"{column}_{key}"]
-    shown = [*_present(pooled, methods or SHOWN), ORACLE]
+    shown = [*(_present(pooled, methods) if methods else _the_few(pooled)), ORACLE]
     table = pd.DataFrame(columns).loc[shown]
     table.index = pd.Index([method_style(method).label for method in shown])
     return table
+
+
+def _the_few(pooled: pd.DataFrame) -> list[str]:
+    """Those of a table's methods that a figure of a few shows (`Method.of_the_few`), the last registered first."""
+    first: dict[str, str] = {}
+    for name in methods_of(pooled):
+        known = find(name)
+        if known and known.of_the_few:
+            first.setdefault(known.family or known.name, name)
+    order = list(all_methods())
+    return sorted(first.values(), key=lambda name: order.index(name.partition(" ")[0]), reverse=True)
 
 
 def _present(pooled: pd.DataFrame, methods: Sequence[str]) -> list[str]:

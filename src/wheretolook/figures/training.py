@@ -16,9 +16,8 @@ from wheretolook.methods.styles import method_style
 def training_figure(histories: Mapping[str, pd.DataFrame]) -> Figure:
     """Loss and average precision over the epochs (the first is 1), a ring at the best validation average precision.
 
-    Args:
-        histories: for each method, one row for each epoch with `epoch`, `train_bce`, `val_bce`,
-            `train_average_precision` and `val_average_precision`.
+    `histories` have, for each method, a row for each epoch with `epoch`, `train_bce`, `val_bce`,
+    `train_average_precision` and `val_average_precision`.
     """
     with context(RC):
         figure = new_figure(9, 3.4)

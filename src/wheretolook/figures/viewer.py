@@ -9,13 +9,13 @@ import open3d as o3d
 from matplotlib.colors import to_rgb
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.figures.house_image import BLUE, ORANGE, VERMILION, frustum_segments
+from wheretolook.figures.house_image import frustum_segments
+from wheretolook.figures.style import BLUE, ORANGE, VERMILION
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.scenes.cutting import cut_above
 
-FRUSTUM_M = 0.25
-"""Depth of the cameras that are drawn."""
+FRUSTUM_M = 0.25  # depth of the cameras that are drawn
 
 _POINT_PX = 3
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -87,13 +87,18 @@ class PinholeCamera:
         return (self.fx + self.fy) / 2
 
     @property
+    def principal_point(self) -> tuple[float, float]:
+        """Principal point (x, y) in pixels."""
+        return self.cx, self.cy
+
+    @property
     def matrix(self) -> Float:
         """Intrinsic matrix K, (3, 3)."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]])
 
     @property
     def colmap(self) -> ColmapCamera:
-        """The same camera as COLMAP describes it, of the model SIMPLE_PINHOLE if its pixels are square, else PINHOLE."""
+        """The same camera by a model of COLMAP: SIMPLE_PINHOLE if its pixels are square, else PINHOLE."""
         if self.fx == self.fy:
             return ColmapCamera("SIMPLE_PINHOLE", self.width, self.height, (self.fx, self.cx, self.cy))
         return ColmapCamera("PINHOLE", self.width, self.height, (self.fx, self.fy, self.cx, self.cy))
@@ -152,10 +157,8 @@ class ColmapCamera:
 
     Beyond the field of view that they were fitted to, distortion polynomials turn back and map points far outside of it
     into the image. So a point counts as seen only if the ray of its pixel, by COLMAP's own inverse, leads back to it.
-    COLMAP's fisheye models see nothing at 90 degrees from the axis and beyond.
-
-    Raises:
-        ConfigError: COLMAP has no such model, or the model takes other parameters.
+    COLMAP's fisheye models see nothing at 90 degrees from the axis and beyond. Raises ConfigError if COLMAP has no such
+    model, or the model takes other parameters.
     """
 
     model: str  # COLMAP's name, such as "OPENCV" or "OPENCV_FISHEYE"
@@ -168,9 +171,8 @@ class ColmapCamera:
 
         names = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
         if self.model not in names:
-            raise ConfigError(
-                "COLMAP has no such camera model", value=self.model, fix=f"Use one of {', '.join(names)}."
-            )
+            fix = f"Use one of {', '.join(names)}."
+            raise ConfigError("COLMAP has no such camera model", value=self.model, fix=fix)
         expected = pycolmap.Camera.create_from_model_name(1, self.model, 1.0, 1, 1).params_info
         check_size(self.width, self.height)
         if len(self.params) != len(expected.split(",")) or not np.isfinite(self.params).all():
@@ -193,9 +195,14 @@ class ColmapCamera:
     @property
     def mean_focal_px(self) -> float:
         """Mean focal length in pixels; of a panorama, pixels per radian across."""
-        if len(self._camera.focal_length_idxs()) == 0:
-            return self.width / (2 * np.pi)
-        return float(self._camera.mean_focal_length())
+        return mean_focal_px(self._camera)
+
+    @property
+    def principal_point(self) -> tuple[float, float]:
+        """Principal point (x, y) in pixels; of a panorama the image's centre."""
+        if len(self._camera.principal_point_idxs()) == 0:
+            return self.width / 2, self.height / 2
+        return float(self._camera.principal_point_x), float(self._camera.principal_point_y)
 
     @property
     def colmap(self) -> ColmapCamera:
@@ -254,14 +261,23 @@ class ColmapCamera:
 Camera = PinholeCamera | ColmapCamera  # what views can be scored for
 
 
-def camera_of(model: str, width: int, height: int, params: Sequence[float]) -> Camera:
-    """The camera of a COLMAP model; of PINHOLE and SIMPLE_PINHOLE an ideal pinhole, which is faster. Raises ConfigError."""
+def camera_of(model: str, width: int, height: int, params: Iterable[float]) -> Camera:
+    """The camera of a COLMAP model, for PINHOLE and SIMPLE_PINHOLE the faster ideal pinhole. Raises ConfigError."""
     camera = ColmapCamera(model, width, height, tuple(float(value) for value in params))
     if model == "PINHOLE":
-        return PinholeCamera(width, height, *camera.params[:2], center_px=(camera.params[2], camera.params[3]))
+        fx, fy, cx, cy = camera.params
+        return PinholeCamera(width, height, fx, fy, (cx, cy))
     if model == "SIMPLE_PINHOLE":
-        return PinholeCamera(width, height, camera.params[0], center_px=(camera.params[1], camera.params[2]))
+        focal, cx, cy = camera.params
+        return PinholeCamera(width, height, focal, center_px=(cx, cy))
     return camera
+
+
+def mean_focal_px(camera: pycolmap.Camera) -> float:
+    """Mean focal length in pixels; of a panorama, pixels per radian across."""
+    if len(camera.focal_length_idxs()) == 0:
+        return float(camera.width / (2 * np.pi))
+    return float(camera.mean_focal_length())
 
 
 def camera_of_record(record: Mapping[str, Any]) -> Camera:
@@ -311,8 +327,8 @@ def cameras_of_map(model: str | Path) -> dict[int, Camera]:
     return cameras_by_id(cameras, path)
 
 
-def cameras_by_id(cameras: Mapping[int, pycolmap.Camera], path: Path) -> dict[int, Camera]:
-    """Cameras of pycolmap by their camera_id; MapError, naming the model's folder, if one of them is no camera."""
+def cameras_by_id(cameras: Any, path: Path) -> dict[int, Camera]:
+    """Cameras of a pycolmap model by their camera_id; MapError, naming the model, if one is no camera."""
     found: dict[int, Camera] = {}
     for number, camera in sorted(cameras.items()):
         try:

@@ -21,16 +21,11 @@ class VoxelGrid:
     """A box cut into equal cuboids; a voxel's centre is a location (paper, Sec. 3.1 "Location").
 
     A location's id is its position in row-major (x, y, z) order, so id and centre follow from each other by arithmetic.
-
-    Args:
-        lower: lowest corner (x, y, z) in metres.
-        upper: highest corner (x, y, z) in metres.
-        shape: number of voxels along x, y and z.
     """
 
-    lower: tuple[float, float, float]
-    upper: tuple[float, float, float]
-    shape: tuple[int, int, int] = (8, 8, 8)
+    lower: tuple[float, float, float]  # lowest corner (x, y, z) in metres
+    upper: tuple[float, float, float]  # highest corner
+    shape: tuple[int, int, int] = (8, 8, 8)  # number of voxels along x, y and z
 
     def __post_init__(self) -> None:
         if min(self.shape) < 1:

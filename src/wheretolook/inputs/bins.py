@@ -12,8 +12,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 import warp as wp
 from numpy.typing import NDArray
+from torch import Tensor
 
 from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import split_poses
@@ -22,21 +24,11 @@ from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS, Layout
 from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.warp import start_warp
-from wheretolook.visibility.frustum import (
-    PosedViews,
-    in_view,
-    offsets_from,
-    pixels_of,
-    points_on_device,
-    rotate,
-    sets_on_device,
-    views_on_device,
-)
+from wheretolook.visibility import frustum
+from wheretolook.visibility.frustum import PosedViews
 
 if TYPE_CHECKING:
     from wheretolook.mapping.landmarks import Landmarks
-import torch
-from torch import Tensor
 
 GPU_LANES = 32  # threads that share a view on a GPU where bins are only counted
 
@@ -147,14 +139,14 @@ def _blocks(posed: PosedViews, bins: int, device: str, block: int) -> Iterator[t
     """Up to `block` views at a time: which of the views, and `Views` and `BinGrid` of them on the device."""
     camera, poses = posed.camera, np.asarray(posed.cam_from_world)
     assert isinstance(camera, PinholeCamera)
-    landmarks, sets = points_on_device(posed.points, device), sets_on_device(posed.unoccluded, device)
+    landmarks, sets = frustum.points_on_device(posed.points, device), frustum.sets_on_device(posed.unoccluded, device)
     for begin in range(0, len(poses), block):
         rows = slice(begin, min(begin + block, len(poses)))
         grid: Any = BinGrid()
         grid.rotations = wp.array(poses[rows, :, :3].astype(np.float32), dtype=wp.mat33, device=device)
         grid.focal, grid.center, grid.bins = wp.vec2d(camera.fx, camera.fy), wp.vec2d(camera.cx, camera.cy), bins
         grid.columns_per_pixel, grid.rows_per_pixel = bins / camera.width, bins / camera.height
-        yield rows, views_on_device(posed, rows, landmarks, sets, device), grid
+        yield rows, frustum.views_on_device(posed, rows, landmarks, sets, device), grid
 
 
 def bin_views_plain(posed: PosedViews, bins: int = 30, landmarks: Landmarks | None = None) -> BinnedViews:
@@ -167,11 +159,11 @@ def bin_views_plain(posed: PosedViews, bins: int = 30, landmarks: Landmarks | No
     rows = zip(*split_poses(posed.cam_from_world), posed.location_rows, strict=True)
     for view, (rotation, center, location) in enumerate(rows):
         candidates = posed.unoccluded[int(location)]
-        offsets = offsets_from(center, posed.points[candidates])
-        seen = in_view(camera, rotation[None], offsets)[0]
+        offsets = frustum.offsets_from(center, posed.points[candidates])
+        seen = frustum.in_view(camera, rotation[None], offsets)[0]
         offsets, seen_rows = offsets[seen], candidates[seen]
-        points_cam = rotate(rotation.astype(np.float32), offsets)
-        pixels = pixels_of(camera, points_cam)
+        points_cam = frustum.rotate(rotation.astype(np.float32), offsets)
+        pixels = frustum.pixels_of(camera, points_cam)
         scale = np.array([bins / camera.width, bins / camera.height])
         column, row = np.clip((pixels * scale).astype(int), 0, bins - 1).T
         cell = row * bins + column

@@ -49,7 +49,7 @@ class LabelConfig:
             install ray`).
         ray_address: address of the Ray cluster; empty starts one on this machine. Such as "auto" on one of its
             machines, or "ray://head:10001" from elsewhere (which needs `pip install 'ray[client]'`).
-        workers: worker processes on this machine; 0 means one for each CPU core that may be used.
+        workers: worker processes on this machine; 0 for one a CPU core. Of those that may be used.
         shard_size: viewpoints a shard, which is what an interruption can lose.
         store_matches: keep which landmarks each view matched; needed to learn matchability. Their rows, and of those
             that agree with the view's pose, in the columns matched_rows and inlier_rows.

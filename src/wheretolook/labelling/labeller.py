@@ -17,15 +17,13 @@ import numpy as np
 import pandas as pd
 from tqdm.auto import tqdm
 
-from wheretolook.features.keypoints import ExtractorConfig
-from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.labelling.config import LabelConfig
 from wheretolook.labelling.shard import LabelledShard, SceneJob, Shard
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.utils.errors import MapError, SceneError, StorageError, TableError
 from wheretolook.utils.files import fingerprint, sha256, write_json
 from wheretolook.utils.version import VERSION
-from wheretolook.viewpoints.table import SCHEMA, read_table, write_table
+from wheretolook.viewpoints.table import CAMERA_ID, SCHEMA, read_table, write_table
 
 MANIFEST = "manifest.json"
 """File in the folder of shards that says what the labels are made with; later `labels.json` beside the table."""
@@ -62,25 +60,6 @@ class LabelledScene:
     seconds: dict[str, float] = field(default_factory=dict)
 
 
-def label_viewpoints(
-    table: pd.DataFrame,
-    mesh: Path,
-    landmarks: Path,
-    camera: PinholeCamera,
-    shards: Path,
-    config: LabelConfig | None = None,
-    extractor: ExtractorConfig | None = None,
-    device: str = "cpu",
-    progress: bool = True,
-    description: str = "label",
-) -> pd.DataFrame:
-    """`label_scenes` for one scene, of the parts of a `SceneJob` and a `LabelTask`: the table with its labels."""
-    config, extractor = config or LabelConfig(), extractor or ExtractorConfig()
-    job = SceneJob(mesh, landmarks, camera, config.localizer, extractor, device, config.store_matches)
-    (scene,) = label_scenes([LabelTask(description, job, table, shards)], config, progress, description)
-    return scene.table
-
-
 def label_scenes(
     tasks: Sequence[LabelTask], config: LabelConfig, progress: bool = True, description: str = "label"
 ) -> Generator[LabelledScene, None, None]:
@@ -89,17 +68,12 @@ def label_scenes(
     Work is cut into shards. A finished shard is a file named by a hash of all that decides its labels (viewpoints,
     mesh, landmarks, settings, versions). A run that was interrupted or killed therefore goes on where it stopped and
     ends with the same table, for any engine and any number of workers, which go from one scene to the next without
-    pause. `description` is the title of the progress bar, one for all scenes.
+    pause. `description` is the title of the progress bar, one for all scenes. Yields scenes as they are finished; the
+    caller stores their tables, and may then remove their shards.
 
-    Yields:
-        Scenes as they are finished; the caller stores their tables, and may then remove their shards.
-
-    Raises:
-        SceneError, MapError: a mesh or landmarks cannot be used.
-        TableError: a table is empty.
-        WorkerError: workers were killed repeatedly, or something failed in one.
-        StorageError: a shard or its manifest cannot be written, as when the disk is full.
-        ConfigError: the Ray engine cannot be used.
+    Raises a SceneError or MapError if a mesh or landmarks cannot be used; a TableError if a table is empty; a
+    WorkerError if workers were killed repeatedly, or something failed in one; a StorageError if a shard or its manifest
+    cannot be written, as when the disk is full; a ConfigError if the Ray engine cannot be used.
     """
     scenes = [_SceneInProgress.of(task, config.shard_size) for task in tasks]
     scene_of_shard = {shard: scene for scene in scenes for shard in scene.missing}
@@ -155,13 +129,17 @@ class _SceneInProgress:
             fix = "Build the map again."
             raise MapError("landmarks without descriptors cannot be matched", path=job.landmarks, fix=fix)
         settings: dict[str, Any] = {"versions": versions()}
-        settings |= {name: asdict(getattr(job, name)) for name in ("localizer", "extractor", "camera")}
+        settings |= {name: asdict(getattr(job, name)) for name in ("localizer", "extractor")}
+        settings["camera"] = job.camera.record()
         settings |= {"renderer": _renderer_name(job.device)}
         settings |= {"mesh": fingerprint(job.mesh), "landmarks": fingerprint(job.landmarks)}
+        if job.cameras:
+            settings["cameras"] = {number: camera.record() for number, camera in job.cameras}
         if job.store_matches:  # only then, so that shards without matches keep their names from earlier versions
             settings["store_matches"] = True
         text = json.dumps(settings, sort_keys=True).encode()
-        inputs = [name for name in SCHEMA.names if name not in LABELS]  # a shard's file holds them all
+        # a shard's file holds them all
+        inputs = [name for name in (*SCHEMA.names, CAMERA_ID) if name not in LABELS and name in table]
         shards = []
         for begin in range(0, len(table), shard_size):
             rows = table.iloc[begin : begin + shard_size]

@@ -32,10 +32,7 @@ def run_local(
     """Label shards in processes, begun in this order, and yield them as they are finished.
 
     `tick` is called with the number of viewpoints just finished, negative when a worker died and they are redone.
-
-    Raises:
-        SceneError, MapError, WorkerError: from a worker.
-        WorkerError: a shard's worker was killed `MAX_DEATHS` times.
+    Raises what a worker raises, and a WorkerError if a shard's worker was killed `MAX_DEATHS` times.
     """
     waiting, deaths = deque(shards), Counter[Shard]()
     team: list[_Worker] = []

@@ -82,14 +82,22 @@ class Localizer:
         return match(self._matcher, descriptors, self.config.max_ratio)
 
     def estimate(
-        self, keypoints: Keypoints, keypoint_rows: NDArray[np.int64], landmark_rows: NDArray[np.int64]
+        self,
+        keypoints: Keypoints,
+        keypoint_rows: NDArray[np.int64],
+        landmark_rows: NDArray[np.int64],
+        camera: Camera | None = None,
     ) -> Localization:
-        """Step 3: the pose of one image from its matches, rows (M,) of its keypoints and rows (M,) of the landmarks."""
+        """Step 3: the pose of one image from its matches, rows (M,) of its keypoints and rows (M,) of the landmarks.
+
+        The image is of the localizer's camera, or of the one given.
+        """
         n_matches = len(keypoint_rows)
         if n_matches < self.config.min_matches:
             return Localization(TOO_FEW_MATCHES, None, n_matches, matched_rows=landmark_rows)
         pixels, points = keypoints.pixels[keypoint_rows].astype(np.float64), self.landmarks.points[landmark_rows]
-        options = (self._camera, self._estimation, self._refinement)
+        taken_with = self._camera if camera is None else camera.colmap.pycolmap
+        options = (taken_with, self._estimation, self._refinement)
         estimate = pycolmap.estimate_and_refine_absolute_pose(pixels, points, *options)
         if estimate is None:
             return Localization(NO_POSE, None, n_matches, matched_rows=landmark_rows)

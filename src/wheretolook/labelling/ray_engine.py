@@ -41,10 +41,8 @@ def run_ray(
     They are begun in this order and yielded as they are finished. An empty address uses the cluster that this process
     is connected to, or starts one on this machine. `tick` is called with the number of viewpoints just finished.
 
-    Raises:
-        ConfigError: Ray is not installed, or there is no cluster at the address.
-        SceneError, MapError, WorkerError: from a worker.
-        WorkerError: a shard was lost more than `MAX_RETRIES` times.
+    Raises what a worker raises; a ConfigError if Ray is not installed, or there is no cluster at the address; a
+    WorkerError if a shard was lost more than `MAX_RETRIES` times.
     """
     try:
         import ray

@@ -109,11 +109,9 @@ def _shares(views: pd.DataFrame) -> dict[str, Any]:
     finest, coarsest = (views[name].to_numpy() for name in (POSITIVE[0], POSITIVE[-1]))
     by_location = views.groupby(["scene", "location_id"])[POSITIVE[0]].any()
     positives = views[list(POSITIVE)].to_numpy()
-    medians = {
-        f"median_{name}_{unit}": views.loc[rows, f"error_{unit}"].median()
-        for name, rows in (("within", coarsest), ("beyond", ~coarsest))
-        for unit in ("m", "deg")
-    }
+    medians: dict[str, float] = {}
+    for name, rows in (("within", coarsest), ("beyond", ~coarsest)):
+        medians |= {f"median_{name}_{unit}": views.loc[rows, f"error_{unit}"].median() for unit in ("m", "deg")}
     return {
         "n_views": len(views),
         "n_locations": len(by_location),

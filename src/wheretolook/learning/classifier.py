@@ -22,8 +22,7 @@ def weighted_bce(
 ) -> Tensor:
     """Mean weighted binary cross-entropy of logits and labels (B,), 0 or 1 (paper, Sec. 3.3), a scalar.
 
-    The weights are those of the negative and the positive class; the sum is divided by `count` if that is given, not by
-    B.
+    The weights are those of the negative and the positive class; a `count` divides the sum in place of B.
     """
     negative, positive = class_weights
     weights = negative + (positive - negative) * labels
@@ -96,19 +95,10 @@ class ViewpointClassifier(LightningModule):
         logits, labels = self._gather(self._val_seen)
         bce = weighted_bce(logits, labels, self.class_weights)
         penalty = self.options.l2 * weight_penalty(self.network)
-        probabilities, truth = logits.sigmoid(), labels.long()
-        self._log(
-            {
-                "val_loss": bce + penalty,
-                "val_bce": bce,
-                "l2": penalty,
-                "val_average_precision": binary_average_precision(probabilities, truth, validate_args=False),
-                "val_roc_auc": binary_auroc(probabilities, truth, validate_args=False),
-                "val_calibration_error": binary_calibration_error(
-                    probabilities, truth, n_bins=CALIBRATION_BINS, norm="l1", validate_args=False
-                ),
-            }
-        )
+        views: dict[str, Any] = {"preds": logits.sigmoid(), "target": labels.long(), "validate_args": False}
+        ranking = {"val_average_precision": binary_average_precision(**views), "val_roc_auc": binary_auroc(**views)}
+        calibration = {"val_calibration_error": binary_calibration_error(**views, n_bins=CALIBRATION_BINS, norm="l1")}
+        self._log({"val_loss": bce + penalty, "val_bce": bce, "l2": penalty, **ranking, **calibration})
 
     def on_train_epoch_end(self) -> None:
         """Log the metrics of all training views, each as it was when the network learnt from it."""

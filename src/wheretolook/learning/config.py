@@ -16,14 +16,14 @@ class SharedConfig:
     """Options of training that all learners share. Each learner has its own beside them, in the group of its folder.
 
     Args:
-        methods: what to train, by name or by family, see `wheretolook evaluate --list-methods`; and "matchability",
-            which tells which landmarks will be found (needs labels with `--label.store_matches true`).
-        also: names of further datasets in the same folder; their train scenes are learnt from as well.
+        methods: what to train, by name or family, such as set and mlp. See `wheretolook evaluate --list-methods`; and
+            "matchability", which tells which landmarks will be found (needs labels with `--label.store_matches true`).
+        also: further datasets in the same folder whose train scenes are learnt from as well.
         max_error_m: a viewpoint is positive if its position error is strictly smaller, in metres.
         max_error_deg: and its orientation error too, in degrees.
-        val_fraction: share of the locations of each training scene held out for validation when the dataset has no
+        val_fraction: share of each training scene's locations held out for validation. Only when the dataset has no
             validation scene.
-        seed: seed of the split, the balance, the initial weights, dropout, noise and the order of batches.
+        seed: seed of all that is random. The split, the balance, initial weights, dropout, noise, the order of batches.
         accelerator: where to train: "auto", "cpu" or "gpu".
         devices: GPUs, or processes on the CPU, to train with. One step of many is one step of one: each takes its share
             of the same batch. Dropout and noise draw other numbers, though.

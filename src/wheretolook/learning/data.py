@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from math import ceil
 from typing import Any, NamedTuple, Self
@@ -30,8 +31,7 @@ ROOM = 2  # views are kept on a GPU that has this many times the memory they nee
 class Batch(NamedTuple):
     """One process's share of a batch."""
 
-    # what the network takes, tensors with B rows; of binned views means (B, C, bins, bins) float32 and filled (B, bins,
-    # bins) bool
+    # what the network takes, tensors with B rows; of binned views means (B, C, bins, bins) and filled (B, bins, bins)
     inputs: tuple[Tensor, ...]
     labels: Tensor  # (B,) float32
     total: int  # views in the whole batch, over all processes
@@ -121,15 +121,18 @@ def load_views(
                 filled[rows] = torch.from_numpy(binned.counts > 0)
                 start += len(binned)
                 bar.update(len(binned))
+    labels, scene_of, location_of = labels_of(tables, config)
+    return LabelledViews(means, filled, labels.to(home), scene_of, location_of, channels)
+
+
+def labels_of(
+    tables: Sequence[pd.DataFrame], config: SharedConfig
+) -> tuple[Tensor, NDArray[np.int64], NDArray[np.int64]]:
+    """Labels (B,) float32 of scenes' views, the number of each view's scene, and its location_id, (B,) int64 each."""
     good = [is_good(table, config.max_error_m, config.max_error_deg) for table in tables]
-    return LabelledViews(
-        means,
-        filled,
-        torch.from_numpy(np.concatenate(good).astype(np.float32)).to(home),
-        np.repeat(np.arange(len(tables)), [len(table) for table in tables]),
-        np.concatenate([table["location_id"].to_numpy(np.int64) for table in tables]),
-        channels,
-    )
+    location = np.concatenate([table["location_id"].to_numpy(np.int64) for table in tables])
+    scene = np.repeat(np.arange(len(tables)), [len(table) for table in tables])
+    return torch.from_numpy(np.concatenate(good).astype(np.float32)), scene, location
 
 
 def labelled_rows(scene: SceneFolder, matches: bool = False) -> pd.DataFrame:
@@ -158,8 +161,8 @@ def _share(*tensors: Tensor) -> None:
 def with_also(dataset: Dataset, names: Sequence[str]) -> Dataset:
     """A dataset together with the train scenes of others beside it.
 
-    Raises a TableError if there is no such dataset or it has no train scene; a ConfigError if it was made for another
-    camera, is named twice or is the dataset itself, or one of its scenes is one of the dataset's under another name.
+    Raises a TableError if there is no such dataset or it has no train scene; a ConfigError if it is named
+    twice or is the dataset itself, or one of its scenes is one of the dataset's under another name.
     """
     if len({dataset.name, *names}) <= len(names):
         fix = "Name other datasets in the same folder, each once."
@@ -167,9 +170,6 @@ def with_also(dataset: Dataset, names: Sequence[str]) -> Dataset:
     scenes = list(dataset.scenes)
     for name in names:
         other = Dataset.load(dataset.root.parent / name)
-        if other.camera != dataset.camera:
-            fix = f"It must be {dataset.camera}, as that of {dataset.root}."
-            raise ConfigError(f"{other.root} was made for another camera", value=other.camera, fix=fix)
         scenes += training_scenes(Dataset(other.root, other.split("train")))
     if names:
         seen: dict[str, SceneFolder] = {}
@@ -183,14 +183,11 @@ def with_also(dataset: Dataset, names: Sequence[str]) -> Dataset:
 
 
 def training_scenes(dataset: Dataset) -> list[SceneFolder]:
-    """The scenes that are read for training: train scenes, of which a TableError says if there are none, then val
-    scenes.
-    """
-    train = dataset.split("train")
-    if not train:
+    """The scenes that are read for training: train scenes, then val scenes; a TableError without train scenes."""
+    if not dataset.split("train"):
         fix = "Make one, or train on another dataset."
         raise TableError("the dataset has no train scene", path=dataset.root, fix=fix)
-    return [*train, *dataset.split("val")]
+    return [*dataset.split("train"), *dataset.split("val")]
 
 
 def validation_views(
@@ -247,8 +244,7 @@ def balance_classes(labels: Tensor, seed: int) -> Tensor:
 
 
 class BatchLoader:
-    """Batches of the views in `rows` (n,), cut from tensors by index: no worker, no per-sample work, no copy of the
-    views.
+    """Batches of the views in `rows` (n,), cut from tensors by index: no worker, nothing done for a single view.
 
     With several processes, every one cuts the same batches of `batch_size` and keeps its share of each. Shares differ
     by one view at most and can be empty, so that all processes take equally many steps. With a `shuffle_seed` every
@@ -291,9 +287,10 @@ class BatchLoader:
             yield Batch((binned, filled.index_select(0, share)), labels.index_select(0, share), len(batch))
 
 
-class ViewsDataModule(LightningDataModule):
+class ViewsDataModule(LightningDataModule, ABC):
     """Labelled viewpoints of train and val scenes, some to learn from and some to tell which epoch was best."""
 
+    config: SharedConfig
     views: Any  # `TensorViews`
     train_rows: Any  # rows of the views to learn from, (n,) int64
     val_rows: Any  # rows of the views for validation
@@ -304,6 +301,18 @@ class ViewsDataModule(LightningDataModule):
             device = self.trainer.strategy.root_device
             if device != self.views.device and has_room(device, self.views.n_bytes):
                 self.views = self.views.to(device)
+
+    def train_dataloader(self) -> Iterable[Batch]:
+        """Shuffled batches of the training views."""
+        return self.batches(self.train_rows, self.config.seed)
+
+    def val_dataloader(self) -> Iterable[Batch]:
+        """Batches of the validation views, in order."""
+        return self.batches(self.val_rows)
+
+    @abstractmethod
+    def batches(self, rows: Any, shuffle_seed: int | None = None) -> Iterable[Batch]:
+        """Batches of the views in `rows`, shuffled by a seed; without one in order, and larger: nothing is learnt."""
 
     @property
     def share(self) -> tuple[int, int]:
@@ -351,14 +360,6 @@ class ViewpointDataModule(ViewsDataModule):
             self.use(views, validation_views(self.dataset, views.scene, views.location, self.config))
         super().setup(stage)
 
-    def train_dataloader(self) -> BatchLoader:
-        """Shuffled batches of the training views."""
-        return self._loader(self.train_rows, self.options.batch_size, self.config.seed)
-
-    def val_dataloader(self) -> BatchLoader:
-        """Batches of the validation views, in order."""
-        return self._loader(self.val_rows, 8 * self.options.batch_size)
-
     def use(self, views: LabelledViews, held_out: NDArray[np.bool_]) -> None:
         """Train on these views instead of those of the dataset, without those held out (B,).
 
@@ -373,7 +374,9 @@ class ViewpointDataModule(ViewsDataModule):
         self.statistics = InputStatistics.of(views.means, views.filled, self.train_rows, views.channels)
         self.views = views
 
-    def _loader(self, rows: Tensor, batch_size: int, shuffle_seed: int | None = None) -> BatchLoader:
+    def batches(self, rows: Tensor, shuffle_seed: int | None = None) -> BatchLoader:
+        """See `ViewsDataModule.batches`."""
+        batch_size = self.options.batch_size * (8 if shuffle_seed is None else 1)
         return BatchLoader(self.views, rows, batch_size, shuffle_seed, self.channels, *self.share)
 
 

@@ -44,11 +44,8 @@ def home_device(config: SharedConfig) -> str:
     gpus = torch.cuda.device_count() if config.accelerator != "cpu" else 0
     wanted = config.devices if gpus or config.accelerator == "gpu" else 0
     if wanted > max(gpus, torch.backends.mps.is_available()):
-        raise ConfigError(
-            f"train.devices asks for more GPUs than there are: {gpus}",
-            value=config.devices,
-            fix="Ask for fewer, or set train.accelerator to cpu to train in processes on the CPU.",
-        )
+        fix = "Ask for fewer, or set train.accelerator to cpu to train in processes on the CPU."
+        raise ConfigError(f"train.devices asks for more GPUs than there are: {gpus}", value=config.devices, fix=fix)
     return "cuda:0" if gpus else "cpu"
 
 
@@ -66,26 +63,19 @@ def fit(classifier: ViewpointClassifier, data: LightningDataModule, record: Epoc
     with _quiet(), TemporaryDirectory() as folder:
         if several:
             record.file = Path(folder) / "record.pt"
-        trainer = Trainer(
-            accelerator="cpu" if several and home_device(config) == "cpu" else config.accelerator,
-            devices=config.devices,
-            # spawned processes run nothing but the fit; processes that run the program anew would repeat all else
-            strategy=_Spawned(start_method="spawn") if several else "auto",
-            max_epochs=options.epochs,
-            logger=False,
-            callbacks=callbacks,
-            default_root_dir=folder,
-            num_sanity_val_steps=0,
-            enable_progress_bar=False,
-            enable_model_summary=False,
-        )
+        where: dict[str, Any] = {"accelerator": config.accelerator, "devices": config.devices}
+        if several:  # spawned processes run nothing but the fit; those that run the program anew would repeat all else
+            where["strategy"] = _Spawned(start_method="spawn")
+            where["accelerator"] = "cpu" if home_device(config) == "cpu" else config.accelerator
+        quiet: dict[str, Any] = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False}
+        how: dict[str, Any] = {"max_epochs": options.epochs, "callbacks": callbacks, "num_sanity_val_steps": 0}
+        trainer = Trainer(**where, **how, **quiet, default_root_dir=folder)
         try:
             trainer.fit(classifier, datamodule=data)
         except ProcessException as error:
-            raise WorkerError(
-                f"a training process ended before its work was done: {error}", value=f"train.devices {config.devices}",
-                fix="There may be too little memory: lower train.devices.",
-            ) from error  # fmt: skip
+            problem = f"a training process ended before its work was done: {error}"
+            fix = "There may be too little memory: lower train.devices."
+            raise WorkerError(problem, value=f"train.devices {config.devices}", fix=fix) from error
         record.collect()
     data.trainer = None  # who asks for batches from now on gets whole ones, not one process's share
 
@@ -115,8 +105,7 @@ class RunLog:
 
 
 class EpochRecord(Checkpoint):
-    """Keeps each epoch's metrics (`rows`) and the weights that the options ask for (of the epoch `kept`), and shows and
-    logs them.
+    """Keeps, shows and logs each epoch's metrics (`rows`), and keeps the weights of the epoch asked for (`kept`).
 
     In `file` a process that trains leaves the record for the one that started it; None if they are the same.
     """

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from math import ceil, log
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from wheretolook.dataset.folders import Dataset, SceneFolder
+from wheretolook.dataset.folders import Dataset, SceneFolder, views_by_camera
 from wheretolook.inputs.landmarks_in_view import ATTRIBUTES, LandmarkDescriber, ViewLandmarks
 from wheretolook.learning.config import SharedConfig
 from wheretolook.learning.data import (
@@ -28,7 +29,7 @@ from wheretolook.learning.fit import home_device
 from wheretolook.learning.learner import Task
 from wheretolook.viewpoints.table import LOCALIZED, is_good, poses
 
-DISTANCES = [ATTRIBUTES.index(name) for name in ("distance", "mapped_distance")]
+DISTANCES = [ATTRIBUTES.index(name) for name in ("distance", "mapped_distance", "mapped_pixel_size")]
 """Attributes that are logarithms of distances: those that change when a scene is enlarged."""
 
 BLOCK = 2048  # views described at a time: some million landmarks
@@ -100,27 +101,20 @@ def load_landmark_views(
     total = sum(len(table) for _, table in tables)
     with tqdm(total=total, desc="describe views", unit="view", disable=not progress) as bar:
         for number, (scene, table) in enumerate(tables):
-            describer = LandmarkDescriber(scene.localization_map(dataset.camera, device))
+            describer = LandmarkDescriber(scene.localization_map(device=device))
             cam_from_world, good = poses(table), is_good(table, config.max_error_m, config.max_error_deg)
             error_m = np.where(is_good(table, np.inf, config.max_error_deg), table["error_m"], np.inf)
-            for begin in range(0, len(table), BLOCK):
-                rows = slice(begin, begin + BLOCK)
-                described = describer.describe(cam_from_world[rows])
+            of_views = np.stack([cam_from_world[:, 2, 2], good, error_m]).astype(np.float32)
+            location = table["location_id"].to_numpy(np.int64)
+            for camera, rows in views_by_camera(scene, table, BLOCK):
+                described = describer.of_camera(camera).describe(cam_from_world[rows])
                 found = _found(described, table.iloc[rows]) if matches else None
                 starts, kept = _some_of_each(described, most, generator)
-                blocks.append(
-                    LandmarkViews(
-                        starts.cpu(),
-                        described.values[kept].to("cpu", torch.float16),
-                        described.counts.cpu(),
-                        torch.from_numpy(cam_from_world[rows, 2, 2].astype(np.float32)),
-                        torch.from_numpy(good[rows].astype(np.float32)),
-                        torch.from_numpy(error_m[rows].astype(np.float32)),
-                        np.full(len(described), number),
-                        table["location_id"].to_numpy(np.int64)[rows],
-                        None if found is None else found[kept.cpu()],
-                    )
-                )
+                values, counts = described.values[kept].to("cpu", torch.float16), described.counts.cpu()
+                found = None if found is None else found[kept.cpu()]
+                scene_of, at = np.full(len(described), number), location[rows]
+                height, label, off_m = torch.from_numpy(of_views[:, rows])
+                blocks.append(LandmarkViews(starts.cpu(), values, counts, height, label, off_m, scene_of, at, found))
                 bar.update(len(described))
     return _joined(blocks)
 
@@ -152,18 +146,12 @@ def _joined(blocks: Sequence[LandmarkViews]) -> LandmarkViews:
     lengths = torch.cat([block.starts.diff() for block in blocks])
     starts = torch.zeros(len(lengths) + 1, dtype=torch.int64)
     starts[1:] = lengths.cumsum(0)
-    found = [block.found for block in blocks if block.found is not None]
-    return LandmarkViews(
-        starts,
-        torch.cat([block.values for block in blocks]),
-        torch.cat([block.visible for block in blocks]),
-        torch.cat([block.axis_height for block in blocks]),
-        torch.cat([block.labels for block in blocks]),
-        torch.cat([block.error_m for block in blocks]),
-        np.concatenate([block.scene for block in blocks]),
-        np.concatenate([block.location for block in blocks]),
-        torch.cat(found) if found else None,
-    )
+    joined: dict[str, Any] = {"starts": starts}
+    for name in ("values", "visible", "axis_height", "labels", "error_m", "scene", "location", "found"):
+        parts = [getattr(block, name) for block in blocks if getattr(block, name) is not None]
+        if parts:
+            joined[name] = torch.cat(parts) if isinstance(parts[0], Tensor) else np.concatenate(parts)
+    return LandmarkViews(**joined)
 
 
 class LandmarkLoader:

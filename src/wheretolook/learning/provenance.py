@@ -41,15 +41,15 @@ def about_training(dataset: Dataset, method: str, config: SharedConfig, options:
     a dataclass. What training starts from (`FittingConfig.starts_from`) decides, too.
     """
     shared = {name: value for name, value in asdict(config).items() if name in DECIDING}
+    seen = [scene for scene in dataset.scenes if scene.split != "test"]
+    cameras = [camera.record() for camera in dataset.cameras]
     about: dict[str, Any] = {
         "dataset": dataset.name,
         "dataset_fingerprint": training_fingerprint(dataset),
-        "landmarks": {
-            _name(scene, dataset): fingerprint(scene.landmarks) for scene in dataset.scenes if scene.split != "test"
-        },
+        "landmarks": {_name(scene, dataset): fingerprint(scene.landmarks) for scene in seen},
         "code_version": VERSION,
         "method": method,
-        "camera": dataset.camera.record(),
+        "camera": cameras[0] if len(cameras) == 1 else cameras,
         "config": {**asdict(options), **shared},
     }
     if config.also:

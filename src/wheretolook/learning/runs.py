@@ -40,9 +40,7 @@ def method_of_run(run: Run) -> str:
 def train_runs(
     tracking: TrackingConfig, dataset: str = "", method: str = "", file: str = ""
 ) -> Iterator[tuple[str, Run]]:
-    """Finished train runs, the newest first, with the names of their methods; "" is for any dataset, any method, and
-    any files.
-    """
+    """Finished train runs, the newest first, with the names of their methods; "" is for any."""
     for run in finished_runs(tracking, "train", params={"dataset": dataset} if dataset else None, file=file):
         name = method_of_run(run)
         if not method or name == method:
@@ -78,9 +76,7 @@ _MEASURES = ("average_precision", "roc_auc", "calibration_error")
 
 
 def log_history(tracking: TrackingConfig, run_id: str, history: pd.DataFrame) -> None:
-    """Log a history, a row an epoch with its number as `epoch`, as training itself does; what is not finite is left
-    out.
-    """
+    """Log a history, a row an epoch with its number as `epoch`, as training itself does; not what is unknown."""
     from mlflow.entities import Metric
 
     start = int(client(tracking).get_run(run_id).info.start_time)
@@ -117,11 +113,8 @@ def keep_histories(release: Dataset, tracking: TrackingConfig) -> pd.DataFrame:
     for record in records(release.root / "weights").values():
         method, history = record["about"]["method"], None
         same = {name: str(value) for name, value in params_of(record["about"]).items() if name != "method"}
-        alike = [
-            run
-            for _, run in train_runs(tracking, same["dataset"], method, HISTORY_CSV)
-            if same.items() <= run.data.params.items()
-        ]
+        runs = (run for _, run in train_runs(tracking, same["dataset"], method, HISTORY_CSV))
+        alike = [run for run in runs if same.items() <= run.data.params.items()]
         own = [run for run in alike if run.info.run_id == record["run_id"]]
         for run in (own or alike)[:1]:
             history = pd.read_csv(artifact(tracking, run.info.run_id, HISTORY_CSV))

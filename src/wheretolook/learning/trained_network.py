@@ -2,30 +2,30 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Generic, Self, TypeVar
 
 from torch import Tensor, nn
 
-from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.camera import Camera, camera_of_record
 from wheretolook.learning.old_names import name_of_header
 from wheretolook.learning.weights import check_serves, read_weights, write_weights
 from wheretolook.utils.errors import ConfigError, WeightsError
 
 
-class StoredNetwork(nn.Module):
+class StoredNetwork(nn.Module, ABC):
     """A network that can be built anew from what it tells of itself."""
 
+    @abstractmethod
     def description(self) -> dict[str, Any]:
         """All that defines the network but its weights, as JSON values."""
-        raise NotImplementedError
 
     @classmethod
+    @abstractmethod
     def of_description(cls, stored: Mapping[str, Any]) -> Self:
         """The untrained network with this description; a WeightsError if it asks for what is not known here."""
-        raise NotImplementedError
 
     @property
     def stored(self) -> nn.Module:
@@ -37,12 +37,10 @@ NetworkT = TypeVar("NetworkT", bound=StoredNetwork)
 
 
 class TrainedNetwork(Generic[NetworkT]):
-    """A network, the camera of its training views, and what makes its logits calibrated log-odds: scale * logit +
-    offset.
-    """
+    """A network, the camera of its training views, and what calibrates its logits: scale * logit + offset."""
 
     def __init__(
-        self, method: str, network: NetworkT, camera: PinholeCamera, scale: float = 1.0, offset: float = 0.0
+        self, method: str, network: NetworkT, camera: Camera | None, scale: float = 1.0, offset: float = 0.0
     ) -> None:
         self.method, self.network, self.camera = method, network.eval(), camera
         self.scale, self.offset = scale, offset
@@ -52,16 +50,13 @@ class TrainedNetwork(Generic[NetworkT]):
         return self.scale * logits + self.offset
 
     def save(self, path: Path, training: Mapping[str, Any] | None = None) -> None:
-        """Write one safetensors file, atomically, with JSON values on the training. The same network gives the same
-        bytes.
-        """
+        """Write one safetensors file, atomically, with JSON values on the training. Equal networks, equal bytes."""
         header = {
             **self.network.description(),
-            "camera": self.camera.record(),
+            "camera": None if self.camera is None else self.camera.record(),
             "scale": self.scale,
-            "offset": self.offset,
-            "training": dict(training or {}),
         }
+        header |= {"offset": self.offset, "training": dict(training or {})}
         write_weights(path, self.method, self.network.stored.state_dict(), header)
 
     @classmethod
@@ -70,15 +65,14 @@ class TrainedNetwork(Generic[NetworkT]):
     ) -> TrainedNetwork[NetworkT]:
         """Read what `save` wrote for one of these methods, ready to score on a device (dropout off, no gradients).
 
-        Raises a WeightsError if the file is missing, damaged, foreign, of another method, or does not fit its own
-        description.
+        Raises a WeightsError if the file is missing, damaged, foreign, of another method, or unlike its description.
         """
         tensors, header = read_weights(Path(path))
         check_serves(path, header, *methods)
         fix = f"Train again, or give other weights of {methods[0]}."
         try:
             network = network_class.of_description(header)
-            camera = PinholeCamera(**header["camera"])
+            camera = None if header["camera"] is None else camera_of_record(header["camera"])
             scale, offset = float(header.get("scale", 1.0)), float(header.get("offset", 0.0))
         except WeightsError as error:
             raise WeightsError(error.problem, path=path, value=error.value, fix=error.fix or fix) from error

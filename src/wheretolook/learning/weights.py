@@ -48,18 +48,15 @@ def read_training(path: str | Path) -> dict[str, Any]:
 
 
 def read_record(path: str | Path) -> dict[str, Any]:
-    """What the train stage wrote beside weights: "about", "weights_sha256", "run_id" and "metrics"; a WeightsError if
-    it is missing or damaged.
-    """
+    """The record beside weights: "about", "weights_sha256", "run_id", "metrics". WeightsError if missing or damaged."""
     beside = Path(path).with_suffix(".json")
     try:
         record = dict(json.loads(beside.read_text()))
         float(record["metrics"]["val_average_precision"])
         return record | {"about": with_name(record["about"])}
     except (OSError, ValueError, TypeError, KeyError) as error:
-        raise WeightsError(
-            f"the record of training is missing or damaged: {error}", path=beside, fix="Train again."
-        ) from error
+        problem = f"the record of training is missing or damaged: {error}"
+        raise WeightsError(problem, path=beside, fix="Train again.") from error
 
 
 def method_of_weights(path: str | Path) -> str:
@@ -97,11 +94,8 @@ def read_weights(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         header = dict(json.loads(metadata[METADATA_KEY]))
     except ValueError as error:
         raise WeightsError(f"damaged description in the header: {error}", path=path, fix="Train again.") from error
-    if header.get("format_version") != FORMAT_VERSION:
-        raise WeightsError(
-            f"this version of wheretolook reads weights of format {FORMAT_VERSION}",
-            path=path,
-            value=header.get("format_version"),
-            fix="Train again, or install the version that wrote them.",
-        )
+    if (found := header.get("format_version")) != FORMAT_VERSION:
+        problem = f"this version of wheretolook reads weights of format {FORMAT_VERSION}"
+        fix = "Train again, or install the version that wrote them."
+        raise WeightsError(problem, path=path, value=found, fix=fix)
     return tensors, header

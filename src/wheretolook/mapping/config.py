@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from math import inf
 from pathlib import Path
 
-from wheretolook.geometry.camera import CameraConfig
 from wheretolook.features.keypoints import ExtractorConfig
+from wheretolook.geometry.camera import CameraConfig
 from wheretolook.utils.errors import ConfigError
 
 
@@ -192,7 +192,7 @@ class MapConfig:
             paper's 0.5 px).
         photographs: a folder of photographs to map instead of a mesh; of the other settings, only `extractor` and
             `keep_database` then count.
-        camera: the camera that maps, if it is not the one that looks, such as `{width: 1280, height: 720, fov_deg: 70}`.
+        camera: the camera that maps, if not the one that looks, such as `{width: 1280, height: 720, fov_deg: 70}`.
         draw_camera: draw the camera that maps from the scene's seed, as `sample.cameras` draws those that look.
         keep_images: keep the rendered images, as `images/` in the map's folder.
         keep_database: keep COLMAP's database of keypoints and matches, as `database.db`.

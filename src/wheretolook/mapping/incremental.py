@@ -179,14 +179,11 @@ def _reconstruct(
     shutil.rmtree(models, ignore_errors=True)
     models.mkdir()
     bar = tqdm(total=n_images, desc="map: register", disable=not progress, unit="image")
-    callbacks: Any = {
-        "initial_image_pair_callback": lambda: bar.update(2),
-        "next_image_callback": lambda: bar.update(1),
-    }
+    steps: Any = {"initial_image_pair_callback": lambda: bar.update(2), "next_image_callback": lambda: bar.update(1)}
     with quiet_colmap("ERROR"), bar:
         verifier = pycolmap.GeometricVerifierOptions(num_threads=threads)
         pycolmap.geometric_verification(str(database), verifier, two_view_geometry_options=verification)
-        found = pycolmap.incremental_mapping(str(database), str(models), str(models), options, **callbacks)
+        found = pycolmap.incremental_mapping(str(database), str(models), str(models), options, **steps)
     ordered = sorted(found.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
     shutil.rmtree(models)
     if not ordered:

@@ -106,6 +106,8 @@ def map_photographs(
             landmarks = building.save_landmarks(partial, mapped.database, settings.max_reprojection_error_px)
         if config.keep_database:
             shutil.copyfile(mapped.database, partial / DATABASE_FILE)
+        off_deg = gravity.residual_deg
+        upright_by = {"median_deg": float(np.median(off_deg)), "max_deg": float(off_deg.max())}
         registered = set(names.values())
         report = PhotographMapReport(
             n_images=len(features.names),
@@ -119,11 +121,7 @@ def map_photographs(
             mean_reprojection_error_px=float(landmarks.reprojection_error_px.mean()),
             cameras=[_describe(camera) for _, camera in sorted(model.cameras.items())],
             n_known_focal=cameras.n_known_focal,
-            gravity={
-                "method": "positions" if known.positions else gravity.method,
-                "median_deg": float(np.median(gravity.residual_deg)),
-                "max_deg": float(gravity.residual_deg.max()),
-            },
+            gravity={"method": "positions" if known.positions else gravity.method, **upright_by},
             scale=scale,
             seed=seed,
             config=asdict(config),

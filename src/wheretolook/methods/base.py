@@ -8,14 +8,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from wheretolook.geometry.camera import Camera, ColmapCamera, describe_camera
 from wheretolook.geometry.poses import Float
 from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS
+from wheretolook.utils.errors import CameraError
 
 if TYPE_CHECKING:
     from wheretolook.inputs.bins import BinnedViews
     from wheretolook.inputs.localization_map import LocalizationMap
 
 BLOCK = 4096  # views scored at a time: about 80 MB of bins
+FIELD_OF_VIEW_TOLERANCE = (
+    1e-3  # relative difference in size / focal length, and of the principal point, up to which they are the same
+)
 
 
 class Scorer(ABC):
@@ -41,16 +46,12 @@ class Scorer(ABC):
         """Score poses (B, 3, 4). Returns (B,) float64, finite."""
 
     def score_binned(self, cam_from_world: Float, binned: BinnedViews) -> Float:
-        """The same as `score` gives, (B,), for poses that `localization_map.bin_views` has binned already, with all of
-        `CHANNELS`.
-        """
+        """What `score` gives, (B,), for poses that the map's `bin_views` has binned already, with all `CHANNELS`."""
         return self.score(cam_from_world)
 
 
 class BinnedScorer(Scorer):
-    """A method that scores a view by its binned landmarks alone, by `ALL_CHANNELS` or by `CHANNELS`, of `bins` x `bins`
-    bins.
-    """
+    """Scores a view by its binned landmarks alone: `CHANNELS` or `ALL_CHANNELS` of `bins` x `bins` bins."""
 
     def __init__(self, localization_map: LocalizationMap, bins: int = 30, landmark_channels: bool = False) -> None:
         super().__init__(localization_map)
@@ -91,3 +92,20 @@ class CountingScorer(BinnedScorer):
     @abstractmethod
     def score_counts(self, n_visible: NDArray[np.int32], n_filled: NDArray[np.int32]) -> Float:
         """Score views by their landmarks and filled bins, (B,) each. Returns (B,) float64, finite."""
+
+
+def check_field_of_view(trained: Camera | None, camera: Camera) -> Camera:
+    """The camera of the training views; a CameraError if its field of view is not that of the camera that looks."""
+    if trained is None or not same_field_of_view(trained, camera):
+        of = "several cameras" if trained is None else f"a camera of {describe_camera(trained)}"
+        fix = "Use a pinhole camera with that field of view, or train with this one."
+        raise CameraError(f"the network was trained for {of}", value=describe_camera(camera), fix=fix)
+    return trained
+
+
+def same_field_of_view(trained: Camera, camera: Camera) -> bool:
+    """Whether two pinholes see the same: their image is the same but for its resolution."""
+    if isinstance(camera, ColmapCamera) or isinstance(trained, ColmapCamera):
+        return False
+    spans = [(c.width / c.fx, c.height / c.fy, c.cx / c.width, c.cy / c.height) for c in (trained, camera)]
+    return bool(np.allclose(spans[0], spans[1], rtol=FIELD_OF_VIEW_TOLERANCE, atol=0))

@@ -7,15 +7,14 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from wheretolook.geometry.poses import Float
 from wheretolook.inputs.bins import BinnedViews, InputStatistics
 from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.learning.trained_network import StoredNetwork, TrainedNetwork
-from wheretolook.methods.base import BinnedScorer
-from wheretolook.methods.field_of_view import check_field_of_view
+from wheretolook.methods.base import BinnedScorer, check_field_of_view
 from wheretolook.utils.errors import WeightsError
 
 
@@ -37,31 +36,38 @@ def stored_statistics(stored: Mapping[str, Any]) -> InputStatistics:
     return InputStatistics(tuple(values["channels"]), tuple(values["mean"]), tuple(values["std"]))
 
 
-def standardize(means: Tensor, filled: Tensor, mean: Tensor, std: Tensor, n_certain: int) -> Tensor:
-    """Standardize each channel of means (B, C, bins, bins) by mean and std (C, 1, 1) of its kind (paper, Sec. 3.3
-    "Data").
+class StandardBins(nn.Module):
+    """Standardizes the channels of binned views by the mean and deviation of their kind (paper, Sec. 3.3 "Data").
 
     Empty bins are exactly zero afterwards, that is, the mean of their kind; so are landmark channels where a value is
-    not known. The first `n_certain` channels, of where landmarks lie, are always known: a NaN there is an error to be
-    seen.
+    not known. Where landmarks lie, in the first channels, is always known: a NaN there is an error that must show.
     """
-    values = (means - mean) / std * filled[:, None]
-    if values.shape[1] > n_certain:
-        of_landmarks = values[:, n_certain:]
-        of_landmarks.masked_fill_(of_landmarks.isnan(), 0.0)
-    return values
 
+    mean: Tensor
+    std: Tensor
 
-def n_certain(channels: tuple[str, ...]) -> int:
-    """How many of the first channels tell where landmarks lie, which is always known."""
-    return next((place for place, name in enumerate(channels) if name not in CHANNELS), len(channels))
+    def __init__(self, statistics: InputStatistics) -> None:
+        super().__init__()
+        channels = statistics.channels
+        self.n_certain = next((i for i, name in enumerate(channels) if name not in CHANNELS), len(channels))
+        # these follow from the description that is stored beside the weights: persistent=False
+        self.register_buffer("mean", torch.tensor(statistics.mean)[:, None, None], persistent=False)
+        self.register_buffer("std", torch.tensor(statistics.std)[:, None, None], persistent=False)
+
+    def forward(self, means: Tensor, filled: Tensor) -> Tensor:
+        """Means (B, C, bins, bins), standardized, of bins (B, bins, bins) that are filled or not."""
+        values = (means - self.mean) / self.std * filled[:, None]
+        if values.shape[1] > self.n_certain:
+            of_landmarks = values[:, self.n_certain :]
+            of_landmarks.masked_fill_(of_landmarks.isnan(), 0.0)
+        return values
 
 
 class BinnedNetworkScorer(BinnedScorer):
     """The probability that a view localizes, by a network over its binned landmarks.
 
     A network knows the field of view it was trained with. A camera of another resolution but the same field of view is
-    served by scaling its pixels; another is refused with a WeightsError, since the network has never seen one.
+    served by scaling its pixels; another is refused with a CameraError, since the network has never seen one.
     """
 
     local = True
@@ -71,10 +77,10 @@ class BinnedNetworkScorer(BinnedScorer):
         self.channels = network.statistics.channels
         super().__init__(localization_map, network.bins, not {*self.channels} <= {*CHANNELS})
         camera, self.device = localization_map.camera, localization_map.device
-        check_field_of_view(trained.camera, camera)
+        seen = check_field_of_view(trained.camera, camera)
         self.name, self.trained = trained.method, trained
         self.network: Any = network.to(self.device).eval()
-        pixels = {"u": trained.camera.width / camera.width, "v": trained.camera.height / camera.height}
+        pixels = {"u": seen.width / camera.width, "v": seen.height / camera.height}
         scales = [pixels.get(name, 1.0) for name in self.channels]
         self._scale = torch.tensor(scales, device=self.device)[:, None, None]
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from wheretolook.geometry.poses import Float
 from wheretolook.methods.base import CountingScorer
-from wheretolook.methods.method import Method, MethodStyle
+from wheretolook.methods.method import MethodStyle, rule
 
 
 class BinsScorer(CountingScorer):
@@ -26,10 +26,5 @@ class BinsScorer(CountingScorer):
 
 
 METHODS = (
-    Method(
-        name=BinsScorer.name,
-        about='Share of the image\'s bins with a visible landmark in them (paper, Sec. 4.1, "reprojection with bins").',
-        style=MethodStyle("reprojections with bins", "#009E73", "D", "-."),
-        build=lambda localization_map, options: BinsScorer(localization_map),
-    ),
+    rule(BinsScorer, MethodStyle("reprojections with bins", "#009E73", "D", "-."), of_the_few=True, fallback=True),
 )

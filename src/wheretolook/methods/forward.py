@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from wheretolook.geometry.poses import Float, camera_centers, check_poses
 from wheretolook.methods.base import Scorer
-from wheretolook.methods.method import Method, MethodStyle, ScorerOptions
+from wheretolook.methods.method import MethodStyle, ScorerOptions, rule
 from wheretolook.methods.random import uniform
 
 if TYPE_CHECKING:
@@ -19,15 +19,10 @@ if TYPE_CHECKING:
 class ForwardScorer(Scorer):
     """Views by how near they look to a heading: the classical camera that knows nothing of the map (paper, Sec. 4.3).
 
-    Args:
-        localization_map: not looked at.
-        heading: where the robot drives to, in the world: (3,) everywhere, of any length but zero; or (W, 3) waypoints
-            of a path in metres, W > 1, for the direction of the leg that is nearest to the camera. None for a
-            horizontal heading drawn for each location.
-        seed: of the headings that are drawn.
-
-    Raises:
-        ValueError: a heading is zero or not finite, or two waypoints in a row are the same.
+    The heading is where the robot drives to, in the world: (3,) everywhere, of any length but zero; or (W, 3) waypoints
+    of a path in metres, W > 1, for the direction of the leg that is nearest to the camera. None is for a horizontal
+    heading drawn for each location, by the seed. Raises a ValueError if a heading is zero or not finite, or two
+    waypoints in a row are the same.
     """
 
     name = "forward"
@@ -41,15 +36,9 @@ class ForwardScorer(Scorer):
             given = np.asarray(heading, dtype=np.float64)
             legs = given[None] if given.ndim == 1 else np.diff(given, axis=0)
             lengths = np.linalg.norm(legs, axis=-1)
-            if (
-                given.shape[-1:] != (3,)
-                or given.ndim > 2
-                or not len(legs)
-                or not np.all((lengths > 0) & (lengths < np.inf))
-            ):
-                raise ValueError(
-                    f"a heading is a direction (3,) of finite length, or a path (W, 3) of such, got {given}"
-                )
+            usable = len(legs) and np.all((lengths > 0) & (lengths < np.inf))
+            if given.shape[-1:] != (3,) or given.ndim > 2 or not usable:
+                raise ValueError(f"a heading is a direction (3,) of finite length, or a path (W, 3) of such: {given}")
             self._starts, self._legs = (np.zeros((1, 3)) if given.ndim == 1 else given[:-1]), legs
 
     def headings(self, centers: ArrayLike) -> Float:
@@ -75,12 +64,4 @@ def _build(localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
     return ForwardScorer(localization_map, heading, options.seed)
 
 
-METHODS = (
-    Method(
-        name=ForwardScorer.name,
-        about="Views by how near they look to a heading: the classical camera that knows nothing of the map (paper, "
-        "Sec. 4.3).",
-        style=MethodStyle("forward", "#6B6B6B", ">", (0, (6, 2))),
-        build=_build,
-    ),
-)
+METHODS = (rule(ForwardScorer, MethodStyle("forward", "#6B6B6B", ">", (0, (6, 2))), build=_build),)

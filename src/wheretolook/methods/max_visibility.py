@@ -9,7 +9,7 @@ import numpy as np
 from wheretolook.geometry.lattices import axes_of_angles, yaw_pitch_angles
 from wheretolook.geometry.poses import Float, check_poses, poses_looking_along
 from wheretolook.methods.base import Scorer
-from wheretolook.methods.method import Method, MethodStyle
+from wheretolook.methods.method import MethodStyle, rule
 
 if TYPE_CHECKING:
     from wheretolook.inputs.localization_map import LocalizationMap
@@ -31,11 +31,8 @@ class MaxVisibilityScorer(Scorer):
 
     def score(self, cam_from_world: Float) -> Float:
         """(B,) in [0, 1]."""
-        from wheretolook.visibility.frustum import (  # Warp takes seconds to load
-            LandmarkSets,
-            PosedViews,
-            landmarks_in_view,
-        )
+        # Warp takes seconds to load
+        from wheretolook.visibility.frustum import LandmarkSets, PosedViews, landmarks_in_view
 
         poses = check_poses(cam_from_world)
         camera, device = self.localization_map.camera, self.localization_map.device
@@ -56,7 +53,7 @@ class MaxVisibilityScorer(Scorer):
 class SwappedMaxVisibilityScorer(Scorer):
     """What the benchmark's code does: the best of 6 x 18 pitches and yaws, with the two exchanged in what it returns.
 
-    Views by how near they look to what it returns.
+    A view scores the higher, the nearer its optical axis is to the direction returned.
     """
 
     name = "max-visibility-swapped"
@@ -81,17 +78,9 @@ class SwappedMaxVisibilityScorer(Scorer):
 
 
 METHODS = (
-    Method(
-        name=MaxVisibilityScorer.name,
-        about="Landmarks in view within 3 m of depth, seen through walls, as a share of the map's.",
-        style=MethodStyle("max visibility (ActLoc)", "#8F8500", "<", (0, (4, 1, 1, 1))),
-        build=lambda localization_map, options: MaxVisibilityScorer(localization_map),
-    ),
-    Method(
-        name=SwappedMaxVisibilityScorer.name,
-        about="What the benchmark's code does: the best of 6 x 18 pitches and yaws, with the two exchanged in what it "
-        "returns.",
-        style=MethodStyle("max visibility, angles swapped (as shipped)", "#D6CA1E", "d", (0, (4, 1, 1, 1, 1, 1))),
-        build=lambda localization_map, options: SwappedMaxVisibilityScorer(localization_map),
+    rule(MaxVisibilityScorer, MethodStyle("max visibility (ActLoc)", "#8F8500", "<", (0, (4, 1, 1, 1)))),
+    rule(
+        SwappedMaxVisibilityScorer,
+        MethodStyle("max visibility, angles swapped (as shipped)", "#D6CA1E", "d", (0, (4, 1, 1, 1, 1, 1))),
     ),
 )

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from inspect import getdoc
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, Literal
 
 if TYPE_CHECKING:
@@ -64,6 +66,9 @@ class Method:
     probability: bool = False  # whether its score is the probability that a view localizes
     by_chance: bool = False  # whether it is drawn at random: an evaluation then tells the exact expectation
     only_if_named: bool = False  # whether an evaluation has it only if it is named
+    # whether a figure of a few methods shows it: of a family, the first of those that are evaluated
+    of_the_few: bool = False
+    fallback: bool = False  # whether a viewpoint map has its scores where no method is named and there are no weights
     # of the learned methods evaluated, the one with the highest number is what others are compared with unless told
     # otherwise
     reference: int = 0
@@ -72,8 +77,39 @@ class Method:
     folder: str = ""  # name of these options' group in `train`; methods with the same folder share them
     settings: Mapping[str, Any] = field(default_factory=dict)  # options that it has whatever its group says
     trained_unasked: bool = False  # whether the train stage learns it unless told what to learn
+    one_camera: bool = False  # whether its weights serve only cameras with the field of view of their training views
     # whether a release may ship it: as the best of all; as the paper's network, of which the best one ships in half
     # precision; or not at all, as it is trained to compare with only
     ships: Literal["best", "network", "never"] = "best"
     # what an evaluation logs about it as parameters, by the camera
     params: Callable[[Camera], dict[str, Any]] = no_params
+
+
+def rule(scorer: type[Scorer], style: MethodStyle, **fields: Any) -> Method:
+    """The record of a method that is built of a map alone, unless `build` is given; its docstring says what it is."""
+    about = " ".join((getdoc(scorer) or "").partition("\n\n")[0].split())
+    return Method(scorer.name, about, style, **{"build": lambda map, options: scorer(map), **fields})
+
+
+def imported(reference: str) -> Callable[..., Any]:
+    """The function or class `module:name` of this package, imported when called: PyTorch takes seconds to load."""
+
+    def call(*given: Any) -> Any:
+        return resolve_name(f"wheretolook.methods.{reference}")(*given)
+
+    return call
+
+
+def network_scorer(scorer: str, network: str, *methods: str) -> Callable[[LocalizationMap, ScorerOptions], Scorer]:
+    """Builds a scorer from the weights of a network that serves one of these methods; both classes as in `imported`."""
+
+    def build(localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
+        from wheretolook.learning.trained_network import TrainedNetwork
+
+        assert options.weights is not None
+        network_class: Any = resolve_name(f"wheretolook.methods.{network}")
+        trained = TrainedNetwork.load(options.weights, network_class, *methods, device=localization_map.device)
+        built: Scorer = imported(scorer)(localization_map, trained)
+        return built
+
+    return build

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from wheretolook.geometry.poses import Float
 from wheretolook.methods.base import Scorer
-from wheretolook.methods.method import Method, MethodStyle
+from wheretolook.methods.method import MethodStyle, ScorerOptions, rule
 
 if TYPE_CHECKING:
     from wheretolook.inputs.localization_map import LocalizationMap
@@ -49,13 +49,10 @@ def _splitmix64(state: NDArray[np.uint64]) -> NDArray[np.uint64]:
     return state ^ (state >> np.uint64(31))
 
 
+def _build(localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
+    return RandomScorer(localization_map, options.seed)
+
+
 METHODS = (
-    Method(
-        name=RandomScorer.name,
-        about="Uniform random scores, a function of pose and seed, so that they do not depend on the order of the "
-        "batch.",
-        style=MethodStyle("random", "#999999", "x", ":"),
-        build=lambda localization_map, options: RandomScorer(localization_map, options.seed),
-        by_chance=True,
-    ),
+    rule(RandomScorer, MethodStyle("random", "#999999", "x", ":"), build=_build, by_chance=True, of_the_few=True),
 )

@@ -11,7 +11,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from wheretolook.methods.method import Method, ScorerOptions
-from wheretolook.utils.errors import ConfigError, WeightsError
+from wheretolook.utils.errors import CameraError, ConfigError, WeightsError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -19,10 +19,8 @@ if TYPE_CHECKING:
     from wheretolook.inputs.localization_map import LocalizationMap
     from wheretolook.methods.base import Scorer
 
-MODULES = (
-    "random", "forward", "visible", "bins", "max_visibility", "fisher", "mlp", "matchability", "trees", "conv", "set",
-    "sphere",
-)  # fmt: skip
+_RULES = ("random", "forward", "visible", "bins", "max_visibility", "fisher")
+MODULES = (*_RULES, "mlp", "matchability", "trees", "conv", "set", "sphere")
 """Modules of `wheretolook.methods` whose `METHODS` are the package's own, in the order of tables."""
 
 GROUP = "wheretolook.methods"  # entry points of this group give a `Method`, or several, of another package
@@ -81,6 +79,11 @@ def scorers() -> dict[str, Method]:
     return {name: method for name, method in all_methods().items() if method.build is not None}
 
 
+def fallback() -> Method:
+    """What scores a viewpoint map where no method is named and there are no weights."""
+    return next(method for method in scorers().values() if method.fallback)
+
+
 def learned() -> dict[str, Method]:
     """What can be trained, by name."""
     return {name: method for name, method in all_methods().items() if method.learn is not None}
@@ -90,9 +93,8 @@ def members(name: str, among: Mapping[str, Method]) -> list[Method]:
     """The methods that a name stands for: one, or those of a family; empty if there are none among these."""
     if name in among:
         return [among[name]]
-    return (
-        [] if not name else [method for method in among.values() if method.family == name and not method.only_if_named]
-    )
+    family = [method for method in among.values() if method.family == name and not method.only_if_named]
+    return family if name else []
 
 
 def methods_named(names: Iterable[str], among: Mapping[str, Method]) -> list[Method]:
@@ -199,6 +201,10 @@ def _build(method: Method, localization_map: LocalizationMap, options: ScorerOpt
     assert method.build is not None
     try:
         scorer = method.build(localization_map, options)
+    except CameraError as error:
+        others = [name for name, known in scorers().items() if known.weights == name and not known.one_camera]
+        fix = f"{error.fix} Weights of {', '.join(others)} serve every camera, as do methods without weights."
+        raise CameraError(error.problem, path=options.weights, value=error.value, fix=fix) from None
     except WeightsError as error:
         if error.path is not None or options.weights is None:
             raise

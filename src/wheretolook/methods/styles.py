@@ -19,9 +19,7 @@ _SPARE = (("#CC79A7", "8", (0, (1, 1))), ("#F0E442", "H", (0, (4, 2))), ("#7F3C8
 
 
 def method_style(name: str) -> MethodStyle:
-    """Style of a method, with what follows a space in its name, such as a file of weights; by its name alone if not
-    known.
-    """
+    """Style of a method. What follows a space in its name, such as a file of weights, is added to the label."""
     if name == ORACLE:
         return _ORACLE_STYLE
     method = find(name)

@@ -7,19 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 from wheretolook.learning.config import SharedConfig
 from wheretolook.methods.method import Method
+from wheretolook.methods.mlp.config import MlpConfig
 from wheretolook.methods.registry import learned, methods_named
 from wheretolook.utils.errors import ConfigError
 
-MOVED = {
-    "train.variants": "It is train.methods now, with the names of methods: mlp-2d+z for 2d+z.",
-    **{
-        f"train.{name}": f"train.mlp.{name}"
-        for name in (
-            "epochs", "batch_size", "learning_rate", "schedule", "l2", "dropout", "input_dropout", "hidden", "bins",
-            "layout", "noise_px", "noise_m", "balance", "keep", "patience",
-        )
-    },
-}  # fmt: skip
+MOVED = {f"train.{option.name}": f"train.mlp.{option.name}" for option in fields(MlpConfig)}
+MOVED["train.variants"] = "It is train.methods now, with the names of methods: mlp-2d+z for 2d+z."
 """Where options have gone that had another name before."""
 
 

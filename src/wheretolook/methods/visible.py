@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from wheretolook.geometry.poses import Float
 from wheretolook.methods.base import CountingScorer
-from wheretolook.methods.method import Method, MethodStyle
+from wheretolook.methods.method import MethodStyle, rule
 
 
 class VisibleScorer(CountingScorer):
@@ -20,11 +20,4 @@ class VisibleScorer(CountingScorer):
         return n_visible / max(1, len(self.localization_map.landmarks.points))
 
 
-METHODS = (
-    Method(
-        name=VisibleScorer.name,
-        about="Share of the map's landmarks that a view sees (paper, Sec. 3.2).",
-        style=MethodStyle("most visible landmarks", "#E69F00", "s", "--"),
-        build=lambda localization_map, options: VisibleScorer(localization_map),
-    ),
-)
+METHODS = (rule(VisibleScorer, MethodStyle("most visible landmarks", "#E69F00", "s", "--")),)

@@ -8,7 +8,11 @@ from pathlib import Path
 from typing import Literal
 
 from wheretolook.geometry.lattices import ViewLattice
+from wheretolook.methods.forward import ForwardScorer
 from wheretolook.utils.errors import ConfigError
+
+FORWARD = ForwardScorer.name
+"""The method that needs no map: the shortest path, looking ahead. Others are compared with it."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +104,7 @@ class PathsConfig(ViewLattice):
     seed: int = 0
     min_distance_m: float = 3.0
     height_m: tuple[float, float] = (1.2, 1.6)
-    methods: tuple[str, ...] = ("forward", "fisher-trace-gp", "set")
+    methods: tuple[str, ...] = (FORWARD, "fisher-trace-gp", "set")
     weights: Path | None = None
     max_turn_deg: float = 30.0
     max_error_m: float = 0.25
@@ -115,8 +119,8 @@ class PathsConfig(ViewLattice):
                 raise ConfigError(f"{name} must be positive", value=getattr(self, name))
         if not 0 < self.height_m[0] <= self.height_m[1]:
             raise ConfigError("height_m needs a range above 0", value=self.height_m)
-        if "forward" not in self.methods or len(set(self.methods)) < len(self.methods):
-            raise ConfigError('methods need "forward" to compare with, and every name once', value=self.methods)
+        if FORWARD not in self.methods or len(set(self.methods)) < len(self.methods):
+            raise ConfigError(f'methods need "{FORWARD}" to compare with, and every name once', value=self.methods)
 
 
 @dataclass(frozen=True)
@@ -131,9 +135,9 @@ class PlanConfig(ViewLattice):
         method: method that scores the views; forward for the shortest path, looking ahead. Empty as for the viewpoint
             map.
         weights: file of weights, for a method that has learnt; by default the best there are.
-        against: further methods to plan by, drawn beside it. As `methods.png`, such as "forward" and "fisher-trace-gp".
+        against: further methods to plan by, drawn beside it. In `methods.png`; forward or fisher-trace-gp, say.
         film: kind of film to make: gif, mp4 or none.
-        rerun: write a recording for the Rerun viewer too (needs `pip install rerun-sdk`).
+        rerun: write a recording for the Rerun viewer too. Needs `pip install rerun-sdk`.
         planner: costs and limits of the path, time to plan.
     """
 

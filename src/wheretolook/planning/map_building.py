@@ -21,17 +21,13 @@ from wheretolook.utils.errors import ConfigError, MapError, SceneError
 from wheretolook.visibility.occlusion import OcclusionModel, StoredOcclusion
 from wheretolook.visibility.survey import survey
 
-Text = str | None
-"""Text of progress bars; None shows none."""
+Text = str | None  # text of progress bars; None shows none
 
 VIEWS_AT_ONCE = 16_384
 """Views scored at a time, in whole locations: enough to fill a GPU, few enough for the progress bar to move."""
 
-SIGHT_BYTES = 1 << 28
-"""Lines of sight tested at a time in an update, one byte each."""
-
-MAX_DIRECTIONS = 1 << 16
-"""Ids of directions are stored in 16 bits."""
+SIGHT_BYTES = 1 << 28  # lines of sight tested at a time in an update, one byte each
+MAX_DIRECTIONS = 1 << 16  # ids of directions are stored in 16 bits
 
 SAME_SCORE = 1e-4
 """Absolute and relative tolerance for scores of a voxel computed again; networks may sum in another order."""

@@ -22,18 +22,17 @@ FORMAT, VERSION = "wheretolook viewpoint map", 1
 DESCRIPTION, LAYOUT = "viewpoint_map.json", "LAYOUT.txt"
 
 ARRAYS = {
-    "row_of_voxel": ("<i4", "V"),
-    "directions": ("<f8", "D, 3"),
-    "ranked": ("<u2", "L, D"),
-    "scores": ("<f4", "L, D"),
-    "n_visible": ("<u4", "L, D"),
-    "landmark_ids": ("<i8", "N"),
-    "landmark_digests": ("<u8", "N, 2"),
+    "row_of_voxel": ("<i4", "V", "row of each voxel in the arrays by row, -1 if it is not free"),
+    "directions": ("<f8", "D, 3", "unit optical axes in the world"),
+    "ranked": ("<u2", "L, D", "ids of the directions, the best first"),
+    "scores": ("<f4", "L, D", "by direction id"),
+    "n_visible": ("<u4", "L, D", "landmarks in view, by direction id"),
+    "landmark_ids": ("<i8", "N", "of the map's landmarks, ascending"),
+    "landmark_digests": ("<u8", "N, 2", "of these"),
 }
-"""Type, little-endian, and shape of each array; each is a file `<name>.npy`."""
+"""Type, little-endian, shape and meaning of each array; each is a file `<name>.npy`."""
 
-_OLD = "old"
-"""Name of a map that is being replaced, in the hidden folder where the new one is written."""
+_OLD = "old"  # name of a map that is being replaced, in the hidden folder where the new one is written
 
 REBUILD = "Build it anew with `wheretolook viewpoint-map`, or get the folder again."
 
@@ -90,16 +89,6 @@ TO UPDATE
   tell `update_viewpoint_map` which landmarks were added; a planner has no use for them.
 """
 
-_MEANINGS = {
-    "row_of_voxel": "row of each voxel in the arrays by row, -1 if it is not free",
-    "directions": "unit optical axes in the world",
-    "ranked": "ids of the directions, the best first",
-    "scores": "by direction id",
-    "n_visible": "landmarks in view, by direction id",
-    "landmark_ids": "of the map's landmarks, ascending",
-    "landmark_digests": "of these",
-}
-
 
 def write_map(
     folder: str | Path, grid: VoxelGrid, origin: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]
@@ -110,10 +99,8 @@ def write_map(
     folder beside it, `.<name>.<some letters>`, into which the old one is moved until the new one is in place. A process
     killed in between leaves both there, and `read_map` says where.
 
-    `origin` has the fields of `MapOrigin` but `derived`, `arrays` those of `ARRAYS` by name.
-
-    Raises:
-        MapFormatError: the folder holds anything that is not part of a viewpoint map.
+    `origin` has the fields of `MapOrigin` but `derived`, `arrays` those of `ARRAYS` by name. Raises MapFormatError if
+    the folder holds anything that is not part of a viewpoint map.
     """
     folder = Path(folder).resolve()  # so that "." has a name too
     _refuse_something_else(folder)
@@ -150,35 +137,27 @@ def _refuse_something_else(folder: Path) -> None:
 
 def _write(folder: Path, grid: VoxelGrid, origin: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> None:
     checksums = {}
-    for name, (kind, _) in ARRAYS.items():
+    for name, (kind, _, _) in ARRAYS.items():
         np.save(folder / f"{name}.npy", np.ascontiguousarray(arrays[name], dtype=kind))
         checksums[f"{name}.npy"] = sha256(folder / f"{name}.npy")
     n_rows, n_directions = arrays["scores"].shape
     files = "\n".join(
-        f"  {name + '.npy':<20}{np.dtype(kind).name:<9}({shape + ')':<7}{_MEANINGS[name]}"
-        for name, (kind, shape) in ARRAYS.items()
+        f"  {name + '.npy':<20}{np.dtype(kind).name:<9}({shape + ')':<7}{meaning}"
+        for name, (kind, shape, meaning) in ARRAYS.items()
     )
     write_text(folder / LAYOUT, _TEXT.format(version=VERSION, files=files))
-    content = {
-        "format": FORMAT,
-        "version": VERSION,
-        "grid": {name: [*map(float, getattr(grid, name))] for name in ("lower", "upper")}
-        | {"shape": [*map(int, grid.shape)]},
-        "sizes": {"V": len(grid), "L": n_rows, "D": n_directions, "N": len(arrays["landmark_ids"])},
-        "origin": dict(origin),
-        "sha256": checksums,
-    }
-    write_json(folder / DESCRIPTION, content)
+    corners = {name: [*map(float, getattr(grid, name))] for name in ("lower", "upper")}
+    content = {"format": FORMAT, "version": VERSION, "grid": {**corners, "shape": [*map(int, grid.shape)]}}
+    sizes = {"V": len(grid), "L": n_rows, "D": n_directions, "N": len(arrays["landmark_ids"])}
+    write_json(folder / DESCRIPTION, {**content, "sizes": sizes, "origin": dict(origin), "sha256": checksums})
 
 
 def read_map(folder: str | Path, mmap: bool = False) -> tuple[VoxelGrid, dict[str, Any], dict[str, NDArray[Any]]]:
     """Read what `write_map` wrote: grid, origin and arrays.
 
     With `mmap` the files are mapped into memory, read-only, and read where they are used. Sizes and types are still
-    checked, but not the checksums, for which every byte would have to be read.
-
-    Raises:
-        MapFormatError: there is no map, it is damaged, or of another version.
+    checked, but not the checksums, for which every byte would have to be read. Raises MapFormatError if there is no
+    map, or it is damaged or of another version.
     """
     folder = Path(folder)
     path = folder / DESCRIPTION
@@ -196,9 +175,8 @@ def read_map(folder: str | Path, mmap: bool = False) -> tuple[VoxelGrid, dict[st
         corners = content["grid"]
         grid = VoxelGrid(tuple(corners["lower"]), tuple(corners["upper"]), tuple(corners["shape"]))
         origin, sizes, checksums = (dict(content[name]) for name in ("origin", "sizes", "sha256"))
-        expected = {
-            name: tuple(int(sizes.get(side, side)) for side in shape.split(", ")) for name, (_, shape) in ARRAYS.items()
-        }
+        sides = {name: shape.split(", ") for name, (_, shape, _) in ARRAYS.items()}
+        expected = {name: tuple(int(sizes.get(side, side)) for side in sides[name]) for name in ARRAYS}
     except Exception as error:  # any value may be damaged
         raise MapFormatError(f"damaged description: {error}", path=path, fix=REBUILD) from error
     arrays: dict[str, NDArray[Any]] = {}

@@ -10,11 +10,9 @@ from numpy.typing import ArrayLike
 
 from wheretolook.dataset.folders import Dataset
 from wheretolook.dataset.scene import Scene
-from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.planning.config import PlanConfig
-from wheretolook.planning.path_comparison import FORWARD
+from wheretolook.planning.config import FORWARD, PlanConfig
 from wheretolook.planning.path_planning import check_ends, plan_path
 from wheretolook.planning.route_views import PathView, PlannedPath
 from wheretolook.planning.scene_map import check_methods, planner_map, weights_for
@@ -33,10 +31,8 @@ def plan_by_methods(
 
     What a method thinks of the views is its own map's scores. Methods are "forward", or names of scorers; empty for
     that of the weights, or bins without. `config` has weights for methods that have learnt, if they are of their kind
-    (`weights_for`). Returns paths by the names of their methods, in the order given.
-
-    Raises:
-        ConfigError: a method needs weights, or there is none of that name. PlanningError: no path can be found.
+    (`weights_for`). Returns paths by the names of their methods, in the order given. Raises ConfigError if a method
+    needs weights or there is none of that name, PlanningError if no path can be found.
     """
     methods, space = tuple(methods), scene.space
     check_methods(methods)
@@ -47,7 +43,7 @@ def plan_by_methods(
         if method != FORWARD:
             views = planner_map(scene, dataset, config, method, weights_for(method, dataset, config.weights))
             name = method or views.origin.scorer
-        paths.pop(name, None)  # named twice, it is what was asked for last
+        paths.pop(name, None)  # a method named twice stands where it was named last
         paths[name] = plan_path(start, goal, space, space.bounds, views, config.planner)
     return paths
 
@@ -55,16 +51,14 @@ def plan_by_methods(
 def path_views(
     path: PlannedPath, localization_map: LocalizationMap, renderer: WarpRenderer | None = None
 ) -> list[PathView]:
-    """What a pinhole camera sees along a path: the landmarks in view, and the image if there is a renderer."""
+    """What the camera sees along a path: the landmarks in view, and the image if there is a renderer."""
     camera, points = localization_map.camera, localization_map.landmarks.points
-    assert isinstance(camera, PinholeCamera)
     cam_from_world = poses_looking_along(path.positions, path.axes)
-    visible = localization_map.landmarks_in_view(cam_from_world)
-    images: Any = [None] * len(visible) if renderer is None else renderer.render(camera, cam_from_world).rgb
+    seen = localization_map.landmarks_in_view(cam_from_world)
+    images: Any = [None] * len(seen) if renderer is None else renderer.render(camera, cam_from_world).rgb
     views, size = [], (camera.width, camera.height)
     for number, (pose, image) in enumerate(zip(cam_from_world, images, strict=True)):
-        pixels = camera.project(points[visible[number]] @ pose[:, :3].T + pose[:, 3])
-        views.append(
-            PathView(path.positions[number], path.axes[number], float(path.scores[number]), pixels, size, image)
-        )
+        pixels = camera.project(points[seen[number]] @ pose[:, :3].T + pose[:, 3])
+        view = (path.positions[number], path.axes[number], float(path.scores[number]))
+        views.append(PathView(*view, pixels, size, image))
     return views

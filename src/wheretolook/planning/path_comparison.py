@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from tqdm.auto import tqdm
 
 from wheretolook.geometry.poses import Float, poses_looking_along
-from wheretolook.planning.config import PathsConfig
+from wheretolook.planning.config import FORWARD, PathsConfig
 from wheretolook.planning.path_planning import plan_path
 from wheretolook.planning.route_views import PlannedPath
 from wheretolook.planning.sequences import TurnLimit, ViewSequence, best_sequence, greedy_sequence, resample_path
@@ -25,19 +25,16 @@ from wheretolook.space.mapped_space import MappedSpace
 from wheretolook.utils.errors import PlanningError, SceneError
 from wheretolook.viewpoints.table import pose_columns
 
-FORWARD = "forward"
-"""The method that needs no map: the shortest path, looking ahead."""
-
 PLANNED, GIVEN = "planned", "given"
 """What a method may choose: places and views, or the views along a path that is given."""
 
+Space = FreeSpace | MappedSpace
 Rule = Callable[[Float, TurnLimit], ViewSequence]
 
 RULES: dict[str, Rule] = {"": best_sequence, "greedy": greedy_sequence}
 """How the views along a given path are chosen, exactly and by ActLoc's rule, by what is added to a method's name."""
 
-DRAWS = 50
-"""Pairs drawn for each one wanted, before a scene is said to have too little room."""
+DRAWS = 50  # pairs drawn for each one wanted, before a scene is said to have too little room
 
 WAYS_M, MOST = 0.25, 200_000
 """Grid of places by which to find out whether there is a way from a start to a goal, and their largest number."""
@@ -60,13 +57,11 @@ class ComparedPaths:
     views: pd.DataFrame
 
 
-def draw_pairs(space: FreeSpace | MappedSpace, config: PathsConfig) -> Float:
+def draw_pairs(space: Space, config: PathsConfig) -> Float:
     """Starts and goals (P, 2, 3) m in free space, far enough from each other, with a way between them.
 
-    Above floors, heights are those asked for; without a mesh, they are drawn.
-
-    Raises:
-        SceneError: there is too little room.
+    Above floors, heights are those asked for; without a mesh, they are drawn. Raises SceneError if there is too little
+    room.
     """
     rng = np.random.default_rng(config.seed)
     low, high = space.bounds
@@ -81,15 +76,13 @@ def draw_pairs(space: FreeSpace | MappedSpace, config: PathsConfig) -> Float:
         if ways.joins(ends[0], ends[1]):  # not in parts of the scene between which there is no way
             found.append(ends)
     if len(found) < config.pairs:
-        raise SceneError(
-            f"found only {len(found)} starts and goals {config.min_distance_m:g} m apart with a way between them",
-            value=config.pairs,
-            fix="Lower paths.min_distance_m or paths.pairs.",
-        )
+        apart = f"{config.min_distance_m:g} m apart with a way between them"
+        fix = "Lower paths.min_distance_m or paths.pairs."
+        raise SceneError(f"found only {len(found)} starts and goals {apart}", value=config.pairs, fix=fix)
     return np.array(found)
 
 
-def _free_points(space: FreeSpace | MappedSpace, points: Float, config: PathsConfig, rng: np.random.Generator) -> Float:
+def _free_points(space: Space, points: Float, config: PathsConfig, rng: np.random.Generator) -> Float:
     points = points[space.is_free(points)]
     if isinstance(space, FreeSpace) and len(points):
         points[:, 2] = space.floor_below(points) + rng.uniform(*config.height_m, len(points))
@@ -104,7 +97,7 @@ class Ways:
     would be more than `MOST` places.
     """
 
-    def __init__(self, space: FreeSpace | MappedSpace, step_m: float) -> None:
+    def __init__(self, space: Space, step_m: float) -> None:
         self.space = space
         low, high = np.asarray(space.bounds, dtype=np.float64)
         step_m = max(step_m, float(np.prod(high - low) / MOST) ** (1 / 3))
@@ -141,18 +134,12 @@ class Ways:
 
 
 def plan_pairs(
-    pairs: Float,
-    space: FreeSpace | MappedSpace,
-    maps: Mapping[str, ViewpointMap],
-    config: PathsConfig,
-    progress: str | None = None,
+    pairs: Float, space: Space, maps: Mapping[str, ViewpointMap], config: PathsConfig, progress: str | None = None
 ) -> ComparedPaths:
     """Plan between pairs by every method; then choose views along the shortest paths by every method.
 
-    `pairs` are starts and goals (P, 2, 3) m, `maps` those of each method but "forward", with scores in [0, 1].
-
-    Raises:
-        PlanningError: no path was found at all.
+    `pairs` are starts and goals (P, 2, 3) m, `maps` those of each method but "forward", with scores in [0, 1]. Raises
+    PlanningError if no path was found at all.
     """
     paths: list[dict[str, Any]] = []
     tables: list[pd.DataFrame] = []

@@ -21,24 +21,16 @@ from wheretolook.planning.turns import check_axis
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.utils.errors import PlanningError
 
-TABLE_STEP_DEG = 2.0
-"""Step of yaw and pitch of the table of the map's direction nearest to an axis."""
+TABLE_STEP_DEG = 2.0  # step of yaw and pitch of the table of the map's direction nearest to an axis
 
 SHORT_SHARE, SEARCH_SHARE, SHORTEN_SHARE = 0.25, 0.3, 0.05
 """Shares of the time for finding a short path, for searching places and views together, and for shortening the short
 path. The rest is for improving the cheapest path."""
 
-AHEAD_SHARE = 0.5
-"""Share of the time for finding a short path without a viewpoint map; the rest is for shortening it."""
-
-SAME_M = 1e-6
-"""Points closer than this count as equal."""
-
-STARTS = 12
-"""Number of start orientations to choose from if none is given."""
-
-STEPS_M = (0.05, 1.0)
-"""Range of the standard deviation by which a corner of a route is moved."""
+AHEAD_SHARE = 0.5  # share of the time for finding a short path without a viewpoint map; the rest is for shortening it
+SAME_M = 1e-6  # points closer than this count as equal
+STARTS = 12  # number of start orientations to choose from if none is given
+STEPS_M = (0.05, 1.0)  # range of the standard deviation by which a corner of a route is moved
 
 
 class Space(Protocol):
@@ -105,7 +97,10 @@ def plan_path(
         if viewpoint_map is None:
             assert route is not None
             bar.update(max(0.0, bar.total - bar.n))
-            return _looking_ahead(route, config)
+            samples = RouteSamples.of(route, config.spacing_m)
+            axes = _forward(samples.positions, np.radians(config.pitch_deg))
+            unknown = np.full(len(samples.positions), np.nan)
+            return PlannedPath(samples.positions, axes, unknown, float(samples.corners[-1]), SHORT_ROUTE)
         axis = None if start_axis is None else axes_of_angles(np.degrees(orientations[0]))
         views = RouteViews(viewpoint_map, config, axis)
         found: dict[float, tuple[PlannedPath, Float]] = {}
@@ -150,14 +145,6 @@ def check_ends(ends: Float, space: Space, bounds: Float) -> None:
     if np.linalg.norm(ends[1] - ends[0]) < SAME_M:
         fix = "Ask the map for the best view there."
         raise PlanningError("the start is the goal", value=tuple(ends[0].tolist()), fix=fix)
-
-
-def _looking_ahead(route: Float, config: PathConfig) -> PlannedPath:
-    """The path along a route (S, 3) m whose camera looks forward."""
-    samples = RouteSamples.of(route, config.spacing_m)
-    axes = _forward(samples.positions, np.radians(config.pitch_deg))
-    unknown = np.full(len(samples.positions), np.nan)
-    return PlannedPath(samples.positions, axes, unknown, float(samples.corners[-1]), SHORT_ROUTE)
 
 
 def _length(places: Float) -> float:
@@ -286,8 +273,7 @@ class _Problem:
     def solve(self, orientations: list[tuple[float, float]], time_s: float, most_s: float, bar: Any) -> Float:
         """States (S, 5) of the best path found in `time_s`, or else of the first one found until `most_s`.
 
-        Raises:
-            PlanningError: no path was found.
+        Raises PlanningError if no path was found.
         """
         from ompl import base, geometric, util
 

@@ -10,20 +10,15 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from wheretolook.planning.config import PathsConfig
-from wheretolook.planning.path_comparison import FORWARD
+from wheretolook.planning.config import FORWARD, PathsConfig
 from wheretolook.utils.markdown import markdown_table
-from wheretolook.utils.tracking import NestedRun, log_nested, start_run
+from wheretolook.utils.tracking import NestedRun, Tags, log_nested, start_run
 from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import LOCALIZED
+from wheretolook.viewpoints.thresholds import ALL
 
 PATHS_CSV, PATHS_MD, PATHS_PNG = "paths.csv", "paths.md", "paths.png"
 """Files of a comparison, in `<dataset>/results/` and as artifacts of its run."""
-
-ALL = "all"
-"""Name of the rows over all scenes."""
-
-Tags = Mapping[str, str] | None
 
 
 def summarize_paths(paths: pd.DataFrame, views: pd.DataFrame, config: PathsConfig) -> pd.DataFrame:

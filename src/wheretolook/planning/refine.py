@@ -32,8 +32,7 @@ class RefinedViews:
 def score_directions(scorer: Scorer, locations: ArrayLike, directions: ArrayLike) -> Float:
     """Scores (L, D) of cameras without roll at locations (L, 3) m that look along each of directions (D, 3).
 
-    Raises:
-        ValueError: a location or a direction is not finite, or a direction has no length.
+    Raises ValueError if a location or a direction is not finite, or a direction has no length.
     """
     at, axes = np.asarray(locations, dtype=np.float64).reshape(-1, 3), np.asarray(directions, dtype=np.float64)
     poses = poses_looking_along(np.repeat(at, len(axes), axis=0), np.tile(axes, (len(at), 1)))
@@ -56,10 +55,8 @@ def refine_directions(
 
     The search begins at locations (B, 3) m with axes (B, 3) of any length, such as the best of a lattice. The default
     `max_angle_deg` from there exceeds the distance of neighbours on a lattice of 500 directions; about half that
-    distance works well as the first step.
-
-    Raises:
-        ValueError: locations or axes are not finite, have no length or differ in number, or an angle is not positive.
+    distance works well as the first step. Raises ValueError if locations or axes are not finite, have no length or
+    differ in number, or an angle is not positive.
     """
     at, start = (np.asarray(values, dtype=np.float64).reshape(-1, 3) for values in (locations, axes))
     length = np.linalg.norm(start, axis=1, keepdims=True)

@@ -10,19 +10,18 @@ import numpy as np
 
 from wheretolook.dataset.folders import RELEASE, Dataset
 from wheretolook.dataset.scene import Scene
-from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.camera import camera_of_record
 from wheretolook.geometry.lattices import ViewLattice
 from wheretolook.learning.provenance import was_trained_on
 from wheretolook.learning.weights import method_of_weights, read_record, read_training, read_weights
-from wheretolook.methods.field_of_view import same_field_of_view
-from wheretolook.methods.registry import find, load_scorer, make_scorer, members, methods_named, scorers
+from wheretolook.methods.base import same_field_of_view
+from wheretolook.methods.registry import fallback, find, load_scorer, make_scorer, members, methods_named, scorers
 from wheretolook.planning.map_building import build_viewpoint_map
 from wheretolook.planning.path_planning import Space
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.utils.errors import ConfigError, WeightsError
 
-REACH = 2
-"""A voxel borrows from voxels at most this many away along each axis."""
+REACH = 2  # a voxel borrows from voxels at most this many away along each axis
 
 INSIDE = np.stack(np.meshgrid(*[(-1 / 3, 0.0, 1 / 3)] * 3, indexing="ij"), -1).reshape(-1, 3)
 """Points of a voxel that are tested for free space (27, 3), relative to its centre in units of its size."""
@@ -41,7 +40,7 @@ def scene_viewpoint_map(
     if weights is not None and not method:
         scorer = load_scorer(weights, scene.localization_map)
     else:
-        scorer = make_scorer(method or "bins", scene.localization_map, weights=weights)
+        scorer = make_scorer(method or fallback().name, scene.localization_map, weights=weights)
     return build_viewpoint_map(scorer, grid, free, views.axes(), views.lattice, f"viewpoint map {scene.name}")
 
 
@@ -51,10 +50,8 @@ def weights_for(
     """The weights that a method scores with: those given if they are of its kind, or else the best there are.
 
     An empty `method` stands for whatever the weights are of; `say` is told of files that cannot be used, and why. None
-    for a method that has learnt nothing, or if there are no weights (`default_weights`).
-
-    Raises:
-        WeightsError: the file given is missing or damaged.
+    for a method that has learnt nothing, or if there are no weights (`default_weights`). Raises WeightsError if the
+    file given is missing or damaged.
     """
     kinds = {known.weights for known in members(method, scorers())}
     if "" in kinds or (method and not kinds):
@@ -65,7 +62,7 @@ def weights_for(
 
 
 def default_weights(dataset: Dataset, say: Callable[[str], None] = print, kinds: Collection[str] = ()) -> Path | None:
-    """The best weights of a dataset, or else of the release beside it, that serve its camera's field of view.
+    """The best weights of a dataset, or else of the release beside it, that serve its cameras.
 
     They are of one of the methods named by `kinds`; empty for all that score views by themselves.
     """
@@ -77,14 +74,15 @@ def default_weights(dataset: Dataset, say: Callable[[str], None] = print, kinds:
                 if method_of_weights(path) not in kinds:
                     continue
                 header, training = read_weights(path)[1], read_training(path)
-                trained = PinholeCamera(**header["camera"])
+                serves_all = not scorers()[method_of_weights(path)].one_camera
+                trained = None if serves_all else camera_of_record(header["camera"])
                 precision = float(read_record(path)["metrics"]["val_average_precision"])
             except (WeightsError, ConfigError, KeyError, TypeError, ValueError) as error:
                 say(f"not used: {path}: {error}")
                 continue
             if root == dataset.root and not was_trained_on(dataset, training):
                 say(f"not used: {path}: trained on other data than the dataset now holds")
-            elif same_field_of_view(trained, dataset.camera):
+            elif trained is None or all(same_field_of_view(trained, camera) for camera in dataset.cameras):
                 fitting[path] = precision
         if fitting:
             return max(fitting, key=lambda path: fitting[path])
@@ -97,10 +95,8 @@ def planner_map(
     """The map that a planner is given: scores in [0, 1], and something to go by wherever a camera can be.
 
     Scores are the method's probabilities, or ranks of scores that are none; views are borrowed where needed. `weights`
-    are those of `weights_for`; the dataset is named where they are missing.
-
-    Raises:
-        ConfigError: the method needs weights. Else as `scene_viewpoint_map`.
+    are those of `weights_for`; the dataset is named where they are missing. Raises ConfigError if the method needs
+    weights, else as `scene_viewpoint_map`.
     """
     if weights is None and any(known.weights for known in members(method, scorers())):
         raise ConfigError(f"{method} needs weights", path=dataset.root, fix="Train it, or name weights.")

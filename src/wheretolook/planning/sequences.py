@@ -8,14 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.geometry.poses import Float, rotation_looking_along
-from wheretolook.planning.turns import (
-    check_axis,
-    pan_tilt_angles,
-    pan_tilt_turns_deg,
-    turns_deg,
-    turns_from_deg,
-    within,
-)
+from wheretolook.planning import turns
 from wheretolook.utils.errors import PlanningError
 
 SPACING_M, MAX_TURN_DEG = 0.2, 30.0
@@ -43,13 +36,13 @@ class TurnLimit:
     def of(cls, directions: ArrayLike, max_turn_deg: float = MAX_TURN_DEG, pan_tilt: bool = False) -> TurnLimit:
         """For a lattice of unit vectors (D, 3), such as `direction_lattice` gives.
 
-        Raises:
-            ValueError: directions of another shape or not of unit length, or a limit that is negative or NaN.
+        Raises ValueError for directions of another shape or not of unit length, or a limit that is negative or NaN.
         """
         axes = np.asarray(directions, dtype=np.float64)
         if axes.ndim != 2 or axes.shape[1] != 3 or not np.allclose(np.linalg.norm(axes, axis=1), 1, atol=1e-6):
             raise ValueError(f"directions must be unit vectors (D, 3), got an array of shape {axes.shape}")
-        reachable = within(pan_tilt_turns_deg(axes, axes) if pan_tilt else turns_deg(axes), max_turn_deg)
+        angles = turns.pan_tilt_turns_deg(axes, axes) if pan_tilt else turns.turns_deg(axes)
+        reachable = turns.within(angles, max_turn_deg)
         most = int(reachable.sum(axis=1).max(initial=0))
         ids = np.where(reachable, np.arange(len(axes)), len(axes))
         return cls(axes, float(max_turn_deg), np.sort(ids, axis=1)[:, :most], pan_tilt)
@@ -62,8 +55,9 @@ class TurnLimit:
         if start is None:
             return np.ones(len(self.directions), dtype=bool)
         if self.pan_tilt:
-            return within(pan_tilt_turns_deg(check_axis(start)[None], self.directions)[0], self.max_turn_deg)
-        return within(turns_from_deg(start, rotation_looking_along(self.directions)), self.max_turn_deg)
+            angles = turns.pan_tilt_turns_deg(turns.check_axis(start)[None], self.directions)[0]
+            return turns.within(angles, self.max_turn_deg)
+        return turns.within(turns.turns_from_deg(start, rotation_looking_along(self.directions)), self.max_turn_deg)
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,10 +146,8 @@ def greedy_sequence(
 def resample_path(points: ArrayLike, spacing_m: float = SPACING_M) -> Float:
     """Waypoints (W, 3) m along a polyline (P, 3) m: its first point, one every `spacing_m` along it, and its last.
 
-    The last leg may be shorter than the others.
-
-    Raises:
-        ValueError: fewer than one point, another shape, not finite, or a spacing that is not positive.
+    The last leg may be shorter than the others. Raises ValueError for no point, another shape, values that are not
+    finite, or a spacing that is not positive.
     """
     path = np.asarray(points, dtype=np.float64)
     if path.ndim != 2 or path.shape[1:] != (3,) or len(path) < 1 or not np.isfinite(path).all():
@@ -196,6 +188,6 @@ def _check_reached(worth: Float, waypoint: int, limit: TurnLimit, start: ArrayLi
 
 def _cells(directions: Float) -> Float:
     """Differences (D, D) of pitch plus, the short way round, of yaw between directions, in steps of 20 degrees."""
-    yaw, pitch = map(np.degrees, pan_tilt_angles(directions))
+    yaw, pitch = map(np.degrees, turns.pan_tilt_angles(directions))
     across = np.abs(yaw[:, None] - yaw)
     return np.asarray((np.abs(pitch[:, None] - pitch) + np.minimum(across, 360 - across)) / CELL_DEG)

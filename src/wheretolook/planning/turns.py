@@ -9,8 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.geometry.poses import Float, rotation_looking_along
 
-TOLERANCE_DEG = 1e-5
-"""Angles may exceed a limit by this much, for rounding."""
+TOLERANCE_DEG = 1e-5  # angles may exceed a limit by this much, for rounding
 
 
 def within(angles_deg: Float, limit_deg: float) -> NDArray[np.bool_]:
@@ -54,10 +53,8 @@ def angles_to_axis_deg(directions: Float, axis: Float) -> Float:
 def turns_from_deg(current: ArrayLike, rotations: Float) -> Float:
     """Rotation angles (D,) in degrees from one orientation to others, cam_from_world (D, 3, 3).
 
-    `current` is the axis (3,) of a camera without roll, or a cam_from_world rotation (3, 3).
-
-    Raises:
-        ValueError: `current` has another shape, is not finite, no rotation, or an axis of no length.
+    `current` is the axis (3,) of a camera without roll, or a cam_from_world rotation (3, 3). Raises ValueError if
+    `current` has another shape, is not finite, no rotation, or an axis of no length.
     """
     given: Float = np.asarray(current, dtype=np.float64)
     if given.shape == (3,):

@@ -118,8 +118,7 @@ class ViewpointMap:
     def load(cls, folder: str | Path, mmap: bool = False) -> ViewpointMap:
         """Read what `save` wrote; with `mmap` the files are mapped into memory (`map_file.read_map`).
 
-        Raises:
-            MapFormatError: there is no map, it is damaged, or of another version.
+        Raises MapFormatError if there is no map, or it is damaged or of another version.
         """
         grid, origin, arrays = read_map(folder, mmap)
         if "inputs" in origin:  # of a map built before methods had one name each
@@ -127,19 +126,17 @@ class ViewpointMap:
             del origin["inputs"]
         try:
             return cls(grid=grid, origin=MapOrigin(**origin), **arrays)
-        except TypeError as error:
-            problem, path = f"damaged description: {error}", Path(folder) / DESCRIPTION
+        except (TypeError, ValueError) as error:
+            problem, path = f"the arrays do not fit together: {error}", Path(folder)
+            if isinstance(error, TypeError):
+                problem, path = f"damaged description: {error}", path / DESCRIPTION
             raise MapFormatError(problem, path=path, fix=REBUILD) from error
-        except ValueError as error:
-            problem = f"the arrays do not fit together: {error}"
-            raise MapFormatError(problem, path=Path(folder), fix=REBUILD) from error
 
     def save(self, folder: str | Path) -> None:
         """Write a folder that needs no Python to be read, see `wheretolook.planning.map_file.write_map`.
 
-        Raises:
-            MapFormatError: the folder holds something else, or something beside a map; or the map was derived from
-                another (`MapOrigin.derived`).
+        Raises MapFormatError if the folder holds something else, or something beside a map; or the map was derived from
+        another (`MapOrigin.derived`).
         """
         origin = asdict(self.origin)
         if derived := origin.pop("derived"):
@@ -149,11 +146,7 @@ class ViewpointMap:
 
     @property
     def voxel_of_row(self) -> NDArray[np.int64]:
-        """Ids of the free voxels, (L,), ascending.
-
-        Raises:
-            ValueError: voxels share rows in this derived map.
-        """
+        """Ids of the free voxels, (L,), ascending. Raises ValueError if voxels share rows in this derived map."""
         voxels = np.flatnonzero(self.row_of_voxel >= 0)
         if len(voxels) != len(self.scores):
             raise ValueError(f"voxels share rows in this map ({self.origin.derived}); ask the one it was derived from")
@@ -186,8 +179,7 @@ class ViewpointMap:
     def best_n(self, point: Point, n: int) -> list[ViewChoice] | None:
         """The n best orientations at a world point (3,) m, or all if there are fewer, the best first.
 
-        Raises:
-            ValueError: n is no whole number of at least 1.
+        Raises ValueError if n is no whole number of at least 1.
         """
         if not isinstance(n, int | np.integer) or n < 1:
             raise ValueError(f"n must be a whole number of at least 1, got {n!r}")
@@ -197,8 +189,7 @@ class ViewpointMap:
     def best_in_cone(self, point: Point, axis: ArrayLike, half_angle_deg: float) -> ViewChoice | None:
         """The best orientation whose optical axis is at most `half_angle_deg` from a world axis (3,), or None.
 
-        Raises:
-            ValueError: the axis is not finite or has no length.
+        Raises ValueError if the axis is not finite or has no length.
         """
         row = self.row(point)
         inside = within(angles_to_axis_deg(self.directions, check_axis(axis)), half_angle_deg)
@@ -208,10 +199,8 @@ class ViewpointMap:
         """The best orientation that the camera reaches by a single rotation of at most `max_turn_deg`.
 
         The angle is that of the whole camera's rotation (`turns_deg`). `current` is the (3,) axis of a camera without
-        roll, or a (3, 3) cam_from_world rotation. Returns None also if no direction of the lattice is in reach.
-
-        Raises:
-            ValueError: `current` is not finite, an axis without length, or no rotation (such as a reflection).
+        roll, or a (3, 3) cam_from_world rotation. Returns None also if no direction of the lattice is in reach. Raises
+        ValueError if `current` is not finite, an axis without length, or no rotation (such as a reflection).
         """
         row = self.row(point)
         if np.shape(current) == (3, 3) and not np.linalg.det(np.asarray(current, dtype=np.float64)) > 0:
@@ -228,8 +217,7 @@ class ViewpointMap:
     def rows(self, points: ArrayLike) -> NDArray[np.int64]:
         """Rows (N,) of the free voxels that hold world points (N, 3) m; -1 where none does.
 
-        Raises:
-            ValueError: points of another shape, or not finite.
+        Raises ValueError for points of another shape, or not finite.
         """
         at = np.asarray(points, dtype=np.float64)
         if at.ndim != 2 or at.shape[1] != 3:
@@ -266,9 +254,8 @@ class ViewpointMap:
         return self._choice(row, ranked.item(allowed[ranked].argmax()))
 
     def _choice(self, row: int, direction: int) -> ViewChoice:
-        return ViewChoice(
-            direction, self._axes[direction], self.scores.item(row, direction), self.n_visible.item(row, direction)
-        )
+        score, n_visible = self.scores.item(row, direction), self.n_visible.item(row, direction)
+        return ViewChoice(direction, self._axes[direction], score, n_visible)
 
     @cached_property
     def _hash(self) -> tuple[Any, ...]:

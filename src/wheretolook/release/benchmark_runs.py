@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -11,7 +10,7 @@ import pandas as pd
 
 from wheretolook.figures.runtimes import runtime_figure, scaling_figure
 from wheretolook.figures.style import save_figure
-from wheretolook.utils.tracking import log, start_run
+from wheretolook.utils.tracking import Tags, log, start_run
 from wheretolook.utils.tracking_config import TrackingConfig
 
 RUNTIMES_CSV, SCALING_CSV = "runtimes.csv", "scaling.csv"
@@ -19,11 +18,7 @@ RUNTIMES_CSV, SCALING_CSV = "runtimes.csv", "scaling.csv"
 
 
 def log_runtimes(
-    tracking: TrackingConfig,
-    sizes: pd.DataFrame,
-    growth: pd.DataFrame,
-    tags: Mapping[str, str] | None = None,
-    file: Path | None = None,
+    tracking: TrackingConfig, sizes: pd.DataFrame, growth: pd.DataFrame, tags: Tags = None, file: Path | None = None
 ) -> str:
     """Log measured times as a run of the stage "benchmark", with both tables and their figures; returns its id.
 

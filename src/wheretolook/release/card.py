@@ -178,10 +178,9 @@ def _network(release: Dataset) -> Path:
     networks = [name for name, method in learned().items() if method.ships == "network"]
     found = [path for path in _weights(release) if path.stem in networks]
     if len(found) != 1:
-        raise WeightsError(
-            "a release ships the weights of one of the paper's networks", path=release.root / "weights",
-            value=[path.name for path in found], fix=f"Run `wheretolook release --config configs/{release.name}.yaml`.",
-        )  # fmt: skip
+        problem = "a release ships the weights of one of the paper's networks"
+        fix = f"Run `wheretolook release --config configs/{release.name}.yaml`."
+        raise WeightsError(problem, path=release.root / "weights", value=[path.name for path in found], fix=fix)
     return found[0]
 
 
@@ -233,10 +232,8 @@ def _label_text(release: Dataset) -> list[str]:
     for package in first["versions"]:
         found = {manifest["versions"].get(package, "unknown") for manifest in manifests}
         versions[package] = " and ".join(sorted(found))
-    return [
-        f"Keypoints: {_pairs(first['extractor'])}. Localizer: {_pairs(first['localizer'])}. Labelled with "
-        f"{_pairs(versions)}."
-    ]
+    made = f"Keypoints: {_pairs(first['extractor'])}. Localizer: {_pairs(first['localizer'])}."
+    return [f"{made} Labelled with {_pairs(versions)}."]
 
 
 def _training_text(weights: Path, training: Mapping[str, Any], record: Mapping[str, Any], shares: pd.DataFrame) -> str:
@@ -284,14 +281,9 @@ def _learner_text(network: Path) -> list[str]:
     """Options and validation metrics of what was trained beside the paper's network, if anything was."""
     from wheretolook.learning.weights import read_record
 
-    places = {True: network.parent, False: network.parent / SHELF}
     names = [name for name, method in learned().items() if method.folder != learned()[network.stem].folder]
-    records = [
-        (ships, read_record(place / f"{name}.safetensors"))
-        for name in names
-        for ships, place in places.items()
-        if (place / f"{name}.json").is_file()
-    ]
+    paths = [place / f"{name}.safetensors" for name in names for place in (network.parent, network.parent / SHELF)]
+    records = [(x.parent == network.parent, read_record(x)) for x in paths if x.with_suffix(".json").is_file()]
     if not records:
         return []
     lines, options, further = [], [], []
@@ -330,11 +322,8 @@ def _size_text(release: Dataset) -> str:
     n_landmarks = sum(len(Landmarks.load(scene.landmarks)) for scene in release.scenes)
     n_locations = sum(len(StoredOcclusion.load(scene.occlusion).locations) for scene in release.scenes)
     shown = {name: size for name, size in parts.items() if size and name != "text"}
-    return (
-        f"{size_text(shown)}; {parts['tables'] / n_views:.1f} bytes a viewpoint, "
-        f"{parts['landmarks'] / n_landmarks:.1f} a landmark, "
-        f"{parts['occlusion'] / n_locations:.0f} a location"
-    )
+    each = f"{parts['tables'] / n_views:.1f} bytes a viewpoint, {parts['landmarks'] / n_landmarks:.1f} a landmark"
+    return f"{size_text(shown)}; {each}, {parts['occlusion'] / n_locations:.0f} a location"
 
 
 def _pairs(values: Mapping[str, Any]) -> str:

@@ -195,7 +195,7 @@ def _shown(source: Source, weights: str = "") -> tuple[Showcase, Scorer, int]:
 
 
 def _learnt(source: Source) -> Learning:
-    showcase, scorer, location = _shown(source, "mlp-2d+z.safetensors")
+    showcase, scorer, location = _shown(source, f"{method_of_run(source.runs[0])}.safetensors")
     return learning_of(showcase, cast("BinnedNetworkScorer", scorer), location)
 
 

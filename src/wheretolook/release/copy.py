@@ -30,8 +30,7 @@ CARD = "README.md"
 SHELF = "others"
 """Folder beside the shipped weights for those of other methods. Only their records ship."""
 
-MAX_BYTES = 16_000_000
-"""A release is smaller than this."""
+MAX_BYTES = 16_000_000  # a release is smaller than this
 
 
 def is_release(dataset: Dataset) -> bool:
@@ -42,10 +41,10 @@ def is_release(dataset: Dataset) -> bool:
 def copy_dataset(dataset: Dataset, root: Path, settings: Mapping[str, Any]) -> Dataset:
     """Write a compact copy of a labelled dataset. The same dataset gives the same bytes.
 
-    Tables are written compact (`viewpoints.table.COMPACT_SCHEMA`), without matches, landmarks without descriptors and
-    in half precision, the mapping images' poses if they are known, what labels were made with without the list of
-    shards, and the dataset's settings, JSON values. Weights and results that lie at `root`, `<data>/<release_name>`,
-    stay; the card and the scores of networks that do not ship go if the data changed.
+    It holds compact tables (`viewpoints.table.COMPACT_SCHEMA`) without matches, landmarks in half precision without
+    descriptors, the mapping images' poses if they are known, what labels were made with but for the list of shards, and
+    the dataset's settings as JSON values. Weights and results that lie at `root`, `<data>/<release_name>`, stay; if the
+    data changed, the card and the scores of networks that do not ship are removed.
 
     Raises:
         ConfigError: the release's folder holds another dataset, or a release of another one.
@@ -81,23 +80,16 @@ def copy_dataset(dataset: Dataset, root: Path, settings: Mapping[str, Any]) -> D
 
 @dataclass(frozen=True)
 class Choice:
-    """What of the weights in a release's folder ships.
+    """What of the weights in a release's folder ships, by the validation average precision of each."""
 
-    Attributes:
-        network: of the paper's networks that with the best validation average precision.
-        best: the weights with the best one of all, which a user gets who names none; may be the network.
-        shelved: the rest.
-        precision: validation average precision of all by their file's name without its ending.
-    """
-
-    network: Path
-    best: Path
-    shelved: tuple[Path, ...]
-    precision: dict[str, float]
+    network: Path  # the best of the paper's networks
+    best: Path  # the best of all, used where none are named; may be the network
+    shelved: tuple[Path, ...]  # the rest
+    precision: dict[str, float]  # of all, by their file's name without its ending
 
 
 def trained_weights(release: Dataset) -> dict[Path, Method]:
-    """Weights in a release's folder and their methods, of all that were trained and score views by themselves."""
+    """The weights in a release's folder of methods that score views by themselves, and these methods."""
     from wheretolook.learning.provenance import weights_path
 
     paths = {weights_path(release, name): method for name, method in learned().items() if name in scorers()}
@@ -105,11 +97,8 @@ def trained_weights(release: Dataset) -> dict[Path, Method]:
 
 
 def choose_weights_to_ship(release: Dataset) -> Choice:
-    """Choose by the best validation average precision.
-
-    Raises:
-        WeightsError: there are no weights of the paper's network, or weights or their record do not fit the release.
-    """
+    """Choose by the best validation average precision. Raises WeightsError if the paper's network has no weights, or if
+    weights or their record do not fit the release."""
     from wheretolook.learning.provenance import was_trained_on
     from wheretolook.learning.weights import read_record, read_training
 
@@ -156,10 +145,8 @@ def ship_weights(release: Dataset) -> Choice:
 def sizes(root: Path, weights: bool = True) -> dict[str, int]:
     """Bytes of what ships of the release at `root`, by kind of file. Figures and shelved weights do not ship.
 
-    Before it is chosen which weights do, there may be several: they can be left out.
-
-    Raises:
-        StorageError: it is not smaller than `MAX_BYTES`.
+    Until it is chosen which weights ship, they can be left out. Raises StorageError if it is not
+    smaller than `MAX_BYTES`.
     """
     kinds = {"viewpoints.parquet": "tables", "landmarks.npz": "landmarks", CAMERAS_FILE: "cameras"}
     kinds["occlusion.npz"] = "occlusion"
@@ -184,8 +171,7 @@ def size_text(parts: Mapping[str, int]) -> str:
 def read_about(release: Dataset) -> dict[str, Any]:
     """What a release was made from: source, source_fingerprint, code_version and settings.
 
-    Raises:
-        ConfigError: the file is missing or damaged.
+    Raises ConfigError if the file is missing or damaged.
     """
     path = release.root / RELEASE_FILE
     try:

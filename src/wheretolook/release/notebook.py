@@ -16,8 +16,7 @@ RELEASE_VARIABLE, STORE_VARIABLE = "WHERETOLOOK_RELEASE", "WHERETOLOOK_MLRUNS"
 def open_release() -> Dataset:
     """The released dataset: the folder in `WHERETOLOOK_RELEASE`, or the nearest `data/release` here or above.
 
-    Raises:
-        ConfigError: there is none. TableError: it is damaged.
+    Raises ConfigError if there is none, TableError if it is damaged.
     """
     here, named = Path.cwd(), os.environ.get(RELEASE_VARIABLE)
     places = [Path(named)] if named else [folder / "data" / RELEASE for folder in (here, *here.parents)]
@@ -39,8 +38,7 @@ def find_store() -> TrackingConfig:
 def open_store(release: Dataset | None = None) -> TrackingConfig:
     """The store of `find_store`; the runs of a release (`open_release` by default) are logged if it lacks them.
 
-    Raises:
-        ConfigError: there is no release. TableError: it is damaged.
+    Raises ConfigError if there is no release, TableError if it is damaged.
     """
     from wheretolook.release.runs import log_release
 

@@ -34,10 +34,10 @@ from wheretolook.viewpoints.thresholds import ALL
 LEARNERS_CSV = "learners.csv"
 """In a release's `results/`: how all learners do on scenes of validation, test and others, a row for each seed."""
 
-TAGS = {"logged_from": "release"}
-"""Of runs that were not computed where they are logged."""
+TAGS = {"logged_from": "release"}  # of runs that were not computed where they are logged
 
 Say = Callable[[str], None]
+Values = dict[str, Any]
 
 
 @dataclass
@@ -53,10 +53,10 @@ class ReleaseRuns:
 
 
 def log_release(dataset: Dataset, tracking: TrackingConfig, say: Say = lambda text: None) -> ReleaseRuns:
-    """Log what a release holds, as far as the store does not have it yet. Returns the runs, those found again too.
+    """Log those runs of a release that the store lacks. Returns all of them, also those that were there.
 
-    The store is made if there is none. What an earlier call left half done, because it was killed, is deleted first; of
-    several calls at once one waits for the other.
+    The store is made if there is none. Runs that a killed call left unfinished are deleted first; calls made at the
+    same time wait for each other.
     """
     with _alone(tracking):
         _forget_halves(tracking)
@@ -73,7 +73,7 @@ def _alone(tracking: TrackingConfig) -> Iterator[None]:
 
 
 def _forget_halves(tracking: TrackingConfig) -> None:
-    """Delete runs that were being logged from a release when something ended it, and those nested in them."""
+    """Delete the unfinished runs of a release, and those nested in them."""
     mlflow = client_of(tracking)
     experiments = list(experiment_ids(mlflow, tracking).values())
 
@@ -138,7 +138,7 @@ def _train_run(tracking: TrackingConfig, path: Path, record: dict[str, Any], wit
 
 
 def _log_scores(dataset: Dataset, tracking: TrackingConfig) -> str:
-    """The evaluation on the release's own test scenes, as `wheretolook evaluate` logs it, but for single locations."""
+    """The evaluation on the release's own test scenes, as the evaluate stage logs it, without tables of locations."""
     results, scenes = dataset.root / "results", dataset.split("test")
     table = read_scores(results / SCORES_CSV)
     named = (dataset.root / "weights" / f"{name}.safetensors" for name in learned())
@@ -160,16 +160,15 @@ def _log_others(name: str, table: pd.DataFrame, dataset: Dataset, tracking: Trac
         return _log_evaluation(name, table, params, {}, [path], tracking)
 
 
-def _choices(table: pd.DataFrame) -> dict[str, Any]:
-    """What of an evaluation's options its table tells."""
+def _choices(table: pd.DataFrame) -> Values:
+    """Those options of an evaluation that its table shows."""
     choices = {name: tuple(table[name].unique().tolist()) for name in ("top_n", "occlusion", "candidates")}
     return {**choices, "reference": table["reference"].iloc[0]}
 
 
 def _log_evaluation(
-    name: str, table: pd.DataFrame, params: dict[str, Any], metrics: dict[str, float], files: list[Path],
-    tracking: TrackingConfig,
-) -> str:  # fmt: skip
+    name: str, table: pd.DataFrame, params: Values, metrics: Values, files: list[Path], tracking: TrackingConfig
+) -> str:
     tags = {**TAGS, "dataset": name}
     metrics |= {"n_locations": float(table.loc[table["scene"] == ALL, "n_locations"].iloc[0])}
     with start_run(tracking, f"evaluate {name}", "evaluate", params, tags=tags) as (mlflow, run):

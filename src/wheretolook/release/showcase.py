@@ -30,11 +30,8 @@ from wheretolook.viewpoints.table import instructive_location, is_good
 from wheretolook.visibility.config import OcclusionConfig
 from wheretolook.visibility.occlusion import StoredOcclusion
 
-EYE_M = 1.45
-"""Height of the locations that figures show, unless told otherwise: about that of the mapping cameras."""
-
-SAME_OCCLUSION = 0.999
-"""Share of the lines of sight that must be as stored; what differs is rounding."""
+EYE_M = 1.45  # height of the locations that figures show, unless told otherwise: about that of the mapping cameras
+SAME_OCCLUSION = 0.999  # share of the lines of sight that must be as stored; what differs is rounding
 
 _CHECKED = 16  # locations whose lines of sight are compared
 
@@ -42,12 +39,9 @@ _SEEDED = re.compile(r"apartment-(\d+)")
 
 
 class Showcase(Scene):
-    """A scene of a release, with everything that figures ask for; its lines of sight are found by the mesh.
+    """A scene of a release with everything that figures need; its mesh tells what is occluded."""
 
-    `sampling` is how its viewpoints were sampled.
-    """
-
-    sampling: SampleConfig
+    sampling: SampleConfig  # how its viewpoints were sampled
 
     @cached_property
     def table(self) -> pd.DataFrame:
@@ -66,7 +60,7 @@ class Showcase(Scene):
 
     @cached_property
     def directions(self) -> Float:
-        """Optical axes that each location was looked from, (D, 3) unit vectors."""
+        """Optical axes sampled at each location, (D, 3) unit vectors."""
         return self.sampling.axes()
 
     @property
@@ -152,7 +146,7 @@ def open_showcase(dataset: Dataset, name: str | None = None, device: str = "cpu"
     occlusion = recorded(OcclusionConfig, {**settings["occlusion"], "model": "mesh"})
     config = SceneConfig(occlusion, recorded(FreeSpaceConfig, settings["scenes"]["free_space"]))
     mesh = generate_apartment(recorded(ApartmentConfig, settings["scenes"]["apartment"]), int(seeded[1]), device=device)
-    showcase = Showcase(scene, dataset.camera, config, device, mesh)
+    showcase = Showcase(scene, None, config, device, mesh)
     showcase.sampling = recorded(SampleConfig, settings["sample"])
     if settings["occlusion"]["model"] == "mesh":
         _check_same(showcase)

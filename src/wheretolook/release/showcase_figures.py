@@ -173,14 +173,10 @@ def rendered_views(
     return tuple(View(rgb, pose[2, :3], float(score), words(rows.iloc[row])) for rgb, pose, score, row in seen)
 
 
-PLANNED_BY = ("forward", "fisher-trace-gp", "set")
-"""Methods in the figure of planned paths, by their names on the command line."""
-
-
 def planned_views(
     showcase: Showcase,
     dataset: Dataset,
-    methods: Sequence[str] = PLANNED_BY,
+    methods: Sequence[str] = PathsConfig.methods,
     config: PlanConfig = PlanConfig(grid=(8, 8, 4), directions=200),
 ) -> dict[str, list[PathView]]:
     """The views along several methods' paths, by the dataset's weights, between the farthest of ten random pairs."""

@@ -15,8 +15,7 @@ from wheretolook.viewpoints.thresholds import threshold_label
 if TYPE_CHECKING:
     from pandas.io.formats.style import Styler
 
-DIVIDED = f"/{RELEASED_DIVISOR}"
-"""Name of the column of shares divided by the released code's constant."""
+DIVIDED = f"/{RELEASED_DIVISOR}"  # name of the column of shares divided by the released code's constant
 
 
 def latest_paper_table(tracking: TrackingConfig, name: str, dataset: str = "") -> pd.DataFrame:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -44,11 +43,7 @@ def cut_above(mesh: TexturedMesh, height_m: float) -> TexturedMesh:
     corner_uvs = [mesh.corner_uvs[whole], *(np.stack(at, axis=1)[keep] for keep, _, at in pieces)]
     texture = [mesh.triangle_texture[whole], *(mesh.triangle_texture[rows[keep]] for keep, _, _ in pieces)]
     used, renamed = np.unique(np.concatenate(triangles), return_inverse=True)
-    return replace(
-        mesh,
-        vertices=with_cuts(mesh.vertices)[used],
-        triangles=renamed.reshape(-1, 3).astype(np.int32),
-        corner_uvs=np.concatenate(corner_uvs).astype(np.float32),
-        triangle_texture=np.concatenate(texture),
-        vertex_colors=None if mesh.vertex_colors is None else with_cuts(mesh.vertex_colors)[used],
-    )
+    vertices, numbered = with_cuts(mesh.vertices)[used], renamed.reshape(-1, 3).astype(np.int32)
+    colors = None if mesh.vertex_colors is None else with_cuts(mesh.vertex_colors)[used]
+    uv = np.concatenate(corner_uvs).astype(np.float32)
+    return TexturedMesh(vertices, numbered, uv, np.concatenate(texture), mesh.textures, colors)

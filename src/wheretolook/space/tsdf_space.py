@@ -30,11 +30,8 @@ class TsdfSpace(FreeSpace):
 
     The volume is of the same images and not needed any more afterwards; `two_sided` is ignored, since the surface is
     one-sided. Over the bounds lies a grid of `cells`; `to_unseen_m` (nx, ny, nz) is the distance from each one's centre
-    to the nearest centre of a cell that no image saw through.
-
-    Raises:
-        SceneError: the depth images show no surface.
-        ConfigError: if there is no such device.
+    to the nearest centre of a cell that no image saw through. Raises SceneError if the depth images show no surface,
+    ConfigError if there is no such device.
     """
 
     def __init__(

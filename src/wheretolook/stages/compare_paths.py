@@ -15,7 +15,7 @@ from wheretolook.config import Experiment
 from wheretolook.dataset.folders import Dataset, SceneFolder
 from wheretolook.dataset.scene import Scene
 from wheretolook.dataset.stamps import stage_key
-from wheretolook.planning.config import PathsConfig
+from wheretolook.planning.config import FORWARD, PathsConfig
 from wheretolook.stages.inputs import Say, Tick, dataset_after, extractor_of, open_scene
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.utils.files import fingerprint, write_json, write_text
@@ -66,7 +66,7 @@ def _chosen(dataset: Dataset, config: PathsConfig) -> list[SceneFolder]:
 def _plan(scene: Scene, dataset: Dataset, config: PathsConfig, say: Say) -> ComparedPaths:
     """The paths of a scene: those that are there if they were planned with the same settings."""
     from wheretolook.labelling.labeller import storing
-    from wheretolook.planning.path_comparison import FORWARD, ComparedPaths, draw_pairs, plan_pairs
+    from wheretolook.planning.path_comparison import ComparedPaths, draw_pairs, plan_pairs
     from wheretolook.planning.scene_map import planner_map, weights_for
 
     files, folder = scene.files, _folder(dataset, scene)
@@ -134,27 +134,20 @@ def _report(
     from wheretolook.figures.paths import paths_figure
     from wheretolook.figures.style import save_figure
     from wheretolook.labelling.labeller import storing
-    from wheretolook.planning.path_report import (
-        PATHS_CSV,
-        PATHS_MD,
-        PATHS_PNG,
-        log_paths,
-        path_markdown,
-        summarize_paths,
-    )
+    from wheretolook.planning import path_report as report
 
-    summary = summarize_paths(paths, views, config)
-    folder, markdown = dataset.root / "results", path_markdown(summary, config)
-    with storing(folder / PATHS_CSV):
-        summary.to_csv(folder / PATHS_CSV, index=False, float_format="%.6g", lineterminator="\n")
-        write_text(folder / PATHS_MD, markdown)
+    summary = report.summarize_paths(paths, views, config)
+    folder, markdown = dataset.root / "results", report.path_markdown(summary, config)
+    with storing(folder / report.PATHS_CSV):
+        summary.to_csv(folder / report.PATHS_CSV, index=False, float_format="%.6g", lineterminator="\n")
+        write_text(folder / report.PATHS_MD, markdown)
         views.to_parquet(folder / FOLDER / "views.parquet", index=False)
-    save_figure(paths_figure(summary), folder / PATHS_PNG)
+    save_figure(paths_figure(summary), folder / report.PATHS_PNG)
     params = {"dataset": dataset.name, "pairs": config.pairs, "seed": config.seed, "time_s": config.planner.time_s}
     params |= {"score_weight": config.planner.score_weight, "max_turn_deg": config.max_turn_deg}
-    log_paths(params, summary, folder, tracking)
+    report.log_paths(params, summary, folder, tracking)
     say(markdown)
-    say(f"-> {folder / PATHS_CSV}, {PATHS_MD}, {PATHS_PNG}; every view in {folder / FOLDER}")
+    say(f"-> {folder / report.PATHS_CSV}, {report.PATHS_MD}, {report.PATHS_PNG}; every view in {folder / FOLDER}")
     return summary
 
 

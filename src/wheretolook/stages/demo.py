@@ -23,7 +23,6 @@ from wheretolook.utils.tracking import ui_command
 SECONDS = {"scenes": 5.0, "map": 15.0, "sample": 1.0, "label": 75.0, "train": 25.0, "evaluate": 6.0}
 """Rough cost of a stage on two cores (the first four for each scene), from which the share done is estimated."""
 
-
 OVERVIEW = "overview.png"
 
 
@@ -38,7 +37,7 @@ def run_demo(experiment: Experiment) -> None:
     functions = (stages.make_scenes, stages.make_maps, stages.sample, stages.label, stages.train, stages.evaluate)
     steps: dict[str, Callable[..., object]] = dict(zip(SECONDS, functions, strict=True))
     if config.train == 0 and not any(mesh.split == "train" for mesh in config.meshes):
-        del steps["train"], cost["train"]  # meshes of one's own, evaluated with weights from elsewhere
+        del steps["train"], cost["train"]  # all scenes are evaluated, with weights from elsewhere
         asked = methods_named(experiment.evaluate.methods, scorers())
         if any(method.weights for method in asked) and not experiment.evaluate.weights:
             fix = "Name weights in evaluate.weights, or leave methods that have learnt out of evaluate.methods."
@@ -48,8 +47,7 @@ def run_demo(experiment: Experiment) -> None:
     with tqdm(total=sum(cost.values()), desc="demo", bar_format=layout, smoothing=0) as bar:
         for number, (name, step) in enumerate(steps.items(), 1):
             bar.set_description_str(f"demo {number}/{len(steps)} {name}")
-            say, tick = partial(_say, name), partial(_tick, bar, SECONDS[name])
-            step(experiment, say=say, tick=tick)
+            step(experiment, say=partial(_say, name), tick=partial(_tick, bar, SECONDS[name]))
         given, own = experiment.evaluate.weights, experiment.root / "weights"
         if given or any(own.glob("*.safetensors")):
             draw_overview(experiment, given[-1] if given else own)
@@ -61,11 +59,8 @@ def draw_overview(experiment: Experiment, weights: Path) -> None:
     """Draw `<dataset>/results/overview.png`: the last scene's map, and what a network thinks of one place in it.
 
     The place is one where to look matters (`wheretolook.viewpoints.table.instructive_location`). The weights are a
-    file, or a folder of files of which the best is taken, for a camera of the dataset's field of view.
-
-    Raises:
-        TableError: there is no dataset, or its last scene is not labelled.
-        WeightsError: the weights cannot be used.
+    file, or a folder of files of which the best is taken, for a camera of the dataset's field of view. Raises
+    TableError if there is no dataset or its last scene is not labelled, WeightsError if the weights cannot be used.
     """
     from wheretolook.figures.overview import overview_figure
     from wheretolook.figures.style import save_figure

@@ -48,15 +48,10 @@ def evaluate_methods(
     The temperatures of learned methods are fitted on the labelled views of the val scenes, seen by the first occlusion
     model, and hold for all rows; without val scenes, or when these are evaluated, they are not known.
 
-    Args:
-        dataset: labelled scenes; they need not be of the dataset the models were trained on.
-        models: models or weights files to compare, instead of those that `config.weights` tells.
-        progress: show a progress bar, and print the table at the end.
-        occlusion: settings of the models that `config.occlusions` names.
-
-    Returns:
-        The tables of `wheretolook.evaluation.scores.score_table`, one below the other, with columns `occlusion` and
-        `candidates`.
+    The scenes need not be of the dataset the models were trained on. `models` are compared instead of those that
+    `config.weights` tells; `progress` shows a bar, and prints the table at the end; `occlusion` has the settings of the
+    models that `config.occlusions` names. Returns the tables of `wheretolook.evaluation.scores.score_table`, one below
+    the other, with columns `occlusion` and `candidates`.
 
     Raises:
         TableError: there is no scene of the split, a viewpoint has no label, or all labels of a candidate set are of

@@ -13,8 +13,9 @@ def figures(experiment: Experiment, say: Say = print) -> Dataset:
     """Draw every figure and table from logged runs; those of a release are logged first.
 
     Raises:
-        MissingRunError: some of the paper's, or of those named, could not be made for want of a run; the others were.
-        ConfigError: there is no figure of such a name. TableError: there is no dataset.
+        MissingRunError: a figure of the paper, or one named in `figures.only`, has no run to be drawn from. All others
+            were drawn.
+        ConfigError: there is no figure of that name. TableError: there is no dataset.
     """
     from wheretolook.release.catalog import ITEMS, check_names, write_items
     from wheretolook.release.copy import is_release

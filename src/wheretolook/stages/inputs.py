@@ -19,19 +19,17 @@ from wheretolook.utils.options import recorded
 if TYPE_CHECKING:
     from wheretolook.features.keypoints import ExtractorConfig
 
-Say = Callable[[str], None]
-"""Told in a line what a stage has done."""
+Say = Callable[[str], None]  # told in a line what a stage has done
 
 Tick = Callable[[float], None]
 """Told how much of a stage's work is done: 1 a scene, or 1 in all for stages that do not go scene by scene."""
 
 
 def dataset_after(experiment: Experiment, needs: str) -> Dataset:
-    """The dataset, once the stage that is needed has been through all of its scenes with what they now hold.
+    """The dataset, if the stage that is needed has been run for all of its scenes as they are now.
 
-    Raises:
-        ConfigError: it was made with another camera, or is a release where meshes and maps are needed.
-        TableError: there is none, or the stage has not been run.
+    Raises ConfigError if it was made with another camera, or is a release where meshes and maps are needed; TableError
+    if there is none, or the stage has not been run.
     """
     dataset = Dataset.load(experiment.root)
     if needs != "label":
@@ -43,9 +41,7 @@ def dataset_after(experiment: Experiment, needs: str) -> Dataset:
         raise ConfigError(problem, path=experiment.root, value=others[0], fix=fix)
     for scene in dataset.scenes:
         if read_stamp(scene, needs) is None:
-            problem = (
-                f"the {needs} stage has not been run for this scene, or not since an earlier stage remade its input"
-            )
+            problem = f"the {needs} stage has not been run for this scene since its input was made"
             raise TableError(problem, path=scene.folder, fix=f"Run `wheretolook {needs}`.")
     return dataset
 

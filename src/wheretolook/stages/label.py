@@ -28,10 +28,8 @@ def label(experiment: Experiment, say: Say = print, tick: Tick = lambda work: No
     """Stage 4: every viewpoint rendered and localized; status and errors into `<scene>/viewpoints.parquet`.
 
     Resumes after an interruption, see `wheretolook.labelling.labeller.label_scenes`. How the labels came out goes to
-    `<dataset>/results/labels.*` and an MLflow run.
-
-    Raises:
-        SceneError: a mesh is missing, or a scene is known from photographs alone.
+    `<dataset>/results/labels.*` and an MLflow run. Raises SceneError if a mesh is missing, or a scene is known from
+    photographs alone.
     """
     dataset, config = dataset_after(experiment, "sample"), experiment.label
     for files in dataset.scenes:
@@ -41,7 +39,7 @@ def label(experiment: Experiment, say: Say = print, tick: Tick = lambda work: No
             raise SceneError(f"{problem}and so not labelled", path=files.folder, fix=fix)
     to_label: list[tuple[SceneFolder, str]] = []
     for files in sorted(dataset.scenes, key=lambda files: files.split == "train"):  # those to evaluate on come first
-        parts = [asdict(config.localizer), asdict(extractor_of(files)), dataset.camera.record()]
+        parts = [asdict(config.localizer), asdict(extractor_of(files)), files.camera.record()]
         made_from = [existing(files.mesh, SceneError, "scenes"), existing(files.landmarks, MapError, "map")]
         matches = ["store_matches"] if config.store_matches else []
         key = stage_key("label", [*parts, *made_from, read_stamp(files, "sample"), *matches])
@@ -77,7 +75,8 @@ def _label(
     for files, _ in to_label:
         scene = open_scene(experiment, dataset, files)
         options = (config.localizer, extractor_of(files), scene.device, config.store_matches)
-        job = SceneJob(files.mesh, files.landmarks, scene.camera, *options)
+        cameras = tuple(files.cameras().items()) if files.cameras_file.is_file() else ()
+        job = SceneJob(files.mesh, files.landmarks, scene.camera, *options, cameras)
         tasks.append(LabelTask(scene.name, job, files.read_table(), _shards(files)))
     seconds: dict[str, float] = {}
     start, replacing = time.monotonic(), False
@@ -116,10 +115,8 @@ def log_labels(
     """Summarize the labels of a dataset, write `<dataset>/results/labels.csv`, `.md` and `.png`, and log an MLflow run.
 
     The run is of stage "label"; its metrics are the numbers of `LabelSummary.shares` over all scenes and, with the
-    split's name in front, over each split, and the seconds that each step took, `seconds_<name>`.
-
-    Raises:
-        TableError: there is no scene, a scene has no viewpoints, or one of them has no label.
+    split's name in front, over each split, and the seconds that each step took, `seconds_<name>`. Raises TableError if
+    there is no scene, a scene has no viewpoints, or one of them has no label.
     """
     from wheretolook.figures.labels import label_figure
     from wheretolook.figures.style import save_figure

@@ -12,25 +12,15 @@ from wheretolook.stages.inputs import Say
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.tracking import ui_command
 
-QUICK = (
-    "top_n",
-    "table_vs_others",
-    "table_input_variants",
-    "training",
-    "calibration",
-    "scores",
-    "regret",
-    "paths",
-    "runtimes",
-)
+_TABLES = ("table_vs_others", "table_input_variants")
+QUICK = ("top_n", *_TABLES, "training", "calibration", "scores", "regret", "paths", "runtimes")
 """Figures and tables that need no scene, and so only seconds."""
 
 
 def log_release(experiment: Experiment, say: Say = print, attach: bool = True) -> Dataset:
     """Log what a release holds as MLflow runs, as far as the store lacks them, on request with figures and tables.
 
-    Raises:
-        ConfigError: the dataset is no release. TableError: there is none.
+    Raises ConfigError if the dataset is no release, TableError if there is none.
     """
     from wheretolook.release.catalog import write_items
     from wheretolook.release.copy import is_release

@@ -10,7 +10,7 @@ import pandas as pd
 
 from wheretolook.config import Experiment
 from wheretolook.dataset.folders import Dataset
-from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.stages.inputs import Say, Tick, dataset_after, open_scene
 from wheretolook.utils.errors import ConfigError
@@ -83,13 +83,9 @@ def _log(
     experiment: Experiment, dataset: Dataset, scene: str, methods: list[str], path: PlannedPath, files: list[Path]
 ) -> None:
     config = experiment.plan
-    params: dict[str, object] = {
-        "dataset": dataset.name,
-        "scene": scene,
-        "method": methods[-1],
-        "methods": " ".join(methods),
-    }
-    params |= {"start": config.start, "goal": config.goal, "score_weight": config.planner.score_weight}
+    params: dict[str, object] = {"dataset": dataset.name, "scene": scene, "method": methods[-1]}
+    params |= {"methods": " ".join(methods), "start": config.start, "goal": config.goal}
+    params["score_weight"] = config.planner.score_weight
     metrics = {"length_m": path.length_m, "turn_deg": path.turn_deg, "score": float(path.scores.mean())}
     tags = {"dataset": dataset.name}
     with start_run(experiment.tracking, f"plan {scene}", "plan", params, tags=tags) as (client, run):
@@ -114,7 +110,7 @@ def _rerun():  # type: ignore[no-untyped-def]  # the package is no dependency
     return rerun
 
 
-def _record(rerun, seen: list[PathView], landmarks: np.ndarray, camera: PinholeCamera, file: Path) -> None:  # type: ignore[no-untyped-def]
+def _record(rerun, seen: list[PathView], landmarks: np.ndarray, camera: Camera, file: Path) -> None:  # type: ignore[no-untyped-def]
     """A recording for the Rerun viewer: landmarks, path, the camera moving along it, its image, its score."""
     stream = rerun.RecordingStream("wheretolook")
     stream.save(str(file))
@@ -127,8 +123,8 @@ def _record(rerun, seen: list[PathView], landmarks: np.ndarray, camera: PinholeC
         stream.log("world/camera", rerun.Transform3D(translation=view.position, mat3x3=pose[:, :3].T))
         size = {"width": camera.width, "height": camera.height}
         pinhole = rerun.Pinhole(
-            focal_length=(camera.fx, camera.fy),
-            principal_point=(camera.cx, camera.cy),
+            focal_length=camera.mean_focal_px,  # Rerun knows no distortion
+            principal_point=camera.principal_point,
             camera_xyz=rerun.ViewCoordinates.RDF,
             **size,
         )

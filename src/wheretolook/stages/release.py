@@ -21,7 +21,7 @@ def release(experiment: Experiment, say: Say = print, tick: Tick = lambda work: 
     the weights that ship, evaluates them and writes the card. Either can be done again.
 
     Raises:
-        WeightsError: no weights, or such that do not fit the release.
+        WeightsError: there are no weights, or they do not fit the release.
         StorageError: it is not smaller than 16 MB.
         ConfigError: another dataset lies where the copy belongs.
     """
@@ -35,12 +35,12 @@ def release(experiment: Experiment, say: Say = print, tick: Tick = lambda work: 
         copy = releases.copy_dataset(dataset, experiment.data / experiment.release_name, release_settings(experiment))
         for scene, source in zip(copy.scenes, dataset.scenes, strict=True):
             stamp = read_stamp(source, "label")
-            assert stamp is not None  # `_dataset` has seen it
+            assert stamp is not None  # `dataset_after` has checked it
             write_stamp(scene, "label", stamp)
         say(f"{len(copy.scenes)} scenes -> {copy.root}: {releases.size_text(releases.sizes(copy.root, weights=False))}")
         say("next: train on it, then `wheretolook release` with its own configuration")
         return copy
-    # on the CPU, as those who have no GPU will do it
+    # on the CPU, so that machines without a GPU get the same scores
     on_cpu = replace(experiment, device="cpu", evaluate=replace(experiment.evaluate, weights=()))
     results = dataset.root / "results"
     if releases.choose_weights_to_ship(dataset).shelved:  # all that were trained, before only the best are left

@@ -20,12 +20,9 @@ from wheretolook.viewpoints.config import SampleConfig
 def sample(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> Dataset:
     """Stage 3: viewpoints and which landmarks their locations see, `<scene>/viewpoints.parquet` and `occlusion.npz`.
 
-    Every voxel's free location is looked from in every direction; the landmarks it sees are counted exactly.
-
-    A scene of photographs is free near where these were taken, and occluded by hidden-point removal.
-
-    Raises:
-        SceneError: no location is free. MapError: there is no map, or one without a scale.
+    A camera looks in every direction from the centre of every free voxel, and the landmarks in view are counted
+    exactly. In a scene of photographs a camera can be near where these were taken, and hidden-point removal tells what
+    is occluded. Raises SceneError if no location is free, MapError if there is no map, or one without a scale.
     """
     dataset, config = dataset_after(experiment, "map"), experiment.sample
     for files in dataset.scenes:

@@ -20,9 +20,8 @@ if TYPE_CHECKING:
 def make_scenes(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> Dataset:
     """Stage 1: a textured mesh for every scene, `<scene>/mesh.glb`, and the dataset's description.
 
-    Raises:
-        SceneError: a mesh of one's own cannot be used, or two scenes have the same name.
-        ConfigError: the dataset's folder holds a release.
+    Raises SceneError if a mesh in `scenes.meshes` cannot be used or two scenes have the same name, ConfigError if the
+    dataset's folder holds a release.
     """
     config, root, camera = experiment.scenes, experiment.root, experiment.camera.camera
     refuse_release(root)

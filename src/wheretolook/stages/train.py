@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
     from wheretolook.learning.provenance import TrainedModel
 
+Values = dict[str, Any]
+
 
 def train(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> Sequence[TrainedModel]:
     """Stage 5: the weights of each method that is to learn, `<dataset>/weights/`, and an MLflow run for each."""
@@ -58,34 +60,34 @@ def train_methods(
     from wheretolook.learning.provenance import about_training, trained_before, weights_path
 
     dataset = with_also(dataset, config.also)
-    kept: dict[str, Any] = {}
+    shared: dict[str, Any] = {"progress": progress, "kept": {}}
     models = []
     for method in config.chosen():
-        path = weights_path(dataset, method.name)
         about = about_training(dataset, method.name, config, config.options_of(method))
-        known = None if force else trained_before(path, about)
-        models.append(known or _train(method, dataset, config, path, about, tracking, progress, kept))
+        known = None if force else trained_before(weights_path(dataset, method.name), about)
+        models.append(known or _train(method, dataset, config, about, tracking, shared))
     return models
 
 
 def _train(
-    method: Method, dataset: Dataset, config: TrainConfig, path: Path, about: dict[str, Any], tracking: TrackingConfig,
-    progress: bool, kept: dict[str, Any],
-) -> TrainedModel:  # fmt: skip
+    method: Method, dataset: Dataset, config: TrainConfig, about: Values, tracking: TrackingConfig, shared: Values
+) -> TrainedModel:
+    """Train a method, log it, and write its weights; `shared` are further fields of its `Task`."""
     from lightning.pytorch import seed_everything
     from lightning.pytorch.utilities.seed import isolate_rng
 
     from wheretolook.learning.fit import RunLog
     from wheretolook.learning.learner import Task
-    from wheretolook.learning.provenance import TrainedModel
+    from wheretolook.learning.provenance import TrainedModel, weights_path
     from wheretolook.learning.runs import params_of
 
     assert method.learn is not None
-    title, params = f"train {method.name}", {**params_of(about), "devices": config.devices}
+    path, title = weights_path(dataset, method.name), f"train {method.name}"
+    params = {**params_of(about), "devices": config.devices}
     with start_run(tracking, title, "train", params) as (client, run_id), isolate_rng():
         seed_everything(config.seed, verbose=False)
         options, run_log = config.options_of(method), RunLog(tracking, run_id)
-        learnt = method.learn(Task(dataset, method.name, config, options, title, progress, run_log, kept))
+        learnt = method.learn(Task(dataset, method.name, config, options, title, run_log=run_log, **shared))
         learnt.model.save(path, about)
         log(client, run_id, params=learnt.counts, metrics={f"kept_{name}": x for name, x in learnt.metrics.items()})
         _log_artifacts(client, run_id, path, learnt.history, method.name)

@@ -11,13 +11,7 @@ from wheretolook.utils.errors import ConfigError
 def usable_device(device: str) -> str:
     """A device that can be computed on: the one given, or for "auto" a GPU if there is one, else the CPU.
 
-    Where there is no GPU, the answer comes without loading PyTorch.
-
-    Args:
-        device: "cpu", "cuda", "cuda:<index>" or "auto".
-
-    Raises:
-        ConfigError: there is no such device.
+    Where there is no GPU, the answer comes without loading PyTorch. Raises ConfigError if there is no such device.
     """
     check_device_name(device)
     if device == "cpu":

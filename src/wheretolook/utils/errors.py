@@ -8,11 +8,8 @@ from os import PathLike
 class WhereToLookError(Exception):
     """Base of every error this package raises on bad input. The command line exits with code 2 on it.
 
-    Args:
-        problem: what is wrong, in one sentence.
-        path: the offending file or folder, if there is one.
-        value: the offending value, if there is one.
-        fix: what the user can do about it.
+    It says in a sentence what the problem is, the offending file or folder and value, if there are such, and what the
+    user can do about it.
     """
 
     def __init__(
@@ -53,6 +50,10 @@ class StorageError(WhereToLookError):
 
 class WeightsError(WhereToLookError):
     """Trained weights are missing or do not fit the network or the inputs asked for."""
+
+
+class CameraError(WeightsError):
+    """Weights have learnt from the views of another camera than the one that looks, and serve no other."""
 
 
 class MapFormatError(WhereToLookError):

@@ -21,11 +21,7 @@ def save_npz(path: Path, arrays: Mapping[str, NDArray[Any]], compress: bool = Fa
 
 
 def load_npz(path: Path) -> dict[str, NDArray[Any]]:
-    """Read all arrays of an NPZ file by name.
-
-    Raises:
-        ValueError: the file is missing or damaged.
-    """
+    """Read all arrays of an NPZ file by name. Raises ValueError if the file is missing or damaged."""
     try:
         with np.load(path) as stored:
             return {name: stored[name] for name in stored.files}

@@ -21,11 +21,9 @@ from wheretolook.utils.errors import ConfigError
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-WIDTH = 118
-"""Columns of help, where the terminal has so many."""
+WIDTH = 118  # columns of help, where the terminal has so many
 
 _NAME_WIDTH = 36
-
 
 T = TypeVar("T", bound="DataclassInstance")
 
@@ -34,18 +32,13 @@ T = TypeVar("T", bound="DataclassInstance")
 class Option:
     """One option, or a group of them.
 
-    Attributes:
-        name: with those of the groups it is in: "sample.grid".
-        text: what its class's docstring says of it.
-        default: its default as the command line takes it; empty for a group, and for a default that is worked out.
-        is_group: whether further options lie in it.
-        is_fixed: whether it is a constant, a field that `__init__` does not take: it stands among the options since
-            what is recorded of a result must name it, and no one needs to turn it.
+    One that is fixed is a constant, a field that `__init__` does not take: it stands among the options since what is
+    recorded of a result must name it, and no one needs to turn it.
     """
 
-    name: str
-    text: str
-    default: str = ""
+    name: str  # with those of the groups it is in: "sample.grid"
+    text: str  # what its class's docstring says of it
+    default: str = ""  # as the command line takes it; empty for a group, and for a default that is worked out
     is_group: bool = False
     is_fixed: bool = False
 
@@ -69,8 +62,7 @@ def all_options(settings: type, prefix: str = "") -> dict[str, Option]:
 def recorded(settings: type[T], values: Mapping[str, Any]) -> T:
     """Settings as `dataclasses.asdict` recorded them with a result.
 
-    Raises:
-        ConfigError: the record has another value of what is a constant.
+    Raises ConfigError if the record has another value of what is a constant.
     """
     fixed = {field.name for field in dataclasses.fields(settings) if not field.init}
     for name in fixed & {*values}:
@@ -81,16 +73,11 @@ def recorded(settings: type[T], values: Mapping[str, Any]) -> T:
 
 
 def check_names(names: Iterable[str], options: Mapping[str, Option], moved: Mapping[str, str], flag: str = "") -> None:
-    """Raise unless every name is one of an option that can be set.
+    """Raise ConfigError unless every name, with groups and dots, is one of an option that can be set.
 
-    Args:
-        names: with groups and dots, as in a file or on the command line.
-        options: what there is.
-        moved: options there were: where each has gone, as another's name or in a sentence.
-        flag: what stands before a name where it was given, "--" on the command line.
-
-    Raises:
-        ConfigError: a name is unknown, with the one that was probably meant; or it has moved, or is a constant.
+    The error tells which option was probably meant, or that it has moved, or is a constant. `moved` says where options
+    there were have gone, by another's name or in a sentence; `flag` is what stands before names, "--" on the command
+    line.
     """
     for name in names:
         if name in moved:
@@ -122,8 +109,7 @@ def nearest(name: str, names: Iterable[str]) -> str | None:
 def names_in(content: Any, options: Mapping[str, Option], prefix: str = "") -> Iterator[str]:
     """Names of the options that a file's content sets, (nested) mappings as a YAML file holds them.
 
-    Raises:
-        ConfigError: a group is given something else than a mapping.
+    Raises ConfigError if the value of a group is no mapping.
     """
     for key, value in content.items():
         name = f"{prefix}{key}"
@@ -138,10 +124,14 @@ def names_in(content: Any, options: Mapping[str, Option], prefix: str = "") -> I
             yield name
 
 
-def one_line(option: Option, flag: str = "") -> str:
-    """An option, the first sentence of what it is, and its default."""
-    sentence = re.split(r"(?<!Sec)\. (?=[^a-z])|\.$", option.text, maxsplit=1)[0]
-    return _row(flag or f"--{option.name}", f"{sentence}{_default(option)}")
+def short_lines(options: Mapping[str, Option]) -> str:
+    """Options by their flags: of each the first sentence of what it is, and its default."""
+    width = min(_NAME_WIDTH, max(map(len, options)) + 4)
+    rows = []
+    for flag, option in options.items():
+        sentence = re.split(r"(?<!Sec)\. (?=[^a-z])|\.$", option.text, maxsplit=1)[0]
+        rows.append(_row(flag, f"{sentence}{_default(option)}", width))
+    return "\n".join(rows)
 
 
 def grouped(options: Iterable[Option]) -> str:
@@ -163,18 +153,17 @@ def grouped(options: Iterable[Option]) -> str:
     return re.sub(r"\n{3,}", "\n\n", text).strip("\n")
 
 
-def _row(flag: str, text: str) -> str:
-    start = f"  {flag:<{_NAME_WIDTH - 2}}"
-    if len(start) > _NAME_WIDTH or not start.endswith(" "):
+def _row(flag: str, text: str, name_width: int = _NAME_WIDTH) -> str:
+    start = f"  {flag:<{name_width - 2}}"
+    if len(start) > name_width or not start.endswith(" "):
         start = f"{start.rstrip()}  "
-    return _filled(text, start, " " * _NAME_WIDTH)
+    return _filled(text, start, " " * name_width)
 
 
 def _filled(text: str, start: str = "", indent: str = "") -> str:
     width = max(60, min(WIDTH, shutil.get_terminal_size((WIDTH, 0)).columns))
-    return textwrap.fill(
-        text, width, initial_indent=start, subsequent_indent=indent, break_on_hyphens=False, break_long_words=False
-    )
+    breaks: dict[str, Any] = {"break_on_hyphens": False, "break_long_words": False}
+    return textwrap.fill(text, width, initial_indent=start, subsequent_indent=indent, **breaks)
 
 
 def _default(option: Option) -> str:

@@ -38,8 +38,7 @@ class Processes:
     def map(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Generator[Result, None, None]:
         """Apply a function, defined at the top level of a module, to items. Yields results in their order.
 
-        Raises:
-            WorkerError: a process was killed.
+        Raises WorkerError if a process was killed.
         """
         if self._pool is None:
             yield from map(function, items)

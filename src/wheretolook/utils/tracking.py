@@ -14,7 +14,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -30,17 +30,15 @@ if TYPE_CHECKING:
     from mlflow import MlflowClient
     from mlflow.entities import Run
 
+Values = Mapping[str, Any] | None  # parameters or metrics by name
+Tags = Mapping[str, str] | None  # tags by name, or the texts that MLflow keeps of parameters
+
 STAGE_TAG = "stage"
 """Tag of every run this package logs: "label", "train", "evaluate", "plan", "paths", "learners" or "benchmark"."""
 
-PARENT_TAG = "mlflow.parentRunId"
-"""Tag by which MLflow knows what run another is nested in."""
-
-AT_ONCE = 800
-"""Metrics logged at a time: MLflow takes 1000 of metrics and parameters together."""
-
-PAGE = 50
-"""Runs searched at a time."""
+PARENT_TAG = "mlflow.parentRunId"  # tag by which MLflow knows what run another is nested in
+AT_ONCE = 800  # metrics logged at a time: MLflow takes 1000 of metrics and parameters together
+PAGE = 50  # runs searched at a time
 
 
 def client(tracking: TrackingConfig) -> MlflowClient:
@@ -74,30 +72,15 @@ def experiment_id(mlflow_client: MlflowClient, tracking: TrackingConfig) -> str:
 
 @contextmanager
 def start_run(
-    tracking: TrackingConfig,
-    name: str,
-    stage: str,
-    params: Mapping[str, Any] | None = None,
-    parent: str | None = None,
-    tags: Mapping[str, str] | None = None,
+    tracking: TrackingConfig, name: str, stage: str, params: Values = None, tags: Tags = None
 ) -> Iterator[tuple[MlflowClient, str]]:
     """Open a run, and close it as finished, failed (any exception) or killed (Ctrl-C).
 
-    Args:
-        tracking: the store.
-        name: name of the run in the UI.
-        stage: such as "train" or "evaluate", stored as a tag.
-        params: parameters to log.
-        parent: id of the run this one is nested under.
-        tags: further tags.
-
-    Yields:
-        The client and the run's id, for `client.log_metric(run_id, ...)` and its kin.
+    The stage, such as "train", is stored as a tag beside `tags`. Yields the client and the run's id, for
+    `client.log_metric(run_id, ...)` and its kin.
     """
     mlflow_client = client(tracking)
     all_tags = {STAGE_TAG: stage, **code_version(), **(tags or {})}
-    if parent is not None:
-        all_tags[PARENT_TAG] = parent
     with _open_run(mlflow_client, experiment_id(mlflow_client, tracking), name, all_tags) as run_id:
         log(mlflow_client, run_id, params)
         yield mlflow_client, run_id
@@ -117,13 +100,7 @@ def _open_run(mlflow_client: MlflowClient, experiment: str, name: str, tags: Map
         mlflow_client.set_terminated(run_id, status=status)
 
 
-def log(
-    mlflow_client: MlflowClient,
-    run_id: str,
-    params: Mapping[str, Any] | None = None,
-    metrics: Mapping[str, float] | None = None,
-    step: int = 0,
-) -> None:
+def log(mlflow_client: MlflowClient, run_id: str, params: Values = None, metrics: Values = None, step: int = 0) -> None:
     """Log parameters and metrics of a run, in few transactions. Metrics that are not finite are left out."""
     from mlflow.entities import Metric, Param
 
@@ -144,20 +121,11 @@ class NestedRun:
     files: Sequence[Path] = ()
 
 
-def log_nested(
-    tracking: TrackingConfig, parent: str, stage: str, runs: Iterable[NestedRun], tags: Mapping[str, str] | None = None
-) -> None:
-    """Log finished runs within another one.
+def log_nested(tracking: TrackingConfig, parent: str, stage: str, runs: Iterable[NestedRun], tags: Tags = None) -> None:
+    """Log finished runs of a stage within another one, whose id is `parent`; all get the same tags.
 
     MLflow needs 25 ms for a run and 0.3 ms for a metric (`tests/benchmarks/bench_tracking.py`): hundreds of runs take
-    half a minute.
-
-    Args:
-        tracking: the store.
-        parent: id of the run they are nested under.
-        stage: their tag.
-        runs: what to log, each when the one before is done. Metrics that are not finite are left out.
-        tags: further tags, the same for all.
+    half a minute. Each is logged when the one before is done. Metrics that are not finite are left out.
     """
     mlflow_client = client(tracking)
     experiment = experiment_id(mlflow_client, tracking)
@@ -170,30 +138,17 @@ def log_nested(
 
 
 def newest_run(
-    tracking: TrackingConfig,
-    stage: str,
-    tags: Mapping[str, str] | None = None,
-    params: Mapping[str, str] | None = None,
-    file: str = "",
+    tracking: TrackingConfig, stage: str, tags: Tags = None, params: Tags = None, file: str = ""
 ) -> Run | None:
     """The newest finished top-level run of a stage, or None. Does not create a store.
 
-    Args:
-        tracking: the store.
-        stage: its tag, such as "evaluate".
-        tags: tags the run must have.
-        params: parameters the run must have.
-        file: artifact the run must have; "" for any run.
+    The run must have these tags and parameters, and this file as an artifact ("" for any run).
     """
     return next(finished_runs(tracking, stage, tags, params, file), None)
 
 
 def finished_runs(
-    tracking: TrackingConfig,
-    stage: str,
-    tags: Mapping[str, str] | None = None,
-    params: Mapping[str, str] | None = None,
-    file: str = "",
+    tracking: TrackingConfig, stage: str, tags: Tags = None, params: Tags = None, file: str = ""
 ) -> Iterator[Run]:
     """All finished top-level runs of a stage, the newest first; see `newest_run`."""
     if not (tracking.root / "mlflow.db").is_file():
@@ -214,16 +169,9 @@ def finished_runs(
 
 
 def newest_artifact(tracking: TrackingConfig, stage: str, file: str, dataset: str = "") -> Path:
-    """An artifact of the newest finished top-level run that has it.
+    """An artifact of the newest finished top-level run of a stage that has it, about a dataset, or about any ("").
 
-    Args:
-        tracking: the store.
-        stage: of the run.
-        file: the artifact.
-        dataset: that the run is about; "" for any.
-
-    Raises:
-        MissingRunError: there is no such run.
+    Raises MissingRunError if there is no such run.
     """
     run = newest_run(tracking, stage, params={"dataset": dataset} if dataset else None, file=file)
     if run is None:
@@ -254,19 +202,18 @@ def ui_command(tracking: TrackingConfig) -> str:
 def code_version() -> dict[str, str]:
     """Version of this package and, in a checkout, the git commit ("+" appended when files differ from it)."""
     version = {"code_version": VERSION}
-    here = Path(__file__).resolve().parent
-    try:
-        git = ["git", "-C", str(here)]
-        top, commit = subprocess.run(
-            [*git, "rev-parse", "--show-toplevel", "HEAD"], capture_output=True, text=True, check=True, timeout=10
-        ).stdout.split("\n")[:2]
+    here = Path(__file__).resolve().parents[1]
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(here), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout
+
+    with suppress(OSError, subprocess.SubprocessError):
+        top, commit = git("rev-parse", "--show-toplevel", "HEAD").split("\n")[:2]
         # an installed copy may lie inside an unrelated checkout (a virtual environment does)
         if here == Path(top) / "src" / "wheretolook":
-            status = [*git, "status", "--porcelain", "--untracked-files=no"]
-            changed = subprocess.run(status, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+            changed = git("status", "--porcelain", "--untracked-files=no").strip()
             version["git_commit"] = commit + ("+" if changed else "")
-    except (OSError, subprocess.SubprocessError):
-        pass
     return version
 
 

@@ -11,7 +11,7 @@ class TrackingConfig:
     """Where runs are logged.
 
     Args:
-        folder: folder of the MLflow store; made when needed. Holds `mlflow.db` and `artifacts/`.
+        folder: folder of the MLflow store. Made when needed; holds `mlflow.db` and `artifacts/`.
         experiment: name of the MLflow experiment that the runs belong to.
     """
 

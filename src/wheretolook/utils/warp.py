@@ -20,10 +20,8 @@ from wheretolook.utils.errors import ConfigError
 def start_warp(device: str = "cpu") -> str:
     """Initialize Warp without its banner, and return the full name of a device, such as "cuda:0" for "cuda".
 
-    Called when something is built on a device, never on import, so that worker processes start Warp themselves.
-
-    Raises:
-        ConfigError: this machine has no such device.
+    Called when something is built on a device, never on import, so that worker processes start Warp themselves. Raises
+    ConfigError if this machine has no such device.
     """
     wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
     with _without_driver_warning():

@@ -8,8 +8,7 @@ from typing import Literal, get_args
 from wheretolook.geometry.lattices import ViewLattice
 from wheretolook.utils.errors import ConfigError
 
-Split = Literal["train", "val", "test"]
-"""What a scene is for: to learn from, to choose by, to report on."""
+Split = Literal["train", "val", "test"]  # what a scene is for: to learn from, to choose by, to report on
 
 
 @dataclass(frozen=True)
@@ -21,7 +20,7 @@ class SampleConfig(ViewLattice):
         min_visible: directions that see fewer landmarks are dropped. In the paper, those with "none or only a minimal
             number" (Sec. 3.2).
         max_locations: a random subset of the free locations, 0 for all.
-        max_directions: a random subset of the kept directions of each location, 0 for all; one number, or one for
+        max_directions: a random subset of the kept directions of each location, 0 for all. One number, or one for
             each split, such as `{train: 50, val: 50, test: 100}`.
         seed: seed of the random subsets.
         cameras: how many cameras look in a scene, each at its own locations: drawn from the scene's seed over fields of

@@ -48,12 +48,10 @@ def sample_viewpoints(
     """Choose viewpoints by how many landmarks they see, at locations (L,) of the grid, the centres of its voxels.
 
     At every location all directions of the lattice are ranked by the number of landmarks in view (descending, then by
-    direction id), and the best K are kept. Some options differ by the scene's split. Of several cameras, by number, each
-    location looks with one, in turn, and the table says with which. The progress bar has a text; None shows none.
-
-    Returns:
-        The table of viewpoints, unlabelled, in the order of their ids (location id times the number of directions, plus
-        direction id), and the occlusion of the table's locations, for later stages.
+    direction id), and the best K are kept. Some options differ by the scene's split. Of several cameras, by number,
+    each location looks with one, in turn, and the table says with which. The progress bar has a text; None shows none.
+    Returns the table of viewpoints, unlabelled, in the order of their ids (location id times the number of directions,
+    plus direction id), and the occlusion of the table's locations, for later stages.
 
     Raises:
         SceneError: no viewpoint sees enough landmarks, or a location lies inside geometry.

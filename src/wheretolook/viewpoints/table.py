@@ -116,8 +116,8 @@ def outcome_in_brief(label: pd.Series) -> str:
 def write_table(table: pd.DataFrame, path: Path, compact: bool = False) -> None:
     """Write a table atomically as zstd Parquet with checksums; the same rows give the same bytes.
 
-    Columns are those of `SCHEMA`, and of `CAMERA_FIELD` and `MATCH_FIELDS` if they are there. A compact table has `COMPACT_SCHEMA`, about
-    18 bytes a row; read back, its poses agree to 1e-12 and all else exactly.
+    Columns are those of `SCHEMA`, and of `CAMERA_FIELD` and `MATCH_FIELDS` if they are there. A compact table has
+    `COMPACT_SCHEMA`, about 18 bytes a row; read back, its poses agree to 1e-12 and all else exactly.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".partial")
@@ -151,10 +151,8 @@ def read_table(path: Path, matches: bool = False) -> pd.DataFrame:
     """Read the columns of `SCHEMA` of a table of viewpoints, compact or not, and of `CAMERA_FIELD` if it has that.
 
     With `matches` also those of `MATCH_FIELDS`: in each row two int32 arrays, (M,) of the landmarks matched and (I,) of
-    the inliers among them.
-
-    Raises:
-        TableError: the file is missing, truncated, not a Parquet file, or lacks columns that were asked for.
+    the inliers among them. Raises TableError if the file is missing, truncated, not a Parquet file, or lacks columns
+    that were asked for.
     """
     if not path.is_file():
         raise TableError("there is no table of viewpoints", path=path, fix="Run the sample stage first.")
@@ -174,10 +172,9 @@ def read_table(path: Path, matches: bool = False) -> pd.DataFrame:
     if further:
         extra = pa.unify_schemas([CAMERA_FIELD, MATCH_FIELDS])
         schema = pa.schema([*schema, *(extra.field(name) for name in further)])
-    if matches:
-        if missing := [name for name in MATCH_FIELDS.names if name not in names]:
-            fix = "Label again with `--label.store_matches true`; compact tables never hold them."
-            raise TableError("it is not stored which landmarks were matched", path=path, value=missing, fix=fix)
+    if matches and (missing := [name for name in MATCH_FIELDS.names if name not in names]):
+        fix = "Label again with `--label.store_matches true`; compact tables never hold them."
+        raise TableError("it is not stored which landmarks were matched", path=path, value=missing, fix=fix)
     try:
         frame: pd.DataFrame = table.select(schema.names).cast(schema).to_pandas()
     except pa.ArrowException as error:

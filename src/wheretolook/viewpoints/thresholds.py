@@ -18,5 +18,4 @@ def threshold_label(key: str) -> str:
     return f"{distance}, {degrees}°"
 
 
-ALL = "all"
-"""Value of the column `scene` in rows over all scenes."""
+ALL = "all"  # value of the column `scene` in rows over all scenes

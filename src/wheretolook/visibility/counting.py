@@ -12,18 +12,8 @@ from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import Float
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.warp import start_warp
-from wheretolook.visibility import counting_kernel, pixel_kernel
+from wheretolook.visibility import counting_kernel, frustum, pixel_kernel
 from wheretolook.visibility.field_of_view import tabulate
-from wheretolook.visibility.frustum import (
-    MIN_DEPTH_M,
-    frustum_sides,
-    in_view,
-    near_radius_m,
-    offsets_from,
-    pixels_of,
-    rotate,
-    sides_rounding,
-)
 from wheretolook.visibility.sphere_cells import SphereCells, choose_size
 
 GPU_LANES = 16  # threads that share a location and an orientation on a GPU
@@ -37,18 +27,11 @@ class FrustumCounter:
     The landmarks around a location are sorted into cells of the sphere of directions (`SphereCells`). A cell wholly in
     view counts with all its landmarks; landmarks are tested one by one only in cells on the border of the view.
 
-    Args:
-        camera: pinhole, or any COLMAP model.
-        rotations: (D, 3, 3) cam_from_world.
-        n_points: about how many landmarks will be counted, which sets the number of cells.
-        device: "cpu" or a CUDA device.
-        distinct_pixels: count the pixels that some landmark falls on instead of the landmarks, as the released code
-            does. With a COLMAP camera this is done in NumPy, thousands of times slower.
-        size: cells along a side of the sphere's map, instead of what suits `n_points`.
-        scratch_bytes: for bitmaps of distinct pixels, or for lists of landmarks to ask a COLMAP camera about.
-
-    Raises:
-        ConfigError: no such device, a size that is not even, or rotations that are not finite or of another shape.
+    The rotations (D, 3, 3) are cam_from_world. The number of cells follows from about how many landmarks there will be,
+    `n_points`, unless `size` gives the cells along a side of the sphere's map. With `distinct_pixels` the pixels that
+    some landmark falls on are counted instead, as the released code does; for a COLMAP camera in NumPy, thousands of
+    times slower. `scratch_bytes` hold bitmaps of pixels, or lists of landmarks to ask a COLMAP camera about. Raises a
+    ConfigError if there is no such device, the size is not even, or rotations are not finite or of another shape.
     """
 
     def __init__(
@@ -79,10 +62,10 @@ class FrustumCounter:
         self._axes: Any = wp.array(self.rotations, dtype=wp.mat33, device=self.device)
         self._near = 0.0
         if isinstance(camera, PinholeCamera):
-            sides = frustum_sides(camera, rotations)
+            sides = frustum.frustum_sides(camera, rotations)
             self._sides: Any = wp.array(sides, dtype=wp.vec3, device=self.device)
-            self._rounding = sides_rounding(sides)
-            self._near = near_radius_m(camera)
+            self._rounding = frustum.sides_rounding(sides)
+            self._near = frustum.near_radius_m(camera)
         elif self._field is not None:
             self._depth: Any = wp.array(self._field.depth_rad, dtype=wp.float32, device=self.device)
 
@@ -103,10 +86,7 @@ class FrustumCounter:
         """Counts (L, D), int32, from camera centres (L, 3) in the world, metres.
 
         Counts, landmarks (N,) of vec3d and mask (L, N) of bool are Warp arrays on the device; without a mask all lines
-        of sight are free.
-
-        Raises:
-            ConfigError: there are more than `max_locations`; `survey` divides them into blocks.
+        of sight are free. Raises a ConfigError for more than `max_locations`; `survey` divides them into blocks.
         """
         at = np.asarray(locations, dtype=np.float64).reshape(-1, 3)
         if len(at) > (most := self.max_locations(points.shape[0])):
@@ -136,7 +116,7 @@ class FrustumCounter:
             return self._count_by_field(landmarks, counts)
         if self.distinct_pixels:
             return self._count_pixels(landmarks, counts)
-        inputs = [self._sides, landmarks, self._rounding, wp.float64(MIN_DEPTH_M), self.lanes]
+        inputs = [self._sides, landmarks, self._rounding, wp.float64(frustum.MIN_DEPTH_M), self.lanes]
         wp.launch(counting_kernel.count_kernel, (*counts.shape, self.lanes), inputs, [counts], device=device)
         return counts
 
@@ -147,8 +127,7 @@ class FrustumCounter:
         block = min(n_views, max(1, self.scratch_bytes // (words * 4)))
         bits: Any = wp.empty((block, words), dtype=wp.uint32, device=self.device)
         pinhole = [wp.vec2d(camera.fx, camera.fy), wp.vec2d(camera.cx, camera.cy)]
-        intrinsics = [*pinhole, camera.width, camera.height]
-        inputs = [self._sides, self._axes, landmarks, *intrinsics, MIN_DEPTH_M]
+        inputs = [self._sides, self._axes, landmarks, *pinhole, camera.width, camera.height, frustum.MIN_DEPTH_M]
         for first in range(0, n_views, block):
             bits.zero_()
             shape = (min(block, n_views - first), self.lanes)
@@ -188,7 +167,7 @@ class FrustumCounter:
         more = np.zeros(counts.shape, dtype=np.int32)
         for start in range(0, len(pairs), ASKED_AT_ONCE):
             location, orientation = pairs[start : start + ASKED_AT_ONCE].T
-            seen = self.camera.sees(rotate(self.rotations[orientation], offsets[start : start + ASKED_AT_ONCE]))
+            seen = self.camera.sees(frustum.rotate(self.rotations[orientation], offsets[start : start + ASKED_AT_ONCE]))
             np.add.at(more, (location[seen], orientation[seen]), 1)
         wp.copy(counts, wp.array(counts.numpy() + more, dtype=wp.int32, device=self.device))
 
@@ -205,13 +184,13 @@ def count_plain(
     rotations, points = np.asarray(rotations), np.asarray(points)
     counts = np.zeros((len(unoccluded), len(rotations)), dtype=np.int32)
     for row, location in enumerate(np.asarray(locations)):
-        offsets = offsets_from(location, points[unoccluded[row]])
-        seen = in_view(camera, rotations, offsets)
+        offsets = frustum.offsets_from(location, points[unoccluded[row]])
+        seen = frustum.in_view(camera, rotations, offsets)
         if not distinct_pixels:
             counts[row] = seen.sum(-1)
             continue
         for orientation, rotation in enumerate(rotations.astype(np.float32)):
-            pixels = np.floor(pixels_of(camera, rotate(rotation, offsets[seen[orientation]])))
+            pixels = np.floor(frustum.pixels_of(camera, frustum.rotate(rotation, offsets[seen[orientation]])))
             column, line = np.clip(pixels, 0, (camera.width - 1, camera.height - 1)).T
             counts[row, orientation] = len(np.unique(line * camera.width + column))
     return counts

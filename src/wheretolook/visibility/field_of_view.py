@@ -108,8 +108,7 @@ def octahedral_directions(u: ArrayLike, v: ArrayLike) -> Float:
 
 
 def cell_centers(size: int) -> tuple[Float, Float]:
-    """Unit directions (size * size, 3) of the cells' centres, row by row, and the angle (size * size,) in radians from
-    each to the farthest corner of its cell."""
+    """Unit directions (size^2, 3) of cells' centres, and the angle (size^2,) rad from each to its farthest corner."""
     middle, edge = (np.arange(size) + 0.5) / size * 2 - 1, np.arange(size + 1) / size * 2 - 1
     centers = octahedral_directions(middle[None, :], middle[:, None])
     corners = octahedral_directions(edge[None, :], edge[:, None])

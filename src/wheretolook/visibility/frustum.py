@@ -42,11 +42,7 @@ class LandmarkSets:
 
     @classmethod
     def from_mask(cls, mask: NDArray[np.bool_]) -> LandmarkSets:
-        """From a dense mask (L, N).
-
-        Raises:
-            ConfigError: there are more entries than an int32 counts.
-        """
+        """From a dense mask (L, N). Raises a ConfigError if there are more entries than an int32 counts."""
         lengths = mask.sum(1)
         columns = np.flatnonzero(mask) - np.repeat(np.arange(len(mask)) * mask.shape[1], lengths)
         return cls(_starts(lengths), columns.astype(np.int32))
@@ -72,10 +68,9 @@ class PosedViews(NamedTuple):
 def frustum_sides(camera: PinholeCamera, rotations: ArrayLike) -> NDArray[np.float32]:
     """Planes through the camera centre that bound the view, for cam_from_world rotations (D, 3, 3).
 
-    Returns:
-        (D, 5, 3) vectors in the world: inward normals of the left, right, top and bottom side, and the viewing
-        direction. An offset is in view if its product with left and top is at least zero (pixel 0 is in the image),
-        that with right and bottom is positive (pixel `width` is not), and its depth exceeds `MIN_DEPTH_M`.
+    Returns (D, 5, 3) vectors in the world: inward normals of the left, right, top and bottom side, and the viewing
+    direction. An offset is in view if its product with left and top is at least zero (pixel 0 is in the image), that
+    with right and bottom is positive (pixel `width` is not), and its depth exceeds `MIN_DEPTH_M`.
     """
     right, down, forward = np.moveaxis(np.asarray(rotations, dtype=np.float64), -2, 0)
     fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
@@ -135,14 +130,13 @@ def pixels_of(camera: Camera, points_cam: Float) -> Float:
     """Pixels (..., 2) of points (..., 3) in view, in the camera frame, rounded as the kernels round them."""
     if isinstance(camera, ColmapCamera):
         return camera.project(points_cam)
-    return (camera.fx, camera.fy) * (points_cam[..., :2] / points_cam[..., 2:]) + (camera.cx, camera.cy)
+    return np.array([camera.fx, camera.fy]) * (points_cam[..., :2] / points_cam[..., 2:]) + (camera.cx, camera.cy)
 
 
 def landmarks_in_view(views: PosedViews, device: str = "cpu") -> LandmarkSets:
     """The landmarks each of B views sees (paper, Sec. 3.2): B sets. COLMAP's cameras are computed in NumPy on the CPU.
 
-    Raises:
-        ConfigError: there are more entries than an int32 counts; ask for fewer views.
+    Raises a ConfigError if there are more entries than an int32 counts; ask for fewer views then.
     """
     if isinstance(views.camera, ColmapCamera):
         return landmarks_in_view_plain(views)

@@ -31,16 +31,11 @@ class HiddenPointRemoval(OcclusionModel):
     not depend on the map's orientation, scale (if the margin is scaled with it) or order of landmarks. But R, and so
     the result, depends on the farthest landmark, even if that is an outlier far outside the scene.
 
-    Args:
-        radius: R as a multiple of the distance from the location to the farthest landmark, at least 1.
-        margin_m: a landmark that would be free if it were this much nearer is free: what stands this close in front
-            of it is its own surface, as in `MeshOcclusion`. 0 is the published method, with which a landmark is hidden
-            by a neighbour a millimetre nearer.
-        threads: locations worked on at a time, which does not change the result; 0 means one for each CPU core this
-            process may use. A hull takes about 0.4 KB a landmark while it is made.
-
-    Raises:
-        ConfigError: a value is out of range.
+    The radius is R as a multiple of the distance from the location to the farthest landmark, at least 1. A landmark
+    that would be free if it were `margin_m` nearer is free: what stands this close in front of it is its own surface,
+    as in `MeshOcclusion`. 0 is the published method, with which a landmark is hidden by a neighbour a millimetre
+    nearer. With `threads`, 0 for one a CPU core, so many locations are worked on at a time, with the same result. A
+    hull takes about 0.4 KB a landmark while it is made. Raises a ConfigError if a value is out of range.
     """
 
     name = "hidden-points"
@@ -74,10 +69,9 @@ class HiddenPointRemoval(OcclusionModel):
     def check(self, locations: Float, points: Float) -> None:
         """Refuse what cannot be answered, before any long work.
 
-        Raises:
-            MapError: there are no landmarks, or one is not finite.
-            SceneError: a location is not finite, or a landmark lies at it, so that a camera there would be inside
-                geometry. Other locations inside geometry cannot be told from free ones without a mesh.
+        Raises a MapError if there are no landmarks, or one is not finite; a SceneError if a location is not finite, or
+        a landmark lies at it, so that a camera there would be inside geometry. Other locations inside geometry cannot
+        be told from free ones without a mesh.
         """
         super().check(locations, points)
         bad = np.flatnonzero(~np.isfinite(points).all(axis=1))

@@ -100,9 +100,8 @@ class OcclusionModel(ABC):
     def check(self, locations: Float, points: Float) -> None:
         """Refuse what cannot be answered for locations (L, 3) m and points (N, 3) m, before any long work.
 
-        Raises:
-            SceneError: a location is not finite, or lies inside geometry; names the first.
-            MapError: there are no landmarks.
+        Raises a SceneError, which names the first, if a location is not finite or lies inside geometry; a MapError if
+        there are no landmarks.
         """
         if len(points) == 0:
             raise MapError("the map has no landmarks", value=0, fix="Map the scene with more or sharper images.")
@@ -198,11 +197,7 @@ class StoredOcclusion(OcclusionModel):
         return self._unpack(slice(None))
 
     def unoccluded(self, locations: Float, points: Float) -> NDArray[np.bool_]:
-        """(L, N) rows of the stored mask.
-
-        Raises:
-            TableError: a location was not stored, or the mask belongs to a map with another number of landmarks.
-        """
+        """Rows (L, N) of the stored mask; a TableError if one is missing, or not of as many landmarks."""
         if len(points) != self.n_landmarks:
             problem = f"stored occlusion is of {self.n_landmarks} landmarks, the map has {len(points)}"
             raise TableError(problem, fix="Run the sample stage again: the map has changed since.")

@@ -55,10 +55,8 @@ def survey(
     their number (except for the result: a bit for each location and landmark, if occlusion is kept). On a CPU with as
     many threads as said, 0 for all cores. The progress bar has a text; None shows none.
 
-    Raises:
-        MapError: there are no landmarks.
-        SceneError: there are no locations, or what `OcclusionModel.check` refuses.
-        ConfigError: a single location takes more memory than allowed.
+    Raises a MapError if there are no landmarks; a SceneError if there are no locations, or `OcclusionModel.check`
+    refuses one; a ConfigError if a single location takes more memory than allowed.
     """
     at = np.asarray(locations, dtype=np.float64).reshape(-1, 3)
     if len(at) == 0:

@@ -75,9 +75,8 @@ class TsdfConfig:
 class DepthImage:
     """A depth image with its camera and pose.
 
-    Raises:
-        ConfigError: the image has another size than the camera or holds integers, the camera has distortion, or the
-            pose is no rigid transform.
+    Raises a ConfigError if the image has another size than the camera or holds integers, the camera has distortion, or
+    the pose is no rigid transform.
     """
 
     depth_m: NDArray[Any]  # (H, W) floats, metres along the optical axis; 0, negative, NaN and infinite mean no reading
@@ -142,9 +141,8 @@ class TsdfVolume:
     ) -> TsdfVolume:
         """Fuse depth images, in any order. A sequence that reads each from disk when asked for it keeps memory low.
 
-        Raises:
-            ConfigError: the voxels would not fit the memory (found before the fusion, from a sample of the images).
-            SceneError: there is no image, or none of the sampled ones has a reading.
+        Raises a ConfigError if the voxels would not fit the memory (found before the fusion, from a sample of the
+        images), a SceneError if there is no image, or none of the sampled ones has a reading.
         """
         config = config or TsdfConfig()
         n_blocks = estimate_blocks(images, config)
@@ -206,14 +204,9 @@ class TsdfVolume:
 class TsdfOcclusion(MeshOcclusion):
     """Occlusion by the surface of a TSDF: one ray for each location and landmark.
 
-    What no depth image has seen hides nothing.
-
-    The volume of depth images is no longer needed afterwards. A surface `margin_m` in front of a landmark is the
-    landmark's own; keep it above two voxels.
-
-    Raises:
-        ConfigError: a negative margin, or no such device.
-        SceneError: the depth images show no surface.
+    What no depth image saw hides nothing. The volume is no longer needed afterwards. A surface `margin_m` in front of a
+    landmark is the landmark's own; keep it above two voxels. Raises a ConfigError if that is negative, or there is no
+    such device; a SceneError if the depth images show no surface.
     """
 
     name = "tsdf"
@@ -260,12 +253,10 @@ def _check_memory(n_blocks: int, config: TsdfConfig, limit_bytes: int) -> None:
     enough = config.voxel_size_m * np.sqrt(n_blocks / max(fits, 1))
     step = 10.0 ** (np.floor(np.log10(enough)) - 1)
     needed, available = (n * BYTES_PER_BLOCK / 2**30 for n in (n_blocks, fits))
-    raise ConfigError(
-        f"voxels of this size need about {needed:.2f} GiB ({n_blocks * BYTES_PER_BLOCK:,} bytes) for what the depth "
-        f"images show, {available:.2f} GiB ({fits * BYTES_PER_BLOCK:,} bytes) can be used",
-        value=f"voxel_size_m={config.voxel_size_m:g}",
-        fix=f"A voxel_size_m of {np.ceil(enough / step) * step:.2g} would fit.",
-    )
+    need = f"about {needed:.2f} GiB ({n_blocks * BYTES_PER_BLOCK:,} bytes) for what the depth images show"
+    problem = f"voxels of this size need {need}, {available:.2f} GiB ({fits * BYTES_PER_BLOCK:,} bytes) can be used"
+    fix = f"A voxel_size_m of {np.ceil(enough / step) * step:.2g} would fit."
+    raise ConfigError(problem, value=f"voxel_size_m={config.voxel_size_m:g}", fix=fix)
 
 
 def _available_bytes() -> int:

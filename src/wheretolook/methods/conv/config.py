@@ -25,8 +25,6 @@ class ConvConfig(FittingConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.widths or min(self.widths) < 1:
-            raise ConfigError(
-                "convolutions must be at least one channel wide, and there must be one", value=self.widths
-            )
+            raise ConfigError("there must be a convolution, and each at least one channel wide", value=self.widths)
         check_at_least(self, 1, "bins")
         check_share(self, "dropout")

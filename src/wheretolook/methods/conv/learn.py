@@ -10,19 +10,14 @@ from wheretolook.methods.conv.network import ConvNetwork, ConvSpec
 
 
 def learn_conv(task: Task) -> Learnt:
-    """A convolutional network from a dataset's train scenes, calibrated on the validation views; raises as
-    `load_views`.
-    """
+    """A convolutional network from a dataset's train scenes, calibrated on validation views; raises as `load_views`."""
     options, device = task.options, home_device(task.config)
-    data = ViewpointDataModule(
-        task.dataset, task.config, options, options.bins, device, task.progress, landmark_channels=True
-    )
+    data = ViewpointDataModule(task.dataset, task.config, options, options.bins, device, task.progress, True)
     data.setup()
     network = ConvNetwork(ConvSpec(data.statistics, options.bins, options.widths, options.dropout))
     metrics, history = fit_network(network, data, task)
     calibration = fit_platt(*predict(network.to(device), data))
     labels = data.views.labels.cpu()
     counts = class_counts(train=labels[data.train_rows].numpy(), val=labels[data.val_rows].numpy())
-    return Learnt(
-        TrainedNetwork(task.method, network.cpu(), task.dataset.camera, *calibration), metrics, counts, history
-    )
+    model = TrainedNetwork(task.method, network.cpu(), task.dataset.camera, *calibration)
+    return Learnt(model, metrics, counts, history)

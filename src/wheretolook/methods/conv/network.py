@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn.functional import relu
 
 from wheretolook.inputs.bins import InputStatistics
-from wheretolook.methods.binned_network import BinnedNetwork, n_certain, standardize, stored_statistics
+from wheretolook.methods.binned_network import BinnedNetwork, StandardBins, stored_statistics
 
 
 @dataclass(frozen=True)
@@ -32,30 +32,21 @@ class ConvNetwork(BinnedNetwork):
     """
 
     scored_at_once = 512  # the first convolution of one view takes 115 kB
-    mean: Tensor
-    std: Tensor
 
     def __init__(self, spec: ConvSpec) -> None:
         super().__init__()
         self.spec, self.statistics, self.bins = spec, spec.statistics, spec.bins
-        self.n_certain = n_certain(spec.statistics.channels)
-        # these follow from the specification, which is stored beside the weights: persistent=False
-        self.register_buffer("mean", torch.tensor(spec.statistics.mean)[:, None, None], persistent=False)
-        self.register_buffer("std", torch.tensor(spec.statistics.std)[:, None, None], persistent=False)
+        self.standard = StandardBins(spec.statistics)
         before = (len(spec.statistics.channels) + 1, *spec.widths)
-        self.convolutions = nn.ModuleList(
-            nn.Conv2d(width_in, width_out, 3, stride=1 if index == 0 else 2, padding=1)
-            for index, (width_in, width_out) in enumerate(zip(before, spec.widths, strict=False))
-        )
+        strides = (1, *[2] * (len(spec.widths) - 1))
+        sizes = zip(before, spec.widths, strides, strict=False)
+        self.convolutions = nn.ModuleList(nn.Conv2d(n_in, n_out, 3, stride, padding=1) for n_in, n_out, stride in sizes)
         self.dropout = nn.Dropout(spec.dropout)
         self.last = nn.Linear(2 * spec.widths[-1], 1)
 
     def forward(self, means: Tensor, filled: Tensor) -> Tensor:
-        """Logits (B,), not calibrated, of means (B, C, bins, bins) float32 of its channels and filled bins (B, bins,
-        bins).
-        """
-        standard = standardize(means, filled, self.mean, self.std, self.n_certain)
-        values = torch.cat([standard, filled[:, None].to(means.dtype)], dim=1)
+        """Logits (B,), not calibrated, of its channels' means (B, C, bins, bins) and filled bins (B, bins, bins)."""
+        values = torch.cat([self.standard(means, filled), filled[:, None].to(means.dtype)], dim=1)
         for convolution in self.convolutions:
             values = relu(convolution(values))
         pooled = torch.cat([values.mean((2, 3)), values.amax((2, 3))], dim=1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Literal
 
-from wheretolook.methods.method import Method, MethodStyle, ScorerOptions, no_params
+from wheretolook.methods.method import Method, MethodStyle, ScorerOptions, imported, no_params
 
 if TYPE_CHECKING:
     from wheretolook.geometry.camera import Camera
@@ -40,54 +40,46 @@ def _metric(metric: str, approximation: Approximation, about_origin: bool) -> Me
 
     (name, marker), (kind, color, dashes) = METRICS[metric], APPROXIMATIONS[approximation]
     about = ", turned about the world's origin (only if named)" if about_origin else ""
+    label = f"Fisher, {name}, {kind}" + (", about the origin" if about_origin else "")
     return Method(
         name=f"fisher-{metric}-{approximation}" + ("-origin" if about_origin else ""),
         about=f"A metric of the information that a view has on its own pose: {metric}, {approximation}{about}.",
-        style=MethodStyle(
-            f"Fisher, {name}, {kind}" + (", about the origin" if about_origin else ""), color, marker, dashes
-        ),
+        style=MethodStyle(label, color, marker, dashes),
         group="Fisher",
         build=build,
         family="fisher",
         only_if_named=about_origin,
+        of_the_few=(metric, approximation, about_origin) == ("trace", "exact", False),
         params=params if approximation == "gp" else no_params,
     )
 
 
-def _worst(localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
-    from wheretolook.methods.fisher.score import WorstTraceScorer
+def _probe(name: str, scorer: str, about: str, style: MethodStyle) -> Method:
+    def build(localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
+        built: Scorer = imported(f"fisher.score:{scorer}")(localization_map)
+        return built
 
-    return WorstTraceScorer(localization_map)
-
-
-def _stationary(localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
-    from wheretolook.methods.fisher.score import StationaryTraceScorer
-
-    return StationaryTraceScorer(localization_map)
+    return Method(f"fisher-{name}-trace", about, style, "probes", build)
 
 
 METHODS = (
-    *(_metric(metric, approximation, False) for metric in METRICS for approximation in APPROXIMATIONS),
     *(
-        _metric(metric, approximation, True)
+        _metric(metric, approximation, about_origin)
+        for about_origin in (False, True)
         for metric in METRICS
         for approximation in APPROXIMATIONS
-        if metric != "logdet"  # which is the same about any point
+        if not about_origin or metric != "logdet"  # which is the same about any point
     ),
-    Method(
-        name="fisher-worst-trace",
-        about='The view with the least trace by the quadratic field ("trace app worst"): what the field says not '
-        "to do.",
-        style=MethodStyle("probe: worst trace", "#4D4D4D", "1", (0, (1, 2))),
-        group="probes",
-        build=_worst,
+    _probe(
+        "worst",
+        "WorstTraceScorer",
+        'The view with the least trace by the quadratic field ("trace app worst"): what the field says not to do.',
+        MethodStyle("probe: worst trace", "#4D4D4D", "1", (0, (1, 2))),
     ),
-    Method(
-        name="fisher-stationary-trace",
-        about="The stationary point of the quadratic field's trace (\"trace app zero deriv\"), which is its minimum's "
-        "side.",
-        style=MethodStyle("probe: stationary trace", "#7A7A7A", "2", (0, (1, 3))),
-        group="probes",
-        build=_stationary,
+    _probe(
+        "stationary",
+        "StationaryTraceScorer",
+        "The stationary point of the quadratic field's trace (\"trace app zero deriv\"), which is its minimum's side.",
+        MethodStyle("probe: stationary trace", "#7A7A7A", "2", (0, (1, 3))),
     ),
 )

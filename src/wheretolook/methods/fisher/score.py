@@ -1,5 +1,4 @@
-"""Fisher information of the pose (Zhang and Scaramuzza, Fisher Information Field, 2020): the paper's nine rows, and two
-probes of the field that its tables list among them."""
+"""Scores by the Fisher information of the pose, and by probes of the Fisher Information Field, see the package."""
 
 from __future__ import annotations
 
@@ -10,15 +9,10 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
+from wheretolook.fisher import soft_visibility
 from wheretolook.fisher.exact import exact_information
 from wheretolook.fisher.field import FisherField, stationary_axis_of_trace, worst_axis_of_trace
 from wheretolook.fisher.metrics import eigenvalues, metric_of, metric_of_eigenvalues
-from wheretolook.fisher.soft_visibility import (
-    GaussianProcessVisibility,
-    QuadraticVisibility,
-    SoftVisibility,
-    cone_half_angle,
-)
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import Float, check_poses, split_poses
 from wheretolook.inputs.localization_map import LocalizationMap, shared_locations
@@ -38,10 +32,10 @@ class PoseInformation:
         # not the map itself: a value that refers to its key would keep both alive
         self.points, self.camera = localization_map.landmarks.points, localization_map.camera
         self.occlusion, self.device = localization_map.occlusion, localization_map.device
-        half_angle = cone_half_angle(self.camera)
-        self.visibilities: dict[str, SoftVisibility] = {
-            "quadratic": QuadraticVisibility(half_angle),
-            "gp": GaussianProcessVisibility.fitted(half_angle),
+        half_angle = soft_visibility.cone_half_angle(self.camera)
+        self.visibilities: dict[str, soft_visibility.SoftVisibility] = {
+            "quadratic": soft_visibility.QuadraticVisibility(half_angle),
+            "gp": soft_visibility.GaussianProcessVisibility.fitted(half_angle),
         }
         self._poses: Float = np.empty((0, 3, 4))
         self._known: dict[str, Any] = {}

@@ -5,18 +5,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from wheretolook.methods.matchability.config import MatchabilityConfig
-from wheretolook.methods.method import Method, MethodStyle, ScorerOptions
+from wheretolook.methods.method import Method, MethodStyle, ScorerOptions, imported
 
 if TYPE_CHECKING:
     from wheretolook.inputs.localization_map import LocalizationMap
-    from wheretolook.learning.learner import Learnt, Task
     from wheretolook.methods.base import Scorer
-
-
-def _learn(task: Task) -> Learnt:
-    from wheretolook.methods.matchability.learn import learn_matchability
-
-    return learn_matchability(task)
 
 
 def _expected(kind: str, about: str, style: MethodStyle) -> Method:
@@ -36,16 +29,11 @@ def _expected_fisher(metric: str, name: str, marker: str) -> Method:
         assert options.weights is not None
         return ExpectedFisherScorer(localization_map, options.weights, metric)
 
-    return Method(
-        name=f"fisher-{metric}-expected",
-        about="Expected Fisher information of the pose, each landmark in view weighted by its learned chance of being "
-        f"found: {metric}.",
-        style=MethodStyle(f"Fisher, {name}, expected", "#332288", marker, (0, (3, 1))),
-        group="Fisher",
-        build=build,
-        weights="matchability",
-        family="expected",
-    )
+    weighted = "each landmark in view weighted by its learned chance of being found"
+    about = f"Expected Fisher information of the pose, {weighted}: {metric}."
+    style = MethodStyle(f"Fisher, {name}, expected", "#332288", marker, (0, (3, 1)))
+    name = f"fisher-{metric}-expected"
+    return Method(name, about, style, "Fisher", build, weights="matchability", family="expected")
 
 
 METHODS = (
@@ -54,7 +42,7 @@ METHODS = (
         about="The chance that a landmark in view is found.",
         style=MethodStyle("matchability", "#CC79A7", "8", (0, (1, 1))),
         group="learned",
-        learn=_learn,
+        learn=imported("matchability.learn:learn_matchability"),
         config=MatchabilityConfig,
         folder="matchability",
     ),

@@ -16,8 +16,7 @@ from wheretolook.methods.matchability.network import MatchabilityNetwork
 
 
 class LandmarkBatches:
-    """Batches of landmarks (E, len(ATTRIBUTES)) in `rows` (n,), and whether each was found; processes share out each
-    batch.
+    """Batches of landmarks (E, len(ATTRIBUTES)) in `rows` (n,), and whether each was found; processes share each batch.
 
     A `shuffle_seed` of None goes through them in order; shuffled landmarks come from 1 / enlarged to enlarged times as
     far, see `wheretolook.learning.landmark_views.LandmarkLoader`.
@@ -75,16 +74,9 @@ class MatchabilityData(LandmarkDataModule):
         chosen[rows] = True
         return torch.nonzero(chosen.repeat_interleave(self.views.starts.cpu().diff()))[:, 0]
 
-    def train_dataloader(self) -> LandmarkBatches:
-        """Shuffled landmarks of the training views."""
-        return self._loader(self.train_rows, 1, self.config.seed)
-
-    def val_dataloader(self) -> LandmarkBatches:
-        """Landmarks of the validation views, in order."""
-        return self._loader(self.val_rows, 8)
-
-    def _loader(self, rows: Tensor, batches: int, shuffle_seed: int | None = None) -> LandmarkBatches:
-        size = batches * self.options.batch_size * self.options.landmarks
+    def batches(self, rows: Tensor, shuffle_seed: int | None = None) -> LandmarkBatches:
+        """Batches of the landmarks of the views in `rows`, see `ViewsDataModule.batches`."""
+        size = self.options.batch_size * self.options.landmarks * (8 if shuffle_seed is None else 1)
         entries, enlarged = self.entries(rows), self.options.enlarged
         return LandmarkBatches(self.views.values, self.found, entries, size, shuffle_seed, *self.share, enlarged)
 
@@ -99,5 +91,5 @@ def learn_matchability(task: Task) -> Learnt:
     metrics, history = fit_network(network, data, task)
     logits, found = predict(network, data)
     counts = class_counts(train=data.found.cpu()[data.entries(data.train_rows)].numpy(), val=found)
-    model = TrainedNetwork(task.method, network, task.dataset.camera, *fit_platt(logits, found))
+    model = TrainedNetwork(task.method, network, task.camera, *fit_platt(logits, found))
     return Learnt(model, metrics, counts, history)

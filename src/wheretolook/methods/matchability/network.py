@@ -19,9 +19,9 @@ LIKELY = -2.0
 
 
 class LandmarkNetwork(StoredNetwork):
-    """A network over single landmarks, which takes what is known of them by name.
+    """A network over single landmarks. It takes those of their attributes that its statistics name, in that order.
 
-    The attributes of its statistics are what it is told of a landmark, in order; by its options it can be built anew.
+    With its statistics and options it can be built anew.
     """
 
     def __init__(self, statistics: AttributeStatistics, **options: Any) -> None:
@@ -53,16 +53,12 @@ class LandmarkNetwork(StoredNetwork):
         for name in ("across", "down", "distance"):
             if name not in names:
                 raise WeightsError("these weights do not ask where a landmark lies", value=name)
-        options = {
-            name: tuple(value) if isinstance(value, list) else value for name, value in stored["options"].items()
-        }
+        options = {name: tuple(one) if isinstance(one, list) else one for name, one in stored["options"].items()}
         return cls(AttributeStatistics(tuple(statistics["mean"]), tuple(statistics["std"]), names), **options)
 
 
 class StandardAttributes(nn.Module):
-    """What is known of landmarks, standardized; what is not known becomes 0, the mean of its kind, as does what is
-    hidden.
-    """
+    """Attributes of landmarks, standardized; what is not known or hidden becomes 0, the mean of its kind."""
 
     mean: Tensor
     scale: Tensor
@@ -81,9 +77,7 @@ class StandardAttributes(nn.Module):
 
 
 class MatchabilityNetwork(LandmarkNetwork):
-    """The probability that a landmark in view is found: matched, and an inlier of the pose. It has two layers of
-    `width`.
-    """
+    """Whether a landmark in view is found: matched, and an inlier of the pose. It has two layers of `width` units."""
 
     def __init__(self, statistics: AttributeStatistics, width: int = 48, hidden: tuple[str, ...] = ()) -> None:
         super().__init__(statistics, width=width, hidden=hidden)
@@ -100,9 +94,7 @@ class MatchabilityNetwork(LandmarkNetwork):
 
 
 def bearing_numbers(values: Tensor, attributes: tuple[str, ...] = ATTRIBUTES) -> Tensor:
-    """Information (..., 15) of landmarks (..., A) on the pose, `fisher.information.bearing_numbers` in the camera's
-    axes.
-    """
+    """`fisher.information.bearing_numbers` (..., 15) of landmarks (..., A), in the camera's axes."""
     across, down, log_distance = (values[..., attributes.index(name)] for name in ("across", "down", "distance"))
     bearing = torch.stack([across, down, torch.ones_like(across)], -1)
     bearing = bearing / bearing.norm(dim=-1, keepdim=True)
@@ -116,9 +108,7 @@ N_EXPECTED = 1 + 15 + 5  # numbers that `expected_parts` gives of a landmark
 
 
 def expected_parts(values: Tensor, log_odds: Tensor, attributes: tuple[str, ...] = ATTRIBUTES) -> Tensor:
-    """What landmarks (..., A) add to the sums of `expected_statistics`, (..., N_EXPECTED), by their log-odds of being
-    found.
-    """
+    """What landmarks (..., A) add to a view's sums, (..., N_EXPECTED), by their log-odds of being found (...,)."""
     found = log_odds.sigmoid()[..., None]
     across, down = (values[..., attributes.index(name), None] for name in ("across", "down"))
     moments = torch.cat([across, down, across * across, across * down, down * down], -1)

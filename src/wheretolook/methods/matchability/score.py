@@ -16,7 +16,6 @@ from wheretolook.inputs.landmarks_in_view import LandmarkDescriber, ViewLandmark
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.learning.trained_network import TrainedNetwork
 from wheretolook.methods.base import Scorer
-from wheretolook.methods.field_of_view import check_field_of_view
 from wheretolook.methods.matchability.network import MatchabilityNetwork, expected_parts
 from wheretolook.utils.errors import ConfigError
 
@@ -31,7 +30,6 @@ class Expectation:
     _of_maps: ClassVar[WeakKeyDictionary[LocalizationMap, dict[str, Expectation]]] = WeakKeyDictionary()
 
     def __init__(self, localization_map: LocalizationMap, matchability: TrainedNetwork[MatchabilityNetwork]) -> None:
-        check_field_of_view(matchability.camera, localization_map.camera)
         # not the map itself: a value that refers to its key would keep both alive
         self.matchability, self.camera = matchability, localization_map.camera
         self._poses: Float = np.empty((0, 3, 4))
@@ -39,10 +37,9 @@ class Expectation:
 
     @classmethod
     def of_map(cls, localization_map: LocalizationMap, weights: str | Path) -> Expectation:
-        """What a map's views can be expected to find by a file of weights, made once for both.
+        """What a map's views can be expected to find by a file of weights, made once for each map and file.
 
-        Raises a WeightsError if the file cannot be used, or was trained for another field of view than the map's
-        camera.
+        Raises a WeightsError if the file cannot be used, or was trained for another field of view than the camera's.
         """
         known = cls._of_maps.setdefault(localization_map, {})
         if str(weights) not in known:
@@ -52,8 +49,7 @@ class Expectation:
         return known[str(weights)]
 
     def sums(self, describer: LandmarkDescriber, cam_from_world: Float) -> Float:
-        """What views (B, 3, 4) can be expected to find, (B, 17), by a describer with the attributes that the model
-        takes.
+        """What views (B, 3, 4) can be expected to find, (B, 17). The describer gives the attributes the model takes.
 
         Landmarks expected to be found; their information on the pose, 15 numbers (see `wheretolook.fisher.information`,
         in the camera's axes); bins expected to hold one that is found.

@@ -20,7 +20,7 @@ def architecture_table(network: ViewpointNetwork) -> pd.DataFrame:
     spec = network.spec
     rows: list[tuple[str, int, int, int]] = []
     width = spec.input_size
-    for module in _in_order(network):
+    for module in [network.input, *network.layers]:
         after = module.out_features if isinstance(module, nn.Linear) else width
         rows.append((_name(module, network), width, after, sum(p.numel() for p in module.parameters())))
         width = after
@@ -36,25 +36,17 @@ def activations(network: ViewpointNetwork, view: BinnedViews) -> list[Float]:
     The standardized input (C, bins, bins); the values (width,) of each hidden layer behind its nonlinearity; and last
     the probability, (1,).
     """
-    spec = network.spec
+    spec = network.eval().spec
     chosen = view.select(spec.channels)
-    found: list[Tensor] = []
     with torch.inference_mode():
-        values = torch.from_numpy(chosen.means)
-        filled = torch.from_numpy(chosen.counts > 0)
-        network = network.eval()
-        for module in _in_order(network):
-            values = module(values, filled) if isinstance(module, BinnedInput) else module(values)
-            if isinstance(module, BinnedInput):
-                found.append(values.reshape(len(spec.channels), spec.bins, spec.bins))
-            elif isinstance(module, nn.ReLU):
+        values = network.input(torch.from_numpy(chosen.means), torch.from_numpy(chosen.counts > 0))
+        found: list[Tensor] = [values.reshape(len(spec.channels), spec.bins, spec.bins)]
+        for layer in network.layers:
+            values = layer(values)
+            if isinstance(layer, nn.ReLU):
                 found.append(values[0])
         found.append(values[0].double().sigmoid())
     return [value.cpu().numpy() for value in found]
-
-
-def _in_order(network: ViewpointNetwork) -> list[nn.Module]:
-    return [network.input, *network.layers]
 
 
 def _name(module: nn.Module, network: ViewpointNetwork) -> str:

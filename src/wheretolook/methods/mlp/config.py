@@ -33,7 +33,7 @@ class MlpConfig(FittingConfig):
 
     Args:
         epochs: passes over the training viewpoints (paper: 300).
-        batch_size: viewpoints a step, shared out over the devices (the paper gives none; 128 is the released code's).
+        batch_size: viewpoints a step, shared out over the devices. The paper gives none; 128 is the released code's.
         learning_rate: Adam's initial learning rate (paper: 1e-3; released code: 1e-4).
         l2: lambda, the factor of the sum of squared weights (paper: a lambda without a value; released code: 0). The
             default was best on two validation apartments, of 1e-4, 1e-3, 3e-3 and 1e-2; with less, the network overfits
@@ -47,7 +47,7 @@ class MlpConfig(FittingConfig):
             as its released code does.
         noise_px: standard deviation of noise on (u, v) while training, in pixels (released code: 1).
         noise_m: standard deviation of noise on (x, y, z) while training, in metres (released code: 0.02).
-        balance: learn from equally many positive and negative viewpoints, as the paper does (Sec. 4): all of the rarer
+        balance: learn from equally many positive and negative viewpoints. As the paper does (Sec. 4): all of the rarer
             class and a random choice of the other. Validation viewpoints stay as they are.
         keep: "best" keeps the weights of the epoch with the best validation average precision, "last" those of the
             last epoch.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS
+from wheretolook.inputs.channels import CHANNELS
 from wheretolook.learning.data import ViewpointDataModule
 from wheretolook.learning.fit import home_device
 from wheretolook.learning.learner import Learnt, Task, class_counts, fit_network
@@ -18,11 +18,8 @@ def learn_mlp(task: Task, channels: tuple[str, ...]) -> Learnt:
     """The paper's network over these channels from a dataset's train scenes; raises as `load_views`."""
     data, options = _views(task, channels), task.options
     statistics = data.statistics.select(channels)
-    network = ViewpointNetwork(
-        NetworkSpec(
-            statistics, options.bins, options.layout, options.hidden, options.dropout, options.input_dropout
-        )
-    )  # fmt: skip
+    dropouts = options.dropout, options.input_dropout
+    network = ViewpointNetwork(NetworkSpec(statistics, options.bins, options.layout, options.hidden, *dropouts))
     data.channels = channels
     metrics, history = fit_network(network, data, task, data.class_weights)
     labels = data.views.labels.cpu()
@@ -35,11 +32,8 @@ def _views(task: Task, channels: tuple[str, ...]) -> ViewpointDataModule:
     options: MlpConfig = task.options
     known: ViewpointDataModule | None = task.kept.get(KEPT)
     if known is None or known.options != options or not {*channels} <= {*known.views.channels}:
-        wide = not {*channels} <= {*CHANNELS}
-        known = ViewpointDataModule(
-            task.dataset, task.config, options, options.bins, home_device(task.config), task.progress, wide
-        )
-        assert not wide or {*channels} <= {*ALL_CHANNELS}
+        wide, device = not {*channels} <= {*CHANNELS}, home_device(task.config)
+        known = ViewpointDataModule(task.dataset, task.config, options, options.bins, device, task.progress, wide)
         task.kept[KEPT] = known
     known.setup()
     return known

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from wheretolook.inputs.bins import InputStatistics
 from wheretolook.inputs.channels import CHANNELS, Layout
-from wheretolook.methods.binned_network import BinnedNetwork, n_certain, standardize, stored_statistics
+from wheretolook.methods.binned_network import BinnedNetwork, StandardBins, stored_statistics
 from wheretolook.methods.mlp.config import MlpConfig
 
 
@@ -40,28 +40,20 @@ class NetworkSpec:
 class BinnedInput(nn.Module):
     """Turns binned views into a network's standardized, flat input."""
 
-    mean: Tensor
-    std: Tensor
-
     def __init__(self, spec: NetworkSpec) -> None:
         super().__init__()
-        self.layout, self.input_size, self.n_certain = spec.layout, spec.input_size, n_certain(spec.channels)
-        # these follow from the specification, which is stored beside the weights: persistent=False
-        self.register_buffer("mean", torch.tensor(spec.statistics.mean)[:, None, None], persistent=False)
-        self.register_buffer("std", torch.tensor(spec.statistics.std)[:, None, None], persistent=False)
+        self.layout, self.input_size, self.standard = spec.layout, spec.input_size, StandardBins(spec.statistics)
 
     def forward(self, means: Tensor, filled: Tensor) -> Tensor:
         """Means and filled, as `ViewpointNetwork.forward` takes them, to (B, input_size) float32."""
-        values = standardize(means, filled, self.mean, self.std, self.n_certain)
+        values = self.standard(means, filled)
         if self.layout == "compact":
             values = move_to_front(values, filled)
         return values.reshape(-1, self.input_size)
 
 
 def move_to_front(values: Tensor, filled: Tensor) -> Tensor:
-    """`wheretolook.inputs.bins.arrange(..., "compact")` on tensors of any device: (B, C, bins, bins), zero in empty
-    bins.
-    """
+    """`wheretolook.inputs.bins.arrange` of "compact", for tensors (B, C, bins, bins) that are zero in empty bins."""
     flat = filled.flatten(1)
     n_filled = flat.sum(1, keepdim=True)
     # the k-th filled bin goes to place k, the k-th empty bin behind all filled ones: a permutation
@@ -114,11 +106,9 @@ class ViewpointNetwork(BinnedNetwork):
     @classmethod
     def of_description(cls, stored: Mapping[str, Any]) -> ViewpointNetwork:
         """The untrained network of a description; a WeightsError if it looks at an unknown channel of the bins."""
-        spec = NetworkSpec(
-            stored_statistics(stored), int(stored["bins"]), stored["layout"], tuple(stored["hidden"]),
-            float(stored["dropout"]), float(stored["input_dropout"]),
-        )  # fmt: skip
-        return cls(spec)
+        bins, hidden = int(stored["bins"]), tuple(stored["hidden"])
+        dropouts = float(stored["dropout"]), float(stored["input_dropout"])
+        return cls(NetworkSpec(stored_statistics(stored), bins, stored["layout"], hidden, *dropouts))
 
     @property
     def stored(self) -> nn.Module:

@@ -25,17 +25,10 @@ class SetData(LandmarkDataModule):
         positive = (self.views.labels > 0).numpy()
         check_classes(task.dataset, self.config, positive[self.train_rows], positive[self.val_rows])
 
-    def train_dataloader(self) -> LandmarkLoader:
-        """Shuffled views, another sample of each one's landmarks every time."""
-        return self._loader(self.train_rows, 1, self.config.seed)
-
-    def val_dataloader(self) -> LandmarkLoader:
-        """Views in order, with the same landmarks every time."""
-        return self._loader(self.val_rows, MOST_OF_WINDOW)
-
-    def _loader(self, rows: Tensor, windows: int, shuffle_seed: int | None = None) -> LandmarkLoader:
+    def batches(self, rows: Tensor, shuffle_seed: int | None = None) -> LandmarkLoader:
+        """Shuffled views, another sample of each one's landmarks every time; or in order, always with the same."""
         options, limit_m = self.options, self.config.max_error_m
-        width = windows * options.landmarks
+        width = options.landmarks * (MOST_OF_WINDOW if shuffle_seed is None else 1)
         return LandmarkLoader(
             self.views, rows, options.batch_size, width, shuffle_seed, *self.share, options.enlarged, limit_m
         )
@@ -79,5 +72,5 @@ def learn_set(task: Task, data: SetData | None = None) -> Learnt:
     metrics, history = fit_network(network, data, replace(task, options=options))
     logits, labels = predict(network, data)
     counts = class_counts(train=data.views.labels[data.train_rows].cpu().numpy(), val=labels)
-    model = TrainedNetwork(task.method, network, task.dataset.camera, *fit_platt(logits, labels))
+    model = TrainedNetwork(task.method, network, task.camera, *fit_platt(logits, labels))
     return Learnt(model, metrics, counts, history)

@@ -67,24 +67,27 @@ class SetNetwork(LandmarkNetwork):
     """
 
     def __init__(
-        self, statistics: AttributeStatistics, width: int = 48, pooled: int = 0, head: int = 48, dropout: float = 0.1,
+        self,
+        statistics: AttributeStatistics,
+        width: int = 48,
+        pooled: int = 0,
+        head: int = 48,
+        dropout: float = 0.1,
         hidden: tuple[str, ...] = (),
-    ) -> None:  # fmt: skip
+    ) -> None:
         super().__init__(statistics, width=width, pooled=pooled, head=head, dropout=dropout, hidden=hidden)
         self.matchability = MatchabilityNetwork(statistics, width, hidden)
         self.attention = None
         if pooled:
+            layers = nn.Linear(len(self.attributes), width), nn.ReLU(), nn.Linear(width, width), nn.ReLU()
             self.attention = nn.Sequential(
-                StandardAttributes(statistics, hidden), nn.Linear(len(self.attributes), width), nn.ReLU(),
-                nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 1 + pooled),
-            )  # fmt: skip
+                StandardAttributes(statistics, hidden), *layers, nn.Linear(width, 1 + pooled)
+            )
         self.standard = nn.BatchNorm1d(len(EXPECTED) + 1 + pooled)
         n_features = self.standard.num_features
         self.linear = nn.Linear(n_features, 1)
-        self.decide = nn.Sequential(
-            nn.Linear(n_features, head), nn.ReLU(), nn.Dropout(dropout), nn.Linear(head, head), nn.ReLU(),
-            nn.Linear(head, 1),
-        )  # fmt: skip
+        first = nn.Linear(n_features, head), nn.ReLU(), nn.Dropout(dropout)
+        self.decide = nn.Sequential(*first, nn.Linear(head, head), nn.ReLU(), nn.Linear(head, 1))
 
     def forward(self, values: Tensor, taken: Tensor, visible: Tensor, axis_height: Tensor) -> Tensor:
         """Logits (B,) from samples (B, K, A) of each view's landmarks, of which the first `taken` (B,) are its own.
@@ -124,13 +127,16 @@ class SetNetwork(LandmarkNetwork):
 
 
 EXPECTED = (
-    "log_expected_inliers", "log_visible", "expected_share", "log_position_variance", "log_orientation_variance",
-    "log_det_information", "log_variance_x", "log_variance_y", "log_variance_z", "log_spread",
-)  # fmt: skip
-"""What `expected_statistics` gives of a view: the logarithms of one plus the landmarks expected to be found and of one
-plus those visible; the former's share; logarithms of the expected variance of the position (its trace), of the
-orientation, of the determinant of the information, of the variance along each axis of the camera; and of the area of
-the image that the landmarks expected to be found spread over (the determinant of their second moment)."""
+    "log_expected_inliers",  # log(1 + landmarks expected to be found)
+    "log_visible",  # log(1 + landmarks in view)
+    "expected_share",  # how many of these are expected to be found
+    "log_position_variance",  # of the expected covariance: the trace of its block of the position
+    "log_orientation_variance",
+    "log_det_information",
+    *(f"log_variance_{axis}" for axis in "xyz"),  # of the position, along the camera's axes
+    "log_spread",  # area of the image the landmarks expected to be found spread over: det of their second moment
+)
+"""What `expected_statistics` gives of a view."""
 
 
 def expected_statistics(sums: Tensor, visible: Tensor) -> Tensor:
@@ -145,12 +151,7 @@ def expected_statistics(sums: Tensor, visible: Tensor) -> Tensor:
     log_det = 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
     across, down = moments[:, 0], moments[:, 1]
     spread = (moments[:, 2] - across**2) * (moments[:, 4] - down**2) - (moments[:, 3] - across * down) ** 2
-    return torch.cat(
-        [
-            torch.stack([inliers.log1p(), visible.float().log1p(), inliers / visible.clamp(min=1)], 1),
-            torch.stack([variances[:, :3].sum(1).log(), variances[:, 3:].sum(1).log(), log_det], 1).float(),
-            variances[:, :3].log().float(),
-            (spread.clamp(min=0) + 1e-4).log()[:, None],
-        ],
-        1,
-    )
+    counts = torch.stack([inliers.log1p(), visible.float().log1p(), inliers / visible.clamp(min=1)], 1)
+    position, orientation = variances[:, :3].sum(1).log(), variances[:, 3:].sum(1).log()
+    of_pose = torch.stack([position, orientation, log_det], 1).float()
+    return torch.cat([counts, of_pose, variances[:, :3].log().float(), (spread.clamp(min=0) + 1e-4).log()[:, None]], 1)

@@ -17,13 +17,12 @@ def learn_sphere(task: Task) -> Learnt:
     mapping cameras are not known.
     """
     dataset, config = task.dataset, task.config
-    views = load_sphere_views(
-        dataset, training_scenes(dataset), config, task.options, home_device(config), task.progress
-    )
+    scenes, device = training_scenes(dataset), home_device(config)
+    views = load_sphere_views(dataset, scenes, config, task.options, device, task.progress)
     held_out = validation_views(dataset, views.scene, views.location, config)
     labels = views.labels.numpy() > 0
     check_classes(dataset, config, labels[~held_out], labels[held_out])
-    data = SphereDataModule(views, held_out, task.options.batch_size, config.seed)
+    data = SphereDataModule(views, held_out, task.options.batch_size, config)
     network = SphereNetwork(task.options)
     metrics, history = fit_network(network, data, task)
     model = TrainedNetwork(task.method, network, dataset.camera, *fit_platt(*predict(network, data)))

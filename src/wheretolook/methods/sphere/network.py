@@ -27,10 +27,9 @@ LOWEST_PITCH_DEG, FIRST_YAW_DEG, STEP_DEG = -60.0, -180.0, 20.0
 
 
 def on_lattice(values: Tensor, rows: Tensor, axes: Tensor) -> Tensor:
-    """Values (B,) of lattices (L, PITCHES, YAWS) at directions (B, 3), world axes, interpolated between the four
-    around.
+    """Values (B,) of lattices `rows` (B,) among (L, PITCHES, YAWS), interpolated at directions (B, 3), world axes.
 
-    Yaw wraps, pitch ends at the outer rows. The directions need not be of unit length; `rows` (B,) are their lattices.
+    Yaw wraps, pitch ends at the outer rows. The directions need not be of unit length.
     """
     x, y, z = axes.unbind(1)
     yaw = torch.rad2deg(torch.atan2(y, x))
@@ -57,10 +56,8 @@ class SphereNetwork(StoredNetwork):
     def __init__(self, config: SphereConfig) -> None:
         super().__init__()
         self.config, width = config, config.width
-        options: dict[str, Any] = {
-            "nhead": config.heads, "dim_feedforward": 2 * width, "dropout": config.dropout, "activation": "gelu",
-            "batch_first": True, "norm_first": True,
-        }  # fmt: skip
+        options: dict[str, Any] = {"nhead": config.heads, "dim_feedforward": 2 * width, "dropout": config.dropout}
+        options |= {"activation": "gelu", "batch_first": True, "norm_first": True}
         self.token = nn.Sequential(nn.Linear(len(FEATURES), width), nn.GELU(), nn.Linear(width, width))
         self.among_tokens = nn.ModuleList(nn.TransformerEncoderLayer(width, **options) for _ in range(config.layers))
         self.memory_norm = nn.LayerNorm(width)

@@ -9,8 +9,7 @@ from torch import Tensor
 from wheretolook.geometry.poses import Float, check_poses
 from wheretolook.inputs.localization_map import LocalizationMap, shared_locations
 from wheretolook.learning.trained_network import TrainedNetwork
-from wheretolook.methods.base import Scorer
-from wheretolook.methods.field_of_view import check_field_of_view
+from wheretolook.methods.base import Scorer, check_field_of_view
 from wheretolook.methods.sphere.network import SphereNetwork, on_lattice
 from wheretolook.methods.sphere.views import LocationDescriber
 

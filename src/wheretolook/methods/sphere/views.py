@@ -18,16 +18,14 @@ from wheretolook.dataset.folders import Dataset, SceneFolder
 from wheretolook.geometry.poses import Float, split_poses
 from wheretolook.inputs.localization_map import LocalizationMap, shared_locations
 from wheretolook.learning.config import SharedConfig
-from wheretolook.learning.data import Batch, TensorViews, ViewsDataModule, labelled_rows
+from wheretolook.learning.data import Batch, TensorViews, ViewsDataModule, labelled_rows, labels_of
 from wheretolook.mapping.colmap_model import CAMERAS_FILE
 from wheretolook.methods.sphere.config import SphereConfig
 from wheretolook.utils.errors import MapError
-from wheretolook.viewpoints.table import is_good, poses
+from wheretolook.viewpoints.table import poses
 
-FEATURES = (
-    *(f"offset_{axis}" for axis in "xyz"), *(f"towards_{axis}" for axis in "xyz"), *(f"looks_{axis}" for axis in "xyz"),
-    "log_distance", "log_landmarks", "is_landmark", "is_camera",
-)  # fmt: skip
+_VECTORS = tuple(f"{name}_{axis}" for name in ("offset", "towards", "looks") for axis in "xyz")
+FEATURES = (*_VECTORS, "log_distance", "log_landmarks", "is_landmark", "is_camera")
 """Of a token: the offset from the location, world axes, in units of `OFFSET_M`, and its unit direction; the viewing
 direction of a camera; log(1 + distance in metres); log(1 + landmarks with a free line of sight from the location); and
 what it is. The first token of a location is neither: it stands for all landmarks and holds their number."""
@@ -39,7 +37,7 @@ BLOCK = 256  # locations whose lines of sight are asked for at a time
 
 
 class LocationDescriber:
-    """Tells a network of locations: their landmarks with a free line of sight, and the mapping cameras.
+    """Describes locations to a network: their landmarks with a free line of sight, and the mapping cameras.
 
     Of more landmarks or cameras than the configuration wants, evenly spread ones are taken, in the order of their ids.
     Raises a MapError, which names the path, if the map has no mapping cameras.
@@ -49,10 +47,8 @@ class LocationDescriber:
         self, localization_map: LocalizationMap, config: SphereConfig, path: Path = Path("map") / CAMERAS_FILE
     ) -> None:
         if localization_map.mapping_poses is None:
-            raise MapError(
-                "it is not known where the map's images were taken from", path=path,
-                fix="Run the map stage again, copy the release anew, or use `LocalizationMap.from_colmap`.",
-            )  # fmt: skip
+            fix = "Run the map stage again, copy the release anew, or use `LocalizationMap.from_colmap`."
+            raise MapError("it is not known where the map's images were taken from", path=path, fix=fix)
         self.localization_map, self.config = localization_map, config
         rotations, self._centers = split_poses(_spread(localization_map.mapping_poses, config.cameras))
         self._looks = rotations[:, 2]
@@ -117,24 +113,17 @@ def load_sphere_views(
     axes: list[Float] = []
     for scene, table in zip(scenes, tables, strict=True):
         cam_from_world = poses(table)
-        locations, row = shared_locations(cam_from_world)
-        rows.append(row + len(tokens))
+        locations, location_of = shared_locations(cam_from_world)
+        rows.append(location_of + len(tokens))
         axes.append(cam_from_world[:, 2, :3])
         localization_map = scene.localization_map(dataset.camera, device)
         describer = LocationDescriber(localization_map, options, scene.mapping_cameras)
         bar = tqdm(describer.describe(locations), f"describe {scene.name}", len(locations), disable=not progress)
         tokens += bar
     counts = torch.tensor([len(one) for one in tokens])
-    good = [is_good(table, config.max_error_m, config.max_error_deg) for table in tables]
-    return SphereViews(
-        pad_sequence(tokens, batch_first=True),
-        torch.arange(int(counts.max())) >= counts[:, None],
-        torch.from_numpy(np.concatenate(rows)),
-        torch.from_numpy(np.concatenate(axes).astype(np.float32)),
-        torch.from_numpy(np.concatenate(good).astype(np.float32)),
-        np.repeat(np.arange(len(tables)), [len(table) for table in tables]),
-        np.concatenate([table["location_id"].to_numpy(np.int64) for table in tables]),
-    )
+    padded, padding = pad_sequence(tokens, batch_first=True), torch.arange(int(counts.max())) >= counts[:, None]
+    row, axis = torch.from_numpy(np.concatenate(rows)), torch.from_numpy(np.concatenate(axes).astype(np.float32))
+    return SphereViews(padded, padding, row, axis, *labels_of(tables, config))
 
 
 class LocationLoader:
@@ -187,18 +176,11 @@ class LocationLoader:
 class SphereDataModule(ViewsDataModule):
     """Views of a dataset in batches of whole locations, without those held out (B,) to learn from."""
 
-    def __init__(self, views: SphereViews, held_out: NDArray[np.bool_], batch_size: int, seed: int = 0) -> None:
+    def __init__(self, views: SphereViews, held_out: NDArray[np.bool_], batch_size: int, config: SharedConfig) -> None:
         super().__init__()
-        self.views, self.batch_size, self.seed = views, batch_size, seed
+        self.views, self.batch_size, self.config = views, batch_size, config
         self.train_rows, self.val_rows = np.flatnonzero(~held_out), np.flatnonzero(held_out)
 
-    def train_dataloader(self) -> LocationLoader:
-        """Shuffled batches of the training views."""
-        return self._loader(self.train_rows, self.seed)
-
-    def val_dataloader(self) -> LocationLoader:
-        """Batches of the validation views, in order."""
-        return self._loader(self.val_rows)
-
-    def _loader(self, chosen: NDArray[np.int64], shuffle_seed: int | None = None) -> LocationLoader:
-        return LocationLoader(self.views, chosen, self.batch_size, shuffle_seed, *self.share)
+    def batches(self, rows: NDArray[np.int64], shuffle_seed: int | None = None) -> LocationLoader:
+        """See `ViewsDataModule.batches`; all are of one size here."""
+        return LocationLoader(self.views, rows, self.batch_size, shuffle_seed, *self.share)

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from wheretolook.methods.method import Method, MethodStyle, ScorerOptions
+from wheretolook.methods.method import Method, MethodStyle, ScorerOptions, imported
 from wheretolook.methods.trees.config import TreesConfig
 
 if TYPE_CHECKING:
     from wheretolook.inputs.localization_map import LocalizationMap
-    from wheretolook.learning.learner import Learnt, Task
     from wheretolook.methods.base import Scorer
 
 
@@ -19,12 +18,6 @@ def _build(localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
 
     assert options.weights is not None
     return TreesScorer(localization_map, BoostedTrees.load(options.weights))
-
-
-def _learn(task: Task) -> Learnt:
-    from wheretolook.methods.trees.learn import learn_trees
-
-    return learn_trees(task)
 
 
 METHODS = (
@@ -37,7 +30,7 @@ METHODS = (
         build=_build,
         weights="trees",
         probability=True,
-        learn=_learn,
+        learn=imported("trees.learn:learn_trees"),
         config=TreesConfig,
         folder="trees",
     ),

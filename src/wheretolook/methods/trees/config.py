@@ -27,11 +27,8 @@ class TreesConfig:
 
     def __post_init__(self) -> None:
         if self.max_trees < 1 or self.max_leaves < 2 or self.min_leaf < 1:
-            raise ConfigError(
-                "trees need max_trees >= 1, max_leaves >= 2 and min_leaf >= 1",
-                value=(self.max_trees, self.max_leaves, self.min_leaf),
-            )
+            sizes = self.max_trees, self.max_leaves, self.min_leaf
+            raise ConfigError("trees need max_trees >= 1, max_leaves >= 2 and min_leaf >= 1", value=sizes)
         if not self.learning_rate > 0 or not self.l2 >= 0:
-            raise ConfigError(
-                "trees need a positive learning_rate and no negative l2", value=(self.learning_rate, self.l2)
-            )
+            value = self.learning_rate, self.l2
+            raise ConfigError("trees need a positive learning_rate and no negative l2", value=value)

@@ -71,11 +71,8 @@ def bowl(style: Style, radius: float, fruit: bool) -> list[Patch]:
     """Open bowl, with oranges or apples if asked for."""
     rng, r, h = style.rng, radius, radius * 0.5
     material = materials.plain(rng, materials.vary(rng, style.pick(style.cover_colours), 0.05), shared=True)
-    inside, outside = (
-        [(0, 0.02), (0.6 * r, 0.1 * h), (r * 0.96, h)],
-        [(r, h), (0.7 * r, 0.06 * h), (0.4 * r, 0), (0, 0)],
-    )
-    patches = lathe(inside + outside, material, sides=24)
+    inside = [(0, 0.02), (0.6 * r, 0.1 * h), (r * 0.96, h)]
+    patches = lathe([*inside, (r, h), (0.7 * r, 0.06 * h), (0.4 * r, 0), (0, 0)], material, sides=24)
     if fruit:
         skin = materials.plain(rng, style.pick([(0.86, 0.5, 0.14), (0.72, 0.2, 0.14), (0.6, 0.7, 0.25)]), shared=True)
         for k in range(6):  # five around one on top

@@ -76,15 +76,12 @@ class Surface:
 
 def join(patches: Sequence[Patch]) -> Surface:
     """All patches as one set of triangles."""
-    parts = [p.triangles() for p in patches]
-    counts = [p.positions.shape[0] * p.positions.shape[1] for p in patches]
-    first = np.concatenate([[0], np.cumsum(counts)[:-1]])
-    return Surface(
-        np.concatenate([p.positions.reshape(-1, 3) for p in patches]),
-        np.concatenate([triangles + start for (triangles, _), start in zip(parts, first, strict=True)]),
-        np.repeat(np.arange(len(patches)), [len(triangles) for triangles, _ in parts]),
-        np.concatenate([st for _, st in parts]),
-    )
+    triangles, st = zip(*(p.triangles() for p in patches), strict=True)
+    vertices = [p.positions.reshape(-1, 3) for p in patches]
+    first = np.concatenate([[0], np.cumsum([len(v) for v in vertices])[:-1]])
+    numbered = np.concatenate([of_patch + start for of_patch, start in zip(triangles, first, strict=True)])
+    patch = np.repeat(np.arange(len(patches)), [len(of_patch) for of_patch in triangles])
+    return Surface(np.concatenate(vertices), numbered, patch, np.concatenate(st))
 
 
 # Faces of a box in the furniture frame: y points from the wall into the room (front = +y), z up. For each, the corner

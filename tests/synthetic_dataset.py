@@ -37,6 +37,7 @@ def make_landmarks(rng: np.random.Generator, n: int) -> Landmarks:
         "mapping_distance_m": rng.uniform(1, 4, n).astype(np.float32),
         "ambiguity": rng.random(n).astype(np.float32),
         "mapping_distance_spread": np.linspace(0, 0.5, n, dtype=np.float32),
+        "mapping_focal_px": np.linspace(60, 120, n, dtype=np.float32),
     }
     return Landmarks(ids=np.arange(n, dtype=np.int64), points=points, descriptors=None, **values)
 

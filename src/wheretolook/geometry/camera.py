@@ -134,13 +134,13 @@ def check_size(width: int, height: int) -> None:
 
 
 def check_focal_lengths(focal_px: tuple[float, ...], width: int, height: int) -> None:
-    """Raise ConfigError unless focal lengths are positive, and no less than a fiftieth of the image's longer side.
+    """Raise ConfigError unless focal lengths are positive, and no less than a hundredth of the image's longer side.
 
-    A pinhole of that focal length would see 178 degrees; a smaller number is a focal length in metres or millimetres.
+    A pinhole of that focal length would see 179 degrees; a smaller number is a focal length in metres or millimetres.
     """
     if not all(np.isfinite(focal) and focal > 0 for focal in focal_px):
         raise ConfigError("a camera needs a positive, finite focal length in pixels", value=focal_px)
-    if min(focal_px) < max(width, height) / 100:
+    if min(focal_px, default=np.inf) < max(width, height) / 100:
         fix = f"Give it in pixels: half the width ({width / 2:g}) divided by the tangent of half the angle across."
         raise ConfigError("a focal length in pixels was expected, this looks like metres", value=focal_px, fix=fix)
 

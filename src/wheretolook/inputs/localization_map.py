@@ -15,6 +15,7 @@ from wheretolook.geometry.poses import Float, camera_centers, check_poses
 from wheretolook.inputs.bins import BinnedViews, bin_views, count_bins
 from wheretolook.mapping.colmap_model import colmap_poses, read_model
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
+from wheretolook.utils.errors import MapError
 from wheretolook.visibility import frustum
 from wheretolook.visibility.frustum import LandmarkSets, PosedViews
 from wheretolook.visibility.occlusion import NoOcclusion, OcclusionModel

@@ -62,8 +62,8 @@ def _lookup(
     """Of each pixel (H, W): its face of the cube, -1 for none; column and row there; z of its ray over the face's."""
     pixels = np.stack(np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5), axis=-1)
     rays = camera.unproject(pixels)
-    # beyond what a model was made for, such as 90 degrees for COLMAP's fisheyes, rays come back that it does not project
-    known = np.isfinite(rays).all(-1) & camera.sees(np.nan_to_num(rays, nan=-1.0))
+    # beyond what a model was made for, such as 90 degrees for COLMAP's fisheyes, rays come back of other pixels
+    known = np.abs(camera.project(rays) - pixels).max(-1) < 0.01
     depths = np.nan_to_num(rays) @ _FACES[:, 2].T  # (H, W, 6): along the axis of each face
     face = depths.argmax(-1)
     in_face = (_FACES[face] @ np.nan_to_num(rays)[..., None])[..., 0]

@@ -48,7 +48,7 @@ display(top_n_figure(scores))
 # Any methods of the table can be drawn so: here those that weight landmarks by their chance of being found.
 
 # %%
-expected = [("expected", "inliers"), ("expected", "bins"), ("fisher", "trace expected"), ("set", ""), ("random", "")]
+expected = ["expected-inliers", "expected-bins", "fisher-trace-expected", "set", "random"]
 display(top_n_figure(scores, expected))
 
 # %% [markdown]

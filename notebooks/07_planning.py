@@ -52,7 +52,7 @@ config = PlanConfig(grid=(8, 8, 4), directions=200, planner=PathConfig(time_s=6.
 # improved until time is up.
 
 # %%
-one, methods = showcase.localization_map, ["forward", "fisher-trace-gp", "set"]
+localization_map, methods = showcase.localization_map, ["forward", "fisher-trace-gp", "set"]
 paths = plan_by_methods(showcase, release, methods, start, goal, config)
 
 # %% [markdown]
@@ -60,8 +60,9 @@ paths = plan_by_methods(showcase, release, methods, start, goal, config)
 # facing a corner that was hardly mapped; the other two keep turning to where the landmarks are.
 
 # %%
-views = {name: path_views(path, one, showcase.renderer if name == "set" else None) for name, path in paths.items()}
-display(methods_figure(views, one.landmarks.points))
+renderers = {"set": showcase.renderer}
+views = {name: path_views(path, localization_map, renderers.get(name)) for name, path in paths.items()}
+display(methods_figure(views, localization_map.landmarks.points))
 
 # %% [markdown]
 # ## What the camera sees on its way
@@ -70,7 +71,7 @@ display(methods_figure(views, one.landmarks.points))
 # `wheretolook plan --film gif`.
 
 # %%
-display(still_figure(views["set"], one.landmarks.points, "apartment-210, set of landmarks"))
+display(still_figure(views["set"], localization_map.landmarks.points, "apartment-210, set of landmarks"))
 
 # %% [markdown]
 # ## Does it help?

@@ -98,11 +98,24 @@ def _output(output: Any, markdown: Any) -> str:
     if "image/png" in data:
         return f'<p><img src="{small_picture(data["image/png"])}" alt=""></p>'
     if "text/html" in data:
-        return f'<div class="output">{data["text/html"]}</div>'
+        return f'<div class="output">{small_table(data["text/html"])}</div>'
     if "text/markdown" in data:
         return f'<div class="output">{_from_above(markdown.render(data["text/markdown"]))}</div>'
     text = data.get("text/plain", "")
     return f'<pre class="output">{html.escape(text)}</pre>' if text and not text.startswith("<Figure") else ""
+
+
+def small_table(table: str) -> str:
+    """HTML of a table without the ids and classes of cells that no style speaks of."""
+    styles = " ".join(re.findall(r"<style.*?</style>", table, re.DOTALL))
+    ids, classes = (set(re.findall(rf"{mark}([A-Za-z][\w-]*)", styles)) for mark in ("#", r"\."))
+
+    def cell(found: re.Match[str]) -> str:
+        kept = [name for name in found["names"].split() if name in (ids if found["what"] == "id" else classes)]
+        return f' {found["what"]}="{" ".join(kept)}"' if kept else ""
+
+    attribute = re.compile(r' (?P<what>id|class)="(?P<names>[^"]*)"')
+    return re.sub(r"<t[dhr]\b[^>]*>", lambda tag: attribute.sub(cell, tag[0]).replace(" >", ">"), table)
 
 
 def small_picture(png: str) -> str:
@@ -130,8 +143,9 @@ def main(arguments: list[str]) -> int:
     from nbclient.exceptions import CellExecutionError, CellTimeoutError, DeadKernelError
 
     folder, out = Path(arguments[0]), Path(arguments[1])
-    paths = sorted(path for path in folder.glob("*.py") if len(arguments) < 3 or path.stem in arguments[2:])
-    names = sorted(path.stem for path in folder.glob("*.py"))
+    notebooks = sorted(folder.glob("[0-9]*.py"))  # not this file
+    names = [path.stem for path in notebooks]
+    paths = [path for path in notebooks if len(arguments) < 3 or path.stem in arguments[2:]]
     failed = []
     out.mkdir(parents=True, exist_ok=True)
     for path in paths:

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
 from nbclient import NotebookClient
-from pages import main, notebook_page, small_picture
+from pages import main, notebook_page, small_picture, small_table
 from PIL import Image
 
 from synthetic_release import make_release
@@ -168,6 +168,15 @@ def shrunk(pixels: np.ndarray) -> tuple[Image.Image, tuple[int, int]]:
     assert kind == "data:image/webp;base64"
     small = base64.b64decode(content)
     return Image.open(io.BytesIO(small)).convert("RGB"), (len(stream.getvalue()), len(small))
+
+
+def test_cells_of_tables_keep_the_names_that_their_style_speaks_of() -> None:
+    style = "<style>#T_1 th.col_heading { color: red } #T_1_row0_col1 { font-weight: bold }</style>"
+    head, cell = '<th id="T_1_a" class="col_heading level0" >a</th>', '<td id="T_1_b" class="data" >1</td>'
+    bold = '<td id="T_1_row0_col1" class="data col1" >2</td>'
+    assert small_table(f'{style}<table id="T_1"><tr class="x">{head}{cell}{bold}</tr></table>') == (
+        f'{style}<table id="T_1"><tr><th class="col_heading">a</th><td>1</td><td id="T_1_row0_col1">2</td></tr></table>'
+    )
 
 
 def test_a_page_shows_tables_once() -> None:

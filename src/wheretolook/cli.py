@@ -117,7 +117,7 @@ ship, score the views. The folder holds plain arrays and LAYOUT.txt, which says 
         {f"--{name}": f"--plan.{name}" for name in ("scene", "start", "goal", "method", "weights", "out", "film")},
         notes="""\
 Reads a scene's map and its mesh, if it has one, as the scenes and map stages leave them.
-Without a mesh to keep clear of, by what depth images saw: --occlusion.model tsdf""",
+To plan in what depth images saw as free, without the mesh: --occlusion.model tsdf""",
     ),
     "compare-paths": Stage(
         "compare_paths",

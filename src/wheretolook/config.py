@@ -6,7 +6,7 @@ import os
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.figures.config import FiguresConfig
@@ -16,7 +16,7 @@ from wheretolook.mapping.config import MapConfig
 from wheretolook.methods.train_config import MOVED as MOVED_TRAIN_OPTIONS
 from wheretolook.methods.train_config import TrainConfig
 from wheretolook.planning.config import PathsConfig, PlanConfig, ViewpointMapConfig
-from wheretolook.scenes.config import ApartmentConfig
+from wheretolook.scenes.config import ApartmentConfig, SceneKind
 from wheretolook.space.config import FreeSpaceConfig, MappedSpaceConfig
 from wheretolook.utils.devices import check_device_name, usable_device
 from wheretolook.utils.errors import ConfigError
@@ -65,12 +65,15 @@ class ScenesConfig:
     """Settings of the scenes stage.
 
     Args:
-        train: procedural apartments to learn from.
-        val: procedural apartments for validation; with none, some locations of the training scenes are held out.
-        test: procedural apartments to evaluate on.
-        seed: seed of the first apartment; each further one counts up.
-        apartment: what an apartment is like.
-        meshes: scenes from meshes of one's own, beside the apartments, such as [{path: scans/office.glb}].
+        train: generated scenes to learn from.
+        val: generated scenes for validation; with none, some locations of the training scenes are held out.
+        test: generated scenes to evaluate on.
+        seed: seed of the first generated scene; each further one counts up.
+        kinds: kinds of generated scenes, one after the other in turn: a seed's is `kinds[seed % len(kinds)]`. Beside
+            `apartment` there are `hall`, `court`, `office` and `building`, in which rooms repeat that are mapped in
+            part. These draw their sizes and difficulty from the seed, as apartments do that `vary`.
+        apartment: what an apartment is like, and the texture and light of all generated scenes.
+        meshes: scenes from meshes of one's own, beside the generated ones, such as [{path: scans/office.glb}].
         free_space: where a camera may be.
         mapped_space: where it may be in a scene of photographs, which has no mesh.
     """
@@ -79,6 +82,7 @@ class ScenesConfig:
     val: int = 0
     test: int = 1
     seed: int = 0
+    kinds: tuple[SceneKind, ...] = ("apartment",)
     apartment: ApartmentConfig = field(default_factory=ApartmentConfig)
     meshes: tuple[MeshSource, ...] = ()
     free_space: FreeSpaceConfig = field(default_factory=FreeSpaceConfig)
@@ -89,6 +93,13 @@ class ScenesConfig:
             fix = "Set scenes.train and scenes.test, or name meshes in scenes.meshes."
             value = (self.train, self.val, self.test, self.meshes)
             raise ConfigError("an experiment needs scenes", value=value, fix=fix)
+        if not self.kinds or not set(self.kinds) <= set(get_args(SceneKind)):
+            fix = f"Name some of {', '.join(get_args(SceneKind))}."
+            raise ConfigError("scenes.kinds are kinds of generated scenes", value=self.kinds, fix=fix)
+
+    def kind_of(self, seed: int) -> SceneKind:
+        """The kind of the generated scene of a seed."""
+        return self.kinds[seed % len(self.kinds)]
 
 
 @dataclass(frozen=True)
@@ -103,11 +114,11 @@ class Experiment:
         camera: the camera that will look, and that maps unless `map.camera` names another.
         scenes: stage 1, meshes.
         map: stage 2, COLMAP maps, of meshes or of photographs.
-        occlusion: how stage 3 finds out which landmarks nothing stands in front of. Stage 6 takes its settings, but the
-            names of models from `evaluate.occlusions`.
+        occlusion: how stage 3 finds out which landmarks are unoccluded. Stage 6 takes the settings of occlusion models,
+            but not their names, from here; these are `evaluate.occlusions`.
         sample: stage 3, viewpoints and what they see.
         label: stage 4, localization errors.
-        train: stage 5, the network.
+        train: stage 5, what is learnt from the labels.
         evaluate: stage 6, scores of all methods.
         viewpoint_map: what planners query.
         plan: one path to plan.

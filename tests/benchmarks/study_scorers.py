@@ -32,10 +32,10 @@ import torch
 
 from wheretolook.dataset.folders import Dataset
 from wheretolook.inputs.landmarks_in_view import ATTRIBUTES
-from wheretolook.learning.data import with_also
 from wheretolook.learning.fit import RunLog
 from wheretolook.learning.learner import Task
 from wheretolook.learning.provenance import weights_path
+from wheretolook.learning.scenes import with_also
 from wheretolook.methods.mlp.config import MlpConfig
 from wheretolook.methods.set import learn as set_learner
 from wheretolook.methods.set.config import SetConfig

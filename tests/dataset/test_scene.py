@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import wheretolook
 from box_scenes import furnished_room
 from planning.rooms import CAMERA, room_landmarks
 from wheretolook.dataset.folders import SceneFolder
@@ -71,8 +72,12 @@ def test_views_that_cannot_be_are_refused(wrong: dict[str, object]) -> None:
         ViewLattice(**wrong)  # type: ignore[arg-type]
 
 
-def test_stages_load_nothing_heavy_until_there_is_work() -> None:
+@pytest.mark.parametrize("module", ["stages", "learning.provenance"])  # the latter tells a finished train stage so
+def test_stages_load_nothing_heavy_until_there_is_work(module: str) -> None:
     heavy = ["torch", "lightning", "warp", "mlflow", "matplotlib", "pycolmap", "open3d", "sklearn", "scipy", "cv2"]
-    code = f"import sys, wheretolook.stages; print([name for name in {heavy} if name in sys.modules])"
+    code = (
+        f"import sys; sys.path.insert(0, {str(Path(wheretolook.__file__).parents[1])!r}); import wheretolook.{module}"
+    )
+    code += f"; print([name for name in {heavy} if name in sys.modules])"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "[]"

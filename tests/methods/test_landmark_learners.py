@@ -22,8 +22,9 @@ from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.fisher import information
 from wheretolook.inputs.landmarks_in_view import ATTRIBUTES, LandmarkDescriber, ViewLandmarks
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.learning.data import labelled_rows, training_scenes
+from wheretolook.learning.data import labelled_rows
 from wheretolook.learning.landmark_views import AttributeStatistics, LandmarkLoader, load_landmark_views
+from wheretolook.learning.scenes import training_scenes
 from wheretolook.learning.trained_network import StoredNetwork, TrainedNetwork
 from wheretolook.learning.weights import METADATA_KEY, method_of_weights
 from wheretolook.methods.matchability.config import MatchabilityConfig
@@ -171,7 +172,7 @@ def test_views_by_their_landmarks(dataset: Dataset) -> None:
             rows = described.rows[described.starts[view] : described.starts[view + 1]].numpy()
             part = slice(int(views.starts[at]), int(views.starts[at + 1]))
             kept = views.values[part]
-            assert len(kept) == min(20, len(all_values)) and views.visible[at] == len(all_values)
+            assert len(kept) == min(20, len(all_values)) and views.n_visible[at] == len(all_values)
             inliers = table["inlier_rows"].iloc[view] if table["status"].iloc[view] == LOCALIZED else None
             for values, found in zip(kept, views.found[part], strict=True):
                 row = rows[(all_values == values).all(1).numpy()]
@@ -189,10 +190,10 @@ def test_batches_hold_samples_of_each_view(dataset: Dataset) -> None:
     loader = LandmarkLoader(views, rows, 64, width=8, shuffle_seed=3)
     first, second = (torch.cat([batch.inputs[2] for batch in loader]) for _ in range(2))
     assert not torch.equal(first, second)  # another order
-    assert torch.equal(first.sort().values, views.visible[rows].sort().values)
+    assert torch.equal(first.sort().values, views.n_visible[rows].sort().values)
     for batch in LandmarkLoader(views, rows, 64, width=8):
-        values, taken, visible, _ = batch.inputs
-        assert torch.equal(taken, visible.clamp(max=8)) and values.shape[1] == taken.max()
+        values, taken, n_visible, _ = batch.inputs
+        assert torch.equal(taken, n_visible.clamp(max=8)) and values.shape[1] == taken.max()
     in_order = LandmarkLoader(views, rows, len(rows), width=8)
     values, taken, *_ = next(iter(in_order)).inputs
     assert torch.equal(values[0, : taken[0]].half(), views.values[views.starts[5] : views.starts[5] + taken[0]])

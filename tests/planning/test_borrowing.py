@@ -34,17 +34,17 @@ def known_west_and_east() -> tuple:
 
 
 def test_nothing_is_borrowed_through_walls() -> None:
-    centers, one = known_west_and_east()
-    lent = with_borrowed_views(one, BoundedRoom())
-    assert (one.row_of_voxel < 0).sum() > (lent.row_of_voxel < 0).sum()
-    np.testing.assert_array_equal(lent.row_of_voxel[one.row_of_voxel >= 0], one.row_of_voxel[one.row_of_voxel >= 0])
+    centers, own = known_west_and_east()
+    lent = with_borrowed_views(own, BoundedRoom())
+    assert (own.row_of_voxel < 0).sum() > (lent.row_of_voxel < 0).sum()
+    np.testing.assert_array_equal(lent.row_of_voxel[own.row_of_voxel >= 0], own.row_of_voxel[own.row_of_voxel >= 0])
     room = Room()
-    for voxel in np.flatnonzero((one.row_of_voxel < 0) & (lent.row_of_voxel >= 0)):
-        lender = one.voxel_of_row[lent.row_of_voxel[voxel]]
+    for voxel in np.flatnonzero((own.row_of_voxel < 0) & (lent.row_of_voxel >= 0)):
+        lender = own.voxel_of_row[lent.row_of_voxel[voxel]]
         if room.is_free(centers[voxel : voxel + 1])[0]:
             assert room.segments_are_free(centers[voxel : voxel + 1], centers[lender : lender + 1])[0]
-            nearer = np.linalg.norm(centers[one.voxel_of_row] - centers[voxel], axis=1)
-            reach = room.segments_are_free(np.tile(centers[voxel], (len(nearer), 1)), centers[one.voxel_of_row])
+            nearer = np.linalg.norm(centers[own.voxel_of_row] - centers[voxel], axis=1)
+            reach = room.segments_are_free(np.tile(centers[voxel], (len(nearer), 1)), centers[own.voxel_of_row])
             assert nearer[lent.row_of_voxel[voxel]] <= nearer[reach].min() + 1e-9
     beside_the_wall = (centers[:, 1] < 2.9) & (np.abs(centers[:, 0] - 3) < 1)
     west = lent.row_of_voxel[beside_the_wall & (centers[:, 0] < 3)]
@@ -54,19 +54,19 @@ def test_nothing_is_borrowed_through_walls() -> None:
 
 
 def test_a_planner_has_scores_where_it_had_none() -> None:
-    _, one = known_west_and_east()
+    _, own = known_west_and_east()
     config = PathConfig(time_s=0.5, pitch_deg=(-30, 30))
     ends = (1.5, 1.0, 1.1), (2.2, 2.5, 1.1)
-    assert (plan_path(*ends, BoundedRoom(), BOUNDS, one, config, progress=False).scores == 0).all()
-    lent = with_borrowed_views(one, BoundedRoom())
+    assert (plan_path(*ends, BoundedRoom(), BOUNDS, own, config, progress=False).scores == 0).all()
+    lent = with_borrowed_views(own, BoundedRoom())
     np.testing.assert_allclose(plan_path(*ends, BoundedRoom(), BOUNDS, lent, config, progress=False).scores, 0.25)
 
 
 def test_a_map_with_borrowed_views_is_told_from_the_original(tmp_path: Path) -> None:
-    _, one = known_west_and_east()
-    lent = with_borrowed_views(one, BoundedRoom())
-    assert one.origin.derived == "" and lent.origin.derived == "views borrowed by neighbours"
-    ranks = with_borrowed_views(shares_below(one), BoundedRoom())
+    _, own = known_west_and_east()
+    lent = with_borrowed_views(own, BoundedRoom())
+    assert own.origin.derived == "" and lent.origin.derived == "views borrowed by neighbours"
+    ranks = with_borrowed_views(shares_below(own), BoundedRoom())
     assert ranks.origin.derived == "scores replaced by ranks; views borrowed by neighbours"
     with pytest.raises(MapFormatError, match="views borrowed by neighbours"):
         lent.save(tmp_path / "map")

@@ -90,9 +90,9 @@ def test_ways_lead_round_walls_but_not_through_them() -> None:
 
 
 def test_scores_become_ranks() -> None:
-    one = build(room_landmarks(50))
-    ranks = shares_below(replace(one, scores=(1e6 * one.scores).astype(np.float32)))
-    flat = one.scores.ravel()
+    viewpoint_map = build(room_landmarks(50))
+    ranks = shares_below(replace(viewpoint_map, scores=(1e6 * viewpoint_map.scores).astype(np.float32)))
+    flat = viewpoint_map.scores.ravel()
     expected = [(flat < value).sum() / (flat.size - 1) for value in flat[:50]]
     np.testing.assert_allclose(ranks.scores.ravel()[:50], expected, rtol=1e-5)
     assert ranks.scores.min() == 0 and ranks.scores.max() <= 1

@@ -45,14 +45,16 @@ def id_of(choice: ViewChoice | None) -> int | None:
 
 
 def test_every_direction_of_every_free_voxel_has_its_score_and_count(viewpoint_map: ViewpointMap) -> None:
-    one = room_map(room_landmarks(400))
+    localization_map = room_map(room_landmarks(400))
     centers = GRID.centers()[list(free_voxels())]
     assert 10 < len(centers) < len(GRID)
     np.testing.assert_array_equal(viewpoint_map.locations, centers)
     views = poses_looking_along(np.repeat(centers, len(DIRECTIONS), axis=0), np.tile(DIRECTIONS, (len(centers), 1)))
-    scores = make_scorer("bins", one).score(views)
+    scores = make_scorer("bins", localization_map).score(views)
     np.testing.assert_array_equal(viewpoint_map.scores.ravel(), scores.astype(np.float32))
-    np.testing.assert_array_equal(viewpoint_map.n_visible.ravel(), np.diff(one.landmarks_in_view(views).starts))
+    np.testing.assert_array_equal(
+        viewpoint_map.n_visible.ravel(), np.diff(localization_map.landmarks_in_view(views).starts)
+    )
     order = np.lexsort([np.tile(np.arange(60), (len(centers), 1)), -scores.reshape(-1, 60)], axis=1)
     np.testing.assert_array_equal(viewpoint_map.ranked, order)
     origin = viewpoint_map.origin

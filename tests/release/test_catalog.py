@@ -17,7 +17,7 @@ from wheretolook.cli import main
 from wheretolook.dataset.folders import Dataset
 from wheretolook.figures.config import FiguresConfig
 from wheretolook.figures.style import note_of
-from wheretolook.figures.top_n import top_n_figure, top_n_table
+from wheretolook.figures.top_n import ROWS, top_n_figure, top_n_table
 from wheretolook.methods.styles import method_style
 from wheretolook.planning.config import PathConfig, PlanConfig
 from wheretolook.planning.route_views import PathView
@@ -151,7 +151,7 @@ def test_marks_of_several_viewpoints_are_the_tables() -> None:
     scores = make_scores()
     figure = top_n_figure(scores)
     panels = [axes for axes in figure.axes if axes.lines]
-    assert len(panels) == 8
+    assert len(panels) == 8 and [panels[0].get_ylabel(), panels[4].get_ylabel()] == list(ROWS.values())
     pooled = scores[scores["scene"] == ALL]
     for panel, column in ((panels[0], "normalized_0.05m_0.4deg"), (panels[7], "any_5m_10deg")):
         lines = {line.get_label(): line.get_ydata() for line in panel.lines}

@@ -177,8 +177,8 @@ def test_sampling_counts_what_the_table_counts(showcase: Showcase) -> None:
     assert (sampling.kept == (sampling.n_visible > 0)).all()  # K is greater than the lattice
     assert location in sampling.layer and set(sampling.layer[sampling.free]) <= set(showcase.free)
     # what is in view in all directions together is what is not hidden
-    one = showcase.localization_map
-    seen = np.unique(np.concatenate([one.landmarks_in_view(pose[None])[0] for pose in poses(rows)]))
+    localization_map = showcase.localization_map
+    seen = np.unique(np.concatenate([localization_map.landmarks_in_view(pose[None])[0] for pose in poses(rows)]))
     assert sampling.unoccluded[seen].all() and not sampling.unoccluded.all()
 
 

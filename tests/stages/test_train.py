@@ -18,9 +18,10 @@ from learning_options import changed, train_config
 from synthetic_dataset import make_dataset
 from wheretolook.dataset.folders import Dataset
 from wheretolook.inputs.bins import InputStatistics
-from wheretolook.learning.data import BatchLoader, ViewpointDataModule, balance_classes, hold_out_locations, with_also
+from wheretolook.learning.data import BatchLoader, ViewpointDataModule, balance_classes, hold_out_locations
 from wheretolook.learning.fit import EpochRecord
 from wheretolook.learning.provenance import training_fingerprint, was_trained_on
+from wheretolook.learning.scenes import with_also
 from wheretolook.learning.trained_network import TrainedNetwork
 from wheretolook.methods.mlp.network import ViewpointNetwork
 from wheretolook.methods.registry import load_scorer

@@ -17,7 +17,7 @@ from wheretolook.geometry.camera import Camera, PinholeCamera, camera_of_record,
 from wheretolook.geometry.poses import Float
 from wheretolook.mapping.colmap_model import CAMERAS_FILE, colmap_poses, holds_model, load_mapping_poses
 from wheretolook.mapping.scale import read_scale
-from wheretolook.utils.errors import ConfigError, TableError
+from wheretolook.utils.errors import ConfigError, SceneError, TableError
 from wheretolook.utils.files import fingerprint, write_json
 from wheretolook.viewpoints.config import Split
 from wheretolook.viewpoints.table import CAMERA_ID, read_table
@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 
 RELEASE = "release"  # name of the dataset, beside all others, that ships with its weights
 RELEASE_FILE = "release.json"  # what a release was made from; the file that makes a dataset one
+
+MappedFloor = tuple[tuple[float, float, float, float], ...]
+"""The floor that a map is made from: rectangles (x0, y0, x1, y1) in metres; empty for all of it."""
 
 
 @dataclass(frozen=True)
@@ -97,6 +100,28 @@ class SceneFolder:
         Raises MapError if it has no mesh, and its map's report is damaged.
         """
         return not self.mesh.is_file() and read_scale(self.map) is not None
+
+    def mapped_floor(self) -> MappedFloor:
+        """What `save_mapped_floor` has kept. Raises SceneError if its file is damaged."""
+        if not self._about.is_file():
+            return ()
+        try:
+            rectangles = json.loads(self._about.read_text())["mapped_floor"]
+            return tuple((float(x0), float(y0), float(x1), float(y1)) for x0, y0, x1, y1 in rectangles)
+        except (ValueError, KeyError, TypeError) as error:
+            fix = "Remove it with the mesh beside it, and run the scenes stage again."
+            raise SceneError("damaged description of a scene", path=self._about, fix=fix) from error
+
+    def save_mapped_floor(self, floor: MappedFloor) -> None:
+        """Keep the floor that the map is to be made from, as `scene.json` beside the mesh, if it is not all."""
+        if floor:
+            write_json(self._about, {"mapped_floor": floor})
+        else:
+            self._about.unlink(missing_ok=True)
+
+    @property
+    def _about(self) -> Path:
+        return self.folder / "scene.json"
 
     def read_table(self, matches: bool = False) -> pd.DataFrame:
         """The scene's viewpoints, on request with their matches; see `wheretolook.viewpoints.table.read_table`."""

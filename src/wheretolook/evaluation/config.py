@@ -25,7 +25,7 @@ class EvaluateConfig:
 
     Args:
         methods: methods to compare, by name or family, such as set and mlp. See `wheretolook evaluate --list-methods`;
-            if none is named, all but those that are compared only if named.
+            none for all but those that are compared only if named.
         weights: files of weights to evaluate; empty for all in the dataset's `weights` folder.
         split: whose scenes to evaluate on: "test", "val" or "train".
         top_n: how many of a location's best-scored viewpoints count. Every value gives a row of the table.
@@ -38,8 +38,8 @@ class EvaluateConfig:
         candidates: sets of views to choose from, each tabulated apart. 0 is for all labelled directions of a location,
             as a planner meets them, K > 0 for those among the K that see most landmarks (of all directions, labelled or
             not), as in the paper.
-        block_m: intervals and tests resample locations in squares of so many metres on the floor together, as
-            neighbours see the same landmarks; 0 takes each location for independent.
+        block_m: side of the squares of floor whose locations are resampled together, in metres. For intervals and
+            tests, as neighbours see the same landmarks; 0 takes each location for independent.
         heading: heading of the method "forward": one direction, or the waypoints of a path. In the world; the direction
             of travel nearest to a location is the heading there. Empty for a horizontal heading drawn for each
             location.
@@ -89,10 +89,8 @@ def check_heading(heading: Sequence[Sequence[float]]) -> None:
     values = np.asarray(heading, dtype=np.float64).reshape(-1, 3)
     steps = np.diff(values, axis=0) if len(values) > 1 else values
     if not np.isfinite(values).all() or (np.abs(steps).sum(1) == 0).any():
-        given, fix = (
-            tuple(map(tuple, values.tolist())),
-            "Give such as [[1, 0, 0]], or [[0, 0, 1], [2, 0, 1], [2, 3, 1]].",
-        )
+        given = tuple(map(tuple, values.tolist()))
+        fix = "Give a direction such as [[1, 0, 0]], or waypoints such as [[0, 0, 1], [2, 0, 1], [2, 3, 1]]."
         raise ConfigError("a heading is one direction, or waypoints that differ", value=given, fix=fix)
 
 

@@ -87,7 +87,7 @@ _OF_SCENE = re.compile("regret_(?!low_|high_)")  # beginning of the columns that
 
 
 def runs_of_rows(table: pd.DataFrame, params: Mapping[str, Any]) -> Iterator[NestedRun]:
-    """The runs that score tables, one below the other, are logged as: one a method, occlusion model and candidate set.
+    """The runs that log joined score tables: one for each method, occlusion model and candidate set.
 
     Their parameters are those given and the row's own. Metrics are named by N, the scene unless it is all of them, and
     the column, such as `top-1/regret_0.05m_0.4deg` and `top-5/apartment-210/regret_5m_10deg`, or by the column if N

@@ -14,7 +14,7 @@ Matches = tuple[NDArray[np.int64], NDArray[np.int64]]
 """Rows of keypoints and rows of their landmarks, (M,) each, in ascending order of the keypoints."""
 
 GROUP = 32  # landmarks; the two best groups are found first, and in them the two best landmarks
-_PRODUCT_BYTES = {"cpu": 2**22, "cuda": 2**30}  # of a block of products; on a CPU it should fit into the cache
+_PRODUCT_BYTES = {"cpu": 2**24, "cuda": 2**30}  # of a block of products; products of few queries are slow
 
 
 class DescriptorMatcher:
@@ -37,11 +37,10 @@ class DescriptorMatcher:
         if self._in_bytes:  # in signed bytes: q.d = (q - 128).(d - 128) + 128 (sum of d) + terms that depend on q only
             self._descriptors = (whole - 128).to(torch.int8).T
             self._bias = 128 * whole.sum(1, dtype=torch.int32)
+            self._bias[n:] = -(2**28)  # rows of padding are never near
         else:
             number = torch.float32 if self.device.type == "cpu" else torch.float16
             self._descriptors = whole.to(self.device, number).T
-            self._bias = torch.zeros(padded, device=self.device)
-        self._bias[n:] = -(2**28)  # rows of padding are never near
 
     def nearest_two(
         self, descriptors: NDArray[np.uint8]
@@ -52,8 +51,8 @@ class DescriptorMatcher:
         """
         # OpenMP's limit is per thread: without this, the first product in a new thread would start a thread per core.
         torch.set_num_threads(torch.get_num_threads())
-        queries = torch.from_numpy(descriptors.astype(np.int32))
-        block = max(1, _PRODUCT_BYTES[self.device.type] // (4 * len(self._bias)))
+        queries = torch.from_numpy(descriptors).to(self.device)
+        block = max(1, _PRODUCT_BYTES[self.device.type] // (4 * self._descriptors.shape[1]))
         parts = [self._best_two(part) for part in queries.split(block)]
         rows, best = (torch.cat([part[i] for part in parts]).cpu().long().numpy() for i in (0, 1))
         return rows, best[:, 0], best[:, 1]
@@ -62,18 +61,22 @@ class DescriptorMatcher:
         """Row of the nearest landmark, (k,), and the two largest products, (k, 2)."""
         query_bias = torch.zeros((), device=self.device)
         if self._in_bytes:
-            product = torch._int_mm((queries - 128).to(torch.int8), self._descriptors)
-            query_bias = 128 * (queries.sum(1, keepdim=True) - 128 * queries.shape[1])
-        elif self.device.type == "cpu":
-            product = queries.float() @ self._descriptors
+            whole = queries.to(torch.int32)
+            product = torch._int_mm((whole - 128).to(torch.int8), self._descriptors).add_(self._bias)
+            query_bias = 128 * (whole.sum(1, keepdim=True) - 128 * queries.shape[1])
         else:
-            product = torch.mm(queries.to(self.device, torch.float16), self._descriptors, out_dtype=torch.float32)
-        groups = product.add_(self._bias).view(len(product), len(self._bias) // GROUP, GROUP)
-        best_groups = groups.amax(2).topk(2, dim=1).indices
-        candidates = groups.gather(1, best_groups[:, :, None].expand(-1, -1, GROUP)).flatten(1)
+            if self.device.type == "cpu":
+                product = queries.float() @ self._descriptors
+            else:
+                product = torch.mm(queries.to(torch.float16), self._descriptors, out_dtype=torch.float32)
+            product[:, self.n_landmarks :] = -(2**28)
+        # A group's landmarks are a stride apart: maxima of neighbours in memory take a GPU several times as long.
+        groups = product.view(len(product), GROUP, self._descriptors.shape[1] // GROUP)
+        best_groups = groups.amax(1).topk(2, dim=1).indices
+        candidates = groups.gather(2, best_groups[:, None].expand(-1, GROUP, -1)).flatten(1)  # of both groups in turns
         best, best_candidates = candidates.topk(2, dim=1)
-        first = best_candidates[:, 0]
-        rows = best_groups.gather(1, first[:, None] // GROUP)[:, 0] * GROUP + first % GROUP
+        first = best_candidates[:, :1]
+        rows = (best_groups.gather(1, first % 2) + first // 2 * groups.shape[2])[:, 0]
         return rows, best + query_bias
 
 

@@ -33,7 +33,7 @@ def learning_figure(image: BinnedImage, activations: Sequence[Float], channels: 
         stages = figure.add_gridspec(1, len(ratios), width_ratios=ratios)
         picture, bins = figure.add_subplot(stages[0]), figure.add_subplot(stages[1])
         draw_landmarks(picture, image)
-        picture.set_title("a  pose and\nvisible landmarks", loc="left")
+        picture.set_title("a  pose and\nlandmarks in view", loc="left")
         picture.set_xlabel(n_landmarks(image))
         draw_counts(bins, image)
         bins.set_title(f"b  image binning\n{len(image.counts)} × {len(image.counts)}", loc="left")

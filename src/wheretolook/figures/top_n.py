@@ -52,9 +52,9 @@ def top_n_figure(scores: pd.DataFrame, methods: Sequence[str] = ()) -> Figure:
                 _draw(axes, pooled, shown, top_n, f"{column}_{{}}{key}")
                 if column == "normalized":
                     axes.set_title(f"within {threshold_label(key)}")
-                    for name, (marker, _) in _PAPER_MARKS.items():
+                    for printed_row, (marker, _) in _PAPER_MARKS.items():
                         mark: Look = {"markersize": 5, "color": _GREY, "markerfacecolor": "white"}
-                        axes.plot(-0.5, _PRINTED[name][index], marker, **mark)
+                        axes.plot(-0.5, _PRINTED[printed_row][index], marker, **mark)
                 else:
                     _draw_oracle(axes, pooled, top_n, f"{column}_{key}")
             line[0].set_ylabel(name)

@@ -1,4 +1,4 @@
-"""Camera model, poses, projection and rotation angles.
+"""Poses of cameras: transforms, centres, orientations, and the error between two.
 
 Conventions: world in metres, z up. Camera x right, y down, z forward (OpenCV, COLMAP). Pixel (0.5, 0.5) is the centre
 of the top-left pixel, as in COLMAP. Poses are `cam_from_world` matrices (..., 3, 4) in float64; quaternions are wxyz.

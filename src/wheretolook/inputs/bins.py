@@ -87,9 +87,9 @@ def bin_views(
 ) -> BinnedViews:
     """Bin the landmarks in view of each of B views in bins x bins cells, with all of `CHANNELS`.
 
-    With `landmarks`, whose the points are, the bins also have `LANDMARK_CHANNELS`, for about three times the memory.
-    About `block_bytes` of views are worked on at a time, a view by one thread, so that sums do not depend on the order
-    of threads; COLMAP's cameras are computed on the CPU.
+    With `landmarks`, those that the points are of, the bins also have `LANDMARK_CHANNELS`, for about three times the
+    memory. About `block_bytes` of views are worked on at a time, a view by one thread, so that sums do not depend on
+    the order of threads; COLMAP's cameras are computed on the CPU.
     """
     if isinstance(posed.camera, ColmapCamera):
         return bin_views_plain(posed, bins, landmarks)
@@ -118,7 +118,7 @@ def bin_views(
 def count_bins(
     posed: PosedViews, bins: int = 30, device: str = "cpu", block_bytes: int = 1 << 30
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """`n_visible` and `n_filled` of what `bin_views`, the plain twin of this, makes, (B,) each, without the means."""
+    """`n_visible` and `n_filled`, (B,) each, of what `bin_views` makes, which is the plain twin of this."""
     if isinstance(posed.camera, ColmapCamera):
         binned = bin_views_plain(posed, bins)
         return binned.n_visible, binned.n_filled

@@ -52,7 +52,7 @@ class ViewLandmarks:
 class LandmarkDescriber:
     """Finds the landmarks that views of a map see, and their attributes, on the map's device.
 
-    What it tells of each landmark are some of `ATTRIBUTES`, by name, in the order asked for.
+    Of each landmark it gives those of `ATTRIBUTES` that are asked for by name, in that order.
     """
 
     def __init__(self, localization_map: LocalizationMap, attributes: tuple[str, ...] = ATTRIBUTES) -> None:
@@ -107,8 +107,8 @@ class LandmarkDescriber:
     ) -> Iterator[tuple[slice, ViewLandmarks, Tensor]]:
         """Landmarks of views (B, 3, 4), in blocks of views that leave a network over the landmarks room to work.
 
-        At `most` so many landmarks of a view are described, evenly spread over those it sees in the map's order. Yields
-        which of the views, their landmarks, and how many each of them sees in all.
+        Of each view at most `most` landmarks are described, evenly spread over those it sees in the map's order. Yields
+        which views a block holds, their landmarks, and how many each of them sees in all.
         """
         starts, indices = self.localization_map.in_view_on_device(cam_from_world)
         n_in_view = np.diff(starts)

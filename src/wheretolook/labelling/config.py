@@ -22,6 +22,11 @@ class LocalizerConfig:
 
     Attributes:
         min_matches: with fewer matches no pose is sought; four is the least that determines and checks one.
+        confidence: RANSAC stops when it has drawn three inliers at once with this probability, if no pose has more
+            inliers than the best so far.
+        min_trials: trials of RANSAC at least, as of COLMAP's.
+        max_trials: trials of RANSAC at most, as of COLMAP's: where a tenth of the matches are inliers, it misses one
+            pose in 20,000.
     """
 
     max_ratio: float = 0.85
@@ -29,6 +34,9 @@ class LocalizerConfig:
     max_error_px: float = 8.0
     min_inliers: int = 10
     seed: int = 0
+    confidence: float = field(default=0.9999, init=False)
+    min_trials: int = field(default=100, init=False)
+    max_trials: int = field(default=10_000, init=False)
 
     def __post_init__(self) -> None:
         if not 0 < self.max_ratio <= 1:
@@ -45,14 +53,14 @@ class LabelConfig:
 
     Args:
         localizer: matching and pose estimation.
-        engine: where labels are made: local, in processes here, or ray, on a Ray cluster. Of the same shards (`pip
-            install ray`).
+        engine: where labels are made: local, in processes here, or ray, on a Ray cluster. Both give the same labels;
+            ray needs `pip install ray`.
         ray_address: address of the Ray cluster; empty starts one on this machine. Such as "auto" on one of its
             machines, or "ray://head:10001" from elsewhere (which needs `pip install 'ray[client]'`).
-        workers: worker processes on this machine; 0 for one a CPU core. Of those that may be used.
-        shard_size: viewpoints a shard, which is what an interruption can lose.
-        store_matches: keep which landmarks each view matched; needed to learn matchability. Their rows, and of those
-            that agree with the view's pose, in the columns matched_rows and inlier_rows.
+        workers: worker processes on this machine; 0 for one on each CPU core that it may use.
+        shard_size: viewpoints in a shard. An interruption loses at most the shards that were being labelled.
+        store_matches: keep which landmarks each view matched; needed to learn matchability. Their rows are in
+            the column matched_rows, those that agree with the view's pose in inlier_rows.
     """
 
     localizer: LocalizerConfig = field(default_factory=LocalizerConfig)

@@ -100,7 +100,7 @@ def label_scenes(
 def versions() -> dict[str, str]:
     """Versions of the packages that decide a label."""
     found = {"wheretolook": VERSION}
-    for package in ("pycolmap", "opencv-python-headless", "warp-lang", "numpy", "torch"):
+    for package in ("poselib", "pycolmap", "opencv-python-headless", "warp-lang", "numpy", "torch"):
         try:
             found[package] = version(package)
         except PackageNotFoundError:  # installed some other way

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
-import pycolmap
+import poselib
 from numpy.typing import NDArray
 
 from wheretolook.features.extraction import KeypointExtractor
 from wheretolook.features.keypoints import ExtractorConfig, Keypoints, quantize_descriptors
 from wheretolook.features.matching import DescriptorMatcher, Matches, match
-from wheretolook.geometry.camera import Camera
+from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import Float
 from wheretolook.labelling.config import LocalizerConfig
 from wheretolook.mapping.landmarks import Landmarks
@@ -43,9 +44,9 @@ class Localization:
 class Localizer:
     """Localizes images against landmarks (paper, Sec. 3.3 "Self-supervision").
 
-    Keypoints are extracted and matched to the landmarks' mean descriptors with Lowe's ratio test; pycolmap estimates
-    the pose by PnP in LO-RANSAC and refines it. The extractor must be what the map was made with; it and matching run
-    on the device, "cpu" or a CUDA device. Raises MapError if the landmarks have no descriptors.
+    Keypoints are extracted and matched to the landmarks' mean descriptors with Lowe's ratio test; PoseLib estimates the
+    pose by P3P in LO-RANSAC and refines it on the inliers. The extractor must be what the map was made with; it and
+    matching run on the device, "cpu" or a CUDA device. Raises MapError if the landmarks have no descriptors.
     """
 
     def __init__(
@@ -61,11 +62,18 @@ class Localizer:
         self.landmarks, self.config = landmarks, config or LocalizerConfig()
         self.extractor = KeypointExtractor(extractor, device)
         self._matcher = DescriptorMatcher(landmarks.descriptors, device)
-        self._camera = camera.colmap.pycolmap
-        self._estimation = pycolmap.AbsolutePoseEstimationOptions()
-        self._estimation.ransac.max_error = self.config.max_error_px
-        self._estimation.ransac.random_seed = self.config.seed
-        self._refinement = pycolmap.AbsolutePoseRefinementOptions()
+        self._camera = camera
+        self._ransac = {
+            "max_reproj_error": self.config.max_error_px,
+            "seed": self.config.seed,
+            "success_prob": self.config.confidence,
+            "min_iterations": self.config.min_trials,
+            "max_iterations": self.config.max_trials,
+            "dyn_num_trials_mult": 1.0,  # as many trials as the confidence asks for; PoseLib makes three times as many
+        }
+        # Keypoints are accurate to a fraction of a pixel. PoseLib's own scale is half of RANSAC's limit, as if outliers
+        # just within the limit were accurate, too: poses are then worse.
+        self._refinement = {"loss_type": "CAUCHY", "loss_scale": 1.0}
 
     def localize(self, rgb: NDArray[np.uint8]) -> Localization:
         """Localize one image (H, W, 3) uint8."""
@@ -96,12 +104,27 @@ class Localizer:
         if n_matches < self.config.min_matches:
             return Localization(TOO_FEW_MATCHES, None, n_matches, matched_rows=landmark_rows)
         pixels, points = keypoints.pixels[keypoint_rows].astype(np.float64), self.landmarks.points[landmark_rows]
-        taken_with = self._camera if camera is None else camera.colmap.pycolmap
-        options = (taken_with, self._estimation, self._refinement)
-        estimate = pycolmap.estimate_and_refine_absolute_pose(pixels, points, *options)
-        if estimate is None:
+        taken_with, pixels = _known_to_poselib((camera or self._camera).colmap, pixels)
+        pose, found = poselib.estimate_absolute_pose(pixels, points, taken_with, self._ransac, self._refinement)
+        if found["num_inliers"] < 3 or not np.isfinite(pose.Rt).all():  # no three matches determine a pose
             return Localization(NO_POSE, None, n_matches, matched_rows=landmark_rows)
-        pose = np.asarray(estimate["cam_from_world"].matrix())
-        status = LOCALIZED if estimate["num_inliers"] >= self.config.min_inliers else NO_POSE
-        inlier_rows = landmark_rows[np.asarray(estimate["inlier_mask"], dtype=bool)]
-        return Localization(status, pose, n_matches, inlier_rows, landmark_rows)
+        status = LOCALIZED if found["num_inliers"] >= self.config.min_inliers else NO_POSE
+        inlier_rows = landmark_rows[np.asarray(found["inliers"], dtype=bool)]
+        return Localization(status, pose.Rt, n_matches, inlier_rows, landmark_rows)
+
+
+POSELIBS_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")
+
+
+def _known_to_poselib(camera: ColmapCamera, pixels: Float) -> tuple[dict[str, Any], Float]:
+    """A camera as PoseLib takes it, and pixels (M, 2) of its image.
+
+    Of a model that PoseLib does not know, pixels become those of a pinhole with the same focal length, by their rays.
+    Rays that it would not see, more than 84 degrees off its axis, go far outside, where they are nobody's inliers.
+    """
+    if camera.model in POSELIBS_MODELS:
+        return camera.record(), pixels
+    pinhole = PinholeCamera(camera.width, camera.height, camera.mean_focal_px)
+    rays = camera.unproject(pixels)
+    ahead = rays[:, 2:] > 0.1
+    return pinhole.colmap.record(), np.where(ahead, pinhole.project(np.where(ahead, rays, (0, 0, 1))), 1e6)

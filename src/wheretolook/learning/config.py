@@ -20,13 +20,13 @@ class SharedConfig:
             "matchability", which tells which landmarks will be found (needs labels with `--label.store_matches true`).
         also: further datasets in the same folder whose train scenes are learnt from as well.
         max_error_m: a viewpoint is positive if its position error is strictly smaller, in metres.
-        max_error_deg: and its orientation error too, in degrees.
+        max_error_deg: and if its orientation error is strictly smaller, in degrees.
         val_fraction: share of each training scene's locations held out for validation. Only when the dataset has no
             validation scene.
         seed: seed of all that is random. The split, the balance, initial weights, dropout, noise, the order of batches.
         accelerator: where to train: "auto", "cpu" or "gpu".
-        devices: GPUs, or processes on the CPU, to train with. One step of many is one step of one: each takes its share
-            of the same batch. Dropout and noise draw other numbers, though.
+        devices: GPUs, or processes on the CPU, to train with. A step takes the same batch however many share it; only
+            dropout and noise draw other numbers.
     """
 
     methods: tuple[str, ...] = ()

@@ -17,16 +17,10 @@ from tqdm.auto import tqdm
 from wheretolook.dataset.folders import Dataset, SceneFolder, views_by_camera
 from wheretolook.inputs.landmarks_in_view import ATTRIBUTES, LandmarkDescriber, ViewLandmarks
 from wheretolook.learning.config import SharedConfig
-from wheretolook.learning.data import (
-    Batch,
-    TensorViews,
-    ViewsDataModule,
-    labelled_rows,
-    training_scenes,
-    validation_views,
-)
+from wheretolook.learning.data import Batch, TensorViews, ViewsDataModule, labelled_rows, validation_views
 from wheretolook.learning.fit import home_device
 from wheretolook.learning.learner import Task
+from wheretolook.learning.scenes import training_scenes
 from wheretolook.viewpoints.table import LOCALIZED, is_good, poses
 
 DISTANCES = [ATTRIBUTES.index(name) for name in ("distance", "mapped_distance", "mapped_pixel_size")]
@@ -65,7 +59,7 @@ class LandmarkViews(TensorViews):
 
     starts: Tensor  # (B + 1,) int64; view b has entries `starts[b]` to `starts[b + 1]`
     values: Tensor  # (E, len(ATTRIBUTES)) float16
-    visible: Tensor  # (B,) int64, landmarks that each view sees
+    n_visible: Tensor  # (B,) int64, landmarks that each view sees
     axis_height: Tensor  # (B,) float32, z of the optical axis in the world
     labels: Tensor  # (B,) float32, 1 where the viewpoint localizes
     error_m: Tensor  # (B,) float32, error of its position, infinite where it is not localized or its orientation is off
@@ -147,7 +141,7 @@ def _joined(blocks: Sequence[LandmarkViews]) -> LandmarkViews:
     starts = torch.zeros(len(lengths) + 1, dtype=torch.int64)
     starts[1:] = lengths.cumsum(0)
     joined: dict[str, Any] = {"starts": starts}
-    for name in ("values", "visible", "axis_height", "labels", "error_m", "scene", "location", "found"):
+    for name in ("values", "n_visible", "axis_height", "labels", "error_m", "scene", "location", "found"):
         parts = [getattr(block, name) for block in blocks if getattr(block, name) is not None]
         if parts:
             joined[name] = torch.cat(parts) if isinstance(parts[0], Tensor) else np.concatenate(parts)
@@ -209,7 +203,7 @@ class LandmarkLoader:
             if growth is not None:
                 values[..., DISTANCES] += growth[:, None, None]
                 labels = (views.error_m[share] * growth.exp() < self.max_error_m).float()
-            yield Batch((values, taken, views.visible[share], views.axis_height[share]), labels, len(part))
+            yield Batch((values, taken, views.n_visible[share], views.axis_height[share]), labels, len(part))
 
 
 class LandmarkDataModule(ViewsDataModule):

@@ -10,8 +10,8 @@ from typing import Any
 
 from wheretolook.dataset.folders import Dataset, SceneFolder
 from wheretolook.learning.config import DECIDING, SharedConfig
-from wheretolook.learning.data import with_also
 from wheretolook.learning.old_names import with_name
+from wheretolook.learning.scenes import with_also
 from wheretolook.utils.errors import ConfigError, TableError
 from wheretolook.utils.files import fingerprint, sha256
 from wheretolook.utils.version import VERSION

@@ -76,7 +76,7 @@ _MEASURES = ("average_precision", "roc_auc", "calibration_error")
 
 
 def log_history(tracking: TrackingConfig, run_id: str, history: pd.DataFrame) -> None:
-    """Log a history, a row an epoch with its number as `epoch`, as training itself does; not what is unknown."""
+    """Log a history, one row for each `epoch`, as training itself does. What is not finite is left out."""
     from mlflow.entities import Metric
 
     start = int(client(tracking).get_run(run_id).info.start_time)

@@ -26,6 +26,29 @@ class FreeSpaceQueries(Protocol):
     def floor_below(self, points: Any) -> NDArray[np.floating[Any]]: ...
 
 
+@dataclass(frozen=True)
+class PartOfFloor:
+    """Free space above a part of the floor: rectangles (x0, y0, x1, y1) in metres; a step may lead between two."""
+
+    space: FreeSpaceQueries
+    rectangles: tuple[tuple[float, float, float, float], ...]
+
+    def is_free(self, points: Any) -> NDArray[np.bool_]:
+        """Whether a camera can be at points (N, 3); (N,)."""
+        at, part = np.asarray(points, dtype=np.float64)[:, None, :2], np.asarray(self.rectangles, dtype=np.float64)
+        free: NDArray[np.bool_] = np.any(((at >= part[:, :2]) & (at <= part[:, 2:])).all(-1), axis=-1)
+        free[free] = self.space.is_free(np.asarray(points)[free])
+        return free
+
+    def segments_are_free(self, a: Any, b: Any) -> NDArray[np.bool_]:
+        """Whether a camera can move straight from a (N, 3) to b (N, 3), both above this part; (N,)."""
+        return self.is_free(a) & self.is_free(b) & self.space.segments_are_free(a, b)
+
+    def floor_below(self, points: Any) -> NDArray[np.floating[Any]]:
+        """Height (N,) of the floor below points (N, 3)."""
+        return self.space.floor_below(points)
+
+
 @dataclass(frozen=True, eq=False)
 class Walk:
     """A walk and the camera poses along it."""

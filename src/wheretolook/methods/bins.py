@@ -11,7 +11,7 @@ from wheretolook.methods.method import MethodStyle, rule
 
 
 class BinsScorer(CountingScorer):
-    """Share of the image's bins with a visible landmark in them (paper, Sec. 4.1, "reprojection with bins").
+    """Share of the image's bins with a landmark in view in them (paper, Sec. 4.1, "reprojection with bins").
 
     Among views with as many filled bins, the one that sees more landmarks scores higher, by less than one bin is worth.
     """
@@ -21,8 +21,8 @@ class BinsScorer(CountingScorer):
 
     def score_counts(self, n_visible: NDArray[np.int32], n_filled: NDArray[np.int32]) -> Float:
         """(B,) in [0, 1)."""
-        visible = n_visible.astype(np.float64)
-        return (n_filled + visible / (1 + visible)) / (self.bins**2 + 1)
+        seen = n_visible.astype(np.float64)
+        return (n_filled + seen / (1 + seen)) / (self.bins**2 + 1)
 
 
 METHODS = (

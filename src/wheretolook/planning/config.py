@@ -47,7 +47,7 @@ class PathConfig:
     every metre times one less the score of the views along it.
 
     Args:
-        score_weight: metres that a metre without any hope to localize costs beside its length. The paper's lambda.
+        score_weight: metres that a metre on which no view would localize costs beside its length. The paper's lambda.
         turn_weight_m: metres that turning by one radian costs.
         pitch_deg: least and greatest pitch of the optical axis, degrees above the horizon.
         max_turn_deg_per_m: degrees that the camera turns at most while it moves by a metre.
@@ -135,7 +135,7 @@ class PlanConfig(ViewLattice):
         method: method that scores the views; forward for the shortest path, looking ahead. Empty as for the viewpoint
             map.
         weights: file of weights, for a method that has learnt; by default the best there are.
-        against: further methods to plan by, drawn beside it. In `methods.png`; forward or fisher-trace-gp, say.
+        against: further methods to plan by, drawn beside it. Such as forward and fisher-trace-gp; in `methods.png`.
         film: kind of film to make: gif, mp4 or none.
         rerun: write a recording for the Rerun viewer too. Needs `pip install rerun-sdk`.
         planner: costs and limits of the path, time to plan.

@@ -194,7 +194,9 @@ def _scenes_text(scenes: Mapping[str, Any]) -> str:
     parts = []
     if generated:
         first = scenes["seed"]
-        parts.append(f"{generated} generated apartments with seeds {first} to {first + generated - 1}")
+        kinds = [*scenes.get("kinds", ["apartment"])]
+        what = "apartments" if kinds == ["apartment"] else f"scenes ({', '.join(kinds)} in turn)"
+        parts.append(f"{generated} generated {what} with seeds {first} to {first + generated - 1}")
     if scenes["meshes"]:
         parts.append(f"{len(scenes['meshes'])} meshes made by others")
     return f"{' and '.join(parts).capitalize()}. A scene belongs to one split."

@@ -97,8 +97,10 @@ def trained_weights(release: Dataset) -> dict[Path, Method]:
 
 
 def choose_weights_to_ship(release: Dataset) -> Choice:
-    """Choose by the best validation average precision. Raises WeightsError if the paper's network has no weights, or if
-    weights or their record do not fit the release."""
+    """Choose by the best validation average precision.
+
+    Raises WeightsError if the paper's network has no weights, or if weights or their record do not fit the release.
+    """
     from wheretolook.learning.provenance import was_trained_on
     from wheretolook.learning.weights import read_record, read_training
 
@@ -145,8 +147,8 @@ def ship_weights(release: Dataset) -> Choice:
 def sizes(root: Path, weights: bool = True) -> dict[str, int]:
     """Bytes of what ships of the release at `root`, by kind of file. Figures and shelved weights do not ship.
 
-    Until it is chosen which weights ship, they can be left out. Raises StorageError if it is not
-    smaller than `MAX_BYTES`.
+    Without `weights` none are counted, for as long as it is not chosen which of them ship. Raises StorageError if the
+    release is not smaller than `MAX_BYTES`.
     """
     kinds = {"viewpoints.parquet": "tables", "landmarks.npz": "landmarks", CAMERAS_FILE: "cameras"}
     kinds["occlusion.npz"] = "occlusion"

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import re
 from functools import cached_property
+from typing import cast, get_args
 
 import numpy as np
 import pandas as pd
@@ -19,8 +20,8 @@ from wheretolook.dataset.scene import Scene, SceneConfig
 from wheretolook.figures.house_image import Dollhouse, dollhouse
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float
-from wheretolook.scenes.config import ApartmentConfig
-from wheretolook.scenes.procedural.generator import generate_apartment
+from wheretolook.scenes.config import ApartmentConfig, SceneKind
+from wheretolook.scenes.procedural.generator import generate_scene
 from wheretolook.space.config import FreeSpaceConfig
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.utils.options import recorded
@@ -35,7 +36,7 @@ SAME_OCCLUSION = 0.999  # share of the lines of sight that must be as stored; wh
 
 _CHECKED = 16  # locations whose lines of sight are compared
 
-_SEEDED = re.compile(r"apartment-(\d+)")
+_SEEDED = re.compile(rf"({'|'.join(get_args(SceneKind))})-(\d+)")
 
 
 class Showcase(Scene):
@@ -145,7 +146,8 @@ def open_showcase(dataset: Dataset, name: str | None = None, device: str = "cpu"
         raise SceneError("this scene was not generated from a seed", path=scene.folder, value=scene.name)
     occlusion = recorded(OcclusionConfig, {**settings["occlusion"], "model": "mesh"})
     config = SceneConfig(occlusion, recorded(FreeSpaceConfig, settings["scenes"]["free_space"]))
-    mesh = generate_apartment(recorded(ApartmentConfig, settings["scenes"]["apartment"]), int(seeded[1]), device=device)
+    kind, apartment = cast(SceneKind, seeded[1]), recorded(ApartmentConfig, settings["scenes"]["apartment"])
+    mesh, _ = generate_scene(kind, apartment, int(seeded[2]), device=device)
     showcase = Showcase(scene, None, config, device, mesh)
     showcase.sampling = recorded(SampleConfig, settings["sample"])
     if settings["occlusion"]["model"] == "mesh":

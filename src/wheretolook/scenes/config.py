@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from wheretolook.utils.errors import ConfigError
+
+SceneKind = Literal["apartment", "hall", "court", "office", "building"]
 
 
 @dataclass(frozen=True)
@@ -16,8 +18,8 @@ class ApartmentConfig:
     """Options of the procedural apartment.
 
     Args:
-        n_rooms: number of rooms, 3 to 6; None draws it from the seed.
-        area_m2: floor area aimed at, in square metres; None takes about 13 per room.
+        n_rooms: number of rooms, 3 to 6; drawn from the seed if not given.
+        area_m2: floor area aimed at, in square metres; about 13 per room if not given.
         texture_richness: how rich in texture surfaces are, 0 to 1; lower is harder to localize in. The contrast of
             wood, stone and cloth, and how many pictures hang.
         clutter: how many small things there are, 0 to 1; lower is harder. Books, plants, bottles.

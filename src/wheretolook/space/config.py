@@ -15,7 +15,7 @@ class FreeSpaceConfig:
         clearance_m: least distance of a camera to any geometry.
         max_floor_drop_m: greatest height above the surface straight below, which must be roughly level.
         two_sided: whether triangles are surfaces from both sides. If not, only fronts count as floor and as enclosure,
-            so that a point inside a solid or outside a shell of one layer is never free. None finds out: triangles are
+            so that a point inside a solid or outside a shell of one layer is never free. If not given, triangles are
             taken as one-sided if most points that would be free in a two-sided scene see mostly fronts.
 
     Attributes:

@@ -1,7 +1,7 @@
 """The stages, one function each, for Python, notebooks and the command line alike.
 
-A stage works through the scenes of an experiment and leaves its result on disk with a stamp that says what it was made
-from. Called again, it reuses what is there if its settings and inputs are the same, and otherwise makes it anew.
+A stage works through the scenes of an experiment and leaves its result on disk. Up to training, a record says what the
+result was made from: called again, a stage reuses what is there if its settings and inputs are the same.
 """
 
 from wheretolook.stages.compare_paths import compare_paths

@@ -34,16 +34,19 @@ def make_maps(experiment: Experiment, say: Say = print, tick: Tick = lambda work
         scene = open_scene(experiment, dataset, files)
         seed = _seed(files)
         made_from = existing(files.mesh, SceneError, "scenes")
-        camera = _mapping_camera(experiment.map, scene.camera, seed)
-        key = stage_key("map", [settings, asdict(scene.config.free_space), camera.record(), seed, made_from])
+        floor, camera = files.mapped_floor(), _mapping_camera(experiment.map, scene.camera, seed)
+        shown_by = [asdict(scene.config.free_space), camera.record(), seed, made_from, *([floor] if floor else [])]
+        key = stage_key("map", [settings, *shown_by])
         model = [files.map / name for name in ("cameras.bin", "images.bin", "points3D.bin")]
         if is_done(files, "map", key, files.landmarks, *model):
             say(f"{scene.name}: reusing {files.map}")
         else:
             from wheretolook.mapping.building import build_map
+            from wheretolook.mapping.walk import PartOfFloor
 
             with naming_scene(files.mesh):
-                shown = (scene.mesh, scene.renderer, scene.mesh_space, camera)
+                space = PartOfFloor(scene.mesh_space, floor) if floor else scene.mesh_space
+                shown = (scene.mesh, scene.renderer, space, camera)
                 workers, device = experiment.n_workers, scene.device
                 report = build_map(*shown, experiment.map, seed, files.map, scene.raycaster, workers, device)
             write_stamp(files, "map", key)

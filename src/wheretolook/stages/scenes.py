@@ -7,8 +7,9 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from wheretolook.config import Experiment, MeshSource
-from wheretolook.dataset.folders import Dataset, SceneFolder
+from wheretolook.dataset.folders import Dataset, MappedFloor, SceneFolder
 from wheretolook.dataset.stamps import is_done, read_stamp, stage_key, write_stamp
+from wheretolook.scenes.config import SceneKind
 from wheretolook.stages.inputs import Say, Tick, mesh_fingerprint, refuse_release
 from wheretolook.utils.errors import SceneError
 from wheretolook.viewpoints.config import Split
@@ -27,12 +28,13 @@ def make_scenes(experiment: Experiment, say: Say = print, tick: Tick = lambda wo
     refuse_release(root)
     numbers: dict[Split, int] = {"train": config.train, "val": config.val, "test": config.test}
     splits = [split for split, number in numbers.items() for _ in range(number)]
-    sources: dict[SceneFolder, Callable[[], TexturedMesh]] = {}
+    sources: dict[SceneFolder, Callable[[], tuple[TexturedMesh, MappedFloor]]] = {}
     keys: dict[SceneFolder, list[Any]] = {}
     for seed, split in enumerate(splits, config.seed):
-        scene = SceneFolder(root / f"apartment-{seed:03d}", split, camera)
-        sources[scene] = partial(_generate, experiment, seed)
-        keys[scene] = [config.apartment.key(), seed]
+        kind = config.kind_of(seed)
+        scene = SceneFolder(root / f"{kind}-{seed:03d}", split, camera)
+        sources[scene] = partial(_generate, experiment, kind, seed)
+        keys[scene] = [config.apartment.key(), seed, *([] if kind == "apartment" else [kind])]
     for source in config.meshes:
         scene = SceneFolder(root / source.scene_name, source.split, camera)
         if scene.name in {other.name for other in sources}:
@@ -47,9 +49,10 @@ def make_scenes(experiment: Experiment, say: Say = print, tick: Tick = lambda wo
         else:
             from wheretolook.scenes.loading import save_glb
 
-            mesh = make()
+            mesh, mapped = make()
             scene.folder.mkdir(parents=True, exist_ok=True)
             save_glb(mesh, scene.mesh)
+            scene.save_mapped_floor(mapped)
             write_stamp(scene, "scenes", key)
             say(f"{scene.name}: {len(mesh.triangles):,} triangles -> {scene.mesh}")
         tick(1)
@@ -63,13 +66,13 @@ def make_scenes(experiment: Experiment, say: Say = print, tick: Tick = lambda wo
     return dataset
 
 
-def _generate(experiment: Experiment, seed: int) -> TexturedMesh:
-    from wheretolook.scenes.procedural.generator import generate_apartment
+def _generate(experiment: Experiment, kind: SceneKind, seed: int) -> tuple[TexturedMesh, MappedFloor]:
+    from wheretolook.scenes.procedural.generator import generate_scene
 
-    return generate_apartment(experiment.scenes.apartment, seed, device=experiment.warp_device)
+    return generate_scene(kind, experiment.scenes.apartment, seed, device=experiment.warp_device)
 
 
-def _load(source: MeshSource) -> TexturedMesh:
+def _load(source: MeshSource) -> tuple[TexturedMesh, MappedFloor]:
     from wheretolook.scenes.loading import load_mesh
 
-    return load_mesh(source.path, up=source.up)
+    return load_mesh(source.path, up=source.up), ()

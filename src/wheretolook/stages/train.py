@@ -56,8 +56,8 @@ def train_methods(
         ConfigError: there are fewer GPUs than asked for, cameras of datasets differ, or the views do not fit into
             memory shared by processes.
     """
-    from wheretolook.learning.data import with_also
     from wheretolook.learning.provenance import about_training, trained_before, weights_path
+    from wheretolook.learning.scenes import with_also
 
     dataset = with_also(dataset, config.also)
     shared: dict[str, Any] = {"progress": progress, "kept": {}}

@@ -8,8 +8,8 @@ from os import PathLike
 class WhereToLookError(Exception):
     """Base of every error this package raises on bad input. The command line exits with code 2 on it.
 
-    It says in a sentence what the problem is, the offending file or folder and value, if there are such, and what the
-    user can do about it.
+    `problem` is one sentence. `path` is the file or folder, and `value` the value, that it is about, if there is one;
+    `fix` tells the user what to do.
     """
 
     def __init__(

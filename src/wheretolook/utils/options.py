@@ -32,8 +32,8 @@ T = TypeVar("T", bound="DataclassInstance")
 class Option:
     """One option, or a group of them.
 
-    One that is fixed is a constant, a field that `__init__` does not take: it stands among the options since what is
-    recorded of a result must name it, and no one needs to turn it.
+    A fixed one is a constant, a field that `__init__` does not take. It stands among the options because the record of
+    a result must name it, but nobody needs to change it.
     """
 
     name: str  # with those of the groups it is in: "sample.grid"
@@ -75,9 +75,9 @@ def recorded(settings: type[T], values: Mapping[str, Any]) -> T:
 def check_names(names: Iterable[str], options: Mapping[str, Option], moved: Mapping[str, str], flag: str = "") -> None:
     """Raise ConfigError unless every name, with groups and dots, is one of an option that can be set.
 
-    The error tells which option was probably meant, or that it has moved, or is a constant. `moved` says where options
-    there were have gone, by another's name or in a sentence; `flag` is what stands before names, "--" on the command
-    line.
+    The error tells which option was probably meant, or that it has moved, or is a constant. `moved` has the names of
+    former options, and of each the option it is now, or a sentence; `flag` is what stands before names, "--" on the
+    command line.
     """
     for name in names:
         if name in moved:

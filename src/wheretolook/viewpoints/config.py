@@ -19,13 +19,12 @@ class SampleConfig(ViewLattice):
         keep: directions kept at each location, those that see most landmarks; 0 keeps all. The paper's K.
         min_visible: directions that see fewer landmarks are dropped. In the paper, those with "none or only a minimal
             number" (Sec. 3.2).
-        max_locations: a random subset of the free locations, 0 for all.
-        max_directions: a random subset of the kept directions of each location, 0 for all. One number, or one for
-            each split, such as `{train: 50, val: 50, test: 100}`.
-        seed: seed of the random subsets.
-        cameras: how many cameras look in a scene, each at its own locations: drawn from the scene's seed over fields of
-            view, sizes and proportions (`wheretolook.geometry.camera.draw_camera`), to learn from all of them. With 0
-            the experiment's camera looks.
+        max_locations: free locations to keep at most, drawn at random; 0 keeps all.
+        max_directions: kept directions of each location to take at most, drawn at random; 0 takes all. One number, or
+            one for each split, such as `{train: 50, val: 50, test: 100}`.
+        seed: seed of what is drawn at random.
+        cameras: cameras that look in a scene, each at its own locations: drawn from the scene's seed over fields of
+            view, sizes and proportions, to learn from all of them; with 0 the experiment's camera looks.
         distinct_pixels: rank by the number of distinct pixels with a landmark, as the released code counts, instead of
             the number of landmarks.
 

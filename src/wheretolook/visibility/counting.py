@@ -27,11 +27,12 @@ class FrustumCounter:
     The landmarks around a location are sorted into cells of the sphere of directions (`SphereCells`). A cell wholly in
     view counts with all its landmarks; landmarks are tested one by one only in cells on the border of the view.
 
-    The rotations (D, 3, 3) are cam_from_world. The number of cells follows from about how many landmarks there will be,
-    `n_points`, unless `size` gives the cells along a side of the sphere's map. With `distinct_pixels` the pixels that
-    some landmark falls on are counted instead, as the released code does; for a COLMAP camera in NumPy, thousands of
-    times slower. `scratch_bytes` hold bitmaps of pixels, or lists of landmarks to ask a COLMAP camera about. Raises a
-    ConfigError if there is no such device, the size is not even, or rotations are not finite or of another shape.
+    `rotations` (D, 3, 3) are cam_from_world; `device` is "cpu" or a CUDA device. `n_points`, about how many landmarks
+    will be counted, sets the number of cells, unless `size` gives the cells along a side of the sphere's map. With
+    `distinct_pixels` it counts the pixels that some landmark falls on instead, as the released code does; for a COLMAP
+    camera this is done in NumPy, thousands of times slower. `scratch_bytes` is the memory for bitmaps of pixels, or for
+    lists of landmarks to ask a COLMAP camera about. Raises a ConfigError if there is no such device, the size is not
+    even, or rotations are not finite or of another shape.
     """
 
     def __init__(

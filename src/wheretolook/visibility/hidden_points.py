@@ -31,11 +31,11 @@ class HiddenPointRemoval(OcclusionModel):
     not depend on the map's orientation, scale (if the margin is scaled with it) or order of landmarks. But R, and so
     the result, depends on the farthest landmark, even if that is an outlier far outside the scene.
 
-    The radius is R as a multiple of the distance from the location to the farthest landmark, at least 1. A landmark
-    that would be free if it were `margin_m` nearer is free: what stands this close in front of it is its own surface,
-    as in `MeshOcclusion`. 0 is the published method, with which a landmark is hidden by a neighbour a millimetre
-    nearer. With `threads`, 0 for one a CPU core, so many locations are worked on at a time, with the same result. A
-    hull takes about 0.4 KB a landmark while it is made. Raises a ConfigError if a value is out of range.
+    `radius` is R as a multiple of the distance from the location to the farthest landmark, at least 1. A landmark that
+    would be free if it were `margin_m` nearer is free: what stands this close in front of it is its own surface, as in
+    `MeshOcclusion`. A margin of 0 is the published method, with which a landmark is hidden by a neighbour a millimetre
+    nearer. `threads` locations are worked on at a time, 0 for one for each CPU core; the result is the same. A hull
+    takes about 0.4 KB a landmark while it is made. Raises a ConfigError if a value is out of range.
     """
 
     name = "hidden-points"

@@ -197,7 +197,10 @@ class StoredOcclusion(OcclusionModel):
         return self._unpack(slice(None))
 
     def unoccluded(self, locations: Float, points: Float) -> NDArray[np.bool_]:
-        """Rows (L, N) of the stored mask; a TableError if one is missing, or not of as many landmarks."""
+        """Rows (L, N) of the stored mask.
+
+        Raises a TableError if a location was not stored, or the mask is of another number of landmarks.
+        """
         if len(points) != self.n_landmarks:
             problem = f"stored occlusion is of {self.n_landmarks} landmarks, the map has {len(points)}"
             raise TableError(problem, fix="Run the sample stage again: the map has changed since.")

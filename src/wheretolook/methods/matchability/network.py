@@ -53,7 +53,7 @@ class LandmarkNetwork(StoredNetwork):
         for name in ("across", "down", "distance"):
             if name not in names:
                 raise WeightsError("these weights do not ask where a landmark lies", value=name)
-        options = {name: tuple(one) if isinstance(one, list) else one for name, one in stored["options"].items()}
+        options = {name: tuple(x) if isinstance(x, list) else x for name, x in stored["options"].items()}
         return cls(AttributeStatistics(tuple(statistics["mean"]), tuple(statistics["std"]), names), **options)
 
 
@@ -72,7 +72,7 @@ class StandardAttributes(nn.Module):
         self.register_buffer("scale", torch.tensor(scale), persistent=False)
 
     def forward(self, values: Tensor) -> Tensor:
-        """(..., A)."""
+        """Standardized values of landmarks' values (..., A), in the same shape."""
         return ((values - self.mean) * self.scale).nan_to_num(nan=0.0)
 
 

@@ -60,7 +60,7 @@ class SetNetwork(LandmarkNetwork):
     information that the view can be expected to have on its pose, and its inverse to the expected covariance: how far
     off position and orientation will be, which is what a label asks. So the probability is the attention by which
     landmarks are pooled; on request further attention pools what else there may be to know of them, in `pooled`
-    numbers. All of it are sums over landmarks, so a random sample of them scaled up serves in training.
+    numbers. All of these are sums over landmarks, so in training a random sample of them, scaled up, will do.
 
     `width` and `head` are units of the layers that look at single landmarks and of those that decide; `hidden` names
     attributes not to look at. Of "across", "down" and "distance" the information remains.
@@ -89,19 +89,19 @@ class SetNetwork(LandmarkNetwork):
         first = nn.Linear(n_features, head), nn.ReLU(), nn.Dropout(dropout)
         self.decide = nn.Sequential(*first, nn.Linear(head, head), nn.ReLU(), nn.Linear(head, 1))
 
-    def forward(self, values: Tensor, taken: Tensor, visible: Tensor, axis_height: Tensor) -> Tensor:
+    def forward(self, values: Tensor, taken: Tensor, n_visible: Tensor, axis_height: Tensor) -> Tensor:
         """Logits (B,) from samples (B, K, A) of each view's landmarks, of which the first `taken` (B,) are its own.
 
-        A view sees `visible` (B,) landmarks in all; `axis_height` (B,) is the z of its optical axis in the world.
+        A view sees `n_visible` (B,) landmarks in all; `axis_height` (B,) is the z of its optical axis in the world.
         """
         there = torch.arange(values.shape[1], device=values.device) < taken[:, None]
         sums = (self.parts(values) * there[..., None]).sum(1)
-        return self.logits(sums * (visible / taken.clamp(min=1))[:, None], visible, axis_height)
+        return self.logits(sums * (n_visible / taken.clamp(min=1))[:, None], n_visible, axis_height)
 
-    def score(self, landmarks: ViewLandmarks, visible: Tensor, axis_height: Tensor) -> Tensor:
-        """Logits (B,) from landmarks of each view, of those it sees in all (B,), and its height of the axis (B,)."""
+    def score(self, landmarks: ViewLandmarks, n_visible: Tensor, axis_height: Tensor) -> Tensor:
+        """Logits (B,) from described landmarks, which may be a part of those that each view sees; see `forward`."""
         sums = torch.segment_reduce(self.parts(landmarks.values), "sum", lengths=landmarks.counts, initial=0.0)
-        return self.logits(sums * (visible / landmarks.counts.clamp(min=1))[:, None], visible, axis_height)
+        return self.logits(sums * (n_visible / landmarks.counts.clamp(min=1))[:, None], n_visible, axis_height)
 
     def parts(self, values: Tensor) -> Tensor:
         """What each landmark (..., A) adds to its view's sums, (..., D)."""
@@ -112,9 +112,9 @@ class SetNetwork(LandmarkNetwork):
         weight = attended[..., :1].clamp(-8, 8).exp()
         return torch.cat([expected, weight, weight * attended[..., 1:]], -1)
 
-    def logits(self, sums: Tensor, visible: Tensor, axis_height: Tensor) -> Tensor:
+    def logits(self, sums: Tensor, n_visible: Tensor, axis_height: Tensor) -> Tensor:
         """Logits (B,) from the sums over each view's landmarks (B, D)."""
-        features = [expected_statistics(sums[:, :N_EXPECTED], visible), axis_height[:, None]]
+        features = [expected_statistics(sums[:, :N_EXPECTED], n_visible), axis_height[:, None]]
         if self.attention is not None:
             features.append(sums[:, N_EXPECTED + 1 :] / (sums[:, N_EXPECTED : N_EXPECTED + 1] + 1e-6))
         joined = torch.cat(features, 1)
@@ -139,7 +139,7 @@ EXPECTED = (
 """What `expected_statistics` gives of a view."""
 
 
-def expected_statistics(sums: Tensor, visible: Tensor) -> Tensor:
+def expected_statistics(sums: Tensor, n_visible: Tensor) -> Tensor:
     """`EXPECTED`, (B, len(EXPECTED)), of views by sums of `expected_parts` (B, N_EXPECTED), and landmarks seen (B,)."""
     inliers, moments = sums[:, 0], sums[:, 16:] / (sums[:, :1] + 1e-6)
     # in double precision: the covariance is an inverse
@@ -151,7 +151,7 @@ def expected_statistics(sums: Tensor, visible: Tensor) -> Tensor:
     log_det = 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
     across, down = moments[:, 0], moments[:, 1]
     spread = (moments[:, 2] - across**2) * (moments[:, 4] - down**2) - (moments[:, 3] - across * down) ** 2
-    counts = torch.stack([inliers.log1p(), visible.float().log1p(), inliers / visible.clamp(min=1)], 1)
+    counts = torch.stack([inliers.log1p(), n_visible.float().log1p(), inliers / n_visible.clamp(min=1)], 1)
     position, orientation = variances[:, :3].sum(1).log(), variances[:, 3:].sum(1).log()
     of_pose = torch.stack([position, orientation, log_det], 1).float()
     return torch.cat([counts, of_pose, variances[:, :3].log().float(), (spread.clamp(min=0) + 1e-4).log()[:, None]], 1)

@@ -34,9 +34,9 @@ class SetScorer(Scorer):
         """(B,) probabilities in [0, 1]."""
         cam_from_world = check_poses(cam_from_world)
         scores = np.empty(len(cam_from_world))
-        for rows, described, visible in self._describer.in_blocks(cam_from_world, MOST):
+        for rows, described, n_visible in self._describer.in_blocks(cam_from_world, MOST):
             height = torch.from_numpy(cam_from_world[rows, 2, 2]).to(described.values)
             with torch.inference_mode():
-                logits = self.network.score(described, visible, height).double()
+                logits = self.network.score(described, n_visible, height).double()
                 scores[rows] = self.trained.calibrated(logits).sigmoid().cpu().numpy()
         return scores

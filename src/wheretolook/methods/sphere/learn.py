@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from wheretolook.learning.data import check_classes, training_scenes, validation_views
+from wheretolook.learning.data import check_classes, validation_views
 from wheretolook.learning.fit import home_device
 from wheretolook.learning.learner import Learnt, Task, class_counts, fit_network, fit_platt, predict
+from wheretolook.learning.scenes import training_scenes
 from wheretolook.learning.trained_network import TrainedNetwork
 from wheretolook.methods.sphere.network import SphereNetwork
 from wheretolook.methods.sphere.views import SphereDataModule, load_sphere_views

@@ -23,7 +23,7 @@ def _build(localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
 METHODS = (
     Method(
         name="trees",
-        about="Boosted trees on where the visible landmarks lie and how they were mapped: the probability that a view "
+        about="Boosted trees on where the landmarks in view lie and how they were mapped: the probability that a view "
         "localizes.",
         style=MethodStyle("boosted trees, landmark attributes", "#882255", "*", "-"),
         group="learned",

@@ -1,4 +1,4 @@
-"""Boosted trees on pooled statistics of the visible landmarks: the strong simple learner."""
+"""Boosted trees on pooled statistics of the landmarks in view: the strong simple learner."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ from tqdm.auto import tqdm
 from wheretolook.dataset.folders import Dataset, SceneFolder, views_by_camera
 from wheretolook.geometry.camera import Camera, camera_of_record
 from wheretolook.inputs.landmarks_in_view import POOLED, LandmarkDescriber, pool
-from wheretolook.learning.data import check_classes, labelled_rows, training_scenes, validation_views
+from wheretolook.learning.data import check_classes, labelled_rows, validation_views
 from wheretolook.learning.fit import home_device
 from wheretolook.learning.learner import Learnt, Task, class_counts, fit_platt
+from wheretolook.learning.scenes import training_scenes
 from wheretolook.learning.weights import check_serves, read_weights, write_weights
 from wheretolook.methods.trees.config import TreesConfig
 from wheretolook.utils.errors import ConfigError, WeightsError

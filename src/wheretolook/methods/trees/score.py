@@ -12,8 +12,8 @@ from wheretolook.methods.trees.learn import BoostedTrees
 
 
 class TreesScorer(Scorer):
-    """Boosted trees on where the visible landmarks lie and how they were mapped: the probability that
-    a view localizes.
+    """Boosted trees on where the landmarks in view lie and how they were mapped: the probability that a view
+    localizes.
     """
 
     name = "trees"

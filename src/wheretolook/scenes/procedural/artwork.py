@@ -117,7 +117,7 @@ def picture(rng: np.random.Generator, mat: float = 0.0) -> Material:
     def paint(canvas: Canvas) -> Image:
         local = np.random.default_rng(seed)
         image = (_landscape, _abstract, _geometric, _poster)[kind](canvas, local, colours)
-        border = round(mat * canvas.width)
+        border = min(round(mat * canvas.width), canvas.height // 2)
         if border:
             bare = image[border:-border, border:-border]
             image = np.pad(bare, ((border, border), (border, border), (0, 0)), constant_values=0.93)

@@ -107,22 +107,36 @@ def paint_charts(plan: AtlasPlan, noise: NoiseBank) -> list[Image]:
 
 
 def repeat_patterns(
-    plan: AtlasPlan, painted: Sequence[Image], share: float, rng: np.random.Generator, noise: NoiseBank
+    plan: AtlasPlan,
+    painted: Sequence[Image],
+    share: float,
+    rng: np.random.Generator,
+    noise: NoiseBank,
+    periods_m: tuple[float, float] = (0.6, 2.0),
+    alike: bool = False,
 ) -> list[Image]:
     """Albedo of each chart (height, width, 3), where a share (0 to 1) of the large surfaces repeats a pattern.
 
+    `periods_m` are the least and the greatest side of a pattern. If `alike`, surfaces of one material and size get the
+    same one.
+
     As in games, they have many features that look alike: the mean of the pattern and of what was painted, repeated too.
     """
-    periods_m = rng.uniform(0.6, 2.0, PATTERNS)
+    sides_m = rng.uniform(*periods_m, PATTERNS)
     materials = [artwork.picture(rng) for _ in range(PATTERNS)]
     tiles: dict[tuple[int, float], Image] = {}
+    chosen: dict[tuple[int, int, int], int] = {}
     covered = list(painted)
     for number, (chart, image) in enumerate(zip(plan.charts, painted, strict=True)):
         unfit = chart.material.shared or chart.material.emissive
-        if unfit or min(chart.width, chart.height) < LEAST_M * chart.texels_per_m or rng.random() >= share:
+        if unfit or min(chart.width, chart.height) < LEAST_M * chart.texels_per_m:
             continue
-        which = int(rng.integers(PATTERNS))
-        side = max(1, round(periods_m[which] * chart.texels_per_m))
+        which = int(rng.integers(PATTERNS)) if rng.random() < share else -1
+        if alike:
+            which = chosen.setdefault((id(chart.material), chart.width, chart.height), which)
+        if which < 0:
+            continue
+        side = max(1, round(sides_m[which] * chart.texels_per_m))
         key = (which, chart.texels_per_m)
         if key not in tiles:
             canvas = Canvas(side, side, chart.texels_per_m, 0.0, 0.0, noise)

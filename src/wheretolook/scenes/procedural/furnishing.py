@@ -17,21 +17,24 @@ from wheretolook.scenes.procedural.style import Style
 
 def furnish(style: Style, plan: Plan) -> tuple[list[Patch], list[Lamp]]:
     """Everything in the rooms of a plan, and the lamps that are lit. The front door is in the hall if there is one."""
+    layouts = arrange(style, plan)
+    patches = [patch for layout in layouts for patch in layout.placed(plan.height)]
+    return patches, [lamp for layout in layouts for lamp in layout.lamps]
+
+
+def arrange(style: Style, plan: Plan) -> list[Layout]:
+    """What stands and hangs in each room of a plan; see `furnish`."""
     furnisher = Furnisher(style, plan)
     entrance = min(plan.rooms, key=lambda room: {"hall": 0, "living": 1}.get(room.kind, 2))
-    patches: list[Patch] = []
-    lamps: list[Lamp] = []
+    layouts = []
     for room in plan.rooms:
         layout = Layout(room, style.rng)
         if room is entrance:
             furnisher.front_door(layout)
         furnisher.fill(layout)
         dress(style, layout, plan.height)
-        # leaves and coats stop just short of the walls
-        low, high = [room.x0 + 0.002, room.y0 + 0.002, 0], [room.x1 - 0.002, room.y1 - 0.002, plan.height]
-        patches += [replace(p, room=room.index, positions=np.clip(p.positions, low, high)) for p in layout.patches]
-        lamps += layout.lamps
-    return patches, lamps
+        layouts.append(layout)
+    return layouts
 
 
 class Furnisher:

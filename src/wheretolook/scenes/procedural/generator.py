@@ -1,18 +1,24 @@
-"""The default scene, which needs no download: a furnished apartment, generated from a seed."""
+"""Scenes generated from a seed, which need no download: the default, a furnished apartment, and other kinds."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wheretolook.geometry.mesh import TexturedMesh
-from wheretolook.scenes.config import ApartmentConfig
+from wheretolook.scenes.config import ApartmentConfig, SceneKind
 from wheretolook.scenes.procedural import atlas, lighting
+from wheretolook.scenes.procedural.building import building
+from wheretolook.scenes.procedural.court import court
 from wheretolook.scenes.procedural.furnishing import furnish
-from wheretolook.scenes.procedural.layout import Lamp
+from wheretolook.scenes.procedural.hall import hall
+from wheretolook.scenes.procedural.large import Furnished
+from wheretolook.scenes.procedural.layout import Lamp, Rectangle
 from wheretolook.scenes.procedural.materials import NoiseBank
+from wheretolook.scenes.procedural.office import office
 from wheretolook.scenes.procedural.patches import Patch, join
 from wheretolook.scenes.procedural.plan import Plan, draw_plan
 from wheretolook.scenes.procedural.shell import build_shell
@@ -41,19 +47,44 @@ def generate_apartment(config: ApartmentConfig, seed: int, device: str = "cpu") 
     """
     config = config.of_seed(seed)
     floor_plan, patches, lamps, rng = furnish_apartment(config, seed)
+    panes = [p for p in patches if p.material.emissive and p.material.casts_shadow]
+    windows = [(pane, floor_plan.rooms[pane.room].curtains_closed) for pane in panes]
+    return paint(Furnished(patches, lamps, windows, rng), config, seed, device)
+
+
+def generate_scene(
+    kind: SceneKind, config: ApartmentConfig, seed: int, device: str = "cpu"
+) -> tuple[TexturedMesh, tuple[Rectangle, ...]]:
+    """A scene of a kind, as `generate_apartment` makes them, and the floor that its map is to be made from.
+
+    The floor is a tuple of rectangles (x0, y0, x1, y1) in metres, empty where the whole scene is to be mapped. All
+    kinds but apartments draw their size and difficulty from the seed, as apartments do that `vary`.
+    """
+    if kind == "apartment":
+        return generate_apartment(config, seed, device), ()
+    config = replace(replace(config, vary=True).of_seed(seed), enlarged=1.0)
+    furnished = {"hall": hall, "court": court, "office": office, "building": building}[kind](config, seed)
+    # Light is computed more coarsely, as these scenes may have ten times the surface of an apartment.
+    config = replace(config, light_spacing_m=max(config.light_spacing_m, furnished.light_spacing_m))
+    return paint(furnished, config, seed, device), furnished.mapped
+
+
+def paint(furnished: Furnished, config: ApartmentConfig, seed: int, device: str = "cpu") -> TexturedMesh:
+    """The mesh of a furnished scene: its surfaces painted and lit."""
+    patches, rng = furnished.patches, furnished.rng
     surface = join(patches)
     plan = atlas.plan_atlas(patches, config.texels_per_m, config.texture_size)
     noise = NoiseBank(rng)
     painted = atlas.paint_charts(plan, noise)
-    if config.repetition:
-        painted = atlas.repeat_patterns(plan, painted, config.repetition, np.random.default_rng([seed, 1]), noise)
+    if config.repetition and furnished.periods_m:
+        patterns = np.random.default_rng([seed, 1]), noise, furnished.periods_m, furnished.alike
+        painted = atlas.repeat_patterns(plan, painted, config.repetition, *patterns)
     mean_colour = np.array([image[::2, ::2].mean((0, 1)) for image in painted])
     albedo = np.clip(mean_colour[plan.patch_chart], 0, 1) ** 2.2
 
     samples = lighting.place_samples(patches, config.light_spacing_m)
-    panes = [p for p in patches if p.material.emissive and p.material.casts_shadow]
-    windows = [(pane, floor_plan.rooms[pane.room].curtains_closed) for pane in panes]
-    light = lighting.bake(patches, surface, samples, albedo, windows, lamps, device=device, rays=config.light_rays)
+    lights = furnished.windows, furnished.lamps
+    light = lighting.bake(patches, surface, samples, albedo, *lights, device=device, rays=config.light_rays)
     chart, factors = _light_charts(plan, patches, samples, light)
     size = np.array([(c.width, c.height) for c in plan.charts], float)[chart]
     texels = plan.corners[chart].astype(float)[surface.patch][:, None] + surface.st * size[surface.patch][:, None]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy import ndimage
@@ -62,7 +62,7 @@ class Layout:
         for side in range(4):
             for o in self.room.openings[side]:
                 if o.kind == "window":
-                    bare = self.room.kind in ("bathroom", "kitchen")
+                    bare = self.room.kind in ("bathroom", "kitchen", "large")
                     edge, low = (0.08, o.z0 - 0.05) if bare else (0.48, 0.0)
                     self.on_wall[side].append((o.a0 - edge, o.a1 + edge, low, o.z1 + 0.3))
                 else:
@@ -166,6 +166,12 @@ class Layout:
     def put_on_wall(self, side: int, at: float, patches: list[Patch]) -> None:
         """Put patches of the furniture frame against a wall, with x = 0 at a wall coordinate."""
         self.patches += wall_items(self.room, side, at, patches)
+
+    def placed(self, height: float) -> list[Patch]:
+        """All patches, cut off just short of the walls, as leaves and coats reach into them; below the ceiling."""
+        room = self.room
+        low, high = [room.x0 + 0.002, room.y0 + 0.002, 0], [room.x1 - 0.002, room.y1 - 0.002, height]
+        return [replace(p, room=room.index, positions=np.clip(p.positions, low, high)) for p in self.patches]
 
     def add_lamp(self, x: float, y: float, height: float, strength: float) -> None:
         """Light a lamp with the colour of a light bulb at a world position."""

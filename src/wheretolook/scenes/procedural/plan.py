@@ -39,7 +39,7 @@ class Room:
     y0: float  # south wall
     x1: float  # east wall
     y1: float  # north wall
-    kind: str = ""  # `living`, `kitchen`, `bedroom`, `bathroom`, `hall` or `study`
+    kind: str = ""  # `living`, `kitchen`, `bedroom`, `bathroom`, `hall`, `study` or `large`
     openings: list[list[Opening]] = field(default_factory=lambda: [[], [], [], []])  # of south, east, north, west
     lamp_on: bool = True  # on the ceiling
     curtains_closed: bool = False
@@ -210,7 +210,8 @@ def outside_spans(room: Room, rooms: list[Room], side: int) -> list[tuple[float,
     return [f for f in free if f[1] - f[0] > 0.9]
 
 
-def _add_windows(rng: np.random.Generator, rooms: list[Room]) -> None:
+def draw_windows(rng: np.random.Generator, rooms: list[Room]) -> None:
+    """Give each room but halls a window or two in the outer walls that have most space."""
     for room in (room for room in rooms if room.kind != "hall"):
         spans = [(high - low, side, low, high) for side in range(4) for low, high in outside_spans(room, rooms, side)]
         for span, side, low, high in sorted(spans, reverse=True)[: 2 if room.kind == "living" else 1]:
@@ -244,7 +245,7 @@ def draw_plan(rng: np.random.Generator, n_rooms: int, area_m2: float, dark_rooms
         if doors is None:
             continue
         _add_doors(rng, rooms, doors, height)
-        _add_windows(rng, rooms)
+        draw_windows(rng, rooms)
         for index in rng.permutation(n_rooms)[: round(dark_rooms * n_rooms)]:
             rooms[index].lamp_on = False
             rooms[index].curtains_closed = bool(rooms[index].kind != "kitchen" and rng.random() < 0.5)

@@ -93,7 +93,7 @@ def wall_items(room: Room, side: int, at: float, patches: list[Patch]) -> list[P
     return [replace(p, room=room.index) for p in move(patches, rotation=rotation, shift=corner + at * right)]
 
 
-def _reveal(depth: float, o: Opening, material: Material, sill: Material | None) -> list[Patch]:
+def reveal(depth: float, o: Opening, material: Material, sill: Material | None) -> list[Patch]:
     """Inner faces of an opening, in the furniture frame around its middle."""
     w = (o.a1 - o.a0) / 2
     patches = [
@@ -118,7 +118,7 @@ def _architrave(style: Style, o: Opening) -> list[Patch]:
 def _window(style: Style, room: Room, o: Opening, height: float, cloth: Material) -> list[Patch]:
     """Pane that shows the view, frame, sill and, except in bathrooms and kitchens, curtains."""
     w, y, bar, frame = (o.a1 - o.a0) / 2, -REVEAL_M, 0.05, style.trim
-    patches = _reveal(REVEAL_M, o, frame, frame)
+    patches = reveal(REVEAL_M, o, frame, frame)
     patches.append(plane((w, y, o.z1), (-2 * w, 0, 0), (0, 0, o.z0 - o.z1), artwork.view(style.rng), density=0.9))
     for z0, z1 in ((o.z0, o.z0 + bar), (o.z1 - bar, o.z1)):
         patches += box((-w, y + 0.004, z0), (w, y + bar, z1), frame, hidden=("back",))
@@ -126,7 +126,7 @@ def _window(style: Style, room: Room, o: Opening, height: float, cloth: Material
         low, high = (x - bar / 2, y + 0.004, o.z0 + bar), (x + bar / 2, y + bar, o.z1 - bar)
         patches += box(low, high, frame, hidden=("back",))
     patches += box((-w - 0.04, -0.02, o.z0 - 0.03), (w + 0.04, 0.05, o.z0 + 0.004), frame, hidden=("back",))
-    if room.kind in ("bathroom", "kitchen"):
+    if room.kind in ("bathroom", "kitchen", "large"):
         return patches
     top = min(o.z1 + 0.18, height - 0.05)
     patches += tube([(-w - 0.35, 0.1, top + 0.015), (w + 0.35, 0.1, top + 0.015)], 0.012, style.metal, sides=10)
@@ -136,9 +136,12 @@ def _window(style: Style, room: Room, o: Opening, height: float, cloth: Material
     return patches
 
 
-def build_shell(style: Style, plan: Plan) -> list[Patch]:
-    """All surfaces of the empty apartment."""
-    finishes = [choose_finish(style, room) for room in plan.rooms]
+def build_shell(style: Style, plan: Plan, finishes: list[Finish] | None = None, open_air: bool = False) -> list[Patch]:
+    """All surfaces of the empty apartment; without finishes, one is chosen for each room.
+
+    In the `open_air`, there are no ceilings, and what fills the windows is left to others.
+    """
+    finishes = finishes or [choose_finish(style, room) for room in plan.rooms]
     patches: list[Patch] = []
     if style.chance(0.25 + 0.4 * style.richness):
         cloth = style.patterned()
@@ -148,20 +151,21 @@ def build_shell(style: Style, plan: Plan) -> list[Patch]:
         x0, y0, y1, right = room.x0, room.y0, room.y1, (room.width, 0, 0)
         up, down, offset = (0, -room.depth, 0), (0, room.depth, 0), (x0 + 20, 20 - y1)
         patches.append(plane((x0, y1, 0), right, up, finish.floor, room=room.index, offset_m=offset))
-        patches.append(plane((x0, y0, plan.height), right, down, finish.ceiling, room=room.index, density=0.7))
+        if not open_air:
+            patches.append(plane((x0, y0, plan.height), right, down, finish.ceiling, room=room.index, density=0.7))
         for side in range(4):
             patches.append(_wall(room, side, plan.height, finish.walls[side]))
             if room.kind != "bathroom":
                 patches += _skirting(style, room, side)
             for o in room.openings[side]:
                 parts: list[Patch] = []
-                if o.kind == "window":
+                if o.kind == "window" and not open_air:
                     parts = _window(style, room, o, plan.height, cloth)
                 if o.kind == "door":
                     parts = _architrave(style, o)
                 if o.kind != "window" and o.owner:
                     jamb = style.trim if o.kind == "door" else finish.walls[side]
-                    parts += _reveal(INNER_WALL_M, o, jamb, style.second_wood)
+                    parts += reveal(INNER_WALL_M, o, jamb, style.second_wood)
                 patches += wall_items(room, side, (o.a0 + o.a1) / 2, parts)
     return patches
 

@@ -37,6 +37,7 @@ def make_landmarks(rng: np.random.Generator, n: int) -> Landmarks:
         "mapping_distance_m": rng.uniform(1, 4, n).astype(np.float32),
         "ambiguity": rng.random(n).astype(np.float32),
         "mapping_distance_spread": np.linspace(0, 0.5, n, dtype=np.float32),
+        "mapping_focal_px": np.linspace(60, 120, n, dtype=np.float32),
     }
     return Landmarks(ids=np.arange(n, dtype=np.int64), points=points, descriptors=None, **values)
 
@@ -52,7 +53,7 @@ def make_scene(
 ) -> SceneFolder:
     """Write one labelled scene. The errors fall with the number of filled bins, the median view just localizes."""
     rng = np.random.default_rng(seed)
-    scene = SceneFolder(folder, split)
+    scene = SceneFolder(folder, split, CAMERA)
     scene.map.mkdir(parents=True)
     landmarks = make_landmarks(rng, n_landmarks)
     landmarks.save(scene.landmarks)
@@ -92,6 +93,6 @@ def make_scene(
 def make_dataset(root: Path, splits: tuple[Split, ...] = ("train", "train", "test"), **options: int) -> Dataset:
     """Write a dataset with one scene for each split named."""
     scenes = [make_scene(root / f"scene-{index}", split, seed=index, **options) for index, split in enumerate(splits)]
-    dataset = Dataset(root, CAMERA, tuple(scenes))
+    dataset = Dataset(root, tuple(scenes))
     dataset.save()
     return dataset

@@ -58,7 +58,7 @@ def test_meshes_of_ones_own(tmp_path: Path) -> None:
         (["scenes", "--device", "gpu"], "unknown device (got 'gpu')"),
         (["map", "--config"], "--config"),
         (["map", "--map.n_images", "many"], "many"),
-        (["scenes", "--camera.width", "0"], "positive width"),
+        (["scenes", "--camera.width", "0"], "positive image size"),
         (["sample", "--sample.lattice", "spiral"], "spiral"),
         (["scenes", "--config", str(CONFIGS / "own-meshes.yaml")], "needs scenes"),
     ],

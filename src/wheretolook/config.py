@@ -10,7 +10,7 @@ from typing import Literal, get_args
 
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.figures.config import FiguresConfig
-from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.camera import CameraConfig
 from wheretolook.labelling.config import LabelConfig
 from wheretolook.mapping.config import MapConfig
 from wheretolook.methods.train_config import MOVED as MOVED_TRAIN_OPTIONS
@@ -111,7 +111,7 @@ class Experiment:
         data: folder of all datasets.
         release_name: folder of the dataset's release.
         device: where to compute: auto, cpu, cuda, or cuda:<index>.
-        camera: the camera that will look, and with which the map's images are rendered.
+        camera: the camera that will look, and that maps unless `map.camera` names another.
         scenes: stage 1, meshes.
         map: stage 2, COLMAP maps, of meshes or of photographs.
         occlusion: how stage 3 finds out which landmarks are unoccluded. Stage 6 takes the settings of occlusion models,
@@ -131,7 +131,7 @@ class Experiment:
     data: Path = Path("data")
     release_name: str = "release"
     device: str = "auto"
-    camera: PinholeCamera = field(default_factory=PinholeCamera)
+    camera: CameraConfig = field(default_factory=CameraConfig)
     scenes: ScenesConfig = field(default_factory=ScenesConfig)
     map: MapConfig = field(default_factory=MapConfig)
     occlusion: OcclusionConfig = field(default_factory=OcclusionConfig)

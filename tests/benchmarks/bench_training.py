@@ -140,7 +140,7 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
     views = random_views(args.views + args.val_views, device if args.devices == 1 else "cpu", options.bins)
     made = now(device)
     with tempfile.TemporaryDirectory() as folder:
-        data = ViewpointDataModule(Dataset(folder, CAMERA, ()), config, options, device=device, progress=False)
+        data = ViewpointDataModule(Dataset(folder, ()), config, options, device=device, progress=False)
         data.use(views, np.arange(len(views)) >= args.views)
         data.channels = PAPER_VARIANTS[args.variant]
         split = now(device)

@@ -98,7 +98,7 @@ def seeds(dataset: Dataset, args: argparse.Namespace, tracking: TrackingConfig) 
         for method in args.methods:
             if table.has(method=method, seed=seed):
                 continue
-            own = Dataset(args.out / f"{method}-{seed}", dataset.camera, dataset.scenes)
+            own = Dataset(args.out / f"{method}-{seed}", dataset.scenes)
             start = weights_path(dataset, "matchability")
             if start.is_file():
                 (own.root / "weights").mkdir(parents=True, exist_ok=True)
@@ -168,7 +168,7 @@ def main() -> None:
     parser.add_argument("--progress", action="store_true")
     args = parser.parse_args()
     whole = with_also(Dataset.load(args.data / args.dataset), args.also)
-    dataset = Dataset(whole.root, whole.camera, (*whole.split("train"), *whole.split("val")))
+    dataset = Dataset(whole.root, (*whole.split("train"), *whole.split("val")))
     part = seeds if args.part == "seeds" else of_set_network
     part(dataset, args, TrackingConfig(folder=str(args.out / "mlruns"), experiment="study"))
 

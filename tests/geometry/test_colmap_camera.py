@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
+from wheretolook.geometry.camera import ColmapCamera, PinholeCamera, cameras_of_map, only_camera
 from wheretolook.utils.errors import ConfigError, MapError
 
 
@@ -63,15 +63,19 @@ def test_the_camera_of_a_map(tmp_path: Path) -> None:
     import pycolmap
 
     model = pycolmap.Reconstruction()
-    model.add_camera(pycolmap.Camera(model="RADIAL", width=640, height=480, params=[1, 2, 3, 4, 5], camera_id=1))
+    model.add_camera(
+        pycolmap.Camera(model="RADIAL", width=640, height=480, params=[500, 320, 240, 0.1, 0.01], camera_id=1)
+    )
     model.write(tmp_path)
-    assert ColmapCamera.of_map(tmp_path) == ColmapCamera("RADIAL", 640, 480, (1.0, 2.0, 3.0, 4.0, 5.0))
-    model.add_camera(pycolmap.Camera(model="SIMPLE_PINHOLE", width=64, height=48, params=[1, 2, 3], camera_id=2))
+    camera = ColmapCamera("RADIAL", 640, 480, (500.0, 320.0, 240.0, 0.1, 0.01))
+    assert only_camera(cameras_of_map(tmp_path), tmp_path) == camera
+    model.add_camera(pycolmap.Camera(model="SIMPLE_PINHOLE", width=64, height=48, params=[50, 32, 24], camera_id=2))
     model.write(tmp_path)
-    with pytest.raises(MapError, match="2"):
-        ColmapCamera.of_map(tmp_path)
+    assert cameras_of_map(tmp_path) == {1: camera, 2: PinholeCamera(64, 48, 50.0)}
+    with pytest.raises(MapError, match=r"2: 64 x 48 px, 65\.2 x 51\.3 degrees"):
+        only_camera(cameras_of_map(tmp_path), tmp_path)
     with pytest.raises(MapError, match="nowhere"):
-        ColmapCamera.of_map(tmp_path / "nowhere")
+        cameras_of_map(tmp_path / "nowhere")
 
 
 def test_unknown_models_and_wrong_parameters_are_named() -> None:

@@ -142,7 +142,7 @@ def test_input_sizes_are_those_of_the_variants(random_views: RandomViews) -> Non
     binned = bin_views(PosedViews(v.camera, v.cam_from_world, v.points, v.visible, v.location_rows))
     sizes = {name: binned.select(channels).means[0].size for name, channels in PAPER_VARIANTS.items()}
     assert sizes == {"2d": 1800, "2d+z": 2700, "2d+3d": 4500}
-    assert len(ALL_CHANNELS) * 900 == 12600
+    assert len(ALL_CHANNELS) * 900 == 13500
     np.testing.assert_array_equal(binned.select(("z",)).means[:, 0], binned.means[:, CHANNELS.index("z")])
     with pytest.raises(ConfigError, match="unknown input channel"):
         binned.select(("u", "colour"))

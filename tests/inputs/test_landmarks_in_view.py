@@ -55,6 +55,9 @@ def test_each_landmark_by_hand(localization_map: LocalizationMap) -> None:
             "distance": np.log(distance),
             "mapped_angle": (ray * m.mapping_direction[rows]).sum(1) / distance,
             "distance_ratio": np.log(distance / m.mapping_distance_m[rows]),
+            "pixel_angle": np.full(len(rows), -np.log(localization_map.camera.mean_focal_px)),
+            "pixel_size_ratio": np.log(distance / localization_map.camera.mean_focal_px)
+            - np.log(m.mapping_distance_m[rows] / m.mapping_focal_px[rows]),
             "track_length": np.log(m.track_length[rows]),
             "reprojection_error": m.reprojection_error_px[rows],
             "triangulation_angle": np.log(m.triangulation_angle_deg[rows]),
@@ -62,6 +65,7 @@ def test_each_landmark_by_hand(localization_map: LocalizationMap) -> None:
             "ambiguity": m.ambiguity[rows],
             "mapped_distance": np.log(m.mapping_distance_m[rows]),
             "distance_spread": m.mapping_distance_spread[rows],
+            "mapped_pixel_size": np.log(m.mapping_distance_m[rows] / m.mapping_focal_px[rows]),
         }
         assert tuple(expected) == ATTRIBUTES == POSE_ATTRIBUTES + MAP_ATTRIBUTES
         found = described.values[described.starts[view] : described.starts[view + 1]].cpu()

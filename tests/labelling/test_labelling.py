@@ -7,11 +7,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from labelling.rooms import CAMERA, PLAIN, POSTER, MappedRoom, facing, map_room
 from one_scene import label_viewpoints
 from wheretolook.features.keypoints import Keypoints
+from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import pose_error, transform
 from wheretolook.labelling.config import LabelConfig, LocalizerConfig
 from wheretolook.labelling.localizer import Localizer
@@ -87,6 +89,44 @@ def test_a_pose_is_found_where_seven_matches_in_eight_are_wrong(room: MappedRoom
     np.testing.assert_array_equal(found.cam_from_world, again.cam_from_world)
     strict = Localizer(landmarks, CAMERA, LocalizerConfig(min_inliers=len(found.inlier_rows) + 1))
     assert strict.estimate(keypoints, *matches).status == NO_POSE
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        PinholeCamera(640, 480, 300.0, 320.0, (310.0, 250.0)),
+        ColmapCamera("OPENCV", 640, 480, (300.0, 305.0, 320.0, 240.0, -0.1, 0.02, 0.001, -0.002)),
+        ColmapCamera("OPENCV_FISHEYE", 640, 480, (220.0, 221.0, 318.0, 242.0, 0.01, -0.002, 0.0, 0.0)),
+        ColmapCamera("SIMPLE_RADIAL_FISHEYE", 640, 480, (220.0, 318.0, 242.0, 0.01)),
+        ColmapCamera("FOV", 640, 480, (300.0, 300.0, 320.0, 240.0, 0.9)),
+    ],
+    ids=lambda camera: getattr(camera, "model", "pinhole"),
+)
+def test_a_pose_is_found_with_every_camera(room: MappedRoom, camera: Camera) -> None:
+    """Half of the matches are wrong."""
+    landmarks, (pose,) = Landmarks.load(room.landmarks), poses(facing(POSTER, 1, distance_m=1.5))
+    pixels = camera.project(transform(pose[None], landmarks.points)[0])
+    rows = np.flatnonzero(camera.in_image(pixels) & (transform(pose[None], landmarks.points)[0][:, 2] > 0))[:300]
+    found = pixels[rows] + np.random.default_rng(0).normal(0, 0.3, (len(rows), 2))
+    matched = rows.copy()
+    matched[::2] = np.roll(matched[::2], 7)
+    keypoints = Keypoints(found.astype(np.float32), np.zeros((len(rows), 128), np.float32))
+    estimate = Localizer(landmarks, CAMERA).estimate(keypoints, np.arange(len(rows)), matched, camera)
+    assert estimate.cam_from_world is not None and estimate.status == LOCALIZED
+    (error_m,), (error_deg,) = pose_error(estimate.cam_from_world[None], pose[None])
+    assert error_m < 0.02 and error_deg < 0.3 and len(estimate.inlier_rows) >= 0.4 * len(rows)
+
+
+def test_views_of_several_cameras_are_labelled_as_each_alone(room: MappedRoom) -> None:
+    cameras = {4: CAMERA, 9: PinholeCamera(240, 320, 200.0, center_px=(118.0, 166.0))}
+    table = facing(POSTER, 8, distance_m=1.5).assign(camera_id=np.array([4, 9, 9, 4, 4, 4, 9, 4], np.int32))
+    renderer, localizer = WarpRenderer(load_mesh(room.mesh)), Localizer(Landmarks.load(room.landmarks), CAMERA)
+    labelled = label_rows(table, renderer, localizer, cameras)
+    assert is_good(labelled).all() and labelled["viewpoint_id"].equals(table["viewpoint_id"])
+    for number, camera in cameras.items():
+        rows = table["camera_id"] == number
+        alone = label_rows(table[rows], renderer, Localizer(localizer.landmarks, camera), camera)
+        pd.testing.assert_frame_equal(labelled[rows], alone)
 
 
 def test_matches_with_one_landmark_determine_no_pose(room: MappedRoom) -> None:

@@ -80,9 +80,9 @@ def test_only_labels_of_the_outcome_are_learnt_from(tmp_path: Path, tracking: Tr
 def test_what_is_known_of_a_landmark_comes_from_map_and_pose() -> None:
     of_map = {
         "track_length", "reprojection_error", "triangulation_angle", "direction_spread", "ambiguity",
-        "mapped_distance", "distance_spread",
+        "mapped_distance", "distance_spread", "mapped_pixel_size",
     }  # fmt: skip
-    of_pose = {"across", "down", "distance", "mapped_angle", "distance_ratio"}
+    of_pose = {"across", "down", "distance", "mapped_angle", "distance_ratio", "pixel_angle", "pixel_size_ratio"}
     assert set(MAP_ATTRIBUTES) == of_map and set(ATTRIBUTES) == of_map | of_pose
     assert {name.rsplit("_", 1)[0] for name in POOLED[5:]} == set(ATTRIBUTES)
     # a describer is built of a map, and asked about poses and what is visible: there is no way in for anything else

@@ -46,7 +46,7 @@ def test_a_model_tells_the_poses_where_there_is_no_file(scene: SceneFolder) -> N
 
 
 def test_the_file_leaves_a_datasets_fingerprint_alone(scene: SceneFolder) -> None:
-    dataset = Dataset(scene.folder.parent, CAMERA, (scene,))
+    dataset = Dataset(scene.folder.parent, (scene,))
     before = dataset.fingerprint()
     scene.mapping_cameras.unlink()
     assert dataset.fingerprint() == before  # weights trained before there was such a file stay valid

@@ -233,7 +233,7 @@ def test_photographs_do_not_join_scenes_with_meshes(photographs: Path, tmp_path:
     scene = tmp_path / "mixed" / "apartment-000"
     scene.mkdir(parents=True)
     (scene / "mesh.glb").write_bytes(b"")
-    Dataset(tmp_path / "mixed", experiment.camera, (SceneFolder(scene, "train"),)).save()
+    Dataset(tmp_path / "mixed", (SceneFolder(scene, "train"),)).save()
     with pytest.raises(ConfigError, match="dataset of their own: --name"):
         stages.make_maps(experiment)
 

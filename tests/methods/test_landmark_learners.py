@@ -235,7 +235,7 @@ def test_enlarged_views_are_those_of_an_enlarged_scene(dataset: Dataset) -> None
     views = replace(views, axis_height=torch.arange(len(views)).float())  # tells who is who
     rows = torch.arange(len(views))
     plain, large = (next(iter(LandmarkLoader(views, rows, len(rows), 8, 3, enlarged=by))) for by in (1.0, 4.0))
-    changed = [DISTANCE, ATTRIBUTES.index("mapped_distance")]
+    changed = [DISTANCE, *(ATTRIBUTES.index(name) for name in ("mapped_distance", "mapped_pixel_size"))]
     same = [at for at in range(len(ATTRIBUTES)) if at not in changed]
     torch.testing.assert_close(large.inputs[0][..., same], plain.inputs[0][..., same], equal_nan=True)
     growth = (large.inputs[0] - plain.inputs[0])[..., changed]
@@ -268,8 +268,9 @@ def test_landmarks_of_enlarged_views() -> None:
     (plain,), (large,) = (list(LandmarkBatches(values, found, rows, 500, 1, enlarged=by)) for by in (1.0, 2.0))
     growth = large.inputs[0] - plain.inputs[0]
     assert torch.equal(large.labels, plain.labels) and 0.6 < float(growth.max()) <= np.log(2) + 1e-5
-    assert torch.allclose(growth[:, DISTANCE], growth[:, ATTRIBUTES.index("mapped_distance")], atol=1e-5)
-    growth[:, [DISTANCE, ATTRIBUTES.index("mapped_distance")]] = 0
+    mapped = [ATTRIBUTES.index(name) for name in ("mapped_distance", "mapped_pixel_size")]
+    assert torch.allclose(growth[:, [DISTANCE] * 2], growth[:, mapped], atol=1e-5)
+    growth[:, [DISTANCE, *mapped]] = 0
     assert not growth.any()
 
 
@@ -430,9 +431,8 @@ def test_scores_of_a_set_network(dataset: Dataset, trained: dict[str, Path]) -> 
     order = np.random.default_rng(0).permutation(len(views))
     np.testing.assert_allclose(scorer.score(views[order]), scores[order], rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(scorer.score(views[7:8]), scores[7:8], rtol=1e-4, atol=1e-6)
-    narrow = LocalizationMap(localization_map.landmarks, replace(CAMERA, focal_px=2 * CAMERA.focal_px))
-    with pytest.raises(WeightsError, match="trained for a camera"):
-        load_scorer(trained["set"], narrow)
+    narrow = localization_map.of_camera(replace(CAMERA, focal_px=2 * CAMERA.focal_px))  # it serves every camera
+    assert load_scorer(trained["set"], narrow).score(views).mean() < scores.mean()
     with pytest.raises(WeightsError, match="not of a scorer"):
         load_scorer(trained["matchability"], localization_map)
 

@@ -170,7 +170,7 @@ def test_unusable_weights_are_named(views: tuple[torch.Tensor, torch.Tensor], tm
         ({"hidden": [9, 9]}, "do not fit the network"),
         ({"statistics": {"channels": ["w"], "mean": [0], "std": [1]}}, "unknown channel of the bins.*'w'"),
         ({"method": "set"}, "not of mlp"),
-        ({"camera": {"width": 0}}, "camera needs a positive width"),
+        ({"camera": {"width": 0}}, "camera needs a positive image size"),
     ):
         save_file(tensors, other, metadata={METADATA_KEY: json.dumps({**header, **change})})
         with pytest.raises(WeightsError, match=message):

@@ -69,7 +69,7 @@ def some_trees(localization_map: LocalizationMap) -> BoostedTrees:
 def some_convolutions() -> ConvNetwork:
     """An untrained network whose scores differ from view to view."""
     torch.manual_seed(0)
-    mean, std = (80.0, 60.0, 0.0, 0.0, 2.0, *[0.5] * 9), (40.0, 30.0, *[1.0] * 12)
+    mean, std = (80.0, 60.0, 0.0, 0.0, 2.0, *[0.5] * 10), (40.0, 30.0, *[1.0] * 13)
     return ConvNetwork(ConvSpec(InputStatistics(ALL_CHANNELS, mean, std), 30, (8, 8), 0.0))
 
 
@@ -108,11 +108,13 @@ def test_scorers_keep_their_contract(
     assert name.startswith("fisher") or np.all((scores >= 0) & (scores <= 1))
     assert len(np.unique(scores)) > 15
     order = np.random.default_rng(0).permutation(40)
-    np.testing.assert_allclose(scorer.score(views[order]), scores[order], rtol=1e-6)  # a pose's score is its own
-    np.testing.assert_allclose(scorer.score(views[7:8]), scores[7:8], rtol=1e-6)
+    # networks compute in single precision, which a determinant or least eigenvalue of what they weigh magnifies
+    rtol = 2e-5 if "expected" in name else 1e-6
+    np.testing.assert_allclose(scorer.score(views[order]), scores[order], rtol=rtol)  # a pose's score is its own
+    np.testing.assert_allclose(scorer.score(views[7:8]), scores[7:8], rtol=rtol)
     np.testing.assert_array_equal(scorer.score_binned(views, localization_map.bin_views(views)), scores)
     monkeypatch.setattr("wheretolook.methods.base.BLOCK", 7)
-    np.testing.assert_allclose(scorer.score(views), scores, rtol=1e-6)
+    np.testing.assert_allclose(scorer.score(views), scores, rtol=rtol)
     assert scorer.score(views[:0]).shape == (0,)
 
 
@@ -171,7 +173,10 @@ def test_another_resolution_of_the_same_field_of_view_scores_the_same(
 
 def test_another_field_of_view_is_refused(localization_map: LocalizationMap, weights: Path) -> None:
     narrow = PinholeCamera(CAMERA.width, CAMERA.height, 2 * CAMERA.focal_px)
-    with pytest.raises(WeightsError, match=r"mlp\.safetensors.*trained for a camera of 160 x 120 px, 90\.0"):
+    with pytest.raises(
+        WeightsError,
+        match=r"mlp\.safetensors.*trained for a camera of 160 x 120 px, 90\.0.*Weights of .*set.* serve every",
+    ):
         load_scorer(weights, LocalizationMap(localization_map.landmarks, narrow))
 
 

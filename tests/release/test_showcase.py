@@ -63,7 +63,7 @@ SAMPLING = SampleConfig(grid=(5, 4, 3), directions=40, keep=0, max_directions=12
 def release(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     """A release of one apartment whose landmarks are random points of its mesh; views up localize worse."""
     root = tmp_path_factory.mktemp("data") / "tiny"
-    scene = SceneFolder(root / f"apartment-{SEED:03d}", "test")
+    scene = SceneFolder(root / f"apartment-{SEED:03d}", "test", CAMERA)
     scene.map.mkdir(parents=True)
     mesh = generate_apartment(APARTMENT, SEED)
     rng = np.random.default_rng(0)
@@ -84,7 +84,7 @@ def release(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
         table.assign(status=status, n_inliers=10, **errors).astype(dict.fromkeys(errors, np.float32)), scene.table
     )
     stored.save(scene.occlusion)
-    dataset = Dataset(root, CAMERA, (scene,))
+    dataset = Dataset(root, (scene,))
     dataset.save()
     settings = {
         "scenes": {"apartment": asdict(APARTMENT), "free_space": asdict(FreeSpaceConfig())},
@@ -128,13 +128,13 @@ def test_another_scene_than_the_one_that_was_labelled_is_refused(release: Datase
             open_showcase(release)
     finally:
         (release.root / "release.json").write_text(original)
-    elsewhere = Dataset(release.root, CAMERA, (SceneFolder(release.root / "house", "test"),))
+    elsewhere = Dataset(release.root, (SceneFolder(release.root / "house", "test", CAMERA),))
     with pytest.raises(SceneError, match="not generated from a seed"):
         open_showcase(elsewhere)
     with pytest.raises(ConfigError, match="no such scene"):
         open_showcase(release, "apartment-004")
     with pytest.raises(ConfigError, match="no release"):
-        open_showcase(Dataset(tmp_path, CAMERA, ()))
+        open_showcase(Dataset(tmp_path, ()))
 
 
 def test_locations_are_found(showcase: Showcase) -> None:

@@ -22,7 +22,7 @@ from wheretolook import stages
 from wheretolook.cli import main, parse_experiment
 from wheretolook.dataset.folders import Dataset
 from wheretolook.evaluation.config import EvaluateConfig
-from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
+from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.inputs.channels import CHANNELS
 from wheretolook.inputs.localization_map import LocalizationMap
@@ -180,7 +180,7 @@ def test_three_lines_score_viewpoints_of_a_colmap_model(demo: Path) -> None:
     assert scores.shape == (len(table),) and np.all((scores > 0) & (scores < 1)) and np.ptp(scores) > 0
     assert TrainedNetwork.load(weights, ViewpointNetwork, "mlp-2d+3d").network.spec.channels == CHANNELS
     # the camera that mapped is the same pinhole, projected by COLMAP; landmarks on an edge may be rounded otherwise
-    by_colmap = LocalizationMap.from_colmap(scene.map, ColmapCamera.of_map(scene.map), mesh=scene.mesh)
+    by_colmap = LocalizationMap.from_colmap(scene.map, PinholeCamera(320, 240, 160.0).colmap, mesh=scene.mesh)
     difference = by_colmap.bin_views(poses(table)).counts - localization_map.bin_views(poses(table)).counts
     assert np.abs(difference).sum() <= 2
     hidden = LocalizationMap.from_colmap(scene.map, PinholeCamera(320, 240, 160), occlusion=HiddenPointRemoval())

@@ -27,13 +27,13 @@ SHIPPED = Path(__file__).parents[2] / "data" / "release" / "weights"
 @pytest.fixture
 def dataset(tmp_path: Path) -> Path:
     """Two scenes as the map stage leaves them, and a configuration."""
-    scenes = tuple(SceneFolder(tmp_path / "data" / "rooms" / name, "test") for name in ("a", "b"))
+    scenes = tuple(SceneFolder(tmp_path / "data" / "rooms" / name, "test", CAMERA) for name in ("a", "b"))
     for scene in scenes:
         scene.map.mkdir(parents=True)
         save_glb(furnished_room(), scene.mesh)
         LANDMARKS.save(scene.landmarks)
         write_json(scene.folder / "stages.json", {"scenes": "x", "map": "y"})
-    Dataset(tmp_path / "data" / "rooms", CAMERA, scenes).save()
+    Dataset(tmp_path / "data" / "rooms", scenes).save()
     (tmp_path / "rooms.yaml").write_text(
         "name: rooms\ncamera: {width: 160, height: 120, focal_px: 80}\nviewpoint_map: {grid: [5, 4, 3], directions: 60}"
     )

@@ -16,7 +16,7 @@ import torch
 
 from learning_options import changed, train_config
 from synthetic_dataset import make_dataset
-from wheretolook.dataset.folders import Dataset, SceneFolder
+from wheretolook.dataset.folders import Dataset
 from wheretolook.inputs.bins import InputStatistics
 from wheretolook.learning.data import BatchLoader, ViewpointDataModule, balance_classes, hold_out_locations
 from wheretolook.learning.fit import EpochRecord
@@ -267,7 +267,7 @@ def test_other_datasets_are_learnt_from_too(dataset: Dataset, store: str) -> Non
     tracking, config = TrackingConfig(store, "also"), changed(SMALL, epochs=1, also=("other",))
     (model,) = train(dataset, config, tracking, progress=False)
     about = json.loads(model.path.with_suffix(".json").read_text())["about"]
-    together = Dataset(dataset.root, dataset.camera, (*dataset.scenes, *other.split("train")))
+    together = Dataset(dataset.root, (*dataset.scenes, *other.split("train")))
     assert about["also"] == ["other"] and about["dataset_fingerprint"] == training_fingerprint(together)
     views = client(tracking).get_run(model.run_id).data.params
     assert int(views["n_train"]) + int(views["n_val"]) == (2 * 24 + 5) * 20
@@ -277,22 +277,23 @@ def test_other_datasets_are_learnt_from_too(dataset: Dataset, store: str) -> Non
     assert again.reused and not without.reused
     with pytest.raises(TableError, match=r"nowhere.*no dataset"):
         train(dataset, changed(config, also=("nowhere",)), tracking, progress=False)
-    elsewhere = Dataset(dataset.root.parent / "moved" / "tiny", dataset.camera, dataset.scenes)  # without the other one
+    elsewhere = Dataset(dataset.root.parent / "moved" / "tiny", dataset.scenes)  # without the other one
     assert was_trained_on(elsewhere, about)
-    assert not was_trained_on(Dataset(elsewhere.root, dataset.camera, dataset.scenes[1:]), about)
+    assert not was_trained_on(Dataset(elsewhere.root, dataset.scenes[1:]), about)
     for names in (("tiny",), ("other", "other")):
         with pytest.raises(ConfigError, match="learnt from twice"):
             with_also(dataset, names)
-    leak = Dataset(other.root, other.camera, (SceneFolder(other.scenes[2].folder, "train"),))
+    leak = Dataset(other.root, (replace(other.scenes[2], split="train"),))
     shutil.copy(dataset.split("test")[0].landmarks, leak.scenes[0].landmarks)
     leak.save()
     with pytest.raises(ConfigError, match=r"other/scene-2.*is the scene .*tiny/scene-2 again"):
         train(dataset, config, tracking, progress=False)
-    Dataset(other.root, other.camera, other.split("test")).save()
+    Dataset(other.root, other.split("test")).save()
     with pytest.raises(TableError, match=r"other.*no train scene"):
         train(dataset, config, tracking, progress=False)
-    Dataset(other.root, replace(other.camera, width=other.camera.width + 2), other.scenes).save()
-    with pytest.raises(ConfigError, match="other was made for another camera"):
+    wider = replace(other.camera, width=other.camera.width + 2)
+    Dataset(other.root, tuple(replace(scene, camera=wider) for scene in other.scenes)).save()
+    with pytest.raises(ConfigError, match="not one camera looks in this dataset"):
         train(dataset, config, tracking, progress=False)
 
 

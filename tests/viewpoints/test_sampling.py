@@ -54,6 +54,20 @@ def test_rows_say_what_their_viewpoint_sees(landmarks: Landmarks) -> None:
     assert (table["viewpoint_id"] == table["location_id"] * 100 + table["direction_id"]).all()
 
 
+def test_each_location_looks_with_one_of_several_cameras(landmarks: Landmarks) -> None:
+    cameras = {1: PinholeCamera(160, 120, 60.0), 2: PinholeCamera(80, 160, 150.0, center_px=(44.0, 77.0))}
+    config, ids = SampleConfig(directions=100, keep=0, min_visible=0), np.arange(len(GRID))
+    table, occlusion = sample_viewpoints(GRID, ids, landmarks, cameras, NoOcclusion(), config)
+    assert set(table.columns) == {*SCHEMA.names, "camera_id"}
+    assert table.groupby("location_id")["camera_id"].nunique().max() == 1
+    assert table.groupby("camera_id")["location_id"].nunique().tolist() == [len(GRID) // 2] * 2
+    for number, camera in cameras.items():
+        alone, same = sample_viewpoints(GRID, ids, landmarks, camera, NoOcclusion(), config)
+        rows = (table["camera_id"] == number).to_numpy()
+        pd.testing.assert_frame_equal(table[rows].drop(columns="camera_id"), alone[rows])
+        np.testing.assert_array_equal(occlusion.packed, same.packed)
+
+
 def test_the_best_directions_are_kept_and_ranked(landmarks: Landmarks) -> None:
     everything, _ = sampled(landmarks, keep=0, min_visible=0)
     best, _ = sampled(landmarks, keep=7)

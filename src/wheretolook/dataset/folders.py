@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
-from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.camera import Camera, PinholeCamera, camera_of_record, read_cameras
 from wheretolook.geometry.poses import Float
 from wheretolook.mapping.colmap_model import CAMERAS_FILE, colmap_poses, holds_model, load_mapping_poses
 from wheretolook.mapping.scale import read_scale
 from wheretolook.utils.errors import ConfigError, SceneError, TableError
 from wheretolook.utils.files import fingerprint, write_json
 from wheretolook.viewpoints.config import Split
-from wheretolook.viewpoints.table import read_table
+from wheretolook.viewpoints.table import CAMERA_ID, read_table
 
 if TYPE_CHECKING:
     from wheretolook.inputs.localization_map import LocalizationMap
@@ -36,6 +38,7 @@ class SceneFolder:
 
     folder: Path  # `<data>/<dataset>/<scene>`
     split: Split  # the whole scene belongs to it
+    camera: Camera = PinholeCamera()  # the one that looks, where a viewpoint names none of `cameras.txt`
 
     @property
     def name(self) -> str:
@@ -66,6 +69,19 @@ class SceneFolder:
     def table(self) -> Path:
         """Table of viewpoints."""
         return self.folder / "viewpoints.parquet"
+
+    @property
+    def cameras_file(self) -> Path:
+        """Cameras that viewpoints name by their `camera_id`, in COLMAP's text format; only if there are several."""
+        return self.folder / "cameras.txt"
+
+    def cameras(self) -> dict[int, Camera]:
+        """The cameras that look, by `camera_id`: those of `cameras.txt`, or the scene's one camera as number 0.
+
+        Raises:
+            TableError: the file is damaged.
+        """
+        return read_cameras(self.cameras_file) if self.cameras_file.is_file() else {0: self.camera}
 
     @property
     def label_manifest(self) -> Path:
@@ -121,23 +137,68 @@ class SceneFolder:
             return load_mapping_poses(self.mapping_cameras)
         return colmap_poses(self.map).astype(np.float32) if holds_model(self.map) else None
 
-    def localization_map(self, camera: PinholeCamera, device: str = "cpu") -> LocalizationMap:
-        """The scene's map with the occlusion stored for its sampled locations; the mesh is not needed."""
+    def localization_map(self, camera: Camera | None = None, device: str = "cpu") -> LocalizationMap:
+        """The scene's map with the occlusion stored for its sampled locations; the mesh is not needed.
+
+        For the scene's camera, unless another one looks.
+        """
         from wheretolook.inputs.localization_map import LocalizationMap
         from wheretolook.mapping.landmarks import Landmarks
         from wheretolook.visibility.occlusion import StoredOcclusion
 
         landmarks, occlusion = Landmarks.load(self.landmarks), StoredOcclusion.load(self.occlusion)
-        return LocalizationMap(landmarks, camera, occlusion, device, self.mapping_poses())
+        if landmarks.mapping_focal_px is None:  # before it was told, the camera that looks was the one that mapped
+            focal_px = np.full(len(landmarks), self.camera.mean_focal_px, dtype=np.float32)
+            landmarks = replace(landmarks, mapping_focal_px=focal_px)
+        return LocalizationMap(landmarks, camera or self.camera, occlusion, device, self.mapping_poses())
+
+
+def views_by_camera(
+    scene: SceneFolder, table: pd.DataFrame, at_most: int = 0
+) -> Iterator[tuple[Camera, NDArray[np.int64]]]:
+    """Rows of a table of a scene's viewpoints that look with one camera, ascending, and this camera.
+
+    With `at_most` the rows come in blocks of so many.
+
+    Raises:
+        TableError: a viewpoint names a camera that the scene has not.
+    """
+    cameras = scene.cameras()
+    if CAMERA_ID not in table:
+        numbers = np.full(len(table), next(iter(cameras)))
+        if len(cameras) > 1:
+            problem, fix = "the scene has several cameras, and its viewpoints name none", "Run the sample stage again."
+            raise TableError(problem, path=scene.table, fix=fix)
+    else:
+        numbers = table[CAMERA_ID].to_numpy()
+    for number in np.unique(numbers).tolist():
+        if number not in cameras:
+            fix = "Run the sample stage again."
+            raise TableError("a viewpoint's camera is missing", path=scene.cameras_file, value=number, fix=fix)
+        rows = np.flatnonzero(numbers == number)
+        for begin in range(0, len(rows), at_most or len(rows)):
+            yield cameras[number], rows[begin : begin + (at_most or len(rows))]
 
 
 @dataclass(frozen=True)
 class Dataset:
-    """A folder of scenes with one camera."""
+    """A folder of scenes."""
 
     root: Path  # `<data>/<dataset>`
-    camera: PinholeCamera  # intrinsics of every viewpoint
     scenes: tuple[SceneFolder, ...]  # in the order they were made
+
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        """All that look in its scenes, each once."""
+        return tuple(dict.fromkeys(camera for scene in self.scenes for camera in scene.cameras().values()))
+
+    @property
+    def camera(self) -> Camera:
+        """The camera that looks in all scenes. Raises ConfigError if there are several, or none."""
+        if len(self.cameras) != 1:
+            fix = "Use a method that serves every camera, such as set, or a dataset of one camera."
+            raise ConfigError("not one camera looks in this dataset", path=self.root, value=len(self.cameras), fix=fix)
+        return self.cameras[0]
 
     @property
     def name(self) -> str:
@@ -160,14 +221,24 @@ class Dataset:
         """16 hexadecimal digits that change with any scene's table, landmarks or occlusion."""
         digest = hashlib.sha256()
         for scene in self.scenes:
-            parts = [fingerprint(path) for path in (scene.table, scene.landmarks, scene.occlusion) if path.is_file()]
+            parts = [
+                fingerprint(path)
+                for path in (scene.table, scene.landmarks, scene.occlusion, scene.cameras_file)
+                if path.is_file()
+            ]
             digest.update("".join([scene.name, scene.split, *parts]).encode())
         return digest.hexdigest()[:16]
 
     def save(self) -> None:
         """Write `dataset.json`, which makes the folder a dataset."""
-        scenes = [{"name": scene.name, "split": scene.split} for scene in self.scenes]
-        write_json(self.root / "dataset.json", {"camera": asdict(self.camera), "scenes": scenes})
+        scenes: list[dict[str, Any]] = [{"name": scene.name, "split": scene.split} for scene in self.scenes]
+        content: dict[str, Any] = {"scenes": scenes}
+        if len({scene.camera for scene in self.scenes}) == 1:
+            content = {"camera": self.scenes[0].camera.record(), **content}
+        else:
+            for scene, entry in zip(self.scenes, scenes, strict=True):
+                entry["camera"] = scene.camera.record()
+        write_json(self.root / "dataset.json", content)
 
     @classmethod
     def load(cls, root: Path) -> Dataset:
@@ -175,10 +246,13 @@ class Dataset:
         path = root / "dataset.json"
         try:
             content = json.loads(path.read_text())
-            scenes = tuple(SceneFolder(root / scene["name"], scene["split"]) for scene in content["scenes"])
-            return cls(root, PinholeCamera(**content["camera"]), scenes)
+            scenes = []
+            for entry in content["scenes"]:
+                camera = camera_of_record(entry["camera"] if "camera" in entry else content["camera"])
+                scenes.append(SceneFolder(root / entry["name"], entry["split"], camera))
+            return cls(root, tuple(scenes))
         except FileNotFoundError as error:
             raise TableError("this folder is no dataset", path=path, fix="Run the scenes stage first.") from error
-        except (ValueError, KeyError, TypeError) as error:
+        except (ConfigError, ValueError, KeyError, TypeError) as error:
             problem, fix = f"damaged dataset description: {error}", "Run the scenes stage again."
             raise TableError(problem, path=path, fix=fix) from error

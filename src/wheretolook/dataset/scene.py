@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wheretolook.dataset.folders import SceneFolder
-from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.camera import Camera, cameras_of_map, only_camera
 from wheretolook.geometry.lattices import ViewLattice, VoxelGrid
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.mapping.scale import read_scale
@@ -46,8 +46,9 @@ class SceneConfig:
 class Scene:
     """A scene of a dataset with the camera that will look. Each part is made when it is first asked for, and kept.
 
-    `device` is where kernels run: "cpu", a CUDA device, or "auto" for the first GPU there is. A `mesh` (metres, z up)
-    is given if there is no file of it. `progress` shows progress bars where depth images are fused.
+    The camera is that of the scene unless another one is given. `device` is where kernels run: "cpu", a CUDA device, or
+    "auto" for the first GPU there is. A `mesh` (metres, z up) is given if there is no file of it. `progress` shows
+    progress bars where depth images are fused.
 
     Raises (each part, when it is made):
         SceneError: the mesh is missing or cannot be used.
@@ -58,13 +59,13 @@ class Scene:
     def __init__(
         self,
         files: SceneFolder,
-        camera: PinholeCamera,
+        camera: Camera | None = None,
         config: SceneConfig = SceneConfig(),
         device: str = "cpu",
         mesh: TexturedMesh | None = None,
         progress: bool = True,
     ) -> None:
-        self.files, self.camera, self.config, self.progress = files, camera, config, progress
+        self.files, self.camera, self.config, self.progress = files, camera or files.camera, config, progress
         self._device = device
         if mesh is not None:
             self.mesh = mesh
@@ -215,7 +216,8 @@ class Scene:
         from wheretolook.visibility.tsdf import TsdfConfig, TsdfVolume
 
         config = self.config.occlusion
-        images = RenderedDepth(self.renderer, self.camera, colmap_poses(self.files.map))
+        mapped = only_camera(cameras_of_map(self.files.map), self.files.map)
+        images = RenderedDepth(self.renderer, mapped, colmap_poses(self.files.map))
         tsdf = TsdfConfig(voxel_size_m=config.voxel_m, max_depth_m=config.max_depth_m)
         return TsdfVolume.from_images(images, tsdf, self.progress), images
 
@@ -223,7 +225,7 @@ class Scene:
 class RenderedDepth(Sequence["DepthImage"]):
     """Depth images of poses (B, 3, 4), each rendered when it is asked for."""
 
-    def __init__(self, renderer: WarpRenderer, camera: PinholeCamera, cam_from_world: Float) -> None:
+    def __init__(self, renderer: WarpRenderer, camera: Camera, cam_from_world: Float) -> None:
         self.renderer, self.camera, self.cam_from_world = renderer, camera, cam_from_world
 
     def __len__(self) -> int:

@@ -68,7 +68,7 @@ def evaluation_params(dataset: Dataset, scenes: Sequence[SceneFolder], weights: 
     """Parameters of an evaluation's run that tell what was evaluated: a dataset's scenes, and files of weights."""
     return {
         "dataset": dataset.name,
-        "dataset_fingerprint": Dataset(dataset.root, dataset.camera, tuple(scenes)).fingerprint(),
+        "dataset_fingerprint": Dataset(dataset.root, tuple(scenes)).fingerprint(),
         "scenes": " ".join(scene.name for scene in scenes),
         "weights": " ".join(f"{path.stem}:{fingerprint(path)}" for path in weights),
     }
@@ -162,7 +162,7 @@ def log_evaluation(
     params |= {name: value for name, value in asdict(config).items() if name not in ("weights", "methods")}
     if config.occlusions:
         params |= {f"occlusion_{name}": value for name, value in asdict(occlusion).items() if name != "model"}
-    for method in methods_named(config.methods, scorers()):
+    for method in methods_named(config.methods, scorers()) if len(dataset.cameras) == 1 else []:
         params |= method.params(dataset.camera)
     positives = float(views.good[:, 0].mean())
     metrics = {"n_locations": views.n_locations, "n_views": len(views.good), "positives": positives}

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 from tqdm.auto import tqdm
 
-from wheretolook.dataset.folders import Dataset, SceneFolder
+from wheretolook.dataset.folders import Dataset, SceneFolder, views_by_camera
 from wheretolook.dataset.scene import Scene, SceneConfig
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.scores import reference_method
@@ -105,26 +105,31 @@ def score_scenes(
     text = f"score {scenes[0].split} views" + ("" if occlusion is None else f", {occlusion.model}")
     with tqdm(total=sum(map(len, tables)), desc=text, unit="view", disable=not progress) as bar:
         for scene, table in zip(scenes, tables, strict=True):
-            localization_map = scene.localization_map(dataset.camera, device)
+            localization_map = scene.localization_map(device=device)
             # a release has no mesh, but what each location sees by it
             if occlusion is not None and (scene.mesh.is_file() or occlusion.model != localization_map.occlusion.name):
-                opened = Scene(scene, dataset.camera, SceneConfig(occlusion), device, progress=progress)
+                opened = Scene(scene, config=SceneConfig(occlusion), device=device, progress=progress)
                 localization_map = replace(localization_map, occlusion=opened.occlusion)
             used.add(localization_map.occlusion.name)
-            scorers = _scorers(localization_map, config, weights)
-            reference_method(scorers, config.reference)  # an unknown one is told before the work
-            cam_from_world = poses(table)
-            for begin in range(0, len(table), BLOCK):
-                block = cam_from_world[begin : begin + BLOCK]
-                binned = localization_map.bin_views(block)
+            cam_from_world, looking = poses(table), None
+            of_scene: dict[str, Float] = {}
+            for camera, rows in views_by_camera(scene, table, BLOCK):
+                if camera != looking:
+                    looking, looked_at = camera, localization_map.of_camera(camera)
+                    scorers = _scorers(looked_at, config, weights)
+                    reference_method(scorers, config.reference)  # an unknown one is told before the work
+                block = cam_from_world[rows]
+                binned = looked_at.bin_views(block)
                 for method, scorer in scorers.items():
                     values = scorer.score_binned(block, binned)
                     if not np.isfinite(values).all():
                         problem = "a method gives scores that are not finite"
                         fix = "Check the scene's landmarks and poses, and the weights; or leave the method out."
                         raise TableError(problem, path=scene.folder, value=method, fix=fix)
-                    scores.setdefault(method, []).append(values)
+                    of_scene.setdefault(method, np.empty(len(table)))[rows] = values
                 bar.update(len(block))
+            for method, values in of_scene.items():
+                scores.setdefault(method, []).append(values)
     return {method: np.concatenate(parts) for method, parts in scores.items()}, " ".join(sorted(used))
 
 

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.camera import Camera, PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float, invert_poses, poses_looking_along, rotation_looking_along, transform
 from wheretolook.rendering.warp_renderer import WarpRenderer
@@ -112,15 +112,18 @@ def draw_segments(axes: Axes, house: Dollhouse, segments: ArrayLike, **style: An
     return lines
 
 
-def frustum_corners(camera: PinholeCamera, cam_from_world: ArrayLike, depth_m: float) -> Float:
+def frustum_corners(camera: Camera, cam_from_world: ArrayLike, depth_m: float) -> Float:
     """Corners (B, 5, 3) m of cameras (B, 3, 4): centre, then the image's corners at a depth, from top left."""
-    half = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * (camera.cx, camera.cy) / camera.focal_px
-    corners = np.concatenate([np.zeros((1, 3)), depth_m * np.column_stack([half, np.ones(4)])])
+    pixels = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * (camera.width, camera.height)
+    rays = camera.unproject(pixels)
+    if isinstance(camera, PinholeCamera):  # a fisheye's corners can lie behind it: it is drawn to a distance
+        rays = rays / rays[:, 2:]
+    corners = np.concatenate([np.zeros((1, 3)), depth_m * rays])
     world_from_cam = invert_poses(np.asarray(cam_from_world, dtype=np.float64).reshape(-1, 3, 4))
     return corners @ np.swapaxes(world_from_cam[..., :3], -1, -2) + world_from_cam[:, None, :, 3]
 
 
-def frustum_segments(camera: PinholeCamera, cam_from_world: ArrayLike, depth_m: float) -> Float:
+def frustum_segments(camera: Camera, cam_from_world: ArrayLike, depth_m: float) -> Float:
     """The eight edges (B, 8, 2, 3) m of camera frusta down to a depth."""
     edges = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]])
     return frustum_corners(camera, cam_from_world, depth_m)[:, edges]

@@ -23,7 +23,7 @@ from wheretolook.figures.house_image import (
 )
 from wheretolook.figures.inputs import frame
 from wheretolook.figures.style import BLUE, INK, ONE_COLUMN_IN, ORANGE, PRINT, TWO_COLUMNS_IN, VERMILION, new_figure
-from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import Float
 
@@ -37,7 +37,7 @@ class Pipeline:
     house: Dollhouse  # the scene from above
     landmarks: Float  # (N, 3) of the map, metres
     mapping_poses: Float  # cam_from_world (M, 3, 4) of the images that the map was made from
-    camera: PinholeCamera  # intrinsics of all images
+    camera: Camera  # intrinsics of all images
     locations: Float  # (L, 3) metres, the sampled locations that are shown
     n_locations: int  # in the whole scene
     n_directions: int  # at each location

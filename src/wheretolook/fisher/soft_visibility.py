@@ -155,8 +155,10 @@ def cone_half_angle(camera: Camera) -> float:
         directions = fibonacci_sphere(20_000)
         share = float(np.mean(camera.sees(directions)))
         return float(np.arccos(np.clip(1 - 2 * share, -1, 1)))
-    a, b = camera.width / 2 / camera.focal_px, camera.height / 2 / camera.focal_px
-    solid_angle = 4 * np.arcsin(a * b / np.sqrt((1 + a * a) * (1 + b * b)))
+    a = np.array([camera.cx, camera.width - camera.cx]) / camera.fx
+    b = np.array([[camera.cy], [camera.height - camera.cy]]) / camera.fy
+    # the image's four quarters about the principal point
+    solid_angle = np.sum(np.arcsin(a * b / np.sqrt((1 + a * a) * (1 + b * b))))
     return float(np.arccos(1 - solid_angle / (2 * np.pi)))
 
 

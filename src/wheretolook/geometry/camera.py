@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.geometry.poses import Float
-from wheretolook.utils.errors import ConfigError, MapError
+from wheretolook.utils.errors import ConfigError, MapError, TableError
+from wheretolook.utils.files import write_text
 
 if TYPE_CHECKING:
     import pycolmap
@@ -26,43 +28,121 @@ class PinholeCamera:
     Args:
         width: image width in pixels.
         height: image height in pixels.
-        focal_px: focal length in pixels, the same in x and y. The default, 320 px at 640 x 480, is the paper's camera
-            (90 degrees across).
+        focal_px: focal length in pixels. The default, 320 px at 640 x 480, is the paper's camera (90 degrees across).
+        focal_y_px: focal length down the image in pixels; None for the same as across.
+        center_px: principal point (x, y) in pixels; None for the image's centre.
+
+    Raises:
+        ConfigError: a size or focal length that no camera has, such as a focal length in metres.
     """
 
     width: int = 640
     height: int = 480
     focal_px: float = 320.0
+    focal_y_px: float | None = None
+    center_px: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        if self.width < 1 or self.height < 1 or not self.focal_px > 0:
-            value = (self.width, self.height, self.focal_px)
-            raise ConfigError("camera needs a positive width, height and focal_px", value=value)
+        check_size(self.width, self.height)
+        if self.focal_y_px == self.focal_px:  # one way to say it, so that equal cameras are equal
+            object.__setattr__(self, "focal_y_px", None)
+        if self.center_px is not None and tuple(self.center_px) == (self.width / 2, self.height / 2):
+            object.__setattr__(self, "center_px", None)
+        check_focal_lengths((self.fx, self.fy), self.width, self.height)
+        if not np.isfinite((self.cx, self.cy)).all():
+            raise ConfigError("a camera's principal point must be finite", value=self.center_px)
+
+    @classmethod
+    def of_field_of_view(cls, across_deg: float, width: int, height: int) -> PinholeCamera:
+        """With square pixels, from the angle between the image's left and right side. Raises ConfigError."""
+        check_size(width, height)
+        if not 0 < across_deg < 180:
+            fix = "Give the angle between the image's left and right side; a fisheye needs a COLMAP model."
+            raise ConfigError("a pinhole's field of view must be between 0 and 180 degrees", value=across_deg, fix=fix)
+        return cls(width, height, width / 2 if across_deg == 90 else width / 2 / np.tan(np.radians(across_deg) / 2))
+
+    @property
+    def fx(self) -> float:
+        """Focal length across the image in pixels."""
+        return self.focal_px
+
+    @property
+    def fy(self) -> float:
+        """Focal length down the image in pixels."""
+        return self.focal_px if self.focal_y_px is None else self.focal_y_px
 
     @property
     def cx(self) -> float:
-        """Principal point x in pixels: the image centre."""
-        return self.width / 2
+        """Principal point x in pixels."""
+        return self.width / 2 if self.center_px is None else self.center_px[0]
 
     @property
     def cy(self) -> float:
-        """Principal point y in pixels: the image centre."""
-        return self.height / 2
+        """Principal point y in pixels."""
+        return self.height / 2 if self.center_px is None else self.center_px[1]
+
+    @property
+    def mean_focal_px(self) -> float:
+        """Mean of both focal lengths in pixels."""
+        return (self.fx + self.fy) / 2
+
+    @property
+    def principal_point(self) -> tuple[float, float]:
+        """Principal point (x, y) in pixels."""
+        return self.cx, self.cy
 
     @property
     def matrix(self) -> Float:
         """Intrinsic matrix K, (3, 3)."""
-        return np.array([[self.focal_px, 0, self.cx], [0, self.focal_px, self.cy], [0, 0, 1]])
+        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]])
+
+    @property
+    def colmap(self) -> ColmapCamera:
+        """The same camera by a model of COLMAP: SIMPLE_PINHOLE if its pixels are square, else PINHOLE."""
+        if self.fx == self.fy:
+            return ColmapCamera("SIMPLE_PINHOLE", self.width, self.height, (self.fx, self.cx, self.cy))
+        return ColmapCamera("PINHOLE", self.width, self.height, (self.fx, self.fy, self.cx, self.cy))
+
+    def record(self) -> dict[str, Any]:
+        """What `camera_of_record` makes the camera of, for JSON files."""
+        if self.focal_y_px is None and self.center_px is None:
+            return {"width": self.width, "height": self.height, "focal_px": self.focal_px}
+        return self.colmap.record()
 
     def project(self, points_cam: ArrayLike) -> Float:
         """Pixels (..., 2) of points (..., 3) in the camera frame. Points behind the camera project too, so test z."""
         points = np.asarray(points_cam, dtype=np.float64)
         with np.errstate(divide="ignore", invalid="ignore"):
-            return points[..., :2] / points[..., 2:] * self.focal_px + (self.cx, self.cy)
+            return points[..., :2] / points[..., 2:] * (self.fx, self.fy) + (self.cx, self.cy)
+
+    def unproject(self, pixels: ArrayLike) -> Float:
+        """Unit rays (..., 3) of pixels (..., 2) in the camera frame."""
+        at = (np.asarray(pixels, dtype=np.float64) - (self.cx, self.cy)) / (self.fx, self.fy)
+        rays = np.concatenate([at, np.ones_like(at[..., :1])], axis=-1)
+        return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
 
     def in_image(self, pixels: ArrayLike) -> NDArray[np.bool_]:
         """Whether pixels (..., 2) lie in the image: 0 <= x < width and 0 <= y < height. NaN is outside."""
         return in_image(pixels, self.width, self.height)
+
+
+def check_size(width: int, height: int) -> None:
+    """Raise ConfigError if no image has that size in pixels."""
+    if width < 1 or height < 1:
+        fix = "Give the image's width and height in pixels."
+        raise ConfigError("a camera needs a positive image size", value=(width, height), fix=fix)
+
+
+def check_focal_lengths(focal_px: tuple[float, ...], width: int, height: int) -> None:
+    """Raise ConfigError unless focal lengths are positive, and no less than a hundredth of the image's longer side.
+
+    A pinhole of that focal length would see 179 degrees; a smaller number is a focal length in metres or millimetres.
+    """
+    if not all(np.isfinite(focal) and focal > 0 for focal in focal_px):
+        raise ConfigError("a camera needs a positive, finite focal length in pixels", value=focal_px)
+    if min(focal_px, default=np.inf) < max(width, height) / 100:
+        fix = f"Give it in pixels: half the width ({width / 2:g}) divided by the tangent of half the angle across."
+        raise ConfigError("a focal length in pixels was expected, this looks like metres", value=focal_px, fix=fix)
 
 
 def in_image(pixels: ArrayLike, width: int, height: int) -> NDArray[np.bool_]:
@@ -94,38 +174,49 @@ class ColmapCamera:
             fix = f"Use one of {', '.join(names)}."
             raise ConfigError("COLMAP has no such camera model", value=self.model, fix=fix)
         expected = pycolmap.Camera.create_from_model_name(1, self.model, 1.0, 1, 1).params_info
-        if len(self.params) != len(expected.split(",")) or self.width < 1 or self.height < 1:
-            problem = f"camera model {self.model} needs a positive size and the parameters {expected}"
-            raise ConfigError(problem, value=(self.width, self.height, *self.params))
-        has_focal_length = len(self._camera.focal_length_idxs()) > 0
-        if not np.isfinite(self.params).all() or (has_focal_length and not self._camera.mean_focal_length() > 0):
-            raise ConfigError("a camera needs finite parameters and a positive focal length", value=self.params)
+        check_size(self.width, self.height)
+        if len(self.params) != len(expected.split(",")) or not np.isfinite(self.params).all():
+            problem = f"camera model {self.model} needs the finite parameters {expected}"
+            raise ConfigError(problem, value=self.params)
+        focal_px = tuple(self.params[i] for i in self._camera.focal_length_idxs())
+        check_focal_lengths(focal_px, self.width, self.height)  # panoramas have none
 
     @classmethod
     def of(cls, camera: pycolmap.Camera) -> ColmapCamera:
         """From a camera of pycolmap."""
         return cls(camera.model_name, camera.width, camera.height, tuple(float(value) for value in camera.params))
 
-    @classmethod
-    def of_map(cls, model: str | Path) -> ColmapCamera:
-        """The camera that made the COLMAP model in a folder; MapError if that cannot be read or has several or none."""
-        import pycolmap
-
-        path = Path(model)
-        try:
-            cameras = pycolmap.Reconstruction(path).cameras
-        except Exception as error:
-            raise MapError(f"cannot read the cameras: {error}", path=path, fix="Give a COLMAP model folder.") from error
-        if len(cameras) != 1:
-            fix = "Choose one: ColmapCamera.of(reconstruction.cameras[camera_id])."
-            raise MapError("the map has not one camera but several", path=path, value=len(cameras), fix=fix)
-        return cls.of(next(iter(cameras.values())))
-
     @cached_property
     def _camera(self) -> pycolmap.Camera:
         import pycolmap
 
         return pycolmap.Camera(model=self.model, width=self.width, height=self.height, params=list(self.params))
+
+    @property
+    def mean_focal_px(self) -> float:
+        """Mean focal length in pixels; of a panorama, pixels per radian across."""
+        return mean_focal_px(self._camera)
+
+    @property
+    def principal_point(self) -> tuple[float, float]:
+        """Principal point (x, y) in pixels; of a panorama the image's centre."""
+        if len(self._camera.principal_point_idxs()) == 0:
+            return self.width / 2, self.height / 2
+        return float(self._camera.principal_point_x), float(self._camera.principal_point_y)
+
+    @property
+    def colmap(self) -> ColmapCamera:
+        """The camera itself."""
+        return self
+
+    @property
+    def pycolmap(self) -> pycolmap.Camera:
+        """The camera for functions of pycolmap."""
+        return self._camera
+
+    def record(self) -> dict[str, Any]:
+        """What `camera_of_record` makes the camera of, for JSON files."""
+        return {"model": self.model, "width": self.width, "height": self.height, "params": list(self.params)}
 
     @property
     def matrix(self) -> Float:
@@ -167,4 +258,175 @@ class ColmapCamera:
         return self.in_image(self.project(points_cam))
 
 
-Camera = PinholeCamera | ColmapCamera  # what visibility can be computed for
+Camera = PinholeCamera | ColmapCamera  # what views can be scored for
+
+
+def camera_of(model: str, width: int, height: int, params: Iterable[float]) -> Camera:
+    """The camera of a COLMAP model, for PINHOLE and SIMPLE_PINHOLE the faster ideal pinhole. Raises ConfigError."""
+    camera = ColmapCamera(model, width, height, tuple(float(value) for value in params))
+    if model == "PINHOLE":
+        fx, fy, cx, cy = camera.params
+        return PinholeCamera(width, height, fx, fy, (cx, cy))
+    if model == "SIMPLE_PINHOLE":
+        focal, cx, cy = camera.params
+        return PinholeCamera(width, height, focal, center_px=(cx, cy))
+    return camera
+
+
+def mean_focal_px(camera: pycolmap.Camera) -> float:
+    """Mean focal length in pixels; of a panorama, pixels per radian across."""
+    if len(camera.focal_length_idxs()) == 0:
+        return float(camera.width / (2 * np.pi))
+    return float(camera.mean_focal_length())
+
+
+def camera_of_record(record: Mapping[str, Any]) -> Camera:
+    """The camera of a `record` read from a file. Raises ConfigError, KeyError, TypeError, ValueError if it is none."""
+    if "model" in record:
+        return camera_of(str(record["model"]), int(record["width"]), int(record["height"]), record["params"])
+    return PinholeCamera(**record)
+
+
+def read_cameras(path: Path) -> dict[int, Camera]:
+    """Cameras by their camera_id from a file in COLMAP's text format, a line each: id, model, size, parameters.
+
+    Raises:
+        TableError: a line describes no camera.
+    """
+    cameras: dict[int, Camera] = {}
+    for line in path.read_text(errors="replace").splitlines():
+        if line.strip() and not line.startswith("#"):
+            try:
+                number, model, width, height, *params = line.split()
+                cameras[int(number)] = camera_of(model, int(width), int(height), [float(value) for value in params])
+            except (ValueError, ConfigError) as error:
+                fix = "A line is: camera_id model width height parameters."
+                raise TableError(f"no camera in this line: {error}", path=path, value=line[:200], fix=fix) from error
+    return cameras
+
+
+def write_cameras(cameras: Mapping[int, Camera], path: Path) -> None:
+    """Write what `read_cameras` reads."""
+    lines = ["# Camera list: CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
+    for number, camera in cameras.items():
+        record = camera.colmap.record()
+        values = [number, record["model"], record["width"], record["height"], *record["params"]]
+        lines.append(" ".join(map(str, values)))
+    write_text(path, "\n".join(lines) + "\n")
+
+
+def cameras_of_map(model: str | Path) -> dict[int, Camera]:
+    """The cameras of the COLMAP model in a folder, by their camera_id; MapError if it cannot be read."""
+    import pycolmap
+
+    path = Path(model)
+    try:
+        cameras = pycolmap.Reconstruction(path).cameras
+    except Exception as error:
+        raise MapError(f"cannot read the cameras: {error}", path=path, fix="Give a COLMAP model folder.") from error
+    return cameras_by_id(cameras, path)
+
+
+def cameras_by_id(cameras: Any, path: Path) -> dict[int, Camera]:
+    """Cameras of a pycolmap model by their camera_id; MapError, naming the model, if one is no camera."""
+    found: dict[int, Camera] = {}
+    for number, camera in sorted(cameras.items()):
+        try:
+            found[number] = camera_of(camera.model_name, camera.width, camera.height, camera.params)
+        except ConfigError as error:
+            raise MapError(f"camera {number}: {error.problem}", path=path, value=error.value, fix=error.fix) from error
+    return found
+
+
+def only_camera(cameras: Mapping[int, Camera], path: Path) -> Camera:
+    """The camera that mapped; MapError if there is none, or if there are several that differ."""
+    different = list(dict.fromkeys(cameras.values()))
+    if len(different) == 1:
+        return different[0]
+    listed = "; ".join(f"{number}: {describe_camera(camera)}" for number, camera in list(cameras.items())[:10])
+    fix = "Say which camera will look: camera=, a camera_id of the model or a camera of its own."
+    raise MapError(f"the map has {len(different)} cameras, not one ({listed})", path=path, fix=fix)
+
+
+def describe_camera(camera: Camera) -> str:
+    """Size, and field of view or model of a camera, in words."""
+    size = f"{camera.width} x {camera.height} px"
+    if isinstance(camera, ColmapCamera):
+        return f"{size}, {camera.model}"
+    across, down = field_of_view_deg(camera)
+    return f"{size}, {across:.1f} x {down:.1f} degrees"
+
+
+def field_of_view_deg(camera: Camera) -> tuple[float, float]:
+    """Angles between the rays through the middles of the image's left and right, and of its upper and lower side."""
+    w, h = camera.width, camera.height
+    ends = np.array([[0, h / 2], [w, h / 2], [w / 2, 0], [w / 2, h]])
+    middle = camera.unproject([w / 2, h / 2])
+    angles = np.degrees(np.arccos(np.clip(camera.unproject(ends) @ middle, -1, 1)))
+    return float(angles[0] + angles[1]), float(angles[2] + angles[3])
+
+
+ACROSS_DEG, WIDTHS_PX = (40.0, 120.0), (320, 1280)
+PROPORTIONS = ((4, 3), (3, 2), (16, 9), (1, 1), (3, 4), (2, 3), (9, 16))
+OFF_CENTER = 0.05
+
+
+def draw_camera(rng: np.random.Generator) -> PinholeCamera:
+    """A pinhole as somebody may have one: 40 to 120 degrees along the longer side, 320 to 1,280 px wide or high.
+
+    Sides are 4:3, 3:2, 16:9 or 1:1, also upright; the principal point is off the centre by up to 5 % of a side.
+    """
+    longer, (a, b) = np.exp(rng.uniform(*np.log(WIDTHS_PX))), PROPORTIONS[rng.integers(len(PROPORTIONS))]
+    width, height = (2 * round(longer * side / max(a, b) / 2) for side in (a, b))
+    across = rng.uniform(*ACROSS_DEG)
+    focal_px = round(max(width, height) / 2 / np.tan(np.radians(across) / 2), 2)
+    x, y = rng.uniform(-OFF_CENTER, OFF_CENTER, 2)
+    center = (round(width * (0.5 + x), 2), round(height * (0.5 + y), 2))
+    return PinholeCamera(width, height, focal_px, center_px=center)
+
+
+@dataclass(frozen=True)
+class CameraConfig:
+    """A camera by its options: a pinhole of a focal length or field of view, or any model of COLMAP.
+
+    Args:
+        width: image width in pixels.
+        height: image height in pixels.
+        focal_px: focal length of a pinhole in pixels; by default half the width, 90 degrees across.
+        fov_deg: instead, the angle between the image's left and right side, below 180 degrees.
+        model: name of a COLMAP model, such as OPENCV or OPENCV_FISHEYE, instead of a centred pinhole.
+        params: intrinsics in COLMAP's order for that model.
+
+    Raises:
+        ConfigError: there is no such camera.
+    """
+
+    width: int = 640
+    height: int = 480
+    focal_px: float | None = None
+    fov_deg: float | None = None
+    model: str = ""
+    params: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        given = [value is not None for value in (self.focal_px, self.fov_deg)] + [bool(self.model)]
+        if sum(given) > 1 or (self.params and not self.model):
+            fix = "Give focal_px, or fov_deg, or model and params."
+            raise ConfigError("a camera is described in several ways", value=self, fix=fix)
+        if not self.model:  # COLMAP's models are looked up when they are used: that takes a second
+            _ = self.camera
+
+    @cached_property
+    def camera(self) -> Camera:
+        """The camera."""
+        if self.model:
+            return camera_of(self.model, self.width, self.height, self.params)
+        if self.focal_px is not None:
+            return PinholeCamera(self.width, self.height, self.focal_px)
+        return PinholeCamera.of_field_of_view(90.0 if self.fov_deg is None else self.fov_deg, self.width, self.height)
+
+    @classmethod
+    def of(cls, camera: Camera) -> CameraConfig:
+        """The options of a camera."""
+        record = camera.record()
+        return cls(**{**record, "params": tuple(record["params"])} if "params" in record else record)

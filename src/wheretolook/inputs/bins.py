@@ -144,7 +144,7 @@ def _blocks(posed: PosedViews, bins: int, device: str, block: int) -> Iterator[t
         rows = slice(begin, min(begin + block, len(poses)))
         grid: Any = BinGrid()
         grid.rotations = wp.array(poses[rows, :, :3].astype(np.float32), dtype=wp.mat33, device=device)
-        grid.focal, grid.cx, grid.cy, grid.bins = camera.focal_px, camera.cx, camera.cy, bins
+        grid.focal, grid.center, grid.bins = wp.vec2d(camera.fx, camera.fy), wp.vec2d(camera.cx, camera.cy), bins
         grid.columns_per_pixel, grid.rows_per_pixel = bins / camera.width, bins / camera.height
         yield rows, frustum.views_on_device(posed, rows, landmarks, sets, device), grid
 

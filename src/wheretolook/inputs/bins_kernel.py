@@ -20,9 +20,8 @@ class BinGrid:
     """A grid of bins x bins cells over a pinhole's image, and how B views are turned."""
 
     rotations: wp.array[wp.mat33]  # (B,) cam_from_world
-    focal: wp.float64  # pixels
-    cx: wp.float64
-    cy: wp.float64
+    focal: wp.vec2d  # pixels
+    center: wp.vec2d  # principal point, pixels
     columns_per_pixel: wp.float64
     rows_per_pixel: wp.float64
     bins: wp.int32
@@ -30,7 +29,7 @@ class BinGrid:
 
 @wp.func
 def pixel_in(grid: BinGrid, view: wp.int32, offset: wp.vec3) -> wp.vec2d:
-    return pixel_of(grid.rotations[view], offset, grid.focal, grid.cx, grid.cy)
+    return pixel_of(grid.rotations[view], offset, grid.focal, grid.center)
 
 
 @wp.func

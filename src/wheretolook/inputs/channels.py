@@ -9,9 +9,11 @@ from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 CHANNELS = ("u", "v", "x", "y", "z")
 """Channels of every landmark: pixel (u, v) and position (x, y, z) in the camera frame in metres."""
 
-POSE_ATTRIBUTES = ("across", "down", "distance", "mapped_angle", "distance_ratio")
+POSE_ATTRIBUTES = ("across", "down", "distance", "mapped_angle", "distance_ratio", "pixel_angle", "pixel_size_ratio")
 """Of a landmark in a view: x/z and y/z in the camera; the distance in metres, its logarithm; the cosine between the ray
-from the camera and the mean direction it was mapped from; the logarithm of the distance over the mean mapping one."""
+from the camera and the mean direction it was mapped from; the logarithm of the distance over the mean mapping one; the
+logarithm of the angle that a pixel of the camera covers, one over its focal length in pixels; and the logarithm of the
+size on the landmark's surface that a pixel covers, over that when it was mapped."""
 
 ATTRIBUTES = POSE_ATTRIBUTES + MAP_ATTRIBUTES
 """All that is known of a landmark in a view."""

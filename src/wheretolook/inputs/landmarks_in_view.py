@@ -7,7 +7,9 @@ attributes: from where they were mapped, how well, and how distinctive they are.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from copy import copy
 from dataclasses import dataclass
+from math import log
 
 import numpy as np
 import torch
@@ -61,6 +63,14 @@ class LandmarkDescriber:
         self._directions = torch.from_numpy(landmarks.mapping_direction).to(device)
         self._attributes = torch.from_numpy(landmarks.attributes()).to(device)
 
+    def of_camera(self, camera: Camera) -> LandmarkDescriber:
+        """The same with another camera that looks."""
+        if camera == self.localization_map.camera:
+            return self
+        other = copy(self)
+        other.localization_map = self.localization_map.of_camera(camera)
+        return other
+
     def describe(self, cam_from_world: Float, in_view: LandmarkSets | None = None) -> ViewLandmarks:
         """Landmarks of views (B, 3, 4); `in_view` are those each of them sees, if that is known already."""
         if in_view is None:
@@ -84,7 +94,9 @@ class LandmarkDescriber:
         log_distance = distance.log()
         mapped_angle = (offsets * self._directions[rows]).sum(1) / distance
         ratio = log_distance - map_values[:, MAP_ATTRIBUTES.index("mapped_distance")]
-        pose_values = torch.stack([x / z, y / z, log_distance, mapped_angle, ratio], dim=1)
+        pixel_angle = torch.full_like(ratio, -log(self.localization_map.camera.mean_focal_px))
+        size_ratio = log_distance + pixel_angle - map_values[:, MAP_ATTRIBUTES.index("mapped_pixel_size")]
+        pose_values = torch.stack([x / z, y / z, log_distance, mapped_angle, ratio, pixel_angle, size_ratio], dim=1)
         values = torch.cat([pose_values, map_values], dim=1)
         if self.attributes != ATTRIBUTES:
             values = values[:, self._columns]
@@ -181,7 +193,8 @@ def image_cells(landmarks: ViewLandmarks, camera: Camera, bins: int) -> Tensor:
         along = torch.cat([rays, torch.ones_like(rays[:, :1])], dim=1)
         pixels = torch.from_numpy(camera.project(along.cpu().double().numpy())).to(rays)
     else:
-        pixels = rays * camera.focal_px + torch.tensor([camera.cx, camera.cy]).to(rays)
+        focal, center = torch.tensor([[camera.fx, camera.fy], [camera.cx, camera.cy]]).to(rays)
+        pixels = rays * focal + center
     column = (pixels[:, 0] * (bins / camera.width)).long().clamp(0, bins - 1)
     row = (pixels[:, 1] * (bins / camera.height)).long().clamp(0, bins - 1)
     return row * bins + column

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
+from wheretolook.geometry.camera import Camera, ColmapCamera, cameras_by_id, only_camera
 from wheretolook.geometry.poses import Float, camera_centers, check_poses
 from wheretolook.inputs.bins import BinnedViews, bin_views, count_bins
 from wheretolook.mapping.colmap_model import colmap_poses, read_model
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
+from wheretolook.utils.errors import MapError
 from wheretolook.visibility import frustum
 from wheretolook.visibility.frustum import LandmarkSets, PosedViews
 from wheretolook.visibility.occlusion import NoOcclusion, OcclusionModel
@@ -30,7 +31,7 @@ class LocalizationMap:
     """A map to localize against, for everything that scores viewpoints."""
 
     landmarks: Landmarks  # what a camera may recognize
-    camera: Camera = PinholeCamera()  # the camera that will look: a pinhole, or any COLMAP model
+    camera: Camera  # the one that will look: a pinhole, or any COLMAP model
     occlusion: OcclusionModel = NoOcclusion()  # which landmarks have a free line of sight from a location
     device: str = "cpu"  # where kernels run, "cpu" or a CUDA device
     mapping_poses: Float | None = None  # cam_from_world (M, 3, 4) of the images the map was made from, if known
@@ -39,7 +40,7 @@ class LocalizationMap:
     def from_colmap(
         cls,
         model: str | Path,
-        camera: Camera = PinholeCamera(),
+        camera: Camera | int | None = None,
         mesh: str | Path | None = None,
         occlusion: OcclusionModel | None = None,
         max_reprojection_error_px: float = 0.5,
@@ -49,8 +50,8 @@ class LocalizationMap:
 
         Args:
             model: folder of the model.
-            camera: the camera that will look, which need not be the one that mapped; `ColmapCamera.of_map(model)` is
-                the latter, with its distortion.
+            camera: the camera that will look, which need not be one that mapped: a camera, or the camera_id of one of
+                the model. None for the model's own, with its distortion, if it has but one.
             mesh: a mesh of the scene, for true occlusion.
             occlusion: another model, such as `HiddenPointRemoval()` where there is nothing but the landmarks, or
                 `TsdfOcclusion` where there are depth images. With neither, landmarks are seen through walls.
@@ -58,11 +59,17 @@ class LocalizationMap:
             device: where kernels run.
 
         Raises:
-            MapError: no usable model in the folder.
+            MapError: no usable model in the folder, no such camera in it, or several and none is named.
             SceneError: the mesh cannot be used.
         """
         found, worst_px = read_model(model), max_reprojection_error_px
         landmarks = load_colmap_landmarks(Path(model), max_reprojection_error_px=worst_px, reconstruction=found)
+        if camera is None or isinstance(camera, int):
+            known = cameras_by_id(found.cameras, Path(model))
+            if camera is not None and camera not in known:
+                fix = f"It has {', '.join(map(str, known))}."
+                raise MapError("the model has no such camera", path=model, value=camera, fix=fix)
+            camera = only_camera(known, Path(model)) if camera is None else known[camera]
         occlusion = occlusion or NoOcclusion()
         if mesh is not None:
             from wheretolook.scenes.loading import load_mesh
@@ -72,6 +79,15 @@ class LocalizationMap:
             space = FreeSpace(load_mesh(Path(mesh)), device=device)
             occlusion = MeshOcclusion(space.raycaster, two_sided=space.two_sided)
         return cls(landmarks, camera, occlusion, device, colmap_poses(model, found).astype(np.float32))
+
+    def of_camera(self, camera: Camera) -> LocalizationMap:
+        """The same map, looked at with another camera."""
+        if camera == self.camera:
+            return self
+        other = replace(self, camera=camera)
+        if "_points_on_device" in vars(self):
+            vars(other)["_points_on_device"] = self._points_on_device
+        return other
 
     def bin_views(self, cam_from_world: Float, bins: int = 30, landmark_channels: bool = False) -> BinnedViews:
         """Bin the landmarks that views (B, 3, 4) see, in bins x bins cells of the image.

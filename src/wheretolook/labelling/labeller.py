@@ -23,7 +23,7 @@ from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.utils.errors import MapError, SceneError, StorageError, TableError
 from wheretolook.utils.files import fingerprint, sha256, write_json
 from wheretolook.utils.version import VERSION
-from wheretolook.viewpoints.table import SCHEMA, read_table, write_table
+from wheretolook.viewpoints.table import CAMERA_ID, SCHEMA, read_table, write_table
 
 MANIFEST = "manifest.json"
 """File in the folder of shards that says what the labels are made with; later `labels.json` beside the table."""
@@ -129,13 +129,17 @@ class _SceneInProgress:
             fix = "Build the map again."
             raise MapError("landmarks without descriptors cannot be matched", path=job.landmarks, fix=fix)
         settings: dict[str, Any] = {"versions": versions()}
-        settings |= {name: asdict(getattr(job, name)) for name in ("localizer", "extractor", "camera")}
+        settings |= {name: asdict(getattr(job, name)) for name in ("localizer", "extractor")}
+        settings["camera"] = job.camera.record()
         settings |= {"renderer": _renderer_name(job.device)}
         settings |= {"mesh": fingerprint(job.mesh), "landmarks": fingerprint(job.landmarks)}
+        if job.cameras:
+            settings["cameras"] = {number: camera.record() for number, camera in job.cameras}
         if job.store_matches:  # only then, so that shards without matches keep their names from earlier versions
             settings["store_matches"] = True
         text = json.dumps(settings, sort_keys=True).encode()
-        inputs = [name for name in SCHEMA.names if name not in LABELS]  # a shard's file holds them all
+        # a shard's file holds them all
+        inputs = [name for name in (*SCHEMA.names, CAMERA_ID) if name not in LABELS and name in table]
         shards = []
         for begin in range(0, len(table), shard_size):
             rows = table.iloc[begin : begin + shard_size]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import poselib
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from wheretolook.features.extraction import KeypointExtractor
 from wheretolook.features.keypoints import ExtractorConfig, Keypoints, quantize_descriptors
 from wheretolook.features.matching import DescriptorMatcher, Matches, match
-from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import Float
 from wheretolook.labelling.config import LocalizerConfig
 from wheretolook.mapping.landmarks import Landmarks
@@ -51,7 +52,7 @@ class Localizer:
     def __init__(
         self,
         landmarks: Landmarks,
-        camera: PinholeCamera,
+        camera: Camera,
         config: LocalizerConfig | None = None,
         extractor: ExtractorConfig | None = None,
         device: str = "cpu",
@@ -61,8 +62,7 @@ class Localizer:
         self.landmarks, self.config = landmarks, config or LocalizerConfig()
         self.extractor = KeypointExtractor(extractor, device)
         self._matcher = DescriptorMatcher(landmarks.descriptors, device)
-        params = [camera.focal_px, camera.cx, camera.cy]
-        self._camera = {"model": "SIMPLE_PINHOLE", "width": camera.width, "height": camera.height, "params": params}
+        self._camera = camera
         self._ransac = {
             "max_reproj_error": self.config.max_error_px,
             "seed": self.config.seed,
@@ -90,16 +90,41 @@ class Localizer:
         return match(self._matcher, descriptors, self.config.max_ratio)
 
     def estimate(
-        self, keypoints: Keypoints, keypoint_rows: NDArray[np.int64], landmark_rows: NDArray[np.int64]
+        self,
+        keypoints: Keypoints,
+        keypoint_rows: NDArray[np.int64],
+        landmark_rows: NDArray[np.int64],
+        camera: Camera | None = None,
     ) -> Localization:
-        """Step 3: the pose of one image from its matches, rows (M,) of its keypoints and rows (M,) of the landmarks."""
+        """Step 3: the pose of one image from its matches, rows (M,) of its keypoints and rows (M,) of the landmarks.
+
+        The image is of the localizer's camera, or of the one given.
+        """
         n_matches = len(keypoint_rows)
         if n_matches < self.config.min_matches:
             return Localization(TOO_FEW_MATCHES, None, n_matches, matched_rows=landmark_rows)
         pixels, points = keypoints.pixels[keypoint_rows].astype(np.float64), self.landmarks.points[landmark_rows]
-        pose, found = poselib.estimate_absolute_pose(pixels, points, self._camera, self._ransac, self._refinement)
+        taken_with, pixels = _known_to_poselib((camera or self._camera).colmap, pixels)
+        pose, found = poselib.estimate_absolute_pose(pixels, points, taken_with, self._ransac, self._refinement)
         if found["num_inliers"] < 3 or not np.isfinite(pose.Rt).all():  # no three matches determine a pose
             return Localization(NO_POSE, None, n_matches, matched_rows=landmark_rows)
         status = LOCALIZED if found["num_inliers"] >= self.config.min_inliers else NO_POSE
         inlier_rows = landmark_rows[np.asarray(found["inliers"], dtype=bool)]
         return Localization(status, pose.Rt, n_matches, inlier_rows, landmark_rows)
+
+
+POSELIBS_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")
+
+
+def _known_to_poselib(camera: ColmapCamera, pixels: Float) -> tuple[dict[str, Any], Float]:
+    """A camera as PoseLib takes it, and pixels (M, 2) of its image.
+
+    Of a model that PoseLib does not know, pixels become those of a pinhole with the same focal length, by their rays.
+    Rays that it would not see, more than 84 degrees off its axis, go far outside, where they are nobody's inliers.
+    """
+    if camera.model in POSELIBS_MODELS:
+        return camera.record(), pixels
+    pinhole = PinholeCamera(camera.width, camera.height, camera.mean_focal_px)
+    rays = camera.unproject(pixels)
+    ahead = rays[:, 2:] > 0.1
+    return pinhole.colmap.record(), np.where(ahead, pinhole.project(np.where(ahead, rays, (0, 0, 1))), 1e6)

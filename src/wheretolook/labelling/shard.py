@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,15 +11,17 @@ import numpy as np
 import pandas as pd
 
 from wheretolook.features.keypoints import ExtractorConfig
-from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.camera import Camera, PinholeCamera
 from wheretolook.geometry.poses import Float, pose_error
 from wheretolook.labelling.config import LocalizerConfig
 from wheretolook.labelling.pipeline import Step, run_pipeline
 from wheretolook.utils.errors import WhereToLookError, WorkerError
 from wheretolook.utils.workers import use_one_core
-from wheretolook.viewpoints.table import MATCH_FIELDS, poses
+from wheretolook.viewpoints.table import CAMERA_ID, MATCH_FIELDS, poses
 
 if TYPE_CHECKING:
+    from wheretolook.features.keypoints import Keypoints
+    from wheretolook.features.matching import Matches
     from wheretolook.labelling.localizer import Localization, Localizer
     from wheretolook.rendering.types import Renderer
 
@@ -35,11 +37,12 @@ class SceneJob:
 
     mesh: Path
     landmarks: Path
-    camera: PinholeCamera = PinholeCamera()
+    camera: Camera = PinholeCamera()
     localizer: LocalizerConfig = LocalizerConfig()
     extractor: ExtractorConfig = ExtractorConfig()  # what the map was made with
     device: str = "cpu"  # with "cuda", workers spread over all GPUs
     store_matches: bool = False  # whether labelled rows get the columns of `viewpoints.table.MATCH_FIELDS`
+    cameras: tuple[tuple[int, Camera], ...] = ()  # by number, where viewpoints say with which of several they look
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +84,8 @@ class ShardWorker:
         try:
             seconds: dict[str, float] = {}
             renderer, localizer = self._open(job)
-            labelled = label_rows(rows, renderer, localizer, job.camera, seconds, tick, job.store_matches)
+            cameras = dict(job.cameras) or job.camera
+            labelled = label_rows(rows, renderer, localizer, cameras, seconds, tick, job.store_matches)
             return LabelledShard(labelled, seconds)
         except WhereToLookError:
             raise
@@ -113,29 +117,41 @@ def label_rows(
     table: pd.DataFrame,
     renderer: Renderer,
     localizer: Localizer,
-    camera: PinholeCamera,
+    cameras: Camera | Mapping[int, Camera],
     seconds: dict[str, float] | None = None,
     tick: Tick = lambda n: None,
     store_matches: bool = False,
 ) -> pd.DataFrame:
     """Render viewpoints, localize the images and measure the errors, in batched steps that overlap in this process.
 
-    The time spent in each step (render, extract, match, pose) is added to `seconds`, and `tick` is called with the
-    number of viewpoints just finished. Returns the table with status, error_m, error_deg and n_inliers filled in, and
-    with `viewpoints.table.MATCH_FIELDS` if `store_matches`; those of earlier labels are dropped.
+    Of several cameras, each viewpoint's `camera_id` says which looks. The time spent in each step (render, extract,
+    match, pose) is added to `seconds`, and `tick` is called with the number of viewpoints just finished. Returns the
+    table with status, error_m, error_deg and n_inliers filled in, and with `viewpoints.table.MATCH_FIELDS` if
+    `store_matches`; those of earlier labels are dropped.
     """
     true_poses = poses(table)
-    steps = [
-        Step("render", lambda batch: renderer.render(camera, batch).rgb),
-        Step("extract", localizer.extract),
-        Step("match", lambda keypoints: list(zip(keypoints, localizer.match(keypoints), strict=True))),
-        Step("pose", lambda pairs: [localizer.estimate(keypoints, *matches) for keypoints, matches in pairs]),
+    if not isinstance(cameras, Mapping):
+        groups = [(cameras, np.arange(len(table)))]
+    else:
+        numbers = table[CAMERA_ID].to_numpy()
+        groups = [(cameras[number], np.flatnonzero(numbers == number)) for number in np.unique(numbers).tolist()]
+    batches = [(camera, rows[i : i + BATCH]) for camera, rows in groups for i in range(0, len(rows), BATCH)]
+
+    def poses_of(batch: tuple[Camera, list[tuple[Keypoints, Matches]]]) -> list[Localization]:
+        camera, matched = batch
+        return [localizer.estimate(keypoints, rows, landmarks, camera) for keypoints, (rows, landmarks) in matched]
+
+    steps = [  # a batch is of one camera, which goes with it from step to step
+        Step("render", lambda batch: (batch[0], renderer.render(batch[0], true_poses[batch[1]]).rgb)),
+        Step("extract", lambda batch: (batch[0], localizer.extract(batch[1]))),
+        Step("match", lambda batch: (batch[0], list(zip(batch[1], localizer.match(batch[1]), strict=True)))),
+        Step("pose", poses_of),
     ]
-    batches = [true_poses[start : start + BATCH] for start in range(0, len(true_poses), BATCH)]
-    results: list[Localization] = []
+    found: list[Localization] = []
     for batch in run_pipeline(batches, steps, seconds):
-        results += batch
+        found += batch
         tick(len(batch))
+    results = [found[row] for row in np.argsort(np.concatenate([rows for _, rows in groups]))]
     none: Float = np.full((3, 4), np.nan)
     estimates = np.stack([none if result.cam_from_world is None else result.cam_from_world for result in results])
     error_m, error_deg = pose_error(estimates, true_poses)

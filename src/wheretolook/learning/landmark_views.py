@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from wheretolook.dataset.folders import Dataset, SceneFolder
+from wheretolook.dataset.folders import Dataset, SceneFolder, views_by_camera
 from wheretolook.inputs.landmarks_in_view import ATTRIBUTES, LandmarkDescriber, ViewLandmarks
 from wheretolook.learning.config import SharedConfig
 from wheretolook.learning.data import Batch, TensorViews, ViewsDataModule, labelled_rows, validation_views
@@ -23,7 +23,7 @@ from wheretolook.learning.learner import Task
 from wheretolook.learning.scenes import training_scenes
 from wheretolook.viewpoints.table import LOCALIZED, is_good, poses
 
-DISTANCES = [ATTRIBUTES.index(name) for name in ("distance", "mapped_distance")]
+DISTANCES = [ATTRIBUTES.index(name) for name in ("distance", "mapped_distance", "mapped_pixel_size")]
 """Attributes that are logarithms of distances: those that change when a scene is enlarged."""
 
 BLOCK = 2048  # views described at a time: some million landmarks
@@ -95,14 +95,13 @@ def load_landmark_views(
     total = sum(len(table) for _, table in tables)
     with tqdm(total=total, desc="describe views", unit="view", disable=not progress) as bar:
         for number, (scene, table) in enumerate(tables):
-            describer = LandmarkDescriber(scene.localization_map(dataset.camera, device))
+            describer = LandmarkDescriber(scene.localization_map(device=device))
             cam_from_world, good = poses(table), is_good(table, config.max_error_m, config.max_error_deg)
             error_m = np.where(is_good(table, np.inf, config.max_error_deg), table["error_m"], np.inf)
             of_views = np.stack([cam_from_world[:, 2, 2], good, error_m]).astype(np.float32)
             location = table["location_id"].to_numpy(np.int64)
-            for begin in range(0, len(table), BLOCK):
-                rows = slice(begin, begin + BLOCK)
-                described = describer.describe(cam_from_world[rows])
+            for camera, rows in views_by_camera(scene, table, BLOCK):
+                described = describer.of_camera(camera).describe(cam_from_world[rows])
                 found = _found(described, table.iloc[rows]) if matches else None
                 starts, kept = _some_of_each(described, most, generator)
                 values, counts = described.values[kept].to("cpu", torch.float16), described.counts.cpu()

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import nn
 
 from wheretolook.dataset.folders import Dataset
+from wheretolook.geometry.camera import Camera
 from wheretolook.learning.classifier import ViewpointClassifier
 from wheretolook.learning.config import SharedConfig
 from wheretolook.learning.fit import EpochRecord, RunLog, fit
@@ -50,6 +51,12 @@ class Task:
     run_log: RunLog | None = None  # takes the metrics of epochs; None logs none
     # what learners that follow one another leave for the next, such as views that are binned already
     kept: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def camera(self) -> Camera | None:
+        """The camera of all views to learn from; None if there are several."""
+        cameras = self.dataset.cameras
+        return cameras[0] if len(cameras) == 1 else None
 
 
 def fit_network(

@@ -42,19 +42,20 @@ def about_training(dataset: Dataset, method: str, config: SharedConfig, options:
     """
     shared = {name: value for name, value in asdict(config).items() if name in DECIDING}
     seen = [scene for scene in dataset.scenes if scene.split != "test"]
+    cameras = [camera.record() for camera in dataset.cameras]
     about: dict[str, Any] = {
         "dataset": dataset.name,
         "dataset_fingerprint": training_fingerprint(dataset),
         "landmarks": {_name(scene, dataset): fingerprint(scene.landmarks) for scene in seen},
         "code_version": VERSION,
         "method": method,
-        "camera": asdict(dataset.camera),
+        "camera": cameras[0] if len(cameras) == 1 else cameras,
         "config": {**asdict(options), **shared},
     }
     if config.also:
         about["also"] = list(config.also)
         own = tuple(scene for scene in dataset.scenes if scene.folder.parent == dataset.root)
-        about["own_fingerprint"] = training_fingerprint(Dataset(dataset.root, dataset.camera, own))
+        about["own_fingerprint"] = training_fingerprint(Dataset(dataset.root, own))
     if start := getattr(options, "starts_from", ""):
         path = weights_path(dataset, start)
         about[f"{start}_sha256"] = sha256(path) if path.is_file() else None
@@ -80,7 +81,7 @@ def trained_before(path: Path, about: Mapping[str, Any]) -> TrainedModel | None:
 
 def training_fingerprint(dataset: Dataset) -> str:
     """16 hexadecimal digits that change with anything a network learns from: the train and val scenes."""
-    return Dataset(dataset.root, dataset.camera, (*dataset.split("train"), *dataset.split("val"))).fingerprint()
+    return Dataset(dataset.root, (*dataset.split("train"), *dataset.split("val"))).fingerprint()
 
 
 def was_trained_on(dataset: Dataset, training: Mapping[str, Any]) -> bool:

@@ -12,8 +12,8 @@ from wheretolook.utils.files import fingerprint
 def with_also(dataset: Dataset, names: Sequence[str]) -> Dataset:
     """A dataset together with the train scenes of others beside it.
 
-    Raises a TableError if there is no such dataset or it has no train scene; a ConfigError if it was made for another
-    camera, is named twice or is the dataset itself, or one of its scenes is one of the dataset's under another name.
+    Raises a TableError if there is no such dataset or it has no train scene; a ConfigError if it is named
+    twice or is the dataset itself, or one of its scenes is one of the dataset's under another name.
     """
     if len({dataset.name, *names}) <= len(names):
         fix = "Name other datasets in the same folder, each once."
@@ -21,10 +21,7 @@ def with_also(dataset: Dataset, names: Sequence[str]) -> Dataset:
     scenes = list(dataset.scenes)
     for name in names:
         other = Dataset.load(dataset.root.parent / name)
-        if other.camera != dataset.camera:
-            fix = f"It must be {dataset.camera}, as that of {dataset.root}."
-            raise ConfigError(f"{other.root} was made for another camera", value=other.camera, fix=fix)
-        scenes += training_scenes(Dataset(other.root, other.camera, other.split("train")))
+        scenes += training_scenes(Dataset(other.root, other.split("train")))
     if names:
         seen: dict[str, SceneFolder] = {}
         for scene in scenes:
@@ -33,7 +30,7 @@ def with_also(dataset: Dataset, names: Sequence[str]) -> Dataset:
                 fix = "Leave the dataset out of train.also: scenes must not cross splits."
                 raise ConfigError(f"this is the scene {seen[landmarks].folder} again", path=scene.folder, fix=fix)
             seen[landmarks] = scene
-    return Dataset(dataset.root, dataset.camera, tuple(scenes))
+    return Dataset(dataset.root, tuple(scenes))
 
 
 def training_scenes(dataset: Dataset) -> list[SceneFolder]:

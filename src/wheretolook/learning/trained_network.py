@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Generic, Self, TypeVar
 
 from torch import Tensor, nn
 
-from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.camera import Camera, camera_of_record
 from wheretolook.learning.old_names import name_of_header
 from wheretolook.learning.weights import check_serves, read_weights, write_weights
 from wheretolook.utils.errors import ConfigError, WeightsError
@@ -41,7 +40,7 @@ class TrainedNetwork(Generic[NetworkT]):
     """A network, the camera of its training views, and what calibrates its logits: scale * logit + offset."""
 
     def __init__(
-        self, method: str, network: NetworkT, camera: PinholeCamera, scale: float = 1.0, offset: float = 0.0
+        self, method: str, network: NetworkT, camera: Camera | None, scale: float = 1.0, offset: float = 0.0
     ) -> None:
         self.method, self.network, self.camera = method, network.eval(), camera
         self.scale, self.offset = scale, offset
@@ -52,7 +51,11 @@ class TrainedNetwork(Generic[NetworkT]):
 
     def save(self, path: Path, training: Mapping[str, Any] | None = None) -> None:
         """Write one safetensors file, atomically, with JSON values on the training. Equal networks, equal bytes."""
-        header = {**self.network.description(), "camera": asdict(self.camera), "scale": self.scale}
+        header = {
+            **self.network.description(),
+            "camera": None if self.camera is None else self.camera.record(),
+            "scale": self.scale,
+        }
         header |= {"offset": self.offset, "training": dict(training or {})}
         write_weights(path, self.method, self.network.stored.state_dict(), header)
 
@@ -69,7 +72,7 @@ class TrainedNetwork(Generic[NetworkT]):
         fix = f"Train again, or give other weights of {methods[0]}."
         try:
             network = network_class.of_description(header)
-            camera = PinholeCamera(**header["camera"])
+            camera = None if header["camera"] is None else camera_of_record(header["camera"])
             scale, offset = float(header.get("scale", 1.0)), float(header.get("offset", 0.0))
         except WeightsError as error:
             raise WeightsError(error.problem, path=path, value=error.value, fix=error.fix or fix) from error

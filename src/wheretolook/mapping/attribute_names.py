@@ -8,5 +8,6 @@ MAP_ATTRIBUTES = (
     "ambiguity",  # cosine between the landmark's descriptor and the nearest one of another landmark
     "mapped_distance",  # logarithm of the mean mapping distance, in metres
     "distance_spread",  # standard deviation of the mapping distances over their mean
+    "mapped_pixel_size",  # logarithm of the mean mapping distance over the mapping cameras' focal length in pixels
 )
 """What a scorer is told of a landmark in its map; NaN where a value is not known."""

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from wheretolook.geometry.camera import mean_focal_px
 from wheretolook.geometry.poses import Float
 from wheretolook.utils.colmap import quiet_colmap
 from wheretolook.utils.errors import MapError
@@ -33,6 +34,7 @@ class ModelArrays:
     image_ids: NDArray[np.int64]  # (I,) ascending
     image_names: list[str]  # I names
     image_centers: NDArray[np.float64]  # (I, 3) camera centres in the world
+    image_focal_px: NDArray[np.float64]  # (I,) mean focal length of the image's camera
     observation_start: NDArray[np.int64]  # (P + 1,); observations start[i] to start[i + 1] belong to point i
     observation_image: NDArray[np.int64]  # (O,) row in `image_ids`
     observation_keypoint: NDArray[np.int64]  # (O,) index of the keypoint in its image
@@ -98,6 +100,7 @@ def model_arrays(reconstruction: Any) -> ModelArrays:
         image_ids=image_ids,
         image_names=[image.name for image in images],
         image_centers=np.array([image.projection_center() for image in images], dtype=np.float64).reshape(-1, 3),
+        image_focal_px=np.array([mean_focal_px(reconstruction.cameras[image.camera_id]) for image in images]),
         observation_start=np.concatenate([[0], np.cumsum([len(t) for t in tracks], dtype=np.int64)]).astype(np.int64),
         observation_image=np.searchsorted(image_ids, observations[:, 0]),
         observation_keypoint=observations[:, 1],

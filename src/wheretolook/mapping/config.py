@@ -7,6 +7,7 @@ from math import inf
 from pathlib import Path
 
 from wheretolook.features.keypoints import ExtractorConfig
+from wheretolook.geometry.camera import CameraConfig
 from wheretolook.utils.errors import ConfigError
 
 
@@ -191,6 +192,8 @@ class MapConfig:
             paper's 0.5 px).
         photographs: a folder of photographs to map instead of a mesh; of the other settings, only `extractor` and
             `keep_database` then count.
+        camera: the camera that maps, if not the one that looks, such as `{width: 1280, height: 720, fov_deg: 70}`.
+        draw_camera: draw the camera that maps from the scene's seed, as `sample.cameras` draws those that look.
         keep_images: keep the rendered images, as `images/` in the map's folder.
         keep_database: keep COLMAP's database of keypoints and matches, as `database.db`.
 
@@ -211,11 +214,15 @@ class MapConfig:
     two_view_landmarks: bool = True
     max_reprojection_error_px: float = 0.5
     photographs: PhotographsConfig = field(default_factory=PhotographsConfig)
+    camera: CameraConfig | None = None
+    draw_camera: bool = False
     keep_images: bool = False
     keep_database: bool = False
 
     def __post_init__(self) -> None:
         if self.n_images < 2:
             raise ConfigError("a map needs at least two images", value=self.n_images)
+        if self.camera is not None and self.draw_camera:
+            raise ConfigError("the camera that maps is given and to be drawn", value=self.camera, fix="Choose one.")
         if not self.max_reprojection_error_px > 0:
             raise ConfigError("max_reprojection_error_px must be positive", value=self.max_reprojection_error_px)

@@ -40,20 +40,25 @@ class Landmarks:
     descriptors: NDArray[np.uint8] | None
     # (N,) cosine between the descriptor and the nearest one of another landmark; NaN without descriptors or others
     ambiguity: NDArray[np.float32]
+    # (N,) mean focal length of the mapping cameras, of the logarithms; None in files from before it was told
+    mapping_focal_px: NDArray[np.float32] | None = None
 
     def __len__(self) -> int:
         return len(self.ids)
 
     def attributes(self) -> NDArray[np.float32]:
         """`MAP_ATTRIBUTES` of each landmark, (N, len(MAP_ATTRIBUTES)) float32."""
+        focal_px = self.mapping_focal_px
+        distance = np.log(np.maximum(self.mapping_distance_m, 1e-3))
         values = {
             "track_length": np.log(np.maximum(self.track_length, 1)),
             "reprojection_error": self.reprojection_error_px,
             "triangulation_angle": np.log(np.maximum(self.triangulation_angle_deg, 0.01)),
             "direction_spread": self.mapping_direction_spread,
             "ambiguity": self.ambiguity,
-            "mapped_distance": np.log(np.maximum(self.mapping_distance_m, 1e-3)),
+            "mapped_distance": distance,
             "distance_spread": self.mapping_distance_spread,
+            "mapped_pixel_size": distance - np.log(np.full(len(self), np.nan) if focal_px is None else focal_px),
         }
         return np.stack([values[name] for name in MAP_ATTRIBUTES], axis=1).astype(np.float32)
 
@@ -82,11 +87,15 @@ class Landmarks:
         names = {f.name for f in fields(cls)}
         if set(values) and "mapping_distance_spread" not in values and "mapping_distance_m" in values:
             values["mapping_distance_spread"] = np.full(len(values["mapping_distance_m"]), np.nan, dtype=np.float32)
-        if set(values) | {"descriptors"} != names:
+        if set(values) | {"descriptors", "mapping_focal_px"} != names:
             raise MapError("not a file of landmarks", path=path, value=sorted(values), fix=fix)
         if len({len(v) for v in values.values()}) != 1 or values["points"].shape[1:] != (3,):
             raise MapError("the arrays disagree on the number of landmarks", path=path, fix=fix)
-        arrays: dict[str, Any] = {"descriptors": None, **_floats(values, points=np.float64, others=np.float32)}
+        arrays: dict[str, Any] = {
+            "descriptors": None,
+            "mapping_focal_px": None,
+            **_floats(values, points=np.float64, others=np.float32),
+        }
         return cls(**arrays)
 
 
@@ -187,7 +196,9 @@ def _viewing_geometry(model: ModelArrays) -> dict[str, NDArray[np.float32]]:
             angle[block] = np.degrees(np.arccos(np.clip((track @ track.swapaxes(1, 2)).min((1, 2)), -1, 1)))
     mean_distance = np.add.reduceat(distance, start[:-1]) / lengths
     variance = np.add.reduceat((distance - np.repeat(mean_distance, lengths)) ** 2, start[:-1]) / lengths
+    log_focal = np.add.reduceat(np.log(model.image_focal_px[model.observation_image]), start[:-1]) / lengths
     return {
+        "mapping_focal_px": np.exp(log_focal).astype(np.float32),
         "triangulation_angle_deg": angle.astype(np.float32),
         "mapping_direction": (mean / np.maximum(length, 1e-12)[:, None]).astype(np.float32),
         "mapping_direction_spread": np.clip(1 - length, 0, 1).astype(np.float32),

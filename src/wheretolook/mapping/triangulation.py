@@ -147,9 +147,7 @@ def _posed_model(camera: PinholeCamera, cam_from_world: NDArray[np.floating[Any]
     import pycolmap
 
     model = pycolmap.Reconstruction()
-    size = {"width": camera.width, "height": camera.height}
-    parameters = [camera.focal_px, camera.cx, camera.cy]
-    model.add_camera_with_trivial_rig(pycolmap.Camera(camera_id=1, model="SIMPLE_PINHOLE", params=parameters, **size))
+    model.add_camera_with_trivial_rig(pycolmap.Camera(camera_id=1, **camera.colmap.record()))
     for index, pose in enumerate(np.asarray(cam_from_world, dtype=np.float64)):
         image = pycolmap.Image(name=image_name(index), camera_id=1, image_id=index + 1)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:, :3]), pose[:, 3]))
@@ -198,7 +196,7 @@ def surface_overlap(
     grid = np.meshgrid(np.arange(step // 2, h, step), np.arange(step // 2, w, step), indexing="ij")
     rows, columns = (axis.ravel() for axis in grid)
     pixels = np.column_stack([columns, rows]) * DEPTH_STRIDE + DEPTH_STRIDE // 2 + 0.5
-    rays = np.column_stack([(pixels - (camera.cx, camera.cy)) / camera.focal_px, np.ones(len(pixels))])
+    rays = np.column_stack([(pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy), np.ones(len(pixels))])
     depth = depth_m[:, rows, columns].astype(np.float64)
     centers = camera_centers(cam_from_world)
     points = centers[:, None] + depth[..., None] * (rays @ np.asarray(cam_from_world)[:, :, :3])

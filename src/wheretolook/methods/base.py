@@ -8,17 +8,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
+from wheretolook.geometry.camera import Camera, ColmapCamera, describe_camera
 from wheretolook.geometry.poses import Float
 from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS
-from wheretolook.utils.errors import WeightsError
+from wheretolook.utils.errors import CameraError
 
 if TYPE_CHECKING:
     from wheretolook.inputs.bins import BinnedViews
     from wheretolook.inputs.localization_map import LocalizationMap
 
 BLOCK = 4096  # views scored at a time: about 80 MB of bins
-FIELD_OF_VIEW_TOLERANCE = 1e-3  # relative difference in width / focal length up to which fields of view are the same
+FIELD_OF_VIEW_TOLERANCE = (
+    1e-3  # relative difference in size / focal length, and of the principal point, up to which they are the same
+)
 
 
 class Scorer(ABC):
@@ -92,24 +94,18 @@ class CountingScorer(BinnedScorer):
         """Score views by their landmarks and filled bins, (B,) each. Returns (B,) float64, finite."""
 
 
-def check_field_of_view(trained: PinholeCamera, camera: Camera) -> None:
-    """Raise a WeightsError if a camera's field of view is not that of the camera of the training views."""
-    if not same_field_of_view(trained, camera):
-        problem = f"the network was trained for a camera of {_describe(trained)}"
+def check_field_of_view(trained: Camera | None, camera: Camera) -> Camera:
+    """The camera of the training views; a CameraError if its field of view is not that of the camera that looks."""
+    if trained is None or not same_field_of_view(trained, camera):
+        of = "several cameras" if trained is None else f"a camera of {describe_camera(trained)}"
         fix = "Use a pinhole camera with that field of view, or train with this one."
-        raise WeightsError(problem, value=_describe(camera), fix=fix)
+        raise CameraError(f"the network was trained for {of}", value=describe_camera(camera), fix=fix)
+    return trained
 
 
-def same_field_of_view(trained: PinholeCamera, camera: Camera) -> bool:
-    """Whether weights trained for one camera serve another: image and focal length of the same proportions."""
-    if isinstance(camera, ColmapCamera):
+def same_field_of_view(trained: Camera, camera: Camera) -> bool:
+    """Whether two pinholes see the same: their image is the same but for its resolution."""
+    if isinstance(camera, ColmapCamera) or isinstance(trained, ColmapCamera):
         return False
-    spans = np.array([(one.width / one.focal_px, one.height / one.focal_px) for one in (trained, camera)])
+    spans = [(c.width / c.fx, c.height / c.fy, c.cx / c.width, c.cy / c.height) for c in (trained, camera)]
     return bool(np.allclose(spans[0], spans[1], rtol=FIELD_OF_VIEW_TOLERANCE, atol=0))
-
-
-def _describe(camera: Camera) -> str:
-    if isinstance(camera, ColmapCamera):
-        return f"{camera.width} x {camera.height} px, {camera.model}"
-    across, down = (2 * np.degrees(np.arctan(side / 2 / camera.focal_px)) for side in (camera.width, camera.height))
-    return f"{camera.width} x {camera.height} px, {across:.1f} x {down:.1f} degrees"

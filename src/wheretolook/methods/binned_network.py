@@ -67,7 +67,7 @@ class BinnedNetworkScorer(BinnedScorer):
     """The probability that a view localizes, by a network over its binned landmarks.
 
     A network knows the field of view it was trained with. A camera of another resolution but the same field of view is
-    served by scaling its pixels; another is refused with a WeightsError, since the network has never seen one.
+    served by scaling its pixels; another is refused with a CameraError, since the network has never seen one.
     """
 
     local = True
@@ -77,10 +77,10 @@ class BinnedNetworkScorer(BinnedScorer):
         self.channels = network.statistics.channels
         super().__init__(localization_map, network.bins, not {*self.channels} <= {*CHANNELS})
         camera, self.device = localization_map.camera, localization_map.device
-        check_field_of_view(trained.camera, camera)
+        seen = check_field_of_view(trained.camera, camera)
         self.name, self.trained = trained.method, trained
         self.network: Any = network.to(self.device).eval()
-        pixels = {"u": trained.camera.width / camera.width, "v": trained.camera.height / camera.height}
+        pixels = {"u": seen.width / camera.width, "v": seen.height / camera.height}
         scales = [pixels.get(name, 1.0) for name in self.channels]
         self._scale = torch.tensor(scales, device=self.device)[:, None, None]
 

@@ -11,7 +11,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from wheretolook.methods.method import Method, ScorerOptions
-from wheretolook.utils.errors import ConfigError, WeightsError
+from wheretolook.utils.errors import CameraError, ConfigError, WeightsError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -201,6 +201,10 @@ def _build(method: Method, localization_map: LocalizationMap, options: ScorerOpt
     assert method.build is not None
     try:
         scorer = method.build(localization_map, options)
+    except CameraError as error:
+        others = [name for name, known in scorers().items() if known.weights == name and not known.one_camera]
+        fix = f"{error.fix} Weights of {', '.join(others)} serve every camera, as do methods without weights."
+        raise CameraError(error.problem, path=options.weights, value=error.value, fix=fix) from None
     except WeightsError as error:
         if error.path is not None or options.weights is None:
             raise

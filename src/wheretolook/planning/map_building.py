@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
-from wheretolook.geometry.camera import ColmapCamera
+from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float, rotation_looking_along
 from wheretolook.mapping.landmarks import Landmarks
@@ -217,10 +217,7 @@ def _check_unchanged(old: ViewpointMap, scorer: Scorer, rows: NDArray[np.int64])
 def _origin(scorer: Scorer, lattice: str, digests: NDArray[np.uint64]) -> MapOrigin:
     around, camera = scorer.localization_map, scorer.localization_map.camera
     digest = hashlib.sha256(around.landmarks.ids.tobytes() + digests.tobytes()).hexdigest()[:16]
-    if isinstance(camera, ColmapCamera):
-        model, params = camera.model, camera.params
-    else:
-        model, params = "PINHOLE", (camera.focal_px, camera.focal_px, camera.cx, camera.cy)
-    size = {"width": camera.width, "height": camera.height}
-    intrinsics = {"model": model, **size, "params": [float(value) for value in params]}
+    intrinsics = camera.colmap.record()
+    if isinstance(camera, PinholeCamera):  # one model for all, as maps always had it
+        intrinsics |= {"model": "PINHOLE", "params": [float(v) for v in (camera.fx, camera.fy, camera.cx, camera.cy)]}
     return MapOrigin(scorer.name, lattice, intrinsics, around.occlusion.name, digest)

@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike
 
 from wheretolook.dataset.folders import Dataset
 from wheretolook.dataset.scene import Scene
-from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.planning.config import FORWARD, PlanConfig
@@ -52,9 +51,8 @@ def plan_by_methods(
 def path_views(
     path: PlannedPath, localization_map: LocalizationMap, renderer: WarpRenderer | None = None
 ) -> list[PathView]:
-    """What a pinhole camera sees along a path: the landmarks in view, and the image if there is a renderer."""
+    """What the camera sees along a path: the landmarks in view, and the image if there is a renderer."""
     camera, points = localization_map.camera, localization_map.landmarks.points
-    assert isinstance(camera, PinholeCamera)
     cam_from_world = poses_looking_along(path.positions, path.axes)
     seen = localization_map.landmarks_in_view(cam_from_world)
     images: Any = [None] * len(seen) if renderer is None else renderer.render(camera, cam_from_world).rgb

@@ -10,7 +10,7 @@ import numpy as np
 
 from wheretolook.dataset.folders import RELEASE, Dataset
 from wheretolook.dataset.scene import Scene
-from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.camera import camera_of_record
 from wheretolook.geometry.lattices import ViewLattice
 from wheretolook.learning.provenance import was_trained_on
 from wheretolook.learning.weights import method_of_weights, read_record, read_training, read_weights
@@ -62,7 +62,7 @@ def weights_for(
 
 
 def default_weights(dataset: Dataset, say: Callable[[str], None] = print, kinds: Collection[str] = ()) -> Path | None:
-    """The best weights of a dataset, or else of the release beside it, that serve its camera's field of view.
+    """The best weights of a dataset, or else of the release beside it, that serve its cameras.
 
     They are of one of the methods named by `kinds`; empty for all that score views by themselves.
     """
@@ -74,14 +74,15 @@ def default_weights(dataset: Dataset, say: Callable[[str], None] = print, kinds:
                 if method_of_weights(path) not in kinds:
                     continue
                 header, training = read_weights(path)[1], read_training(path)
-                trained = PinholeCamera(**header["camera"])
+                serves_all = not scorers()[method_of_weights(path)].one_camera
+                trained = None if serves_all else camera_of_record(header["camera"])
                 precision = float(read_record(path)["metrics"]["val_average_precision"])
             except (WeightsError, ConfigError, KeyError, TypeError, ValueError) as error:
                 say(f"not used: {path}: {error}")
                 continue
             if root == dataset.root and not was_trained_on(dataset, training):
                 say(f"not used: {path}: trained on other data than the dataset now holds")
-            elif same_field_of_view(trained, dataset.camera):
+            elif trained is None or all(same_field_of_view(trained, camera) for camera in dataset.cameras):
                 fitting[path] = precision
         if fitting:
             return max(fitting, key=lambda path: fitting[path])

@@ -52,7 +52,7 @@ def copy_dataset(dataset: Dataset, root: Path, settings: Mapping[str, Any]) -> D
     """
     before = _release_of(root, dataset.name)
     fingerprint = None if before is None else before.fingerprint()
-    copied = [(scene, SceneFolder(root / scene.name, scene.split)) for scene in dataset.scenes]
+    copied = [(scene, SceneFolder(root / scene.name, scene.split, scene.camera)) for scene in dataset.scenes]
     for scene, copy in copied:
         copy.map.mkdir(parents=True, exist_ok=True)
         write_table(scene.read_table(), copy.table, compact=True)
@@ -67,7 +67,7 @@ def copy_dataset(dataset: Dataset, root: Path, settings: Mapping[str, Any]) -> D
             write_json(copy.label_manifest, _manifest(scene.label_manifest))
     source = {"source": dataset.name, "source_fingerprint": dataset.fingerprint()}
     write_json(root / RELEASE_FILE, {**source, "code_version": VERSION, "settings": dict(settings)})
-    release = Dataset(root, dataset.camera, tuple(copy for _, copy in copied))
+    release = Dataset(root, tuple(copy for _, copy in copied))
     release.save()
     for scene in before.scenes if before is not None else ():
         if scene.name not in {copy.name for copy in release.scenes}:

@@ -148,7 +148,7 @@ def open_showcase(dataset: Dataset, name: str | None = None, device: str = "cpu"
     config = SceneConfig(occlusion, recorded(FreeSpaceConfig, settings["scenes"]["free_space"]))
     kind, apartment = cast(SceneKind, seeded[1]), recorded(ApartmentConfig, settings["scenes"]["apartment"])
     mesh, _ = generate_scene(kind, apartment, int(seeded[2]), device=device)
-    showcase = Showcase(scene, dataset.camera, config, device, mesh)
+    showcase = Showcase(scene, None, config, device, mesh)
     showcase.sampling = recorded(SampleConfig, settings["sample"])
     if settings["occlusion"]["model"] == "mesh":
         _check_same(showcase)

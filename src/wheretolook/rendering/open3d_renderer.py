@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import check_poses
+from wheretolook.rendering.distorted import render_distorted
 from wheretolook.rendering.textures import MAX_ANISOTROPY, build_pyramids, texel_gradients
 from wheretolook.rendering.types import Rendering, camera_rays
 
@@ -34,9 +35,11 @@ class Open3DRenderer:
         self._pyramids = build_pyramids(mesh.textures)
         self._texel_gradients = texel_gradients(mesh)
 
-    def render(self, camera: PinholeCamera, cam_from_world: ArrayLike) -> Rendering:
+    def render(self, camera: Camera, cam_from_world: ArrayLike) -> Rendering:
         """Render poses (B, 3, 4); see `Renderer.render`."""
         poses = check_poses(cam_from_world)
+        if isinstance(camera, ColmapCamera):
+            return render_distorted(self, camera, poses)
         shape = (len(poses), camera.height, camera.width)
         rgb, depth_m = np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.float32)
         for i in range(len(poses)):

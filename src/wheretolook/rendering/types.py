@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.camera import Camera, PinholeCamera
 from wheretolook.geometry.poses import Float
 
 
@@ -27,7 +27,7 @@ class Renderer(Protocol):
     stored colour times the vertex colour, from both sides of a triangle.
     """
 
-    def render(self, camera: PinholeCamera, cam_from_world: ArrayLike) -> Rendering:
+    def render(self, camera: Camera, cam_from_world: ArrayLike) -> Rendering:
         """Render the poses `cam_from_world` (B, 3, 4) with one camera. Raises ValueError on another shape or NaN."""
         ...
 

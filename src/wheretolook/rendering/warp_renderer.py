@@ -8,9 +8,10 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float, check_poses
+from wheretolook.rendering.distorted import render_distorted
 from wheretolook.rendering.raster_kernels import project_kernel, raster_kernel, shade_kernel
 from wheretolook.rendering.raycasting import warp_mesh
 from wheretolook.rendering.textures import build_pyramids, texel_gradients
@@ -73,9 +74,11 @@ class WarpRenderer:
         appearance.vertex_colors = vec3_array(colors, self.device)
         return appearance
 
-    def render(self, camera: PinholeCamera, cam_from_world: ArrayLike) -> Rendering:
+    def render(self, camera: Camera, cam_from_world: ArrayLike) -> Rendering:
         """RGB (B, H, W, 3) and z-depth (B, H, W) of poses (B, 3, 4); see `Renderer.render`."""
         poses = check_poses(cam_from_world)
+        if isinstance(camera, ColmapCamera):
+            return render_distorted(self, camera, poses)
         height, width = camera.height, camera.width
         rgb = np.empty((len(poses), height, width, 3), dtype=np.uint8)
         depth_m = np.empty((len(poses), height, width), dtype=np.float32)

@@ -72,7 +72,7 @@ def _plan(scene: Scene, dataset: Dataset, config: PathsConfig, say: Say) -> Comp
     files, folder = scene.files, _folder(dataset, scene)
     weights = {method: weights_for(method, dataset, config.weights, say) for method in config.methods}
     settings = {name: value for name, value in asdict(config).items() if name not in _OF_THE_REPORT}
-    looked_at = [asdict(scene.config.free_space), asdict(scene.config.occlusion), asdict(scene.camera)]
+    looked_at = [asdict(scene.config.free_space), asdict(scene.config.occlusion), scene.camera.record()]
     poses = files.mapping_cameras if files.mapping_cameras.is_file() else None
     made_from = [path and fingerprint(path) for path in (files.mesh, files.landmarks, poses)]
     used = [path and fingerprint(path) for path in weights.values()]

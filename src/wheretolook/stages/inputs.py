@@ -34,10 +34,11 @@ def dataset_after(experiment: Experiment, needs: str) -> Dataset:
     dataset = Dataset.load(experiment.root)
     if needs != "label":
         refuse_release(experiment.root)
-    if dataset.camera != experiment.camera:
+    others = [scene.camera for scene in dataset.scenes if scene.camera != experiment.camera.camera]
+    if others:
         fix = "Run the scenes stage with this configuration, or give the experiment another name."
         problem = "the dataset was made with another camera"
-        raise ConfigError(problem, path=experiment.root, value=dataset.camera, fix=fix)
+        raise ConfigError(problem, path=experiment.root, value=others[0], fix=fix)
     for scene in dataset.scenes:
         if read_stamp(scene, needs) is None:
             problem = f"the {needs} stage has not been run for this scene since its input was made"
@@ -49,7 +50,7 @@ def open_scene(experiment: Experiment, dataset: Dataset, files: SceneFolder) -> 
     """A scene of the dataset as the experiment looks at it; nothing is read yet."""
     scenes, assume_metric = experiment.scenes, experiment.map.photographs.assume_metric
     config = SceneConfig(experiment.occlusion, scenes.free_space, scenes.mapped_space, assume_metric)
-    return Scene(files, dataset.camera, config, experiment.device)
+    return Scene(files, config=config, device=experiment.device)
 
 
 def refuse_release(root: Path) -> None:

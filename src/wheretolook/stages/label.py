@@ -39,7 +39,7 @@ def label(experiment: Experiment, say: Say = print, tick: Tick = lambda work: No
             raise SceneError(f"{problem}and so not labelled", path=files.folder, fix=fix)
     to_label: list[tuple[SceneFolder, str]] = []
     for files in sorted(dataset.scenes, key=lambda files: files.split == "train"):  # those to evaluate on come first
-        parts = [asdict(config.localizer), asdict(extractor_of(files)), asdict(dataset.camera)]
+        parts = [asdict(config.localizer), asdict(extractor_of(files)), files.camera.record()]
         made_from = [existing(files.mesh, SceneError, "scenes"), existing(files.landmarks, MapError, "map")]
         matches = ["store_matches"] if config.store_matches else []
         key = stage_key("label", [*parts, *made_from, read_stamp(files, "sample"), *matches])
@@ -75,7 +75,8 @@ def _label(
     for files, _ in to_label:
         scene = open_scene(experiment, dataset, files)
         options = (config.localizer, extractor_of(files), scene.device, config.store_matches)
-        job = SceneJob(files.mesh, files.landmarks, scene.camera, *options)
+        cameras = tuple(files.cameras().items()) if files.cameras_file.is_file() else ()
+        job = SceneJob(files.mesh, files.landmarks, scene.camera, *options, cameras)
         tasks.append(LabelTask(scene.name, job, files.read_table(), _shards(files)))
     seconds: dict[str, float] = {}
     start, replacing = time.monotonic(), False

@@ -5,9 +5,13 @@ from __future__ import annotations
 import zlib
 from dataclasses import asdict, replace
 
+import numpy as np
+
 from wheretolook.config import NOT_SCENES, Experiment, check_folder_name
 from wheretolook.dataset.folders import Dataset, SceneFolder
 from wheretolook.dataset.stamps import is_done, read_stamp, stage_key, write_stamp
+from wheretolook.geometry.camera import Camera, PinholeCamera, draw_camera
+from wheretolook.mapping.config import MapConfig
 from wheretolook.mapping.scale import read_scale
 from wheretolook.stages.inputs import Say, Tick, dataset_after, existing, naming_scene, open_scene, refuse_release
 from wheretolook.utils.errors import ConfigError, SceneError
@@ -24,13 +28,14 @@ def make_maps(experiment: Experiment, say: Say = print, tick: Tick = lambda work
         refuse_release(experiment.root)
         return _map_photographs(experiment, say, tick)
     dataset = dataset_after(experiment, "scenes")
-    settings = {name: value for name, value in asdict(experiment.map).items() if name != "photographs"}
+    apart = ("photographs", "camera", "draw_camera")  # the camera follows by itself
+    settings = {name: value for name, value in asdict(experiment.map).items() if name not in apart}
     for files in dataset.scenes:
         scene = open_scene(experiment, dataset, files)
         seed = _seed(files)
         made_from = existing(files.mesh, SceneError, "scenes")
-        floor = files.mapped_floor()
-        shown_by = [asdict(scene.config.free_space), asdict(scene.camera), seed, made_from, *([floor] if floor else [])]
+        floor, camera = files.mapped_floor(), _mapping_camera(experiment.map, scene.camera, seed)
+        shown_by = [asdict(scene.config.free_space), camera.record(), seed, made_from, *([floor] if floor else [])]
         key = stage_key("map", [settings, *shown_by])
         model = [files.map / name for name in ("cameras.bin", "images.bin", "points3D.bin")]
         if is_done(files, "map", key, files.landmarks, *model):
@@ -41,7 +46,7 @@ def make_maps(experiment: Experiment, say: Say = print, tick: Tick = lambda work
 
             with naming_scene(files.mesh):
                 space = PartOfFloor(scene.mesh_space, floor) if floor else scene.mesh_space
-                shown = (scene.mesh, scene.renderer, space, scene.camera)
+                shown = (scene.mesh, scene.renderer, space, camera)
                 workers, device = experiment.n_workers, scene.device
                 report = build_map(*shown, experiment.map, seed, files.map, scene.raycaster, workers, device)
             write_stamp(files, "map", key)
@@ -50,6 +55,21 @@ def make_maps(experiment: Experiment, say: Say = print, tick: Tick = lambda work
             say(f"{scene.name}: {found}, {off} -> {files.map}")
         tick(1)
     return dataset
+
+
+def _mapping_camera(config: MapConfig, looking: Camera, seed: int) -> PinholeCamera:
+    """The camera that maps: given, drawn, or the one that looks.
+
+    Raises:
+        ConfigError: it has distortion.
+    """
+    if config.draw_camera:
+        return draw_camera(np.random.default_rng([seed, 1]))
+    camera = looking if config.camera is None else config.camera.camera
+    if not isinstance(camera, PinholeCamera):
+        fix = "Give one without distortion: --map.camera '{width: 640, height: 480, fov_deg: 90}'."
+        raise ConfigError("a mesh is mapped with a pinhole camera", value=camera.model, fix=fix)
+    return camera
 
 
 def _seed(scene: SceneFolder) -> int:
@@ -69,7 +89,7 @@ def _map_photographs(experiment: Experiment, say: Say, tick: Tick) -> Dataset:
     assert settings.images is not None
     name = settings.name or settings.images.resolve().name
     check_folder_name("a scene's name, map.photographs.name,", name, NOT_SCENES)
-    scene = SceneFolder(root / name, "test")
+    scene = SceneFolder(root / name, "test", experiment.camera.camera)
     dataset = _with_photographs(scene, experiment)
     files = [settings.images / name for name in list_photographs(settings.images)]
     tables = [path for path in (settings.scale.marker_table, settings.scale.positions) if path is not None]
@@ -111,7 +131,8 @@ def _with_photographs(scene: SceneFolder, experiment: Experiment) -> Dataset:
             problem = "this dataset holds scenes with meshes, which photographs do not join"
             names, fix = [other.name for other in known.scenes], "Give the photographs a dataset of their own: --name."
             raise ConfigError(problem, path=root, value=names, fix=fix)
-        if known.camera != experiment.camera:
-            for other in known.scenes:  # what was sampled with another camera is no longer valid
+        for other in known.scenes:
+            if other.camera != scene.camera:  # what was sampled with another camera is no longer valid
                 write_stamp(other, "map", read_stamp(other, "map") or "")
-    return Dataset(root, experiment.camera, tuple(sorted(scenes, key=lambda scene: scene.name)))
+        scenes = [replace(other, camera=scene.camera) for other in scenes]
+    return Dataset(root, tuple(sorted(scenes, key=lambda scene: scene.name)))

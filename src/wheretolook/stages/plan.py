@@ -10,7 +10,7 @@ import pandas as pd
 
 from wheretolook.config import Experiment
 from wheretolook.dataset.folders import Dataset
-from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.stages.inputs import Say, Tick, dataset_after, open_scene
 from wheretolook.utils.errors import ConfigError
@@ -110,7 +110,7 @@ def _rerun():  # type: ignore[no-untyped-def]  # the package is no dependency
     return rerun
 
 
-def _record(rerun, seen: list[PathView], landmarks: np.ndarray, camera: PinholeCamera, file: Path) -> None:  # type: ignore[no-untyped-def]
+def _record(rerun, seen: list[PathView], landmarks: np.ndarray, camera: Camera, file: Path) -> None:  # type: ignore[no-untyped-def]
     """A recording for the Rerun viewer: landmarks, path, the camera moving along it, its image, its score."""
     stream = rerun.RecordingStream("wheretolook")
     stream.save(str(file))
@@ -122,7 +122,12 @@ def _record(rerun, seen: list[PathView], landmarks: np.ndarray, camera: PinholeC
         pose = poses_looking_along(view.position, view.axis)
         stream.log("world/camera", rerun.Transform3D(translation=view.position, mat3x3=pose[:, :3].T))
         size = {"width": camera.width, "height": camera.height}
-        pinhole = rerun.Pinhole(focal_length=camera.focal_px, camera_xyz=rerun.ViewCoordinates.RDF, **size)
+        pinhole = rerun.Pinhole(
+            focal_length=camera.mean_focal_px,  # Rerun knows no distortion
+            principal_point=camera.principal_point,
+            camera_xyz=rerun.ViewCoordinates.RDF,
+            **size,
+        )
         stream.log("world/camera/image", pinhole)
         if view.rgb is not None:
             stream.log("world/camera/image", rerun.Image(view.rgb).compress(jpeg_quality=85))

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import asdict
+
+import numpy as np
 
 from wheretolook.config import Experiment
 from wheretolook.dataset.folders import Dataset
 from wheretolook.dataset.scene import Scene
 from wheretolook.dataset.stamps import is_done, stage_key, write_stamp
+from wheretolook.geometry.camera import Camera, draw_camera, write_cameras
 from wheretolook.stages.inputs import Say, Tick, dataset_after, existing, naming_scene, open_scene
 from wheretolook.utils.errors import MapError, SceneError
 from wheretolook.viewpoints.config import SampleConfig
@@ -39,10 +43,20 @@ def _key(scene: Scene, config: SampleConfig) -> str:
         scene.require_metres()
         space, stage = asdict(scene.config.mapped_space), "map"
     chosen = {name: value for name, value in asdict(config).items() if name != "memory_gb"}
+    if not config.cameras:  # as before there was the option
+        del chosen["cameras"]
     chosen["max_directions"] = config.directions_of(files.split)
     made_from = [existing(scene.source, SceneError, stage), existing(files.landmarks, MapError, "map")]
-    settings = [chosen, scene.occlusion_config.settings(), space, asdict(scene.camera)]
+    settings = [chosen, scene.occlusion_config.settings(), space, scene.camera.record()]
     return stage_key("sample", [*settings, *made_from])
+
+
+def _cameras(scene: Scene, config: SampleConfig) -> Camera | dict[int, Camera]:
+    """The scene's camera, or those drawn for it, by number."""
+    if not config.cameras:
+        return scene.camera
+    rng = np.random.default_rng([config.seed, zlib.crc32(scene.name.encode())])  # whichever scenes are beside it
+    return {number: draw_camera(rng) for number in range(1, config.cameras + 1)}
 
 
 def _sample(scene: Scene, config: SampleConfig, say: Say) -> None:
@@ -52,9 +66,13 @@ def _sample(scene: Scene, config: SampleConfig, say: Say) -> None:
     files = scene.files
     with naming_scene(scene.source):
         grid, free = scene.free_voxels(config, scene.sampled_space)
-        seen = (scene.landmarks, scene.camera, scene.occlusion)
+        cameras = _cameras(scene, config)
+        seen = (scene.landmarks, cameras, scene.occlusion)
         title = f"sample {scene.name}"
         table, occlusion = sample_viewpoints(grid, free, *seen, config, scene.device, title, files.split)
+    files.cameras_file.unlink(missing_ok=True)
+    if isinstance(cameras, dict):
+        write_cameras(cameras, files.cameras_file)
     occlusion.save(files.occlusion)
     write_table(table, files.table)
     n_locations = table["location_id"].nunique()

@@ -24,7 +24,7 @@ def make_scenes(experiment: Experiment, say: Say = print, tick: Tick = lambda wo
     Raises SceneError if a mesh in `scenes.meshes` cannot be used or two scenes have the same name, ConfigError if the
     dataset's folder holds a release.
     """
-    config, root = experiment.scenes, experiment.root
+    config, root, camera = experiment.scenes, experiment.root, experiment.camera.camera
     refuse_release(root)
     numbers: dict[Split, int] = {"train": config.train, "val": config.val, "test": config.test}
     splits = [split for split, number in numbers.items() for _ in range(number)]
@@ -32,11 +32,11 @@ def make_scenes(experiment: Experiment, say: Say = print, tick: Tick = lambda wo
     keys: dict[SceneFolder, list[Any]] = {}
     for seed, split in enumerate(splits, config.seed):
         kind = config.kind_of(seed)
-        scene = SceneFolder(root / f"{kind}-{seed:03d}", split)
+        scene = SceneFolder(root / f"{kind}-{seed:03d}", split, camera)
         sources[scene] = partial(_generate, experiment, kind, seed)
         keys[scene] = [config.apartment.key(), seed, *([] if kind == "apartment" else [kind])]
     for source in config.meshes:
-        scene = SceneFolder(root / source.scene_name, source.split)
+        scene = SceneFolder(root / source.scene_name, source.split, camera)
         if scene.name in {other.name for other in sources}:
             raise SceneError("two scenes have the same name", path=source.path, value=scene.name, fix="Give it a name.")
         sources[scene] = partial(_load, source)
@@ -56,10 +56,12 @@ def make_scenes(experiment: Experiment, say: Say = print, tick: Tick = lambda wo
             write_stamp(scene, "scenes", key)
             say(f"{scene.name}: {len(mesh.triangles):,} triangles -> {scene.mesh}")
         tick(1)
-    dataset = Dataset(root, experiment.camera, tuple(sources))
-    if (root / "dataset.json").is_file() and Dataset.load(root).camera != experiment.camera:
+    dataset = Dataset(root, tuple(sources))
+    if (root / "dataset.json").is_file():
+        cameras = {scene.name: scene.camera for scene in Dataset.load(root).scenes}
         for scene in dataset.scenes:  # what was made with another camera is no longer valid
-            write_stamp(scene, "scenes", read_stamp(scene, "scenes") or "")
+            if cameras.get(scene.name, camera) != camera:
+                write_stamp(scene, "scenes", read_stamp(scene, "scenes") or "")
     dataset.save()
     return dataset
 

@@ -52,6 +52,10 @@ class WeightsError(WhereToLookError):
     """Trained weights are missing or do not fit the network or the inputs asked for."""
 
 
+class CameraError(WeightsError):
+    """Weights have learnt from the views of another camera than the one that looks, and serve no other."""
+
+
 class MapFormatError(WhereToLookError):
     """A saved viewpoint map is missing, damaged or of another version."""
 

@@ -23,6 +23,8 @@ class SampleConfig(ViewLattice):
         max_directions: kept directions of each location to take at most, drawn at random; 0 takes all. One number, or
             one for each split, such as `{train: 50, val: 50, test: 100}`.
         seed: seed of what is drawn at random.
+        cameras: cameras that look in a scene, each at its own locations: drawn from the scene's seed over fields of
+            view, sizes and proportions, to learn from all of them; with 0 the experiment's camera looks.
         distinct_pixels: rank by the number of distinct pixels with a landmark, as the released code counts, instead of
             the number of landmarks.
 
@@ -35,12 +37,13 @@ class SampleConfig(ViewLattice):
     max_locations: int = 0
     max_directions: int | dict[Split, int] = 0
     seed: int = 0
+    cameras: int = 0
     distinct_pixels: bool = False
     memory_gb: float = field(default=2.0, init=False)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("keep", "min_visible", "max_locations"):
+        for name in ("keep", "min_visible", "max_locations", "cameras"):
             if getattr(self, name) < 0:
                 raise ConfigError(f"sample.{name} must not be negative", value=getattr(self, name))
         if isinstance(self.max_directions, dict) and set(self.max_directions) != set(get_args(Split)):

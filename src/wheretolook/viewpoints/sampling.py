@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.lattices import VoxelGrid
-from wheretolook.geometry.poses import poses_looking_along, rotation_looking_along
+from wheretolook.geometry.poses import Float, poses_looking_along, rotation_looking_along
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.utils.errors import SceneError
 from wheretolook.viewpoints.config import SampleConfig, Split
-from wheretolook.viewpoints.table import UNLABELLED, pose_columns
+from wheretolook.viewpoints.table import CAMERA_ID, UNLABELLED, pose_columns
 from wheretolook.visibility.occlusion import OcclusionModel, StoredOcclusion
-from wheretolook.visibility.survey import survey
+from wheretolook.visibility.survey import Survey, survey
 
 if TYPE_CHECKING:
     from wheretolook.space.free_space import FreeSpace
@@ -37,7 +38,7 @@ def sample_viewpoints(
     grid: VoxelGrid,
     location_ids: ArrayLike,
     landmarks: Landmarks,
-    camera: PinholeCamera,
+    cameras: Camera | Mapping[int, Camera],
     occlusion: OcclusionModel,
     config: SampleConfig | None = None,
     device: str = "cpu",
@@ -47,9 +48,10 @@ def sample_viewpoints(
     """Choose viewpoints by how many landmarks they see, at locations (L,) of the grid, the centres of its voxels.
 
     At every location all directions of the lattice are ranked by the number of landmarks in view (descending, then by
-    direction id), and the best K are kept. Some options differ by the scene's split. The progress bar has a text; None
-    shows none. Returns the table of viewpoints, unlabelled, in the order of their ids (location id times the number of
-    directions, plus direction id), and the occlusion of the table's locations, for later stages.
+    direction id), and the best K are kept. Some options differ by the scene's split. Of several cameras, by number,
+    each location looks with one, in turn, and the table says with which. The progress bar has a text; None shows none.
+    Returns the table of viewpoints, unlabelled, in the order of their ids (location id times the number of directions,
+    plus direction id), and the occlusion of the table's locations, for later stages.
 
     Raises:
         SceneError: no viewpoint sees enough landmarks, or a location lies inside geometry.
@@ -62,8 +64,12 @@ def sample_viewpoints(
     directions = config.axes()
     options: dict[str, Any] = {"keep": config.keep, "distinct_pixels": config.distinct_pixels, "progress": progress}
     options |= {"device": device, "memory_bytes": round(config.memory_gb * 1e9)}
-    rotations = rotation_looking_along(directions)
-    seen = survey(camera, rotations, locations, landmarks.points, occlusion, **options)
+    several = cameras if isinstance(cameras, Mapping) else {0: cameras}
+    numbers = np.array(list(several))[np.arange(len(ids)) % len(several)]
+    if len(several) > 1:
+        rng.shuffle(numbers)
+    around = (rotation_looking_along(directions), locations, landmarks.points, occlusion)
+    seen = _survey_by_camera(several, numbers, *around, **options)
     counts, rank = seen.counts, np.full(seen.counts.shape, -1)
     np.put_along_axis(rank, seen.best, np.arange(seen.best.shape[1])[None], axis=1)
 
@@ -85,10 +91,38 @@ def sample_viewpoints(
         "n_visible": counts[row_index, direction],
         "visibility_rank": rank[row_index, direction],
     }
+    if isinstance(cameras, Mapping):
+        columns[CAMERA_ID] = numbers[row_index].astype(np.int32)
     nan = np.float32(np.nan)
     assert seen.occlusion is not None
     table = pd.DataFrame(columns).assign(status=UNLABELLED, error_m=nan, error_deg=nan, n_inliers=0)
     return table, seen.occlusion
+
+
+def _survey_by_camera(
+    cameras: Mapping[int, Camera],
+    numbers: NDArray[np.integer[Any]],
+    rotations: Float,
+    locations: Float,
+    points: Float,
+    occlusion: OcclusionModel,
+    **options: Any,
+) -> Survey:
+    """`survey` of locations (L, 3), each looked from with the camera of its number (L,)."""
+    if len(cameras) == 1:
+        return survey(next(iter(cameras.values())), rotations, locations, points, occlusion, **options)
+    groups = [np.flatnonzero(numbers == number) for number in cameras]
+    parts = [
+        survey(camera, rotations, locations[rows], points, occlusion, **options)
+        for camera, rows in zip(cameras.values(), groups, strict=True)
+        if len(rows)
+    ]
+    order = np.argsort(np.concatenate(groups))
+    stored = [part.occlusion for part in parts if part.occlusion is not None]
+    packed = np.concatenate([part.packed for part in stored])[order]
+    joined = StoredOcclusion(locations, packed, stored[0].n_landmarks, stored[0].name)
+    counts, best = (np.concatenate([getattr(part, name) for part in parts])[order] for name in ("counts", "best"))
+    return Survey(counts, best, joined)
 
 
 def _subset(values: NDArray[np.int64], at_most: int, rng: np.random.Generator) -> NDArray[np.int64]:

@@ -41,6 +41,12 @@ MATCH_FIELDS = pa.schema([("matched_rows", pa.list_(pa.int32())), ("inlier_rows"
 were matched in each view, and the inliers among them, as rows of the scene's `landmarks.npz`, ascending. A view without
 matches has two empty lists. Compact tables leave them out."""
 
+CAMERA_FIELD = pa.schema([("camera_id", pa.int32())])
+"""A column that a table may have in addition to `SCHEMA`, where a scene's viewpoints look with several cameras: the
+number of the camera in the scene's `cameras.txt`."""
+
+(CAMERA_ID,) = CAMERA_FIELD.names
+
 CENTER_DECIMALS = 12  # of a metre; the centres of a location's viewpoints, each computed from its pose, differ by less
 
 _ENCODINGS = {"viewpoint_id": "DELTA_BINARY_PACKED", "error_m": "BYTE_STREAM_SPLIT", "error_deg": "BYTE_STREAM_SPLIT"}
@@ -110,16 +116,18 @@ def outcome_in_brief(label: pd.Series) -> str:
 def write_table(table: pd.DataFrame, path: Path, compact: bool = False) -> None:
     """Write a table atomically as zstd Parquet with checksums; the same rows give the same bytes.
 
-    Columns are those of `SCHEMA`, and of `MATCH_FIELDS` if both are there. A compact table has `COMPACT_SCHEMA`, about
-    18 bytes a row; read back, its poses agree to 1e-12 and all else exactly.
+    Columns are those of `SCHEMA`, and of `CAMERA_FIELD` and `MATCH_FIELDS` if they are there. A compact table has
+    `COMPACT_SCHEMA`, about 18 bytes a row; read back, its poses agree to 1e-12 and all else exactly.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".partial")
     schema, options = (COMPACT_SCHEMA, _COMPACT_FORMAT) if compact else (SCHEMA, {})
     if compact:
         table = table.assign(**dict(zip(CENTER_COLUMNS, _shared_centers(table).T, strict=True)))
-    elif set(MATCH_FIELDS.names) <= set(table.columns):
-        schema = pa.schema([*SCHEMA, *MATCH_FIELDS])
+    further = [CAMERA_FIELD] if compact else [CAMERA_FIELD, MATCH_FIELDS]
+    schema = pa.schema(
+        [*schema, *(field for part in further if set(part.names) <= set(table.columns) for field in part)]
+    )
     content = pa.Table.from_pandas(table, schema=schema, preserve_index=False)
     content = content.replace_schema_metadata(None)  # it describes the data frame, not the rows
     try:
@@ -140,7 +148,7 @@ def _shared_centers(table: pd.DataFrame) -> Float:
 
 
 def read_table(path: Path, matches: bool = False) -> pd.DataFrame:
-    """Read the columns of `SCHEMA` of a table of viewpoints, compact or not.
+    """Read the columns of `SCHEMA` of a table of viewpoints, compact or not, and of `CAMERA_FIELD` if it has that.
 
     With `matches` also those of `MATCH_FIELDS`: in each row two int32 arrays, (M,) of the landmarks matched and (I,) of
     the inliers among them. Raises TableError if the file is missing, truncated, not a Parquet file, or lacks columns
@@ -160,11 +168,13 @@ def read_table(path: Path, matches: bool = False) -> pd.DataFrame:
     missing = [name for name in schema.names if name not in names]
     if missing:
         raise TableError("columns are missing", path=path, value=missing, fix="Run the sample stage again.")
-    if matches:
-        schema = pa.schema([*schema, *MATCH_FIELDS])
-        if missing := [name for name in MATCH_FIELDS.names if name not in names]:
-            fix = "Label again with `--label.store_matches true`; compact tables never hold them."
-            raise TableError("it is not stored which landmarks were matched", path=path, value=missing, fix=fix)
+    further = [name for name in CAMERA_FIELD.names if name in names] + (MATCH_FIELDS.names if matches else [])
+    if further:
+        extra = pa.unify_schemas([CAMERA_FIELD, MATCH_FIELDS])
+        schema = pa.schema([*schema, *(extra.field(name) for name in further)])
+    if matches and (missing := [name for name in MATCH_FIELDS.names if name not in names]):
+        fix = "Label again with `--label.store_matches true`; compact tables never hold them."
+        raise TableError("it is not stored which landmarks were matched", path=path, value=missing, fix=fix)
     try:
         frame: pd.DataFrame = table.select(schema.names).cast(schema).to_pandas()
     except pa.ArrowException as error:
@@ -180,5 +190,5 @@ def read_table(path: Path, matches: bool = False) -> pd.DataFrame:
         rotation = rotation_from_quaternion(frame[list(POSE_COLUMNS[:4])].to_numpy())
         translation = -(rotation @ position[..., None])[..., 0]
         frame = frame.assign(**dict(zip(POSE_COLUMNS[4:], translation.T, strict=True)))
-        frame = frame[[*SCHEMA.names, *(MATCH_FIELDS.names if matches else [])]]
+        frame = frame[[*SCHEMA.names, *further]]
     return frame

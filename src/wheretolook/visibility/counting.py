@@ -127,8 +127,8 @@ class FrustumCounter:
         words = (camera.width * camera.height + 31) // 32
         block = min(n_views, max(1, self.scratch_bytes // (words * 4)))
         bits: Any = wp.empty((block, words), dtype=wp.uint32, device=self.device)
-        intrinsics = [camera.focal_px, camera.cx, camera.cy, camera.width, camera.height]
-        inputs = [self._sides, self._axes, landmarks, *intrinsics, frustum.MIN_DEPTH_M]
+        pinhole = [wp.vec2d(camera.fx, camera.fy), wp.vec2d(camera.cx, camera.cy)]
+        inputs = [self._sides, self._axes, landmarks, *pinhole, camera.width, camera.height, frustum.MIN_DEPTH_M]
         for first in range(0, n_views, block):
             bits.zero_()
             shape = (min(block, n_views - first), self.lanes)

@@ -73,9 +73,9 @@ def frustum_sides(camera: PinholeCamera, rotations: ArrayLike) -> NDArray[np.flo
     with right and bottom is positive (pixel `width` is not), and its depth exceeds `MIN_DEPTH_M`.
     """
     right, down, forward = np.moveaxis(np.asarray(rotations, dtype=np.float64), -2, 0)
-    f, cx, cy = camera.focal_px, camera.cx, camera.cy
-    horizontal = [f * right + cx * forward, (camera.width - cx) * forward - f * right]
-    vertical = [f * down + cy * forward, (camera.height - cy) * forward - f * down]
+    fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
+    horizontal = [fx * right + cx * forward, (camera.width - cx) * forward - fx * right]
+    vertical = [fy * down + cy * forward, (camera.height - cy) * forward - fy * down]
     return np.stack([*horizontal, *vertical, forward], axis=-2).astype(np.float32)
 
 
@@ -86,7 +86,9 @@ def sides_rounding(sides: NDArray[np.float32]) -> float:
 
 def near_radius_m(camera: PinholeCamera) -> float:
     """Distance from the camera centre beyond which whatever lies within the four sides exceeds `MIN_DEPTH_M` too."""
-    return float(1.001 * MIN_DEPTH_M * np.sqrt(1 + (camera.cx**2 + camera.cy**2) / camera.focal_px**2))
+    x = max(abs(camera.cx), abs(camera.width - camera.cx)) / camera.fx
+    y = max(abs(camera.cy), abs(camera.height - camera.cy)) / camera.fy
+    return float(1.001 * MIN_DEPTH_M * np.sqrt(1 + x**2 + y**2))
 
 
 def offsets_from(location: ArrayLike, points: ArrayLike) -> NDArray[np.float32]:
@@ -128,7 +130,7 @@ def pixels_of(camera: Camera, points_cam: Float) -> Float:
     """Pixels (..., 2) of points (..., 3) in view, in the camera frame, rounded as the kernels round them."""
     if isinstance(camera, ColmapCamera):
         return camera.project(points_cam)
-    return camera.focal_px * (points_cam[..., :2] / points_cam[..., 2:]) + (camera.cx, camera.cy)
+    return np.array([camera.fx, camera.fy]) * (points_cam[..., :2] / points_cam[..., 2:]) + (camera.cx, camera.cy)
 
 
 def landmarks_in_view(views: PosedViews, device: str = "cpu") -> LandmarkSets:

@@ -74,14 +74,17 @@ def rounding_error(offset: wp.vec3, rounding: wp.float32) -> wp.float32:
 
 
 @wp.func
-def pixel_of(axes: wp.mat33, offset: wp.vec3, focal: wp.float64, cx: wp.float64, cy: wp.float64) -> wp.vec2d:
-    """Pixel coordinates; `axes` are the camera's in the world, the rows of cam_from_world.
+def pixel_of(axes: wp.mat33, offset: wp.vec3, focal: wp.vec2d, center: wp.vec2d) -> wp.vec2d:
+    """Pixel coordinates, of focal lengths and principal point in pixels.
 
-    Only for modules that do not fuse multiply and add: a fused operation rounds once where NumPy rounds twice, which
-    can move a landmark on the edge of a pixel or a bin to the next one.
+    `axes` are the camera's in the world, the rows of cam_from_world. Only for modules that do not fuse multiply and
+    add: a fused operation rounds once where NumPy rounds twice, which can move a landmark on the edge of a pixel or a
+    bin to the next one.
     """
     depth = dot(axes[2], offset)
-    return wp.vec2d(focal * (dot(axes[0], offset) / depth) + cx, focal * (dot(axes[1], offset) / depth) + cy)
+    x = focal[0] * (dot(axes[0], offset) / depth) + center[0]
+    y = focal[1] * (dot(axes[1], offset) / depth) + center[1]
+    return wp.vec2d(x, y)
 
 
 @wp.kernel

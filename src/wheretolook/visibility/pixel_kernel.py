@@ -15,15 +15,9 @@ wp.set_module_options({"fuse_fp": False})  # for `pixel_of`
 
 @wp.func
 def pixel_number(
-    axes: wp.mat33,
-    offset: wp.vec3,
-    focal: wp.float64,
-    cx: wp.float64,
-    cy: wp.float64,
-    width: wp.int32,
-    height: wp.int32,
+    axes: wp.mat33, offset: wp.vec3, focal: wp.vec2d, center: wp.vec2d, width: wp.int32, height: wp.int32
 ) -> wp.int32:
-    pixel = pixel_of(axes, offset, focal, cx, cy)
+    pixel = pixel_of(axes, offset, focal, center)
     column = wp.clamp(wp.int32(wp.floor(pixel[0])), 0, width - 1)
     row = wp.clamp(wp.int32(wp.floor(pixel[1])), 0, height - 1)
     return row * width + column
@@ -43,9 +37,8 @@ def count_pixels_kernel(
     sides: wp.array2d[wp.vec3],
     axes: wp.array[wp.mat33],
     landmarks: SortedLandmarks,
-    focal: wp.float64,
-    cx: wp.float64,
-    cy: wp.float64,
+    focal: wp.vec2d,
+    center: wp.vec2d,
     width: wp.int32,
     height: wp.int32,
     min_depth: wp.float64,
@@ -64,16 +57,16 @@ def count_pixels_kernel(
     for run in range(runs[0], runs[1]):
         entries = entries_of(landmarks, location, landmarks.inside[run])
         for entry in range(entries[0] + lane, entries[1], lanes):
-            count += mark(bits, view, pixel_number(axis, landmarks.offsets[entry], focal, cx, cy, width, height))
+            count += mark(bits, view, pixel_number(axis, landmarks.offsets[entry], focal, center, width, height))
     runs = border_runs(landmarks, orientation)
     for run in range(runs[0], runs[1]):
         entries = entries_of(landmarks, location, landmarks.border[run])
         for entry in range(entries[0] + lane, entries[1], lanes):
             if in_view(sides, orientation, landmarks.offsets[entry], min_depth):
-                count += mark(bits, view, pixel_number(axis, landmarks.offsets[entry], focal, cx, cy, width, height))
+                count += mark(bits, view, pixel_number(axis, landmarks.offsets[entry], focal, center, width, height))
     near = near_entries(landmarks, location)
     for entry in range(near[0] + lane, near[1], lanes):
         if in_view(sides, orientation, landmarks.offsets[entry], min_depth):
-            count += mark(bits, view, pixel_number(axis, landmarks.offsets[entry], focal, cx, cy, width, height))
+            count += mark(bits, view, pixel_number(axis, landmarks.offsets[entry], focal, center, width, height))
     if count > 0:
         wp.atomic_add(counts, location, orientation, count)

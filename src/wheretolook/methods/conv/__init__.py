@@ -15,6 +15,7 @@ METHODS = (
         build=network_scorer("binned_network:BinnedNetworkScorer", "conv.network:ConvNetwork", "conv"),
         weights="conv",
         probability=True,
+        one_camera=True,
         learn=imported("conv.learn:learn_conv"),
         config=ConvConfig,
         folder="conv",

@@ -15,7 +15,7 @@ from wheretolook.geometry.poses import Float, check_poses
 from wheretolook.inputs.landmarks_in_view import LandmarkDescriber, ViewLandmarks, image_cells
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.learning.trained_network import TrainedNetwork
-from wheretolook.methods.base import Scorer, check_field_of_view
+from wheretolook.methods.base import Scorer
 from wheretolook.methods.matchability.network import MatchabilityNetwork, expected_parts
 from wheretolook.utils.errors import ConfigError
 
@@ -30,7 +30,6 @@ class Expectation:
     _of_maps: ClassVar[WeakKeyDictionary[LocalizationMap, dict[str, Expectation]]] = WeakKeyDictionary()
 
     def __init__(self, localization_map: LocalizationMap, matchability: TrainedNetwork[MatchabilityNetwork]) -> None:
-        check_field_of_view(matchability.camera, localization_map.camera)
         # not the map itself: a value that refers to its key would keep both alive
         self.matchability, self.camera = matchability, localization_map.camera
         self._poses: Float = np.empty((0, 3, 4))

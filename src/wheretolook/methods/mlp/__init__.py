@@ -27,6 +27,7 @@ def _network(inputs: str, style: MethodStyle, channels: tuple[str, ...], **field
         weights=name,
         family="mlp",
         probability=True,
+        one_camera=True,
         of_the_few=True,
         learn=learn,
         config=MlpConfig,

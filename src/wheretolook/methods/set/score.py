@@ -9,7 +9,7 @@ from wheretolook.geometry.poses import Float, check_poses
 from wheretolook.inputs.landmarks_in_view import LandmarkDescriber
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.learning.trained_network import TrainedNetwork
-from wheretolook.methods.base import Scorer, check_field_of_view
+from wheretolook.methods.base import Scorer
 from wheretolook.methods.set.network import SetNetwork
 
 MOST = 1024
@@ -18,16 +18,14 @@ from samples of a fifth of that; against looking at all, log-odds differ by 0.05
 
 
 class SetScorer(Scorer):
-    """Network over the set of landmarks in view: each by its chance of being found, all by what they tell of the pose.
-
-    Raises a WeightsError if it was trained for another field of view than the map's camera.
+    """Network over the set of landmarks in view: each by its chance of being found, all by what they tell
+    of the pose.
     """
 
     local = True
 
     def __init__(self, localization_map: LocalizationMap, trained: TrainedNetwork[SetNetwork]) -> None:
         super().__init__(localization_map)
-        check_field_of_view(trained.camera, localization_map.camera)
         self.name, self.trained = trained.method, trained
         self.network = trained.network.to(localization_map.device)
         self._describer = LandmarkDescriber(localization_map, self.network.attributes)

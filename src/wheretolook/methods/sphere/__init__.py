@@ -15,6 +15,7 @@ METHODS = (
         build=network_scorer("sphere.score:SphereScorer", "sphere.network:SphereNetwork", "sphere"),
         weights="sphere",
         probability=True,
+        one_camera=True,
         learn=imported("sphere.learn:learn_sphere"),
         config=SphereConfig,
         folder="sphere",

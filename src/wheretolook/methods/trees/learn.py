@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from wheretolook.dataset.folders import Dataset, SceneFolder
-from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.dataset.folders import Dataset, SceneFolder, views_by_camera
+from wheretolook.geometry.camera import Camera, camera_of_record
 from wheretolook.inputs.landmarks_in_view import POOLED, LandmarkDescriber, pool
 from wheretolook.learning.data import check_classes, labelled_rows, validation_views
 from wheretolook.learning.fit import home_device
@@ -35,7 +35,7 @@ BLOCK = 4096  # views described at a time: some million landmarks
 class BoostedTrees:
     """T trees of M nodes in all, as arrays."""
 
-    camera: PinholeCamera  # whose views they have learnt from
+    camera: Camera | None  # whose views they have learnt from; None for several
     roots: Tensor  # (T,) int64, node of each tree's root
     feature: Tensor  # (M,) int64, which of `POOLED` a node asks for
     threshold: Tensor  # (M,) float64; values up to it go left
@@ -49,7 +49,7 @@ class BoostedTrees:
     offset: float = 0.0
 
     @classmethod
-    def of_lightgbm(cls, booster: Booster, camera: PinholeCamera, n_trees: int) -> BoostedTrees:
+    def of_lightgbm(cls, booster: Booster, camera: Camera | None, n_trees: int) -> BoostedTrees:
         """The first trees of a model of two classes that LightGBM has fitted."""
         nodes = [tree["tree_structure"] for tree in booster.dump_model(num_iteration=n_trees)["tree_info"]]
         parts: dict[str, list[Any]] = {name: [] for name in _ARRAYS} | {"roots": list(range(len(nodes)))}
@@ -94,7 +94,7 @@ class BoostedTrees:
 
     def save(self, path: Path, training: dict[str, Any] | None = None) -> None:
         """Write one safetensors file, atomically, with JSON values on the training; the same trees, the same bytes."""
-        header = {"features": list(POOLED), "camera": asdict(self.camera)}
+        header = {"features": list(POOLED), "camera": None if self.camera is None else self.camera.record()}
         header |= {**{name: getattr(self, name) for name in _NUMBERS}, "training": training or {}}
         arrays = {name: getattr(self, name) for name in _ARRAYS}
         arrays |= {name: arrays[name].int() for name in ("roots", "left", "right")}
@@ -107,21 +107,25 @@ class BoostedTrees:
         tensors, header = read_weights(Path(path))
         check_serves(path, header, "trees")
         fix = "Train again, or give weights of trees."
-        if header.get("features") != list(POOLED):
-            raise WeightsError("these trees ask for other statistics of a view", path=path, fix=fix)
+        try:
+            features = torch.tensor([POOLED.index(name) for name in header["features"]])
+        except (KeyError, TypeError, ValueError) as error:
+            problem = f"these trees ask for other statistics of a view: {error}"
+            raise WeightsError(problem, path=path, fix=fix) from error
         try:
             numbers = {name: header[name] for name in _NUMBERS}
-            camera = PinholeCamera(**header["camera"])
+            camera = None if header["camera"] is None else camera_of_record(header["camera"])
             arrays = {name: tensors[name] for name in _ARRAYS}
         except (KeyError, TypeError, ConfigError) as error:
             raise WeightsError(f"damaged description of trees: {error}", path=path, fix=fix) from error
         arrays |= {name: arrays[name].long() for name in ("roots", "feature", "left", "right")}
         arrays["missing_left"] = arrays["missing_left"].bool()
         n_nodes = len(arrays["value"])
-        bounds = {"roots": n_nodes, "left": n_nodes, "right": n_nodes, "feature": len(POOLED)}
+        bounds = {"roots": n_nodes, "left": n_nodes, "right": n_nodes, "feature": len(features)}
         inside = all(bool(((arrays[name] >= 0) & (arrays[name] < bound)).all()) for name, bound in bounds.items())
         if not inside or len({len(arrays[name]) for name in _ARRAYS if name != "roots"}) != 1:
             raise WeightsError("the trees lead out of their own arrays", path=path, fix=fix)
+        arrays["feature"] = features[arrays["feature"]]  # statistics may have come since, or stand in another order
         return cls(camera, **arrays, **numbers)
 
 
@@ -158,20 +162,23 @@ def load_pooled(
     values: list[NDArray[np.float32]] = []
     labels: list[NDArray[np.bool_]] = []
     location: list[NDArray[np.int64]] = []
+    scene_numbers: list[NDArray[np.int64]] = []
     tables = [(scene, labelled_rows(scene)) for scene in scenes]
     total = sum(len(table) for _, table in tables)
     with tqdm(total=total, desc="pool views", unit="view", disable=not progress) as bar:
-        for scene, table in tables:
-            describer = LandmarkDescriber(scene.localization_map(dataset.camera, device))
+        for number, (scene, table) in enumerate(tables):
+            describer = LandmarkDescriber(scene.localization_map(device=device))
             cam_from_world = poses(table)
-            for begin in range(0, len(table), BLOCK):
-                block = cam_from_world[begin : begin + BLOCK]
-                values.append(pool(describer.describe(block), block, dataset.camera).cpu().numpy())
-                bar.update(len(block))
-            labels.append(is_good(table, *limits))
-            location.append(table["location_id"].to_numpy(np.int64))
-    scene_numbers = np.repeat(np.arange(len(scenes)), [len(part) for part in labels])
-    return PooledViews(np.concatenate(values), np.concatenate(labels), scene_numbers, np.concatenate(location))
+            good, location_ids = is_good(table, *limits), table["location_id"].to_numpy(np.int64)
+            for camera, rows in views_by_camera(scene, table, BLOCK):
+                block = cam_from_world[rows]
+                values.append(pool(describer.of_camera(camera).describe(block), block, camera).cpu().numpy())
+                labels.append(good[rows])
+                location.append(location_ids[rows])
+                scene_numbers.append(np.full(len(rows), number))
+                bar.update(len(rows))
+    of_scenes = np.concatenate(scene_numbers), np.concatenate(location)
+    return PooledViews(np.concatenate(values), np.concatenate(labels), *of_scenes)
 
 
 def learn_trees(task: Task) -> Learnt:
@@ -185,12 +192,12 @@ def learn_trees(task: Task) -> Learnt:
     held_out = validation_views(dataset, views.scene, views.location, config)
     train, val = views.only(~held_out), views.only(held_out)
     check_classes(dataset, config, train.labels, val.labels)
-    trees, metrics = fit_trees(train, val, dataset.camera, task.options, config.seed)
+    trees, metrics = fit_trees(train, val, task.camera, task.options, config.seed)
     return Learnt(trees, metrics, class_counts(train=train.labels, val=val.labels))
 
 
 def fit_trees(
-    train: PooledViews, val: PooledViews, camera: PinholeCamera, config: TreesConfig, seed: int = 0
+    train: PooledViews, val: PooledViews, camera: Camera | None, config: TreesConfig, seed: int = 0
 ) -> tuple[BoostedTrees, dict[str, float]]:
     """Boost trees, keep as many as order the validation views best, and calibrate their sum on these.
 

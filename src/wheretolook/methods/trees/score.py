@@ -7,14 +7,13 @@ import numpy as np
 from wheretolook.geometry.poses import Float, check_poses
 from wheretolook.inputs.landmarks_in_view import LandmarkDescriber, pool
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.methods.base import BLOCK, Scorer, check_field_of_view
+from wheretolook.methods.base import BLOCK, Scorer
 from wheretolook.methods.trees.learn import BoostedTrees
 
 
 class TreesScorer(Scorer):
-    """Boosted trees on where the landmarks in view lie and how they were mapped: the probability that a view localizes.
-
-    Raises a WeightsError if they were trained for another field of view than the map's camera.
+    """Boosted trees on where the landmarks in view lie and how they were mapped: the probability that a view
+    localizes.
     """
 
     name = "trees"
@@ -22,7 +21,6 @@ class TreesScorer(Scorer):
 
     def __init__(self, localization_map: LocalizationMap, trees: BoostedTrees) -> None:
         super().__init__(localization_map)
-        check_field_of_view(trees.camera, localization_map.camera)
         self.trees = trees.to(localization_map.device)
         self._describer = LandmarkDescriber(localization_map)
 

@@ -1,0 +1,105 @@
+"""Cameras by their options, their files and their errors; pinholes of any focal lengths against OpenCV."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from wheretolook.geometry.camera import (
+    Camera,
+    CameraConfig,
+    ColmapCamera,
+    PinholeCamera,
+    camera_of_record,
+    describe_camera,
+    draw_camera,
+    field_of_view_deg,
+    read_cameras,
+    write_cameras,
+)
+from wheretolook.utils.errors import ConfigError, TableError
+
+FISHEYE = ColmapCamera("OPENCV_FISHEYE", 640, 480, (220.0, 221.0, 318.0, 242.0, 0.01, -0.002, 0.0, 0.0))
+OFF_CENTER = PinholeCamera(1280, 720, 900.0, 910.0, (620.0, 371.0))
+CAMERAS: tuple[Camera, ...] = (PinholeCamera(), OFF_CENTER, FISHEYE)
+
+
+def test_a_pinhole_projects_as_opencv() -> None:
+    points = np.random.default_rng(0).uniform((-1, -1, 1), (1, 1, 3), (50, 3))
+    expected = cv2.projectPoints(points, np.zeros(3), np.zeros(3), OFF_CENTER.matrix, None)[0][:, 0]
+    np.testing.assert_allclose(OFF_CENTER.project(points), expected, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(OFF_CENTER.unproject(expected), points / np.linalg.norm(points, axis=1, keepdims=True))
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_a_pinhole_is_colmaps(camera: Camera) -> None:
+    points = np.random.default_rng(0).uniform((-1, -1, 1), (1, 1, 3), (50, 3))
+    np.testing.assert_allclose(camera.project(points), camera.colmap.project(points), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_records_options_and_files_give_the_camera_back(camera: Camera, tmp_path: Path) -> None:
+    assert camera_of_record(camera.record()) == camera
+    assert CameraConfig.of(camera).camera == camera
+    write_cameras({3: camera, 7: PinholeCamera(64, 48, 50.5)}, tmp_path / "cameras.txt")
+    assert read_cameras(tmp_path / "cameras.txt") == {3: camera, 7: PinholeCamera(64, 48, 50.5)}
+
+
+def test_the_papers_camera_is_the_default() -> None:
+    assert CameraConfig().camera == PinholeCamera(640, 480, 320.0)
+    assert PinholeCamera(640, 480, 320.0, 320.0, (320.0, 240.0)) == PinholeCamera()  # one way to say it
+    assert field_of_view_deg(PinholeCamera()) == pytest.approx((90.0, 73.7), abs=0.05)  # the paper's angles
+    assert CameraConfig(1280, 720, fov_deg=60).camera == PinholeCamera(1280, 720, 640 / np.tan(np.pi / 6))
+    assert describe_camera(PinholeCamera()) == "640 x 480 px, 90.0 x 73.7 degrees"
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"width": 0}, "positive image size"),
+        ({"fov_deg": 180.0}, "between 0 and 180 degrees"),
+        ({"fov_deg": 0.0}, "between 0 and 180 degrees"),
+        ({"focal_px": 0.0035}, "looks like metres"),
+        ({"focal_px": -320.0}, "positive, finite focal length"),
+        ({"focal_px": float("nan")}, "positive, finite focal length"),
+        ({"focal_px": 320.0, "fov_deg": 90.0}, "described in several ways"),
+        ({"params": (320.0,)}, "described in several ways"),
+        ({"model": "PLENOPTIC", "params": (1.0,)}, "no such camera model"),
+        ({"model": "OPENCV", "params": (300.0, 300.0)}, "fx, fy, cx, cy, k1, k2, p1, p2"),
+        ({"model": "PINHOLE", "params": (0.003, 0.003, 320.0, 240.0)}, "looks like metres"),
+        ({"model": "SIMPLE_PINHOLE", "params": (320.0, float("inf"), 240.0)}, "finite parameters"),
+    ],
+)
+def test_what_is_no_camera_is_told(options: dict[str, object], said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        _ = CameraConfig(**options).camera  # type: ignore[arg-type]
+
+
+def test_a_damaged_list_of_cameras_is_named(tmp_path: Path) -> None:
+    for line in (
+        "1 PINHOLE 640 480 320",
+        "one PINHOLE 640 480 320 320 320 240",
+        "1 PINHOLE 0 480 320 320 320 240",
+        "1",
+    ):
+        (tmp_path / "cameras.txt").write_text(line)
+        with pytest.raises(TableError, match=r"cameras\.txt"):
+            read_cameras(tmp_path / "cameras.txt")
+
+
+def test_drawn_cameras_are_those_that_people_have() -> None:
+    rng = np.random.default_rng(0)
+    drawn = [draw_camera(rng) for _ in range(400)]
+    longer = np.array([max(camera.width, camera.height) for camera in drawn])
+    shorter = np.array([min(camera.width, camera.height) for camera in drawn])
+    angle = 2 * np.degrees(np.arctan(longer / 2 / [camera.fx for camera in drawn]))
+    assert 320 <= longer.min() < 340 and 1200 < longer.max() <= 1280
+    assert 40 - 0.1 < angle.min() < 43 and 117 < angle.max() < 120.1
+    assert {round(ratio, 1) for ratio in longer / shorter} == {1.0, 1.3, 1.5, 1.8}
+    assert any(camera.height > camera.width for camera in drawn)
+    off = np.abs([(camera.cx / camera.width - 0.5, camera.cy / camera.height - 0.5) for camera in drawn])
+    assert 0.045 < off.max() < 0.051
+    assert drawn == [draw_camera(rng) for rng in [np.random.default_rng(0)] for _ in range(400)]

@@ -148,6 +148,8 @@ class Experiment:
     def __post_init__(self) -> None:
         check_device_name(self.device)
         check_folder_name("a release's name", self.release_name)
+        if not isinstance(self.camera, CameraConfig):  # from Python, a camera itself may be given
+            object.__setattr__(self, "camera", CameraConfig.of(self.camera))
 
     @property
     def root(self) -> Path:

@@ -110,7 +110,7 @@ def test_a_pose_is_found_with_every_camera(room: MappedRoom, camera: Camera) -> 
     found = pixels[rows] + np.random.default_rng(0).normal(0, 0.3, (len(rows), 2))
     matched = rows.copy()
     matched[::2] = np.roll(matched[::2], 7)
-    keypoints = Keypoints(found.astype(np.float32), np.zeros((len(rows), 128), np.float32))
+    keypoints = replace(Keypoints.none(), pixels=found.astype(np.float32))
     estimate = Localizer(landmarks, CAMERA).estimate(keypoints, np.arange(len(rows)), matched, camera)
     assert estimate.cam_from_world is not None and estimate.status == LOCALIZED
     (error_m,), (error_deg,) = pose_error(estimate.cam_from_world[None], pose[None])

@@ -124,7 +124,7 @@ def test_shards_with_and_without_matches_are_told_apart(room: MappedRoom, tmp_pa
         "versions": versions(),
         "localizer": asdict(LocalizerConfig()),
         "extractor": asdict(ExtractorConfig()),
-        "camera": asdict(CAMERA),
+        "camera": CAMERA.record(),
         "renderer": "cpu raster",
         "mesh": fingerprint(room.mesh),
         "landmarks": fingerprint(room.landmarks),

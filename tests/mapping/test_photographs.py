@@ -94,7 +94,7 @@ def test_intrinsics_can_be_given(tmp_path: Path) -> None:
     config = PhotographsConfig(camera_model="PINHOLE", camera_params=(300.0, 310.0, 181.0, 119.0))
     found = cameras_of(tmp_path, config, reduction=0.5)
     assert found.given and found.cameras[0].params.tolist() == [150.0, 155.0, 90.5, 59.5]
-    with pytest.raises(ConfigError, match="needs a positive size and the parameters"):
+    with pytest.raises(ConfigError, match="needs the finite parameters"):
         cameras_of(tmp_path, PhotographsConfig(camera_model="PINHOLE", camera_params=(300.0,)))
     with pytest.raises(ConfigError, match="no such camera model"):
         cameras_of(tmp_path, PhotographsConfig(camera_model="POLAROID"))

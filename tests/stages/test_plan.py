@@ -80,7 +80,13 @@ def test_the_best_weights_there_are_score(dataset: Path, capsys: pytest.CaptureF
     assert ViewpointMap.load(folder).origin.scorer == "bins"
     rooms = Dataset.load(dataset / "data" / "rooms")
     assert default_weights(rooms) == weights / "set.safetensors"
-    assert default_weights(replace(rooms, camera=replace(CAMERA, focal_px=70.0))) is None
+    narrow = tuple(replace(scene, camera=replace(CAMERA, focal_px=70.0)) for scene in rooms.scenes)
+    assert default_weights(replace(rooms, scenes=narrow)) == weights / "set.safetensors"  # it serves every camera
+    for suffix in ("safetensors", "json"):
+        (weights / f"set.{suffix}").unlink()
+        shutil.copy(SHIPPED / f"mlp-2d+z.{suffix}", weights)
+    assert default_weights(rooms) == weights / "mlp-2d+z.safetensors"
+    assert default_weights(replace(rooms, scenes=narrow)) is None  # the paper's network serves one field of view
     own = dataset / "data" / "rooms" / "weights"
     shutil.copytree(weights, own)  # learnt from other scenes than those of the dataset
     shutil.copy(weights / "set.safetensors", own / "trees.safetensors")  # without a record

@@ -104,8 +104,8 @@ class Localizer:
         if n_matches < self.config.min_matches:
             return Localization(TOO_FEW_MATCHES, None, n_matches, matched_rows=landmark_rows)
         pixels, points = keypoints.pixels[keypoint_rows].astype(np.float64), self.landmarks.points[landmark_rows]
-        taken_with, pixels = _known_to_poselib((camera or self._camera).colmap, pixels)
-        pose, found = poselib.estimate_absolute_pose(pixels, points, taken_with, self._ransac, self._refinement)
+        taken_with, seen = _known_to_poselib((camera or self._camera).colmap, pixels)
+        pose, found = poselib.estimate_absolute_pose(seen, points, taken_with, self._ransac, self._refinement)
         if found["num_inliers"] < 3 or not np.isfinite(pose.Rt).all():  # no three matches determine a pose
             return Localization(NO_POSE, None, n_matches, matched_rows=landmark_rows)
         status = LOCALIZED if found["num_inliers"] >= self.config.min_inliers else NO_POSE

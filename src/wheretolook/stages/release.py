@@ -62,7 +62,8 @@ def release(experiment: Experiment, say: Say = print, tick: Tick = lambda work: 
 def release_settings(experiment: Experiment) -> dict[str, Any]:
     """Settings that decide what a dataset holds, as JSON values. Meshes go by name: paths mean nothing elsewhere."""
     meshes = [{"name": mesh.scene_name, "split": mesh.split, "up": mesh.up} for mesh in experiment.scenes.meshes]
-    settings = {name: asdict(getattr(experiment, name)) for name in ("camera", "scenes", "map", "occlusion", "sample")}
+    settings = {name: asdict(getattr(experiment, name)) for name in ("scenes", "map", "occlusion", "sample")}
+    settings = {"camera": experiment.camera.camera.record(), **settings}
     settings["scenes"]["meshes"] = meshes
     settings["label"] = {"localizer": asdict(experiment.label.localizer)}
     return dict(json.loads(json.dumps(settings, default=str)))

@@ -329,7 +329,7 @@ def test_what_is_missing_is_named(folder: Path, monkeypatch: pytest.MonkeyPatch)
 
 def test_from_the_command_line(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shutil.rmtree(folder / "data" / "release")
-    camera = [f"--camera.{name}={value}" for name, value in vars(CAMERA).items()]
+    camera = [f"--camera.{name}={value}" for name, value in CAMERA.record().items()]
     options = ["--data", str(folder / "data"), "--tracking.folder", str(folder / "mlruns"), *camera]
     assert main(["release", "--name", "tiny", *options]) == 0
     assert "4 scenes" in capsys.readouterr().out

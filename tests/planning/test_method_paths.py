@@ -30,7 +30,13 @@ LANDMARKS = room_landmarks(300)
 WEIGHTS = Path(__file__).parents[2] / "data" / "release" / "weights" / "set.safetensors"
 OFF_CENTER = PinholeCamera(160, 120, 80.0, 85.0, (74.0, 65.0))
 FISHEYE = ColmapCamera("OPENCV_FISHEYE", 160, 120, (55.0, 55.0, 80.0, 60.0, 0.01, -0.002, 0.0, 0.0))
-START, GOAL = (1.0, 1.0, 1.4), (4.5, 4.0, 1.4)
+START, GOAL = (1.0, 1.0, 1.4), (2.8, 1.6, 1.4)
+
+
+@pytest.fixture(autouse=True)
+def untracked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A new tracking store takes seconds to make."""
+    monkeypatch.setattr("wheretolook.stages.plan._log", lambda *given: None)
 
 
 def options(folder: Path, camera: Camera) -> list[str]:
@@ -44,8 +50,7 @@ def options(folder: Path, camera: Camera) -> list[str]:
     model = camera.colmap
     described = f"{{model: {model.model}, width: {model.width}, height: {model.height}, params: {list(model.params)}}}"
     (folder / "rooms.yaml").write_text(f"name: rooms\ncamera: {described}\n")
-    return ["--config", str(folder / "rooms.yaml"), "--data", str(folder / "data"), "--device", "cpu",
-            "--tracking.folder", str(folder / "runs")]  # fmt: skip
+    return ["--config", str(folder / "rooms.yaml"), "--data", str(folder / "data"), "--device", "cpu"]
 
 
 def planned(folder: Path, camera: Camera, method: str, film: str = "none") -> tuple[PlannedPath, pd.DataFrame, Scorer]:
@@ -66,9 +71,9 @@ def planned(folder: Path, camera: Camera, method: str, film: str = "none") -> tu
     return path, pd.read_csv(folder / "way" / "path.csv"), scorer
 
 
-@pytest.mark.parametrize("method", ["bins", "fisher-trace-gp", "set"])
+@pytest.mark.parametrize("method", ["fisher-trace-gp", "set"])
 def test_a_views_score_is_that_of_its_very_pose(tmp_path: Path, method: str) -> None:
-    """A rule, one whose scores have no upper end, and a learned method."""
+    """A rule whose scores have no upper end, by which the planner goes by ranks, and a learned method."""
     path, table, scorer = planned(tmp_path, OFF_CENTER, method)
     looking = poses_looking_along(path.positions, path.axes)
     np.testing.assert_allclose(poses(table), looking, atol=1e-9)
@@ -84,7 +89,7 @@ def test_a_path_that_nobody_scores_has_no_scores(tmp_path: Path) -> None:
 
 def test_a_fisheye_is_planned_for_and_shown(tmp_path: Path) -> None:
     _, table, scorer = planned(tmp_path, FISHEYE, "bins", "gif")
-    assert scorer.localization_map.camera == FISHEYE and len(table) > 5
+    assert scorer.localization_map.camera == FISHEYE and len(table) > 3
     np.testing.assert_allclose(table["score"], scorer.score(poses(table)), rtol=1e-9)
     assert {file.name for file in (tmp_path / "way").iterdir()} == {"path.csv", "path.png", "path.gif"}
     given = parse_experiment("viewpoint-map", ["--config", str(tmp_path / "rooms.yaml"), "--data",

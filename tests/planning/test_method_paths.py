@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +37,7 @@ START, GOAL = (1.0, 1.0, 1.4), (2.8, 1.6, 1.4)
 @pytest.fixture(autouse=True)
 def untracked(monkeypatch: pytest.MonkeyPatch) -> None:
     """A new tracking store takes seconds to make."""
-    monkeypatch.setattr("wheretolook.stages.plan._log", lambda *given: None)
+    monkeypatch.setattr(import_module("wheretolook.stages.plan"), "_log", lambda *given: None)
 
 
 def options(folder: Path, camera: Camera) -> list[str]:

@@ -55,7 +55,7 @@ def plan(experiment: Experiment, say: Say = print, tick: Tick = lambda work: Non
         written.append("path.rrd")
     written.insert(0, "path.csv")
     _log(experiment, dataset, scene.name, list(paths), path, [folder / name for name in written])
-    score = "" if np.isnan(path.scores).any() else f", mean score {score_text(np.mean(path.scores))}"
+    score = "" if np.isnan(path.scores).any() else f", mean score {score_text(float(np.mean(path.scores)))}"
     found = f"{path.length_m:.2f} m, {path.turn_deg:.0f} degrees of turning, {len(path.positions)} views{score}"
     say(f"{scene.name}: {found} -> {folder}: {', '.join(written)}")
     tick(1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -68,6 +69,15 @@ def test_the_picture_tells_scores_and_landmarks() -> None:
     line = next(axes for axes in figure.axes if axes.get_ylabel() == "score").lines[0]
     np.testing.assert_allclose(line.get_xdata(), 0.5 * np.arange(9))
     np.testing.assert_allclose(line.get_ydata(), np.arange(9) / 9)
+
+
+def test_scores_of_any_size_fit_into_the_picture() -> None:
+    """Only some methods' scores are probabilities."""
+    for size in (-3e4, 3e4):
+        views = [replace(view, score=size * view.score) for view in some_views(9)]
+        axes = next(axes for axes in still_figure(views, LANDMARKS).axes if axes.get_ylabel() == "score")
+        low, high = axes.get_ylim()
+        assert all(low <= view.score <= high for view in views)
 
 
 def test_methods_stand_side_by_side() -> None:

@@ -109,6 +109,11 @@ def save_film(frames: Iterator[Pixels], path: Path) -> None:
     os.replace(partial, path)
 
 
+def score_text(score: float) -> str:
+    """A score in few digits: of a probability two decimals; scores of other methods may be of any size."""
+    return f"{score:.2f}" if abs(score) < 10 else f"{score:.3g}"
+
+
 def _pixels(figure: Figure) -> Pixels:
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
@@ -120,7 +125,7 @@ def _draw_view(axes: Axes, view: PathView, before: str = "") -> None:
     if view.rgb is not None:
         axes.imshow(view.rgb, extent=(0, width, height, 0))
     axes.scatter(view.pixels[:, 0], view.pixels[:, 1], s=3, color=SEEN, linewidths=0)
-    score = "" if np.isnan(view.score) else f", score {view.score:.2f}"
+    score = "" if np.isnan(view.score) else f", score {score_text(view.score)}"
     axes.set(xlim=(0, width), ylim=(height, 0), xticks=[], yticks=[], aspect="equal", anchor="N")
     axes.set_title(f"{before}{len(view.pixels):,} landmarks{score}", fontsize=9)
     axes.grid(False)
@@ -160,4 +165,6 @@ def _draw_scores(
     for column, at in enumerate(() if shown is None else shown, 1):
         side = "left" if at == 0 else "right" if at == len(views) - 1 else "center"
         axes.annotate(str(column), (along[at], scores[at]), (0, 6), textcoords="offset points", ha=side)
-    axes.set(xlim=(0, max(along[-1], 1e-6)), ylim=(0, 1.12), xlabel="along the path (m)", ylabel="score")
+    lowest, highest = min(0.0, *scores), max(1.0, *scores)  # NaN, for unknown, is never less nor more
+    axes.set(xlim=(0, max(along[-1], 1e-6)), ylim=(1.12 * lowest, 1.12 * highest))
+    axes.set(xlabel="along the path (m)", ylabel="score")

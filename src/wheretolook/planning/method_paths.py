@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.planning.config import FORWARD, PlanConfig
 from wheretolook.planning.path_planning import check_ends, plan_path
 from wheretolook.planning.route_views import PathView, PlannedPath
-from wheretolook.planning.scene_map import check_methods, planner_map, weights_for
+from wheretolook.planning.scene_map import check_methods, planner_map, planner_scorer, weights_for
 from wheretolook.rendering.warp_renderer import WarpRenderer
 
 
@@ -29,22 +30,29 @@ def plan_by_methods(
 ) -> dict[str, PlannedPath]:
     """Plan a path from start to goal, (3,) m in the world, by each method, with progress bars.
 
-    What a method thinks of the views is its own map's scores. Methods are "forward", or names of scorers; empty for
-    that of the weights, or bins without. `config` has weights for methods that have learnt, if they are of their kind
-    (`weights_for`). Returns paths by the names of their methods, in the order given. Raises ConfigError if a method
-    needs weights or there is none of that name, PlanningError if no path can be found.
+    A method plans by its own viewpoint map, whose scores are those of views from the centres of voxels. The scores of
+    the path returned are those that the method's scorer gives its very poses, in the scorer's units; NaN for "forward",
+    which scores nothing. The path's cost stays what the planner made of the map.
+
+    Methods are "forward", or names of scorers; empty for that of the weights, or bins without. `config` has weights for
+    methods that have learnt, if they are of their kind (`weights_for`). Returns paths by the names of their methods, in
+    the order given. Raises ConfigError if a method needs weights or there is none of that name, PlanningError if no
+    path can be found.
     """
     methods, space = tuple(methods), scene.space
     check_methods(methods)
     check_ends(np.asarray([start, goal], dtype=np.float64), space, space.bounds)  # before maps are built
     paths: dict[str, PlannedPath] = {}
     for method in methods:
-        views, name = None, method
-        if method != FORWARD:
-            views = planner_map(scene, dataset, config, method, weights_for(method, dataset, config.weights))
-            name = method or views.origin.scorer
+        if method == FORWARD:
+            name, path = method, plan_path(start, goal, space, space.bounds, None, config.planner)
+        else:
+            scorer = planner_scorer(scene, dataset, method, weights_for(method, dataset, config.weights))
+            views = planner_map(scene, config, scorer)
+            name, path = method or scorer.name, plan_path(start, goal, space, space.bounds, views, config.planner)
+            path = replace(path, scores=scorer.score(poses_looking_along(path.positions, path.axes)))
         paths.pop(name, None)  # a method named twice stands where it was named last
-        paths[name] = plan_path(start, goal, space, space.bounds, views, config.planner)
+        paths[name] = path
     return paths
 
 

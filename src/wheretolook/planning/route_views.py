@@ -28,9 +28,10 @@ improving either."""
 class PlannedPath:
     """A path of a camera, sampled at its corners and every `PathConfig.spacing_m` or a little less.
 
-    `positions` (W, 3) m and unit optical `axes` (W, 3) are in the world; `scores` (W,) those of the views in the
-    viewpoint map, 0 outside its free voxels, NaN without a map; `cost` as `PathConfig` defines it, by the trapezoidal
-    rule over the views; `found_by` is `SHORT_ROUTE`, `SEARCH` or `IMPROVEMENT`, empty if the path was not planned.
+    `positions` (W, 3) m and unit optical `axes` (W, 3) are in the world; `scores` (W,) are what the planner read in the
+    viewpoint map, 0 outside its free voxels, NaN without a map, or, from `plan_by_methods`, the scores of these very
+    poses; `cost` is as `PathConfig` defines it, by the trapezoidal rule over the map's scores; `found_by` is
+    `SHORT_ROUTE`, `SEARCH` or `IMPROVEMENT`, empty if the path was not planned.
     """
 
     positions: Float
@@ -55,9 +56,9 @@ class PlannedPath:
 class PathView:
     """One view along a path.
 
-    `position` (3,) m and unit optical `axis` (3,) are in the world; `score` is in [0, 1], NaN if unknown; `pixels`
-    (K, 2) are those of the landmarks in view, in an image of `size_px` (width, height); `rgb` (H, W, 3) is None if the
-    scene cannot be rendered.
+    `position` (3,) m and unit optical `axis` (3,) are in the world; `score` is one of `PlannedPath.scores`, NaN if
+    unknown; `pixels` (K, 2) are those of the landmarks in view, in an image of `size_px` (width, height); `rgb`
+    (H, W, 3) is None if the scene cannot be rendered.
     """
 
     position: Float

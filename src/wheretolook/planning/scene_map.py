@@ -14,7 +14,7 @@ from wheretolook.geometry.camera import camera_of_record
 from wheretolook.geometry.lattices import ViewLattice
 from wheretolook.learning.provenance import was_trained_on
 from wheretolook.learning.weights import method_of_weights, read_record, read_training, read_weights
-from wheretolook.methods.base import same_field_of_view
+from wheretolook.methods.base import Scorer, same_field_of_view
 from wheretolook.methods.registry import fallback, find, load_scorer, make_scorer, members, methods_named, scorers
 from wheretolook.planning.map_building import build_viewpoint_map
 from wheretolook.planning.path_planning import Space
@@ -27,20 +27,24 @@ INSIDE = np.stack(np.meshgrid(*[(-1 / 3, 0.0, 1 / 3)] * 3, indexing="ij"), -1).r
 """Points of a voxel that are tested for free space (27, 3), relative to its centre in units of its size."""
 
 
-def scene_viewpoint_map(
-    scene: Scene, views: ViewLattice, method: str = "", weights: Path | None = None
-) -> ViewpointMap:
-    """Build the viewpoint map of a scene by a method (empty for that of the weights, or bins), with progress bars.
+def scene_scorer(scene: Scene, method: str = "", weights: Path | None = None) -> Scorer:
+    """What scores views of a scene by a method (empty for that of the weights, or bins).
 
     Raises:
-        SceneError: no voxel is free. MapError: there are no landmarks.
         ConfigError: no such method, or it needs weights. WeightsError: the weights cannot be used.
+        MapError: the map lacks what the method needs.
+    """
+    if weights is not None and not method:
+        return load_scorer(weights, scene.localization_map)
+    return make_scorer(method or fallback().name, scene.localization_map, weights=weights)
+
+
+def scene_viewpoint_map(scene: Scene, views: ViewLattice, scorer: Scorer) -> ViewpointMap:
+    """Build the viewpoint map of a scene by a scorer of its views, with progress bars.
+
+    Raises SceneError if no voxel is free, MapError if there are no landmarks.
     """
     grid, free = scene.free_voxels(views, scene.space)
-    if weights is not None and not method:
-        scorer = load_scorer(weights, scene.localization_map)
-    else:
-        scorer = make_scorer(method or fallback().name, scene.localization_map, weights=weights)
     return build_viewpoint_map(scorer, grid, free, views.axes(), views.lattice, f"viewpoint map {scene.name}")
 
 
@@ -89,18 +93,23 @@ def default_weights(dataset: Dataset, say: Callable[[str], None] = print, kinds:
     return None
 
 
-def planner_map(
-    scene: Scene, dataset: Dataset, views: ViewLattice, method: str = "", weights: Path | None = None
-) -> ViewpointMap:
-    """The map that a planner is given: scores in [0, 1], and something to go by wherever a camera can be.
+def planner_scorer(scene: Scene, dataset: Dataset, method: str = "", weights: Path | None = None) -> Scorer:
+    """The scorer by which paths are planned in a scene of a dataset, with weights from `weights_for`.
 
-    Scores are the method's probabilities, or ranks of scores that are none; views are borrowed where needed. `weights`
-    are those of `weights_for`; the dataset is named where they are missing. Raises ConfigError if the method needs
-    weights, else as `scene_viewpoint_map`.
+    Raises as `scene_scorer`; where weights are missing, the error names the dataset.
     """
     if weights is None and any(known.weights for known in members(method, scorers())):
         raise ConfigError(f"{method} needs weights", path=dataset.root, fix="Train it, or name weights.")
-    scored = scene_viewpoint_map(scene, views, method, weights)
+    return scene_scorer(scene, method, weights)
+
+
+def planner_map(scene: Scene, views: ViewLattice, scorer: Scorer) -> ViewpointMap:
+    """The map that a planner is given: scores in [0, 1], and something to go by wherever a camera can be.
+
+    Scores are the scorer's probabilities, or ranks of scores that are none; views are borrowed where needed. Raises as
+    `scene_viewpoint_map`.
+    """
+    scored = scene_viewpoint_map(scene, views, scorer)
     scored_by = find(scored.origin.scorer)
     if scored_by is None or not scored_by.probability:
         scored = shares_below(scored)

@@ -67,7 +67,7 @@ def _plan(scene: Scene, dataset: Dataset, config: PathsConfig, say: Say) -> Comp
     """The paths of a scene: those that are there if they were planned with the same settings."""
     from wheretolook.labelling.labeller import storing
     from wheretolook.planning.path_comparison import ComparedPaths, draw_pairs, plan_pairs
-    from wheretolook.planning.scene_map import planner_map, weights_for
+    from wheretolook.planning.scene_map import planner_map, planner_scorer, weights_for
 
     files, folder = scene.files, _folder(dataset, scene)
     weights = {method: weights_for(method, dataset, config.weights, say) for method in config.methods}
@@ -83,7 +83,7 @@ def _plan(scene: Scene, dataset: Dataset, config: PathsConfig, say: Say) -> Comp
         say(f"{scene.name}: reusing {folder}")
         return ComparedPaths(**{name: pd.read_parquet(path) for name, path in tables.items()})
     mapped = [name for name in config.methods if name != FORWARD]
-    maps = {name: planner_map(scene, dataset, config, name, weights[name]) for name in mapped}
+    maps = {name: planner_map(scene, config, planner_scorer(scene, dataset, name, weights[name])) for name in mapped}
     found = plan_pairs(draw_pairs(scene.space, config), scene.space, maps, config, f"plan {scene.name}")
     made.unlink(missing_ok=True)
     with storing(folder):

@@ -10,7 +10,7 @@ import pandas as pd
 
 from wheretolook.config import Experiment
 from wheretolook.dataset.folders import Dataset
-from wheretolook.geometry.camera import Camera
+from wheretolook.geometry.camera import Camera, PinholeCamera
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.stages.inputs import Say, Tick, dataset_after, open_scene
 from wheretolook.utils.errors import ConfigError
@@ -24,11 +24,14 @@ if TYPE_CHECKING:
 def plan(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> PlannedPath:
     """A path through a scene on which the camera localizes, `<scene>/path/path.{csv,png,gif}`; needs the map stage.
 
+    Each view's score is that of its very pose, as the method's scorer gives it (`plan_by_methods`).
+
     Raises:
         ConfigError: no such scene or method, no start or goal, no weights, or Rerun is asked for and not installed.
         PlanningError: the start or the goal is not free, or no path was found. WeightsError: weights cannot be used.
         SceneError, MapError: the scene has no free place, or no map with a scale.
     """
+    from wheretolook.figures.path_film import score_text
     from wheretolook.planning.method_paths import path_views, plan_by_methods
 
     dataset, config = dataset_after(experiment, "map"), experiment.plan
@@ -52,7 +55,7 @@ def plan(experiment: Experiment, say: Say = print, tick: Tick = lambda work: Non
         written.append("path.rrd")
     written.insert(0, "path.csv")
     _log(experiment, dataset, scene.name, list(paths), path, [folder / name for name in written])
-    score = "" if np.isnan(path.scores).any() else f", mean score {np.mean(path.scores):.2f}"
+    score = "" if np.isnan(path.scores).any() else f", mean score {score_text(float(np.mean(path.scores)))}"
     found = f"{path.length_m:.2f} m, {path.turn_deg:.0f} degrees of turning, {len(path.positions)} views{score}"
     say(f"{scene.name}: {found} -> {folder}: {', '.join(written)}")
     tick(1)
@@ -95,7 +98,7 @@ def _log(
 
 
 def _table(path: PlannedPath) -> pd.DataFrame:
-    """A row a view: position, axis, score, and the pose cam_from_world."""
+    """A row a view: position, axis, the pose's own score (empty if the method scores nothing), pose cam_from_world."""
     positions = dict(zip(("x_m", "y_m", "z_m"), path.positions.T, strict=True))
     axes = dict(zip(("axis_x", "axis_y", "axis_z"), path.axes.T, strict=True))
     poses = pose_columns(poses_looking_along(path.positions, path.axes))
@@ -117,16 +120,15 @@ def _record(rerun, seen: list[PathView], landmarks: np.ndarray, camera: Camera, 
     stream.log("world", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     stream.log("world/landmarks", rerun.Points3D(landmarks, radii=0.008), static=True)
     stream.log("world/path", rerun.LineStrips3D([np.array([view.position for view in seen])]), static=True)
+    # Rerun knows no distortion
+    focal_px = (camera.fx, camera.fy) if isinstance(camera, PinholeCamera) else camera.mean_focal_px
     for number, view in enumerate(seen):
         stream.set_time("view", sequence=number)
         pose = poses_looking_along(view.position, view.axis)
         stream.log("world/camera", rerun.Transform3D(translation=view.position, mat3x3=pose[:, :3].T))
         size = {"width": camera.width, "height": camera.height}
         pinhole = rerun.Pinhole(
-            focal_length=camera.mean_focal_px,  # Rerun knows no distortion
-            principal_point=camera.principal_point,
-            camera_xyz=rerun.ViewCoordinates.RDF,
-            **size,
+            focal_length=focal_px, principal_point=camera.principal_point, camera_xyz=rerun.ViewCoordinates.RDF, **size
         )
         stream.log("world/camera/image", pinhole)
         if view.rgb is not None:

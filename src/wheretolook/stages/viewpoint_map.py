@@ -21,7 +21,7 @@ def viewpoint_map(experiment: Experiment, say: Say = print, tick: Tick = lambda 
         ConfigError: no such scene or method, or the method needs weights. WeightsError: the weights cannot be used.
         SceneError: there is no mesh, or no voxel is free. MapFormatError: something else is where the map belongs.
     """
-    from wheretolook.planning.scene_map import default_weights, scene_viewpoint_map
+    from wheretolook.planning.scene_map import default_weights, scene_scorer, scene_viewpoint_map
 
     dataset, config = dataset_after(experiment, "map"), experiment.viewpoint_map
     if not config.method and config.weights is None and (weights := default_weights(dataset, say)) is not None:
@@ -31,7 +31,7 @@ def viewpoint_map(experiment: Experiment, say: Say = print, tick: Tick = lambda 
     for files in [dataset.scene(config.scene)] if config.scene else dataset.scenes:
         scene = open_scene(experiment, dataset, files)
         with naming_scene(scene.source):
-            views = scene_viewpoint_map(scene, config, config.method, config.weights)
+            views = scene_viewpoint_map(scene, config, scene_scorer(scene, config.method, config.weights))
         folder = config.out or files.folder / "viewpoint-map"
         views.save(folder)
         built[scene.name] = views

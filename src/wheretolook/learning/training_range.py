@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -77,18 +78,19 @@ class TrainingRange:
         """Whether the camera alone does not tell if a view is within the range."""
         return not {*self.bounds} <= {*OF_CAMERA}
 
+    @cached_property
+    def _limits(self) -> Float:
+        """Lowest and highest value of each of `QUANTITIES`, (2, 6)."""
+        return np.array([self.bounds.get(name, (-np.inf, np.inf)) for name in QUANTITIES]).T
+
     def outside(self, quantities: Float) -> NDArray[np.bool_]:
         """Which of `QUANTITIES` (B, 6) lie outside the range; what is not known does not."""
-        outside = np.zeros(quantities.shape, dtype=bool)
-        for column, name in enumerate(QUANTITIES):
-            if name in self.bounds:
-                low, high = self.bounds[name]
-                outside[:, column] = (quantities[:, column] < low) | (quantities[:, column] > high)
-        return outside
+        low, high = self._limits
+        return np.asarray((quantities < low) | (quantities > high))
 
     def contains(self, quantities: Float) -> NDArray[np.bool_]:
         """Which views, described by `QUANTITIES` (B, 6), are like those learnt from, (B,)."""
-        return ~self.outside(quantities).any(axis=1)
+        return np.asarray(~self.outside(quantities).any(axis=1))
 
     def complaint(self, quantities: Float, tolerated: float = 0.0) -> str:
         """What is unlike the views learnt from, in words; "" if no more than this share of the views that see anything.
@@ -97,7 +99,7 @@ class TrainingRange:
         """
         seeing = quantities[_see_something(quantities)]
         outside = self.outside(seeing)
-        n_outside = int(outside.any(axis=1).sum())
+        n_outside = int(np.count_nonzero(outside.any(axis=1)))
         if n_outside <= tolerated * len(seeing):
             return ""
         parts = []
@@ -111,7 +113,7 @@ class TrainingRange:
 
 def _see_something(quantities: Float) -> NDArray[np.bool_]:
     """Which views, described by `QUANTITIES` (B, 6), see any landmark, (B,): it then has a distance or a depth."""
-    return np.isfinite(quantities[:, :2]).any(axis=1)
+    return np.asarray(np.isfinite(quantities[:, :2]).any(axis=1))
 
 
 def camera_quantities(camera: Camera) -> Float:
@@ -120,7 +122,7 @@ def camera_quantities(camera: Camera) -> Float:
     return np.array([np.nan, np.nan, np.nan, *angles, camera.mean_focal_px])
 
 
-def bin_quantities(depth_sums: Float, n_filled: NDArray[np.int64]) -> Float:
+def bin_quantities(depth_sums: Float, n_filled: NDArray[np.integer[Any]]) -> Float:
     """`QUANTITIES` (B, 6) that bins tell: sums (B,) of the mean depths of a view's bins, and how many are filled."""
     found = np.full((len(depth_sums), len(QUANTITIES)), np.nan)
     some = n_filled > 0
@@ -135,7 +137,8 @@ def view_quantities(landmarks: ViewLandmarks, n_in_view: Tensor, of_camera: Floa
     """
     log_distance = landmarks.values[:, landmarks.attributes.index("distance")].contiguous()
     mean = torch.segment_reduce(log_distance, "mean", lengths=landmarks.counts)
-    found = np.tile(of_camera, (len(landmarks), 1))
+    found = np.empty((len(landmarks), len(QUANTITIES)))
+    found[:] = of_camera
     counts = n_in_view.cpu().numpy()
     found[:, 0], found[:, 2] = mean.exp().cpu().numpy(), np.where(counts > 0, counts, np.nan)
     return found

@@ -14,7 +14,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from wheretolook.utils.errors import ConfigError, WhereToLookError
+from wheretolook.utils.errors import ConfigError, OutOfRangeWarning, WhereToLookError
 from wheretolook.utils.options import Option, all_options, check_names, grouped, names_in, nearest, short_lines
 from wheretolook.utils.version import VERSION
 
@@ -367,6 +367,8 @@ def _quieten() -> None:
     os.environ.setdefault("GLOG_minloglevel", "2")
     os.environ.setdefault("PYTHONWARNINGS", "ignore")  # for worker processes
     warnings.simplefilter("ignore")
+    warnings.simplefilter("default", OutOfRangeWarning)  # the user's own views, not chatter
+    warnings.formatwarning = lambda message, *_, **__: f"wheretolook: warning: {message}\n"
     for name in ("lightning", "lightning.pytorch", "lightning.fabric", "mlflow", "alembic"):
         logging.getLogger(name).setLevel(logging.ERROR)
 

@@ -32,7 +32,7 @@ from wheretolook.methods.mlp.network import ViewpointNetwork
 from wheretolook.methods.registry import load_scorer, make_scorer
 from wheretolook.stages.evaluate import evaluate_methods as evaluate
 from wheretolook.stages.train import train_methods as train
-from wheretolook.utils.errors import ConfigError, WeightsError
+from wheretolook.utils.errors import ConfigError, OutOfRangeWarning, WeightsError
 from wheretolook.utils.tracking import client
 from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import LOCALIZED, NO_POSE, UNLABELLED, poses, write_table
@@ -117,6 +117,14 @@ def test_a_convolutional_network_learns_where_landmarks_are(tmp_path: Path, stor
     scorer = load_scorer(model.path, dataset.scenes[1].localization_map(CAMERA))
     table = dataset.scenes[1].read_table()
     table = table[table["status"] != UNLABELLED]
+    far, landmarks = poses(table), scorer.localization_map.landmarks
+    assert scorer.in_range(far).mean() > 0.9
+    far[:, :, 3] *= 10
+    larger = load_scorer(model.path, LocalizationMap(replace(landmarks, points=10 * landmarks.points), CAMERA))
+    with pytest.warns(OutOfRangeWarning, match="mean depth of the filled bins") as caught:
+        larger.score(far)
+        larger.score(far)
+    assert not larger.in_range(far).any() and len(caught) == 1
     good = (table["status"] == LOCALIZED).to_numpy()
     # calibrated on these views: the probabilities are right on average
     assert scorer.score(poses(table)).mean() == pytest.approx(good.mean(), abs=1e-3)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import json
+import warnings
 import weakref
 from dataclasses import replace
 from pathlib import Path
@@ -20,13 +21,15 @@ from synthetic_dataset import CAMERA, make_dataset
 from wheretolook.dataset.folders import Dataset
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.fisher import information
+from wheretolook.geometry.poses import Float
 from wheretolook.inputs.landmarks_in_view import ATTRIBUTES, LandmarkDescriber, ViewLandmarks
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.learning.data import labelled_rows
 from wheretolook.learning.landmark_views import AttributeStatistics, LandmarkLoader, load_landmark_views
 from wheretolook.learning.scenes import training_scenes
 from wheretolook.learning.trained_network import StoredNetwork, TrainedNetwork
-from wheretolook.learning.weights import METADATA_KEY, method_of_weights
+from wheretolook.learning.weights import METADATA_KEY, method_of_weights, read_weights, write_weights
+from wheretolook.methods.base import Scorer
 from wheretolook.methods.matchability.config import MatchabilityConfig
 from wheretolook.methods.matchability.learn import LandmarkBatches
 from wheretolook.methods.matchability.network import MatchabilityNetwork, bearing_numbers, expected_parts
@@ -37,7 +40,7 @@ from wheretolook.methods.set.network import EXPECTED, SetNetwork, expected_stati
 from wheretolook.methods.set.score import SetScorer
 from wheretolook.stages.evaluate import evaluate_methods as evaluate
 from wheretolook.stages.train import train_methods as train
-from wheretolook.utils.errors import ConfigError, TableError, WeightsError
+from wheretolook.utils.errors import ConfigError, OutOfRangeWarning, TableError, WeightsError
 from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import LOCALIZED, poses, read_table, write_table
 
@@ -445,6 +448,68 @@ def test_all_are_evaluated(dataset: Dataset, trained: dict[str, Path], tracking:
     assert {"set", "expected-inliers", "expected-bins", "fisher-logdet-expected"} <= set(rows.index)
     assert rows.loc["set", "roc_auc"] > 0.8 and np.isfinite(rows.loc["set", "ece"])
     assert rows.loc["set", "reference"] == "set"
+
+
+def warnings_of(scorer: Scorer, cam_from_world: Float) -> list[str]:
+    """What scoring warns of, all of it of views out of range, and of this file's making."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        scorer.score(cam_from_world)
+    assert all(one.category is OutOfRangeWarning and one.filename == __file__ for one in caught)
+    return [str(one.message) for one in caught]
+
+
+@pytest.mark.parametrize("name", ["set", "expected-inliers", "fisher-trace-expected"])
+def test_views_unlike_those_learnt_from(dataset: Dataset, trained: dict[str, Path], name: str) -> None:
+    weights = trained["set" if name == "set" else "matchability"]
+    scene = dataset.split("train")[0]
+    localization_map, views = scene.localization_map(CAMERA), poses(scene.read_table())
+    scorer = make_scorer(name, localization_map, weights=weights)
+    assert scorer.in_range(views).mean() >= 0.95 and not warnings_of(scorer, views)
+
+    landmarks, far = localization_map.landmarks, views.copy()
+    far[:, :, 3] *= 50
+    farther = replace(landmarks, points=50 * landmarks.points, mapping_distance_m=50 * landmarks.mapping_distance_m)
+    larger = LocalizationMap(farther, CAMERA)
+    scorer = make_scorer(name, larger, weights=weights)
+    sees = np.diff(larger.landmarks_in_view(far).starts) > 0
+    assert np.array_equal(scorer.in_range(far), ~sees) and 0 < sees.mean() < 1
+    assert not warnings_of(scorer, far[~sees])
+    (text,) = warnings_of(scorer, far)
+    assert text.startswith(f"{name}: {sees.sum()} of {sees.sum()} views") and "mean distance" in text
+    assert not warnings_of(scorer, far)  # once
+
+    telephoto = localization_map.of_camera(replace(CAMERA, focal_px=6 * CAMERA.focal_px))
+    scorer = make_scorer(name, telephoto, weights=weights)
+    assert not scorer.in_range(views).any()
+    (text,) = warnings_of(scorer, views)
+    assert "field of view across" in text and not warnings_of(scorer, views)
+
+
+def test_older_weights_know_the_camera_of_their_views(
+    dataset: Dataset, trained: dict[str, Path], tmp_path: Path
+) -> None:
+    tensors, header = read_weights(trained["set"])
+    assert set(header.pop("range")) == {"distance_m", "in_view", "across_deg", "down_deg", "focal_px"}
+    header.pop("format_version")
+    write_weights(tmp_path / "old.safetensors", "set", tensors, header)
+    localization_map, views = dataset.scenes[0].localization_map(CAMERA), poses(dataset.scenes[0].read_table())
+    narrow = localization_map.of_camera(replace(CAMERA, focal_px=2 * CAMERA.focal_px))
+    for seen, inside in ((localization_map, True), (narrow, False)):
+        old, new = (load_scorer(path, seen) for path in (tmp_path / "old.safetensors", trained["set"]))
+        assert (old.in_range(views) == inside).all() and len(warnings_of(old, views)) == 1 - inside
+        np.testing.assert_array_equal(old.score(views), new.score(views))
+    write_weights(tmp_path / "broken.safetensors", "set", tensors, {**header, "range": {"in_view": [1]}})
+    with pytest.raises(WeightsError, match="damaged description"):
+        load_scorer(tmp_path / "broken.safetensors", localization_map)
+
+
+def test_the_same_seed_gives_the_same_bytes(
+    dataset: Dataset, trained: dict[str, Path], tracking: TrackingConfig
+) -> None:
+    before = {method: path.read_bytes() for method, path in trained.items()}
+    train(dataset, FEW, tracking, progress=False, force=True)
+    assert {method: path.read_bytes() for method, path in trained.items()} == before
 
 
 def test_few_views_are_gone_through_more_often() -> None:

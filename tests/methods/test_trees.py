@@ -26,7 +26,7 @@ from wheretolook.methods.trees.learn import BoostedTrees, PooledViews, fit_trees
 from wheretolook.methods.trees.score import TreesScorer
 from wheretolook.stages.evaluate import evaluate_methods as evaluate
 from wheretolook.stages.train import train_methods as train
-from wheretolook.utils.errors import ConfigError, WeightsError
+from wheretolook.utils.errors import ConfigError, OutOfRangeWarning, WeightsError
 from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import is_good, poses
 
@@ -205,4 +205,7 @@ def test_the_scorer_is_the_trees_on_pooled_views(tmp_path: Path) -> None:
     with pytest.raises(WeightsError, match="not of mlp"):
         make_scorer("mlp", localization_map, weights=model.path)
     wide = localization_map.of_camera(replace(dataset.camera, focal_px=dataset.camera.focal_px / 2))
-    assert load_scorer(model.path, wide).score(poses(table)).mean() != scores.mean()  # they serve every camera
+    other = load_scorer(model.path, wide)
+    assert scorer.in_range(poses(table)).mean() > 0.9 and not other.in_range(poses(table)).any()
+    with pytest.warns(OutOfRangeWarning, match="field of view"):
+        assert other.score(poses(table)).mean() != scores.mean()  # they serve every camera

@@ -21,6 +21,7 @@ from wheretolook.inputs.bins import InputStatistics
 from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS
 from wheretolook.learning.config import FittingConfig, SharedConfig
 from wheretolook.learning.scenes import training_scenes
+from wheretolook.learning.training_range import TrainingRange, bin_quantities
 from wheretolook.utils.errors import ConfigError, TableError
 from wheretolook.viewpoints.table import UNLABELLED, is_good, poses
 
@@ -300,6 +301,7 @@ class ViewpointDataModule(ViewsDataModule):
     views: LabelledViews
     train_rows: Tensor
     val_rows: Tensor
+    training_range: TrainingRange  # of the depths of the training views, known after `setup`
     statistics: InputStatistics  # of all channels over the training views, known after `setup`
     class_weights: tuple[float, float]  # of the negative and the positive class, by the training labels after `setup`
 
@@ -340,6 +342,9 @@ class ViewpointDataModule(ViewsDataModule):
             self.train_rows = self.train_rows[balance_classes(labels[self.train_rows], self.config.seed)]
         self.class_weights = class_weights(labels[self.train_rows])
         self.statistics = InputStatistics.of(views.means, views.filled, self.train_rows, views.channels)
+        depths = views.means[:, views.channels.index("z")].sum((1, 2), dtype=torch.float64)
+        quantities = bin_quantities(depths.cpu().numpy(), views.filled.sum((1, 2)).cpu().numpy())
+        self.training_range = TrainingRange.of(quantities[self.train_rows.numpy()])
         self.views = views
 
     def batches(self, rows: Tensor, shuffle_seed: int | None = None) -> BatchLoader:

@@ -15,12 +15,14 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from wheretolook.dataset.folders import Dataset, SceneFolder, views_by_camera
+from wheretolook.geometry.poses import Float
 from wheretolook.inputs.landmarks_in_view import ATTRIBUTES, LandmarkDescriber, ViewLandmarks
 from wheretolook.learning.config import SharedConfig
 from wheretolook.learning.data import Batch, TensorViews, ViewsDataModule, labelled_rows, validation_views
 from wheretolook.learning.fit import home_device
 from wheretolook.learning.learner import Task
 from wheretolook.learning.scenes import training_scenes
+from wheretolook.learning.training_range import TrainingRange, camera_quantities, view_quantities
 from wheretolook.viewpoints.table import LOCALIZED, is_good, poses
 
 DISTANCES = [ATTRIBUTES.index(name) for name in ("distance", "mapped_distance", "mapped_pixel_size")]
@@ -65,6 +67,7 @@ class LandmarkViews(TensorViews):
     error_m: Tensor  # (B,) float32, error of its position, infinite where it is not localized or its orientation is off
     scene: NDArray[np.int64]  # (B,) int64, number of each view's scene in the order given
     location: NDArray[np.int64]  # (B,) int64, location_id of each view, unique only within its scene
+    quantities: Float  # (B, 6), `wheretolook.learning.training_range.QUANTITIES`
     # (E,) bool, whether the localizer found the landmark; None where that was not asked for
     found: Tensor | None = None
 
@@ -106,9 +109,12 @@ def load_landmark_views(
                 starts, kept = _some_of_each(described, most, generator)
                 values, counts = described.values[kept].to("cpu", torch.float16), described.counts.cpu()
                 found = None if found is None else found[kept.cpu()]
-                scene_of, at = np.full(len(described), number), location[rows]
+                of_scene = np.full(len(described), number), location[rows]
+                quantities = view_quantities(described, described.counts, camera_quantities(camera))
                 height, label, off_m = torch.from_numpy(of_views[:, rows])
-                blocks.append(LandmarkViews(starts.cpu(), values, counts, height, label, off_m, scene_of, at, found))
+                blocks.append(
+                    LandmarkViews(starts.cpu(), values, counts, height, label, off_m, *of_scene, quantities, found)
+                )
                 bar.update(len(described))
     return _joined(blocks)
 
@@ -141,7 +147,7 @@ def _joined(blocks: Sequence[LandmarkViews]) -> LandmarkViews:
     starts = torch.zeros(len(lengths) + 1, dtype=torch.int64)
     starts[1:] = lengths.cumsum(0)
     joined: dict[str, Any] = {"starts": starts}
-    for name in ("values", "n_visible", "axis_height", "labels", "error_m", "scene", "location", "found"):
+    for name in ("values", "n_visible", "axis_height", "labels", "error_m", "scene", "location", "quantities", "found"):
         parts = [getattr(block, name) for block in blocks if getattr(block, name) is not None]
         if parts:
             joined[name] = torch.cat(parts) if isinstance(parts[0], Tensor) else np.concatenate(parts)
@@ -207,7 +213,7 @@ class LandmarkLoader:
 
 
 class LandmarkDataModule(ViewsDataModule):
-    """The `LandmarkViews` of a task's dataset and statistics over the landmarks of those to learn from.
+    """The `LandmarkViews` of a task's dataset, and of those to learn from statistics over the landmarks and the range.
 
     See `load_landmark_views` for the landmarks kept of a view, for matches, and for what is raised.
     """
@@ -226,3 +232,4 @@ class LandmarkDataModule(ViewsDataModule):
         self.train_rows, self.val_rows = (torch.nonzero(side)[:, 0] for side in (~held_out, held_out))
         of_train = (~held_out).repeat_interleave(self.views.starts.diff())
         self.statistics = AttributeStatistics.of(self.views.values[of_train].float())
+        self.training_range = TrainingRange.of(self.views.quantities[~held_out.numpy()], self.options.enlarged)

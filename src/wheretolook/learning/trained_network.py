@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from wheretolook.geometry.camera import Camera, camera_of_record
 from wheretolook.learning.old_names import name_of_header
+from wheretolook.learning.training_range import TrainingRange
 from wheretolook.learning.weights import check_serves, read_weights, write_weights
 from wheretolook.utils.errors import ConfigError, WeightsError
 
@@ -37,13 +38,22 @@ NetworkT = TypeVar("NetworkT", bound=StoredNetwork)
 
 
 class TrainedNetwork(Generic[NetworkT]):
-    """A network, the camera of its training views, and what calibrates its logits: scale * logit + offset."""
+    """A network, the camera of its training views, and what calibrates its logits: scale * logit + offset.
+
+    `training_range` says what the training views were like, if the file of weights tells.
+    """
 
     def __init__(
-        self, method: str, network: NetworkT, camera: Camera | None, scale: float = 1.0, offset: float = 0.0
+        self,
+        method: str,
+        network: NetworkT,
+        camera: Camera | None,
+        scale: float = 1.0,
+        offset: float = 0.0,
+        training_range: TrainingRange | None = None,
     ) -> None:
         self.method, self.network, self.camera = method, network.eval(), camera
-        self.scale, self.offset = scale, offset
+        self.scale, self.offset, self.training_range = scale, offset, training_range
 
     def calibrated(self, logits: Tensor) -> Tensor:
         """Calibrated log-odds of the network's logits, in the same shape and precision."""
@@ -56,6 +66,8 @@ class TrainedNetwork(Generic[NetworkT]):
             "camera": None if self.camera is None else self.camera.record(),
             "scale": self.scale,
         }
+        if self.training_range is not None:
+            header["range"] = self.training_range.record()
         header |= {"offset": self.offset, "training": dict(training or {})}
         write_weights(path, self.method, self.network.stored.state_dict(), header)
 
@@ -74,6 +86,7 @@ class TrainedNetwork(Generic[NetworkT]):
             network = network_class.of_description(header)
             camera = None if header["camera"] is None else camera_of_record(header["camera"])
             scale, offset = float(header.get("scale", 1.0)), float(header.get("offset", 0.0))
+            known = TrainingRange.of_record(header["range"]) if "range" in header else None
         except WeightsError as error:
             raise WeightsError(error.problem, path=path, value=error.value, fix=error.fix or fix) from error
         except (KeyError, TypeError, ValueError, IndexError, ConfigError) as error:
@@ -84,4 +97,4 @@ class TrainedNetwork(Generic[NetworkT]):
             problem = f"the weights do not fit the network they describe: {error}"
             raise WeightsError(problem, path=path, fix=fix) from error
         found = network.to(device).requires_grad_(False)
-        return TrainedNetwork(name_of_header(header), found, camera, scale, offset)
+        return TrainedNetwork(name_of_header(header), found, camera, scale, offset, known)

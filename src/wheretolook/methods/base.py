@@ -45,6 +45,13 @@ class Scorer(ABC):
     def score(self, cam_from_world: Float) -> Float:
         """Score poses (B, 3, 4). Returns (B,) float64, finite."""
 
+    def in_range(self, cam_from_world: Float) -> NDArray[np.bool_]:
+        """Which poses (B, 3, 4) see what is like the views that the scorer has learnt from, (B,) bool.
+
+        All do where nothing was learnt, or nothing is known of the views it was learnt from.
+        """
+        return np.ones(len(cam_from_world), dtype=bool)
+
     def score_binned(self, cam_from_world: Float, binned: BinnedViews) -> Float:
         """What `score` gives, (B,), for poses that the map's `bin_views` has binned already, with all `CHANNELS`."""
         return self.score(cam_from_world)

@@ -7,14 +7,17 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from wheretolook.geometry.poses import Float
+from wheretolook.geometry.poses import Float, check_poses
 from wheretolook.inputs.bins import BinnedViews, InputStatistics
 from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.learning.trained_network import StoredNetwork, TrainedNetwork
-from wheretolook.methods.base import BinnedScorer, check_field_of_view
+from wheretolook.learning.training_range import TrainingRange, bin_quantities
+from wheretolook.methods.base import BLOCK, BinnedScorer, check_field_of_view
+from wheretolook.methods.range_watch import RangeWatch
 from wheretolook.utils.errors import WeightsError
 
 
@@ -67,7 +70,8 @@ class BinnedNetworkScorer(BinnedScorer):
     """The probability that a view localizes, by a network over its binned landmarks.
 
     A network knows the field of view it was trained with. A camera of another resolution but the same field of view is
-    served by scaling its pixels; another is refused with a CameraError, since the network has never seen one.
+    served by scaling its pixels; another is refused with a CameraError, since the network has never seen one. Views are
+    in range if the depths of their bins are like those learnt from, where the weights tell; `score` warns once.
     """
 
     local = True
@@ -79,6 +83,8 @@ class BinnedNetworkScorer(BinnedScorer):
         camera, self.device = localization_map.camera, localization_map.device
         seen = check_field_of_view(trained.camera, camera)
         self.name, self.trained = trained.method, trained
+        self.training_range = trained.training_range or TrainingRange({})
+        self._watch = RangeWatch(self.training_range)
         self.network: Any = network.to(self.device).eval()
         pixels = {"u": seen.width / camera.width, "v": seen.height / camera.height}
         scales = [pixels.get(name, 1.0) for name in self.channels]
@@ -86,6 +92,8 @@ class BinnedNetworkScorer(BinnedScorer):
 
     def score_bins(self, binned: BinnedViews) -> Float:
         """(B,) probabilities in [0, 1]."""
+        if self._watch.watching and "z" in binned.channels:
+            self._watch.check(self.name, [_depths(binned)])
         binned = binned if binned.channels == self.channels else binned.select(self.channels)
         scores, block = np.empty(len(binned)), self.network.scored_at_once
         # TF32 would let a score depend on how many views are scored with it
@@ -98,3 +106,17 @@ class BinnedNetworkScorer(BinnedScorer):
                 logits = self.network(means, filled).double()
                 scores[rows] = self.trained.calibrated(logits).sigmoid().cpu().numpy()
         return scores
+
+    def in_range(self, cam_from_world: Float) -> NDArray[np.bool_]:
+        """Which poses (B, 3, 4) see depths like those of the views learnt from, (B,) bool."""
+        cam_from_world = check_poses(cam_from_world)
+        inside = np.ones(len(cam_from_world), dtype=bool)
+        for begin in range(0, len(inside) if self.training_range.bounds else 0, BLOCK):
+            binned = self.localization_map.bin_views(cam_from_world[begin : begin + BLOCK], self.bins)
+            inside[begin : begin + BLOCK] = self.training_range.contains(_depths(binned))
+        return inside
+
+
+def _depths(binned: BinnedViews) -> Float:
+    depths = binned.means[:, binned.channels.index("z")].sum((1, 2), dtype=np.float64)
+    return bin_quantities(depths, binned.n_filled)

@@ -64,5 +64,9 @@ class MissingRunError(WhereToLookError):
     """A figure needs a run that the tracking store does not have."""
 
 
+class OutOfRangeWarning(UserWarning):
+    """Views are unlike those that a scorer has learnt from, so that its scores are less sure than usual."""
+
+
 class PlanningError(WhereToLookError):
     """There is no path, or no sequence of views along one that keeps the camera's limits."""

@@ -19,5 +19,5 @@ def learn_conv(task: Task) -> Learnt:
     calibration = fit_platt(*predict(network.to(device), data))
     labels = data.views.labels.cpu()
     counts = class_counts(train=labels[data.train_rows].numpy(), val=labels[data.val_rows].numpy())
-    model = TrainedNetwork(task.method, network.cpu(), task.dataset.camera, *calibration)
+    model = TrainedNetwork(task.method, network.cpu(), task.dataset.camera, *calibration, data.training_range)
     return Learnt(model, metrics, counts, history)

@@ -91,5 +91,5 @@ def learn_matchability(task: Task) -> Learnt:
     metrics, history = fit_network(network, data, task)
     logits, found = predict(network, data)
     counts = class_counts(train=data.found.cpu()[data.entries(data.train_rows)].numpy(), val=found)
-    model = TrainedNetwork(task.method, network, task.camera, *fit_platt(logits, found))
+    model = TrainedNetwork(task.method, network, task.camera, *fit_platt(logits, found), data.training_range)
     return Learnt(model, metrics, counts, history)

@@ -15,7 +15,8 @@ from wheretolook.geometry.poses import Float, check_poses
 from wheretolook.inputs.landmarks_in_view import LandmarkDescriber, ViewLandmarks, image_cells
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.learning.trained_network import TrainedNetwork
-from wheretolook.methods.base import Scorer
+from wheretolook.learning.training_range import QUANTITIES, camera_quantities, view_quantities
+from wheretolook.methods.landmark_scorer import LandmarkScorer
 from wheretolook.methods.matchability.network import MatchabilityNetwork, expected_parts
 from wheretolook.utils.errors import ConfigError
 
@@ -34,6 +35,7 @@ class Expectation:
         self.matchability, self.camera = matchability, localization_map.camera
         self._poses: Float = np.empty((0, 3, 4))
         self._sums: Float = np.empty((0, 17))
+        self.quantities: Float = np.empty((0, len(QUANTITIES)))  # of the views that `sums` was asked for last
 
     @classmethod
     def of_map(cls, localization_map: LocalizationMap, weights: str | Path) -> Expectation:
@@ -57,12 +59,14 @@ class Expectation:
         cam_from_world = check_poses(cam_from_world)
         if not np.array_equal(cam_from_world, self._poses):  # several methods ask for the same block of views
             sums = np.empty((len(cam_from_world), 17))
-            for rows, described, _ in describer.in_blocks(cam_from_world):
+            quantities, of_camera = np.empty((len(sums), len(QUANTITIES))), camera_quantities(self.camera)
+            for rows, described, n_in_view in describer.in_blocks(cam_from_world):
+                quantities[rows] = view_quantities(described, n_in_view, of_camera)
                 log_odds = self._log_odds(described.values)
                 parts = expected_parts(described.values, log_odds, described.attributes)[:, :16].double()
                 sums[rows, :16] = torch.segment_reduce(parts, "sum", lengths=described.counts, initial=0.0).cpu()
                 sums[rows, 16] = self._filled(described, log_odds).cpu()
-            self._poses, self._sums = cam_from_world.copy(), sums
+            self._poses, self._sums, self.quantities = cam_from_world.copy(), sums, quantities
         return self._sums
 
     def _log_odds(self, values: Tensor) -> Tensor:
@@ -78,7 +82,7 @@ class Expectation:
         return (1 - missed.exp()).view(len(described), -1).sum(1)
 
 
-class ExpectedScorer(Scorer):
+class ExpectedScorer(LandmarkScorer):
     """Landmarks in view, each by its learned chance of being found; or the bins of the image expected to hold one.
 
     The kind "inliers" is the share of the map's landmarks expected to be found; "bins" the share of the image's bins
@@ -86,23 +90,24 @@ class ExpectedScorer(Scorer):
     """
 
     def __init__(self, localization_map: LocalizationMap, weights: str | Path, kind: str) -> None:
-        super().__init__(localization_map)
         if kind not in (INLIERS, FILLED):
             raise ConfigError("unknown expectation", value=kind, fix=f"There are {INLIERS} and {FILLED}.")
+        self._expectation = expectation = Expectation.of_map(localization_map, weights)
+        trained = expectation.matchability
+        super().__init__(localization_map, trained.network.attributes, trained.training_range, trained.camera)
         self.kind, self.name = kind, f"expected-{kind}"
         self.local = kind == FILLED  # the share of the map's landmarks falls with every landmark that is added
-        self._expectation = Expectation.of_map(localization_map, weights)
-        self._describer = LandmarkDescriber(localization_map, self._expectation.matchability.network.attributes)
 
     def score(self, cam_from_world: Float) -> Float:
         """(B,) in [0, 1]."""
         sums = self._expectation.sums(self._describer, cam_from_world)
+        self._watch.check(self.name, [self._expectation.quantities])
         if self.kind == FILLED:
             return sums[:, 16] / BINS**2
         return sums[:, 0] / max(1, len(self.localization_map.landmarks))
 
 
-class ExpectedFisherScorer(Scorer):
+class ExpectedFisherScorer(LandmarkScorer):
     """Expected Fisher information of the pose, each landmark in view weighted by its learned chance of being found.
 
     The metric is "mineig", "logdet" or "trace"; a ConfigError of others. See `Expectation.of_map` for unfit weights.
@@ -111,14 +116,15 @@ class ExpectedFisherScorer(Scorer):
     local = True
 
     def __init__(self, localization_map: LocalizationMap, weights: str | Path, metric: str) -> None:
-        super().__init__(localization_map)
         if metric not in METRICS:
             raise ConfigError("unknown metric of information", value=metric, fix=f"There are {', '.join(METRICS)}.")
+        self._expectation = expectation = Expectation.of_map(localization_map, weights)
+        trained = expectation.matchability
+        super().__init__(localization_map, trained.network.attributes, trained.training_range, trained.camera)
         self.metric, self.name = metric, f"fisher-{metric}-expected"
-        self._expectation = Expectation.of_map(localization_map, weights)
-        self._describer = LandmarkDescriber(localization_map, self._expectation.matchability.network.attributes)
 
     def score(self, cam_from_world: Float) -> Float:
         """(B,), not bounded by 1."""
         numbers = self._expectation.sums(self._describer, cam_from_world)[:, 1:16]
+        self._watch.check(self.name, [self._expectation.quantities])
         return metric_of(numbers, self.metric, device=self.localization_map.device)

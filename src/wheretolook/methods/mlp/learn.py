@@ -24,7 +24,8 @@ def learn_mlp(task: Task, channels: tuple[str, ...]) -> Learnt:
     metrics, history = fit_network(network, data, task, data.class_weights)
     labels = data.views.labels.cpu()
     counts = class_counts(train=labels[data.train_rows].numpy(), val=labels[data.val_rows].numpy())
-    return Learnt(TrainedNetwork(task.method, network.cpu(), task.dataset.camera), metrics, counts, history)
+    model = TrainedNetwork(task.method, network.cpu(), task.dataset.camera, training_range=data.training_range)
+    return Learnt(model, metrics, counts, history)
 
 
 def _views(task: Task, channels: tuple[str, ...]) -> ViewpointDataModule:

@@ -72,5 +72,5 @@ def learn_set(task: Task, data: SetData | None = None) -> Learnt:
     metrics, history = fit_network(network, data, replace(task, options=options))
     logits, labels = predict(network, data)
     counts = class_counts(train=data.views.labels[data.train_rows].cpu().numpy(), val=labels)
-    model = TrainedNetwork(task.method, network, task.camera, *fit_platt(logits, labels))
+    model = TrainedNetwork(task.method, network, task.camera, *fit_platt(logits, labels), data.training_range)
     return Learnt(model, metrics, counts, history)

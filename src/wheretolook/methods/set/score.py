@@ -6,10 +6,9 @@ import numpy as np
 import torch
 
 from wheretolook.geometry.poses import Float, check_poses
-from wheretolook.inputs.landmarks_in_view import LandmarkDescriber
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.learning.trained_network import TrainedNetwork
-from wheretolook.methods.base import Scorer
+from wheretolook.methods.landmark_scorer import LandmarkScorer
 from wheretolook.methods.set.network import SetNetwork
 
 MOST = 1024
@@ -17,26 +16,29 @@ MOST = 1024
 from samples of a fifth of that; against looking at all, log-odds differ by 0.05 where a view sees thousands."""
 
 
-class SetScorer(Scorer):
+class SetScorer(LandmarkScorer):
     """Network over the set of landmarks in view: each by its chance of being found, all by what they tell
     of the pose.
     """
 
     local = True
+    most = MOST
 
     def __init__(self, localization_map: LocalizationMap, trained: TrainedNetwork[SetNetwork]) -> None:
-        super().__init__(localization_map)
+        super().__init__(localization_map, trained.network.attributes, trained.training_range, trained.camera)
         self.name, self.trained = trained.method, trained
         self.network = trained.network.to(localization_map.device)
-        self._describer = LandmarkDescriber(localization_map, self.network.attributes)
 
     def score(self, cam_from_world: Float) -> Float:
         """(B,) probabilities in [0, 1]."""
         cam_from_world = check_poses(cam_from_world)
         scores = np.empty(len(cam_from_world))
+        looked_at: list[Float] = []
         for rows, described, n_visible in self._describer.in_blocks(cam_from_world, MOST):
+            looked_at += self._look(described, n_visible)
             height = torch.from_numpy(cam_from_world[rows, 2, 2]).to(described.values)
             with torch.inference_mode():
                 logits = self.network.score(described, n_visible, height).double()
                 scores[rows] = self.trained.calibrated(logits).sigmoid().cpu().numpy()
+        self._watch.check(self.name, looked_at)
         return scores

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,11 +15,13 @@ from tqdm.auto import tqdm
 
 from wheretolook.dataset.folders import Dataset, SceneFolder, views_by_camera
 from wheretolook.geometry.camera import Camera, camera_of_record
+from wheretolook.geometry.poses import Float
 from wheretolook.inputs.landmarks_in_view import POOLED, LandmarkDescriber, pool
 from wheretolook.learning.data import check_classes, labelled_rows, validation_views
 from wheretolook.learning.fit import home_device
 from wheretolook.learning.learner import Learnt, Task, class_counts, fit_platt
 from wheretolook.learning.scenes import training_scenes
+from wheretolook.learning.training_range import QUANTITIES, TrainingRange, camera_quantities, view_quantities
 from wheretolook.learning.weights import check_serves, read_weights, write_weights
 from wheretolook.methods.trees.config import TreesConfig
 from wheretolook.utils.errors import ConfigError, WeightsError
@@ -47,6 +49,7 @@ class BoostedTrees:
     baseline: float  # log-odds to add to the sum of the trees: 0 of LightGBM's, whose first tree has it in its leaves
     scale: float = 1.0  # scale, offset: what turns the sum into calibrated log-odds: scale * sum + offset
     offset: float = 0.0
+    training_range: TrainingRange | None = None  # what the training views were like, if that is known
 
     @classmethod
     def of_lightgbm(cls, booster: Booster, camera: Camera | None, n_trees: int) -> BoostedTrees:
@@ -94,7 +97,10 @@ class BoostedTrees:
 
     def save(self, path: Path, training: dict[str, Any] | None = None) -> None:
         """Write one safetensors file, atomically, with JSON values on the training; the same trees, the same bytes."""
-        header = {"features": list(POOLED), "camera": None if self.camera is None else self.camera.record()}
+        header: dict[str, Any] = {"features": list(POOLED)}
+        header |= {"camera": None if self.camera is None else self.camera.record()}
+        if self.training_range is not None:
+            header["range"] = self.training_range.record()
         header |= {**{name: getattr(self, name) for name in _NUMBERS}, "training": training or {}}
         arrays = {name: getattr(self, name) for name in _ARRAYS}
         arrays |= {name: arrays[name].int() for name in ("roots", "left", "right")}
@@ -115,8 +121,9 @@ class BoostedTrees:
         try:
             numbers = {name: header[name] for name in _NUMBERS}
             camera = None if header["camera"] is None else camera_of_record(header["camera"])
+            known = TrainingRange.of_record(header["range"]) if "range" in header else None
             arrays = {name: tensors[name] for name in _ARRAYS}
-        except (KeyError, TypeError, ConfigError) as error:
+        except (KeyError, TypeError, ValueError, IndexError, ConfigError) as error:
             raise WeightsError(f"damaged description of trees: {error}", path=path, fix=fix) from error
         arrays |= {name: arrays[name].long() for name in ("roots", "feature", "left", "right")}
         arrays["missing_left"] = arrays["missing_left"].bool()
@@ -126,7 +133,7 @@ class BoostedTrees:
         if not inside or len({len(arrays[name]) for name in _ARRAYS if name != "roots"}) != 1:
             raise WeightsError("the trees lead out of their own arrays", path=path, fix=fix)
         arrays["feature"] = features[arrays["feature"]]  # statistics may have come since, or stand in another order
-        return cls(camera, **arrays, **numbers)
+        return cls(camera, **arrays, **numbers, training_range=known)
 
 
 _ARRAYS = ("roots", "feature", "threshold", "missing_left", "left", "right", "value")
@@ -142,9 +149,12 @@ class PooledViews:
     scene: NDArray[np.int64]  # (B,) int64, number of each view's scene in the order given
     location: NDArray[np.int64]  # (B,) int64, location_id of each view, unique only within its scene
 
+    quantities: Float = field(default_factory=lambda: np.empty((0, len(QUANTITIES))))  # (B, 6); none if not known
+
     def only(self, mask: NDArray[np.bool_]) -> PooledViews:
         """The views where `mask` (B,) is set."""
-        return PooledViews(self.values[mask], self.labels[mask], self.scene[mask], self.location[mask])
+        quantities = self.quantities[mask] if len(self.quantities) else self.quantities
+        return PooledViews(self.values[mask], self.labels[mask], self.scene[mask], self.location[mask], quantities)
 
 
 def load_pooled(
@@ -163,6 +173,7 @@ def load_pooled(
     labels: list[NDArray[np.bool_]] = []
     location: list[NDArray[np.int64]] = []
     scene_numbers: list[NDArray[np.int64]] = []
+    quantities: list[Float] = []
     tables = [(scene, labelled_rows(scene)) for scene in scenes]
     total = sum(len(table) for _, table in tables)
     with tqdm(total=total, desc="pool views", unit="view", disable=not progress) as bar:
@@ -172,13 +183,15 @@ def load_pooled(
             good, location_ids = is_good(table, *limits), table["location_id"].to_numpy(np.int64)
             for camera, rows in views_by_camera(scene, table, BLOCK):
                 block = cam_from_world[rows]
-                values.append(pool(describer.of_camera(camera).describe(block), block, camera).cpu().numpy())
+                described = describer.of_camera(camera).describe(block)
+                values.append(pool(described, block, camera).cpu().numpy())
+                quantities.append(view_quantities(described, described.counts, camera_quantities(camera)))
                 labels.append(good[rows])
                 location.append(location_ids[rows])
                 scene_numbers.append(np.full(len(rows), number))
                 bar.update(len(rows))
     of_scenes = np.concatenate(scene_numbers), np.concatenate(location)
-    return PooledViews(np.concatenate(values), np.concatenate(labels), *of_scenes)
+    return PooledViews(np.concatenate(values), np.concatenate(labels), *of_scenes, np.concatenate(quantities))
 
 
 def learn_trees(task: Task) -> Learnt:
@@ -193,6 +206,7 @@ def learn_trees(task: Task) -> Learnt:
     train, val = views.only(~held_out), views.only(held_out)
     check_classes(dataset, config, train.labels, val.labels)
     trees, metrics = fit_trees(train, val, task.camera, task.options, config.seed)
+    trees = replace(trees, training_range=TrainingRange.of(train.quantities))
     return Learnt(trees, metrics, class_counts(train=train.labels, val=val.labels))
 
 

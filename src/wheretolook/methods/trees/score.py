@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from wheretolook.geometry.poses import Float, check_poses
-from wheretolook.inputs.landmarks_in_view import LandmarkDescriber, pool
+from wheretolook.inputs.landmarks_in_view import ATTRIBUTES, pool
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.methods.base import BLOCK, Scorer
+from wheretolook.methods.base import BLOCK
+from wheretolook.methods.landmark_scorer import LandmarkScorer
 from wheretolook.methods.trees.learn import BoostedTrees
 
 
-class TreesScorer(Scorer):
+class TreesScorer(LandmarkScorer):
     """Boosted trees on where the landmarks in view lie and how they were mapped: the probability that a view
     localizes.
     """
@@ -20,16 +21,19 @@ class TreesScorer(Scorer):
     local = True
 
     def __init__(self, localization_map: LocalizationMap, trees: BoostedTrees) -> None:
-        super().__init__(localization_map)
+        super().__init__(localization_map, ATTRIBUTES, trees.training_range, trees.camera)
         self.trees = trees.to(localization_map.device)
-        self._describer = LandmarkDescriber(localization_map)
 
     def score(self, cam_from_world: Float) -> Float:
         """(B,) probabilities in [0, 1]."""
         cam_from_world = check_poses(cam_from_world)
         scores = np.empty(len(cam_from_world))
+        looked_at: list[Float] = []
         for begin in range(0, len(scores), BLOCK):
             block = cam_from_world[begin : begin + BLOCK]
-            pooled = pool(self._describer.describe(block), block, self.localization_map.camera)
+            described = self._describer.describe(block)
+            looked_at += self._look(described, described.counts)
+            pooled = pool(described, block, self.localization_map.camera)
             scores[begin : begin + BLOCK] = self.trees.logits(pooled).sigmoid().cpu().numpy()
+        self._watch.check(self.name, looked_at)
         return scores

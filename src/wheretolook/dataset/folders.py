@@ -24,6 +24,7 @@ from wheretolook.viewpoints.table import CAMERA_ID, read_table
 
 if TYPE_CHECKING:
     from wheretolook.inputs.localization_map import LocalizationMap
+    from wheretolook.mapping.landmarks import Landmarks
 
 RELEASE = "release"  # name of the dataset, beside all others, that ships with its weights
 RELEASE_FILE = "release.json"  # what a release was made from; the file that makes a dataset one
@@ -137,19 +138,26 @@ class SceneFolder:
             return load_mapping_poses(self.mapping_cameras)
         return colmap_poses(self.map).astype(np.float32) if holds_model(self.map) else None
 
+    def read_landmarks(self) -> Landmarks:
+        """The map's landmarks. Raises MapError if there is no file of them, or it is damaged."""
+        from wheretolook.mapping.landmarks import Landmarks
+
+        landmarks = Landmarks.load(self.landmarks)
+        if landmarks.mapping_focal_px is not None:
+            return landmarks
+        # before it was told, the camera that looks was the one that mapped
+        focal_px = np.full(len(landmarks), self.camera.mean_focal_px, dtype=np.float32)
+        return replace(landmarks, mapping_focal_px=focal_px)
+
     def localization_map(self, camera: Camera | None = None, device: str = "cpu") -> LocalizationMap:
         """The scene's map with the occlusion stored for its sampled locations; the mesh is not needed.
 
         For the scene's camera, unless another one looks.
         """
         from wheretolook.inputs.localization_map import LocalizationMap
-        from wheretolook.mapping.landmarks import Landmarks
         from wheretolook.visibility.occlusion import StoredOcclusion
 
-        landmarks, occlusion = Landmarks.load(self.landmarks), StoredOcclusion.load(self.occlusion)
-        if landmarks.mapping_focal_px is None:  # before it was told, the camera that looks was the one that mapped
-            focal_px = np.full(len(landmarks), self.camera.mean_focal_px, dtype=np.float32)
-            landmarks = replace(landmarks, mapping_focal_px=focal_px)
+        landmarks, occlusion = self.read_landmarks(), StoredOcclusion.load(self.occlusion)
         return LocalizationMap(landmarks, camera or self.camera, occlusion, device, self.mapping_poses())
 
 

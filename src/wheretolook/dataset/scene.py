@@ -167,9 +167,7 @@ class Scene:
     @cached_property
     def landmarks(self) -> Landmarks:
         """The map's landmarks."""
-        from wheretolook.mapping.landmarks import Landmarks
-
-        return Landmarks.load(self.files.landmarks)
+        return self.files.read_landmarks()
 
     @cached_property
     def mapping_poses(self) -> Float | None:

@@ -1,5 +1,5 @@
 # make demo   sets everything up and runs the whole line on the embedded default
-# make test   sets everything up and runs linter, type checker and the tests: about nine minutes on two cores
+# make test   sets everything up and runs linter, type checker and the tests: about six minutes on two cores
 # make test-all   the same and the slow tests too, in a quarter of an hour
 # make ui     opens MLflow on the runs, those of the release included; make lab opens Jupyter on the notebooks
 # make html   runs all notebooks and writes them as pages, notebooks/html

@@ -100,6 +100,7 @@ def test_a_worker_that_dies_in_the_middle_of_a_message_counts_as_killed(
         next(run_local([Shard(room.job, tmp_path / "a", views)], workers=1))
 
 
+@pytest.mark.slow
 def test_a_failing_renderer_is_named_with_the_mesh(room: MappedRoom, views: pd.DataFrame, tmp_path: Path) -> None:
     job = BreaksRenderer(room.mesh, room.landmarks, CAMERA)
     run = label_scenes([LabelTask("room", job, views, tmp_path)], LabelConfig(workers=1, shard_size=5), progress=False)

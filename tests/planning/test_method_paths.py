@@ -88,6 +88,7 @@ def test_a_path_that_nobody_scores_has_no_scores(tmp_path: Path) -> None:
     assert planned(tmp_path, OFF_CENTER, "forward")[1]["score"].isna().all()
 
 
+@pytest.mark.slow
 def test_a_fisheye_is_planned_for_and_shown(tmp_path: Path) -> None:
     _, table, scorer = planned(tmp_path, FISHEYE, "bins", "gif")
     assert scorer.localization_map.camera == FISHEYE and len(table) > 2

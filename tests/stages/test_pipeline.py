@@ -43,6 +43,8 @@ from wheretolook.viewpoints.table import is_good, poses, read_table, write_table
 from wheretolook.visibility.hidden_points import HiddenPointRemoval
 from wheretolook.visibility.occlusion import StoredOcclusion
 
+pytestmark = pytest.mark.slow  # the whole line, several times over
+
 EXPERIMENT = """\
 name: tiny
 camera: {width: 320, height: 240, focal_px: 160}
@@ -109,7 +111,6 @@ def test_run_again_it_reuses_what_is_there(demo: Path) -> None:
     assert {path: path.stat().st_mtime_ns for path in before} == before
 
 
-@pytest.mark.slow
 def test_all_methods_are_trained_and_compared(copy: Path) -> None:
     methods, learned = EvaluateConfig().methods, TrainConfig().methods
     assert run("train", copy, "--train.methods", f"[{','.join(learned)}]") == 0
@@ -119,7 +120,6 @@ def test_all_methods_are_trained_and_compared(copy: Path) -> None:
     assert {*learned, *rules} <= {*scores["method"]}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("workers", ["1", "2"])
 def test_the_same_seed_gives_the_same_bytes(
     demo: Path, tmp_path: Path, workers: str, request: pytest.FixtureRequest
@@ -145,7 +145,6 @@ def test_a_changed_setting_remakes_what_depends_on_it(copy: Path) -> None:
     pd.testing.assert_frame_equal(scene.read_table(), table)
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("in_this_process", "no_pictures_here")
 def test_matches_are_stored_when_asked_for_and_go_with_the_labels_they_belong_to(copy: Path) -> None:
     scenes = Dataset.load(copy / "data" / "tiny").scenes
@@ -198,7 +197,6 @@ def test_what_a_table_says_is_what_its_features_hold(demo: Path) -> None:
         assert np.abs(binned.n_visible - table["n_visible"]).max() <= 1  # single precision at the border
 
 
-@pytest.mark.slow
 def test_every_occlusion_model_scores_the_same_viewpoints(copy: Path) -> None:
     root = copy / "data" / "tiny"
     stored = pd.read_csv(root / "results" / "scores.csv")
@@ -297,7 +295,6 @@ def test_labels_of_different_settings_are_not_used_together(
         assert "Run `wheretolook label`" in capsys.readouterr().err
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("in_this_process", "no_pictures_here")
 def test_a_report_that_could_not_be_logged_is_logged_the_next_time(
     copy: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -362,7 +359,6 @@ def test_stages_are_plain_functions(demo: Path) -> None:
     assert dataset.name == "tiny"
 
 
-@pytest.mark.slow
 def test_planned_paths_are_rendered_and_localized(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = ["--paths.pairs", "2", "--paths.methods", "[forward,visible]", "--paths.grid", "[4, 4, 2]",
                "--paths.directions", "40", "--paths.min_distance_m", "1", "--paths.planner.time_s", "1",
@@ -386,7 +382,6 @@ def test_planned_paths_are_rendered_and_localized(copy: Path, capsys: pytest.Cap
     assert "There are" in capsys.readouterr().err
 
 
-@pytest.mark.slow
 def test_a_path_is_planned_and_shown(
     copy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -433,7 +428,6 @@ def _longest_straight_way(pairs: np.ndarray, space: TsdfSpace) -> int:
     return int(np.where(straight, np.linalg.norm(pairs[:, 1] - pairs[:, 0], axis=1), 0).argmax())
 
 
-@pytest.mark.slow
 def test_paths_keep_clear_of_what_depth_images_saw(copy: Path, tmp_path: Path) -> None:
     """With the occlusion model tsdf; locations are sampled by the mesh all the same."""
     tsdf = ["--occlusion.model", "tsdf", "--occlusion.voxel_m", "0.04"]

@@ -129,6 +129,21 @@ def test_views_of_several_cameras_are_labelled_as_each_alone(room: MappedRoom) -
         pd.testing.assert_frame_equal(labelled[rows], alone)
 
 
+def test_views_of_a_large_camera_go_in_smaller_batches(room: MappedRoom) -> None:
+    """Twenty workers that shared a GPU ran out of its 80 GB by eight images of 1,280 x 1,280 pixels each."""
+    sizes: list[int] = []
+
+    class Noting(WarpRenderer):
+        def render(self, camera, cam_from_world):  # type: ignore[no-untyped-def]
+            sizes.append(len(cam_from_world))
+            return super().render(camera, cam_from_world)
+
+    camera = PinholeCamera(1280, 960, 640)
+    localizer = Localizer(Landmarks.load(room.landmarks), camera)
+    label_rows(facing(POSTER, 3, distance_m=1.5), Noting(load_mesh(room.mesh)), localizer, camera)
+    assert sizes == [2, 1]
+
+
 def test_matches_with_one_landmark_determine_no_pose(room: MappedRoom) -> None:
     keypoints = replace(Keypoints.none(), pixels=np.full((20, 2), 100.5, np.float32))
     matches = np.arange(20), np.zeros(20, dtype=np.int64)

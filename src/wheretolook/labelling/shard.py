@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from wheretolook.features.keypoints import ExtractorConfig
 from wheretolook.geometry.camera import Camera, PinholeCamera
@@ -27,6 +28,9 @@ if TYPE_CHECKING:
 
 BATCH = 8
 """Number of viewpoints that are rendered, extracted and matched together."""
+
+BATCH_PIXELS = BATCH * 640 * 480
+"""Fewer of a larger camera: many workers share a GPU, and each holds its batches' images and scale spaces there."""
 
 Tick = Callable[[int], None]
 
@@ -135,7 +139,7 @@ def label_rows(
     else:
         numbers = table[CAMERA_ID].to_numpy()
         groups = [(cameras[number], np.flatnonzero(numbers == number)) for number in np.unique(numbers).tolist()]
-    batches = [(camera, rows[i : i + BATCH]) for camera, rows in groups for i in range(0, len(rows), BATCH)]
+    batches = [(camera, part) for camera, rows in groups for part in _batches(camera, rows)]
 
     def poses_of(batch: tuple[Camera, list[tuple[Keypoints, Matches]]]) -> list[Localization]:
         camera, matched = batch
@@ -167,3 +171,9 @@ def label_rows(
         matched_rows=[np.sort(result.matched_rows).astype(np.int32) for result in results],
         inlier_rows=[np.sort(result.inlier_rows).astype(np.int32) for result in results],
     )
+
+
+def _batches(camera: Camera, rows: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """Rows of views of one camera that go together."""
+    size = min(BATCH, max(1, BATCH_PIXELS // (camera.width * camera.height)))
+    return [rows[i : i + size] for i in range(0, len(rows), size)]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from wheretolook.config import Experiment, MeshSource
 from wheretolook.dataset.folders import Dataset, MappedFloor, SceneFolder
-from wheretolook.dataset.stamps import is_done, read_stamp, stage_key, write_stamp
+from wheretolook.dataset.stamps import forget_stamp, is_done, stage_key, write_stamp
 from wheretolook.scenes.config import SceneKind
 from wheretolook.stages.inputs import Say, Tick, mesh_fingerprint, refuse_release
 from wheretolook.utils.errors import SceneError
@@ -59,9 +59,9 @@ def make_scenes(experiment: Experiment, say: Say = print, tick: Tick = lambda wo
     dataset = Dataset(root, tuple(sources))
     if (root / "dataset.json").is_file():
         cameras = {scene.name: scene.camera for scene in Dataset.load(root).scenes}
-        for scene in dataset.scenes:  # what was made with another camera is no longer valid
+        for scene in dataset.scenes:  # what was seen by another camera is no longer valid; maps know theirs
             if cameras.get(scene.name, camera) != camera:
-                write_stamp(scene, "scenes", read_stamp(scene, "scenes") or "")
+                forget_stamp(scene, "sample")
     dataset.save()
     return dataset
 

@@ -44,11 +44,20 @@ class Augmented(Protocol):
         """The inputs to learn from in place of a batch's."""
 
 
+@runtime_checkable
+class LearnsMore(Protocol):
+    """A network that learns something beside the labels of views."""
+
+    def learn(self, options: Any, count: float, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Logits (B,) of a batch's inputs, and a further loss, a sum that the `count` of views divides."""
+
+
 class ViewpointClassifier(LightningModule):
     """Learns whether a viewpoint localizes, from batches of inputs of a network that gives logits (B,).
 
-    A network with a method `augment(options, *inputs)` gets its inputs through that while it learns. The seed is of
-    dropout and noise, where several processes train.
+    A network with a method `augment(options, *inputs)` gets its inputs through that while it learns; one with a method
+    `learn` adds a loss of its own, which the logged ones leave out. The seed is of dropout and noise, where several
+    processes train.
 
     Logged every epoch: `{train,val}_loss`, `{train,val}_bce`, `l2` (the weighted penalty), `train_average_precision`
     (with dropout on), `val_average_precision`, `val_roc_auc` and `val_calibration_error`. Balancing the classes shifts
@@ -80,11 +89,16 @@ class ViewpointClassifier(LightningModule):
         inputs, labels, total = batch
         if isinstance(self.network, Augmented):
             inputs = self.network.augment(self.options, *inputs)
-        logits = self(*inputs)
+        count = total / self.trainer.world_size
+        more: Tensor | float = 0.0
+        if isinstance(self.network, LearnsMore):
+            logits, more = self.network.learn(self.options, count, *inputs)
+        else:
+            logits = self(*inputs)
         penalty = self.options.l2 * weight_penalty(self.network)
         self._train_seen.append(torch.stack([logits.detach(), labels]))
         self._penalties.append(penalty.detach() * total)
-        return weighted_bce(logits, labels, self.class_weights, total / self.trainer.world_size) + penalty
+        return weighted_bce(logits, labels, self.class_weights, count) + more + penalty
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         """Logits of one process's share of a batch."""

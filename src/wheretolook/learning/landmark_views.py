@@ -28,6 +28,10 @@ from wheretolook.viewpoints.table import LOCALIZED, is_good, poses
 DISTANCES = [ATTRIBUTES.index(name) for name in ("distance", "mapped_distance", "mapped_pixel_size")]
 """Attributes that are logarithms of distances: those that change when a scene is enlarged."""
 
+NEAR = 0.5, 5.0
+"""Metres and degrees within which a pose is that of the view, and its inliers are right. Elsewhere the map looks alike:
+what agrees there are wrong matches."""
+
 BLOCK = 2048  # views described at a time: some million landmarks
 
 
@@ -86,8 +90,9 @@ def load_landmark_views(
 ) -> LandmarkViews:
     """Describe what the labelled viewpoints of some scenes see, `most` landmarks of a view at most; on the CPU.
 
-    With `matches` it is told which landmarks the localizer found: the inliers of a view that was localized, and all
-    that were matched in one that was not. Landmarks that the view does not see by the map's occlusion do not count.
+    With `matches` it is told which landmarks the localizer found: the inliers of a view that was localized near where
+    it is, none of one that was localized elsewhere, and all that were matched in one that was not localized. Landmarks
+    that the view does not see by the map's occlusion do not count.
 
     Raises a TableError if a scene has no table or no labelled viewpoint, its occlusion does not fit, or the matches are
     asked for but not stored; a MapError if it has no landmarks.
@@ -123,10 +128,11 @@ def _found(described: ViewLandmarks, table: pd.DataFrame) -> Tensor:
     """(E,) bool, on the CPU: whether each entry's landmark was found in its view."""
     rows, starts = described.rows.cpu().numpy(), described.starts.cpu().numpy()
     found = np.zeros(len(rows), dtype=bool)
-    localized = (table["status"] == LOCALIZED).to_numpy()
+    localized, near = (table["status"] == LOCALIZED).to_numpy(), is_good(table, *NEAR)
     for view, (inliers, matched) in enumerate(zip(table["inlier_rows"], table["matched_rows"], strict=True)):
         part = slice(starts[view], starts[view + 1])
-        found[part] = np.isin(rows[part], inliers if localized[view] else matched)
+        if near[view] or not localized[view]:
+            found[part] = np.isin(rows[part], inliers if localized[view] else matched)
     return torch.from_numpy(found)
 
 
@@ -209,7 +215,13 @@ class LandmarkLoader:
             if growth is not None:
                 values[..., DISTANCES] += growth[:, None, None]
                 labels = (views.error_m[share] * growth.exp() < self.max_error_m).float()
-            yield Batch((values, taken, views.n_visible[share], views.axis_height[share]), labels, len(part))
+            known = (taken, views.n_visible[share], views.axis_height[share])
+            yield Batch((values, *known, self._found(entries, steps < taken[:, None])), labels, len(part))
+
+    def _found(self, entries: Tensor, own: Tensor) -> Tensor:
+        """Whether the landmarks of entries (B, K) were found, where they are a view's `own` (B, K); NaN else."""
+        found = torch.full(entries.shape, torch.nan, device=entries.device)
+        return found if self.views.found is None else torch.where(own, self.views.found[entries].float(), found)
 
 
 class LandmarkDataModule(ViewsDataModule):

@@ -87,8 +87,11 @@ def training_fingerprint(dataset: Dataset) -> str:
 def was_trained_on(dataset: Dataset, training: Mapping[str, Any]) -> bool:
     """Whether weights with a record of training were trained on what a dataset, and others beside it, now hold.
 
-    Where another dataset that they learnt from is not at hand, the dataset's own scenes tell.
+    Where another dataset that they learnt from is not at hand, the dataset's own scenes tell. Of weights that learnt
+    from datasets of other names alone, and were put here to be used, there is nothing to compare.
     """
+    if training.get("dataset", dataset.name) != dataset.name:
+        return True
     also = training.get("also", ())
     if also and not all((dataset.root.parent / name / "dataset.json").is_file() for name in also):
         return bool(training.get("own_fingerprint") == training_fingerprint(dataset))

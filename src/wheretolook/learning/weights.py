@@ -64,6 +64,11 @@ def method_of_weights(path: str | Path) -> str:
     return name_of_header(read_weights(Path(path))[1])
 
 
+def serves_every_camera(path: str | Path) -> bool:
+    """Whether weights have learnt with several cameras, and so name none; see `read_weights`."""
+    return read_weights(Path(path))[1].get("camera", "") is None
+
+
 def save_in_half(path: Path) -> None:
     """Store weights in half precision, atomically, with the same description. Done again, nothing changes."""
     tensors, header = read_weights(path)

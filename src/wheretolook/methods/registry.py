@@ -167,14 +167,17 @@ def load_scorer(weights: str | Path, localization_map: LocalizationMap) -> Score
 def best_weights(folder: str | Path) -> Path:
     """The weights of a folder that score views by themselves and have the best validation average precision.
 
+    Those that have learnt with many cameras come before all that know one: their precision is that on harder views.
+
     Raises a WeightsError if there are none, or a record of training is missing or damaged.
     """
-    from wheretolook.learning.weights import read_record
+    from wheretolook.learning.weights import read_record, serves_every_camera
 
     paths = [path for path in sorted(Path(folder).glob("*.safetensors")) if not _scores_nothing(path.stem)]
     if not paths:
         raise WeightsError("there are no weights of a scorer", path=folder, fix="Run the train stage first.")
-    return max(paths, key=lambda path: float(read_record(path)["metrics"]["val_average_precision"]))
+    precision = {path: float(read_record(path)["metrics"]["val_average_precision"]) for path in paths}
+    return max(paths, key=lambda path: (serves_every_camera(path), precision[path]))
 
 
 def _scores_nothing(name: str) -> bool:

@@ -147,6 +147,14 @@ def _shared_centers(table: pd.DataFrame) -> Float:
     return np.round(np.where(apart, centers, shared), CENTER_DECIMALS) + 0.0  # no negative zero
 
 
+def has_matches(path: Path) -> bool:
+    """Whether a table holds `MATCH_FIELDS`; a file that cannot be read does not."""
+    try:
+        return {*MATCH_FIELDS.names} <= {*pq.read_schema(path).names}
+    except (pa.ArrowException, OSError):
+        return False
+
+
 def read_table(path: Path, matches: bool = False) -> pd.DataFrame:
     """Read the columns of `SCHEMA` of a table of viewpoints, compact or not, and of `CAMERA_FIELD` if it has that.
 

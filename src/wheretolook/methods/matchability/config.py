@@ -9,6 +9,10 @@ from wheretolook.inputs.channels import ATTRIBUTES
 from wheretolook.learning.config import FittingConfig, check_at_least
 from wheretolook.utils.errors import ConfigError
 
+OF_SIZE = ("distance", "mapped_distance", "mapped_pixel_size")
+"""Attributes that tell how large a scene is. Matching does not depend on that, so they are not looked at: what has been
+learnt holds in halls and in dolls' houses."""
+
 
 @dataclass(frozen=True)
 class LandmarksConfig(FittingConfig):
@@ -17,13 +21,14 @@ class LandmarksConfig(FittingConfig):
     Args:
         landmarks: landmarks of a view to learn from at a time, at most, chosen at random.
         width: units of the layers that look at single landmarks.
-        hidden: attributes (`inputs.landmarks_in_view.ATTRIBUTES`) not to look at, to see what each is worth.
+        hidden: attributes (`inputs.landmarks_in_view.ATTRIBUTES`) not to look at; by default those that tell how large
+            a scene is, on which matching does not depend.
         enlarged: greatest factor by which scenes come larger or smaller in training; 1 leaves them as they are.
     """
 
     landmarks: int = 64
     width: int = 48
-    hidden: tuple[str, ...] = ()
+    hidden: tuple[str, ...] = OF_SIZE
     enlarged: float = 3.0
 
     def __post_init__(self) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict
+from math import log
 from typing import Any, Self
 
 import torch
@@ -50,7 +51,7 @@ class LandmarkNetwork(StoredNetwork):
             if name not in ATTRIBUTES:
                 fix = "Use the version that wrote them, or train again."
                 raise WeightsError("these weights ask for an unknown attribute of landmarks", value=name, fix=fix)
-        for name in ("across", "down", "distance"):
+        for name in ("across", "down", "distance", *(("pixel_size_ratio",) if "pixel_angle" in names else ())):
             if name not in names:
                 raise WeightsError("these weights do not ask where a landmark lies", value=name)
         options = {name: tuple(x) if isinstance(x, list) else x for name, x in stored["options"].items()}
@@ -93,6 +94,23 @@ class MatchabilityNetwork(LandmarkNetwork):
         return self.layers(self.input(values)).squeeze(-1)
 
 
+REFERENCE_FOCAL_PX = 320.0
+"""A pixel of this focal length is the unit of a bearing's noise, so information does not depend on image sizes."""
+
+
+def bearing_precision(values: Tensor, attributes: tuple[str, ...] = ATTRIBUTES) -> Tensor | None:
+    """How sharply each landmark (..., A) tells where it is seen, (...): one over its bearing's variance, by the pixels.
+
+    A keypoint is off by a pixel, and the landmark by what a pixel of the images that mapped it covers: whichever is
+    larger there counts most. None where pixels are not among the attributes, as in weights learnt with one camera.
+    """
+    if "pixel_angle" not in attributes:
+        return None
+    pixel = values[..., attributes.index("pixel_angle")] + log(REFERENCE_FOCAL_PX)
+    ratio = values[..., attributes.index("pixel_size_ratio")].nan_to_num(nan=0.0)
+    return (-2 * pixel).exp() / (1 + (-2 * ratio).exp())
+
+
 def bearing_numbers(values: Tensor, attributes: tuple[str, ...] = ATTRIBUTES) -> Tensor:
     """`fisher.information.bearing_numbers` (..., 15) of landmarks (..., A), in the camera's axes."""
     across, down, log_distance = (values[..., attributes.index(name)] for name in ("across", "down", "distance"))
@@ -110,6 +128,8 @@ N_EXPECTED = 1 + 15 + 5  # numbers that `expected_parts` gives of a landmark
 def expected_parts(values: Tensor, log_odds: Tensor, attributes: tuple[str, ...] = ATTRIBUTES) -> Tensor:
     """What landmarks (..., A) add to a view's sums, (..., N_EXPECTED), by their log-odds of being found (...,)."""
     found = log_odds.sigmoid()[..., None]
+    precision = bearing_precision(values, attributes)
+    told = found if precision is None else found * precision[..., None]
     across, down = (values[..., attributes.index(name), None] for name in ("across", "down"))
     moments = torch.cat([across, down, across * across, across * down, down * down], -1)
-    return torch.cat([found, found * bearing_numbers(values, attributes), found * moments], -1)
+    return torch.cat([found, told * bearing_numbers(values, attributes), found * moments], -1)

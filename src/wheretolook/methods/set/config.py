@@ -15,6 +15,8 @@ class SetConfig(LandmarksConfig):
     With few training views, batches get smaller and epochs more (`wheretolook.methods.set.learn.of_size`).
 
     Args:
+        landmark_loss: how much the loss of the chances of being found counts beside that of the views, where it is
+            stored which landmarks were matched.
         pooled: numbers that attention pools beside what the landmarks are expected to tell of the pose.
         head: units of the layers that decide.
         dropout: share of the deciding layers' units dropped.
@@ -25,7 +27,8 @@ class SetConfig(LandmarksConfig):
     batch_size: int = 1024
     learning_rate: float = 3e-3
     landmarks: int = 192
-    pooled: int = 8
+    landmark_loss: float = 0.5
+    pooled: int = 0
     head: int = 48
     dropout: float = 0.1
     from_matchability: bool = True
@@ -33,7 +36,7 @@ class SetConfig(LandmarksConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_at_least(self, 1, "head")
-        check_at_least(self, 0, "pooled")
+        check_at_least(self, 0, "landmark_loss", "pooled")
         check_share(self, "dropout")
 
     @property

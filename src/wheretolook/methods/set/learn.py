@@ -11,17 +11,20 @@ from wheretolook.learning.data import check_classes
 from wheretolook.learning.landmark_views import LandmarkDataModule, LandmarkLoader
 from wheretolook.learning.learner import Learnt, Task, class_counts, fit_network, fit_platt, predict
 from wheretolook.learning.provenance import weights_path
+from wheretolook.learning.scenes import training_scenes
 from wheretolook.learning.trained_network import TrainedNetwork
 from wheretolook.methods.matchability.network import MatchabilityNetwork
 from wheretolook.methods.set.config import SetConfig
 from wheretolook.methods.set.network import SetNetwork
+from wheretolook.viewpoints.table import has_matches
 
 
 class SetData(LandmarkDataModule):
     """The labelled viewpoints of a dataset, by the landmarks they see; a TableError if labels are of one class only."""
 
     def __init__(self, task: Task) -> None:
-        super().__init__(task, MOST_OF_WINDOW * task.options.landmarks)
+        matches = task.options.landmark_loss > 0 and all(has_matches(s.table) for s in training_scenes(task.dataset))
+        super().__init__(task, MOST_OF_WINDOW * task.options.landmarks, matches)
         positive = (self.views.labels > 0).numpy()
         check_classes(task.dataset, self.config, positive[self.train_rows], positive[self.val_rows])
 
@@ -53,8 +56,9 @@ def of_size(options: SetConfig, n_train: int) -> SetConfig:
 def learn_set(task: Task, data: SetData | None = None) -> Learnt:
     """A set network from a dataset's labels, or from its views, if they have been described already.
 
-    Whether landmarks are found it learns on the way, from the labels alone. If the dataset's `weights` folder has a
-    matchability model of the same width, it starts from that.
+    Whether landmarks are found it learns on the way: from the stored matches if all tables have them, so that these
+    chances stay true, and from the labels. If the dataset's `weights` folder has a matchability model of the same
+    width, it starts from that.
 
     Raises a TableError if there is no train scene, no labels, or labels of one class only; a WeightsError if the
     matchability model is damaged.

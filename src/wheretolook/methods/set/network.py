@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cache
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import batch_norm
+from torch.nn.functional import batch_norm, binary_cross_entropy_with_logits
 
 from wheretolook.inputs.landmarks_in_view import ViewLandmarks
 from wheretolook.learning.landmark_views import AttributeStatistics
@@ -17,6 +19,7 @@ from wheretolook.methods.matchability.network import (
     StandardAttributes,
     expected_parts,
 )
+from wheretolook.methods.set.config import SetConfig
 
 PRIOR = 1e-3
 """Information on every coordinate of a pose before anything is seen: keeps the covariance finite (1/m^2 and 1/rad^2
@@ -53,79 +56,6 @@ def _layout(device: torch.device) -> tuple[Tensor, Tensor]:
         return _PLACES.to(device), _SIGNS.to(device)
 
 
-class SetNetwork(LandmarkNetwork):
-    """Scores a view by the set of landmarks it sees, without bins.
-
-    Each landmark has a probability of being found. Weighted by it, the landmarks' Fisher information sums up to the
-    information that the view can be expected to have on its pose, and its inverse to the expected covariance: how far
-    off position and orientation will be, which is what a label asks. So the probability is the attention by which
-    landmarks are pooled; on request further attention pools what else there may be to know of them, in `pooled`
-    numbers. All of these are sums over landmarks, so in training a random sample of them, scaled up, will do.
-
-    `width` and `head` are units of the layers that look at single landmarks and of those that decide; `hidden` names
-    attributes not to look at. Of "across", "down" and "distance" the information remains.
-    """
-
-    def __init__(
-        self,
-        statistics: AttributeStatistics,
-        width: int = 48,
-        pooled: int = 0,
-        head: int = 48,
-        dropout: float = 0.1,
-        hidden: tuple[str, ...] = (),
-    ) -> None:
-        super().__init__(statistics, width=width, pooled=pooled, head=head, dropout=dropout, hidden=hidden)
-        self.matchability = MatchabilityNetwork(statistics, width, hidden)
-        self.attention = None
-        if pooled:
-            layers = nn.Linear(len(self.attributes), width), nn.ReLU(), nn.Linear(width, width), nn.ReLU()
-            self.attention = nn.Sequential(
-                StandardAttributes(statistics, hidden), *layers, nn.Linear(width, 1 + pooled)
-            )
-        self.standard = nn.BatchNorm1d(len(EXPECTED) + 1 + pooled)
-        n_features = self.standard.num_features
-        self.linear = nn.Linear(n_features, 1)
-        first = nn.Linear(n_features, head), nn.ReLU(), nn.Dropout(dropout)
-        self.decide = nn.Sequential(*first, nn.Linear(head, head), nn.ReLU(), nn.Linear(head, 1))
-
-    def forward(self, values: Tensor, taken: Tensor, n_visible: Tensor, axis_height: Tensor) -> Tensor:
-        """Logits (B,) from samples (B, K, A) of each view's landmarks, of which the first `taken` (B,) are its own.
-
-        A view sees `n_visible` (B,) landmarks in all; `axis_height` (B,) is the z of its optical axis in the world.
-        """
-        there = torch.arange(values.shape[1], device=values.device) < taken[:, None]
-        sums = (self.parts(values) * there[..., None]).sum(1)
-        return self.logits(sums * (n_visible / taken.clamp(min=1))[:, None], n_visible, axis_height)
-
-    def score(self, landmarks: ViewLandmarks, n_visible: Tensor, axis_height: Tensor) -> Tensor:
-        """Logits (B,) from described landmarks, which may be a part of those that each view sees; see `forward`."""
-        sums = torch.segment_reduce(self.parts(landmarks.values), "sum", lengths=landmarks.counts, initial=0.0)
-        return self.logits(sums * (n_visible / landmarks.counts.clamp(min=1))[:, None], n_visible, axis_height)
-
-    def parts(self, values: Tensor) -> Tensor:
-        """What each landmark (..., A) adds to its view's sums, (..., D)."""
-        expected = expected_parts(values, self.matchability(values), self.attributes)
-        if self.attention is None:
-            return expected
-        attended = self.attention(values)
-        weight = attended[..., :1].clamp(-8, 8).exp()
-        return torch.cat([expected, weight, weight * attended[..., 1:]], -1)
-
-    def logits(self, sums: Tensor, n_visible: Tensor, axis_height: Tensor) -> Tensor:
-        """Logits (B,) from the sums over each view's landmarks (B, D)."""
-        features = [expected_statistics(sums[:, :N_EXPECTED], n_visible), axis_height[:, None]]
-        if self.attention is not None:
-            features.append(sums[:, N_EXPECTED + 1 :] / (sums[:, N_EXPECTED : N_EXPECTED + 1] + 1e-6))
-        joined = torch.cat(features, 1)
-        if self.training and len(joined) < 2:  # one view has no spread of its own; a process's share may be empty
-            standard = self.standard
-            joined = batch_norm(joined, standard.running_mean, standard.running_var, standard.weight, standard.bias)
-        else:
-            joined = self.standard(joined)
-        return (self.linear(joined) + self.decide(joined)).squeeze(-1)
-
-
 EXPECTED = (
     "log_expected_inliers",  # log(1 + landmarks expected to be found)
     "log_visible",  # log(1 + landmarks in view)
@@ -137,6 +67,115 @@ EXPECTED = (
     "log_spread",  # area of the image the landmarks expected to be found spread over: det of their second moment
 )
 """What `expected_statistics` gives of a view."""
+
+ALL_TOLD = (*EXPECTED, "axis_height")
+
+TOLD = ("log_expected_inliers", "log_visible", "log_position_variance", "log_orientation_variance")
+"""What the layers that decide are told of a view: chosen on the val scenes of configs/cameras.yaml."""
+
+
+class SetNetwork(LandmarkNetwork):
+    """Scores a view by the set of landmarks it sees, without bins.
+
+    Each landmark has a probability of being found. Weighted by it, the landmarks' Fisher information sums up to the
+    information that the view can be expected to have on its pose, and its inverse to the expected covariance: how far
+    off position and orientation will be, which is what a label asks. So the probability is the attention by which
+    landmarks are pooled; on request further attention pools what else there may be to know of them, in `pooled`
+    numbers. All of these are sums over landmarks, so in training a random sample of them, scaled up, will do.
+
+    `width` and `head` are units of the layers that look at single landmarks and of those that decide; `hidden` names
+    attributes not to look at. Of "across", "down" and "distance" the information remains. `told` names what those that
+    decide are told of a view, of `EXPECTED` and "axis_height": the less, the better it holds in scenes unlike those
+    learnt from. What a view is told to be otherwise, those layers learn by heart for the scenes that they know, and
+    choose worse elsewhere than the expected inliers alone.
+    """
+
+    def __init__(
+        self,
+        statistics: AttributeStatistics,
+        width: int = 48,
+        pooled: int = 0,
+        head: int = 48,
+        dropout: float = 0.1,
+        hidden: tuple[str, ...] = (),
+        told: tuple[str, ...] = TOLD,
+    ) -> None:
+        options = {"width": width, "pooled": pooled, "head": head, "dropout": dropout}
+        super().__init__(statistics, **options, hidden=hidden, told=told)
+        self._told = [ALL_TOLD.index(name) for name in told]
+        self.matchability = MatchabilityNetwork(statistics, width, hidden)
+        self.attention = None
+        if pooled:
+            layers = nn.Linear(len(self.attributes), width), nn.ReLU(), nn.Linear(width, width), nn.ReLU()
+            self.attention = nn.Sequential(
+                StandardAttributes(statistics, hidden), *layers, nn.Linear(width, 1 + pooled)
+            )
+        self.standard = nn.BatchNorm1d(len(told) + pooled)
+        n_features = self.standard.num_features
+        self.linear = nn.Linear(n_features, 1)
+        first = nn.Linear(n_features, head), nn.ReLU(), nn.Dropout(dropout)
+        self.decide = nn.Sequential(*first, nn.Linear(head, head), nn.ReLU(), nn.Linear(head, 1))
+
+    @classmethod
+    def of_description(cls, stored: Mapping[str, Any]) -> Self:
+        """The untrained network of a description; one that names nothing that it is told is told all."""
+        return super().of_description({**stored, "options": {"told": ALL_TOLD, **stored["options"]}})
+
+    def forward(
+        self, values: Tensor, taken: Tensor, n_visible: Tensor, axis_height: Tensor, found: Tensor | None = None
+    ) -> Tensor:
+        """Logits (B,) from samples (B, K, A) of each view's landmarks, of which the first `taken` (B,) are its own.
+
+        A view sees `n_visible` (B,) landmarks in all; `axis_height` (B,) is the z of its optical axis in the world.
+        """
+        return self._seen(values, self.matchability(values), taken, n_visible, axis_height)
+
+    def learn(self, options: SetConfig, count: float, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Logits (B,) of the inputs of `forward`, and a loss beside theirs, with which the chances stay true.
+
+        The sixth input tells which landmarks were found, (B, K), NaN where that is not known. The `count` of views
+        divides the loss, and the landmarks that a step looks at of a view.
+        """
+        values, taken, n_visible, axis_height, found = inputs
+        log_odds = self.matchability(values)
+        logits = self._seen(values, log_odds, taken, n_visible, axis_height)
+        known = ~found.isnan()
+        missed = binary_cross_entropy_with_logits(log_odds[known], found[known], reduction="sum")
+        return logits, options.landmark_loss * missed / (count * options.landmarks)
+
+    def _seen(self, values: Tensor, log_odds: Tensor, taken: Tensor, n_visible: Tensor, axis_height: Tensor) -> Tensor:
+        there = torch.arange(values.shape[1], device=values.device) < taken[:, None]
+        sums = (self.parts(values, log_odds) * there[..., None]).sum(1)
+        return self.logits(sums * (n_visible / taken.clamp(min=1))[:, None], n_visible, axis_height)
+
+    def score(self, landmarks: ViewLandmarks, n_visible: Tensor, axis_height: Tensor) -> Tensor:
+        """Logits (B,) from described landmarks, which may be a part of those that each view sees; see `forward`."""
+        values, log_odds = landmarks.values, self.matchability(landmarks.values)
+        sums = torch.segment_reduce(self.parts(values, log_odds), "sum", lengths=landmarks.counts, initial=0.0)
+        return self.logits(sums * (n_visible / landmarks.counts.clamp(min=1))[:, None], n_visible, axis_height)
+
+    def parts(self, values: Tensor, log_odds: Tensor) -> Tensor:
+        """What each landmark (..., A) adds to its view's sums, (..., D), by its log-odds of being found (...,)."""
+        expected = expected_parts(values, log_odds, self.attributes)
+        if self.attention is None:
+            return expected
+        attended = self.attention(values)
+        weight = attended[..., :1].clamp(-8, 8).exp()
+        return torch.cat([expected, weight, weight * attended[..., 1:]], -1)
+
+    def logits(self, sums: Tensor, n_visible: Tensor, axis_height: Tensor) -> Tensor:
+        """Logits (B,) from the sums over each view's landmarks (B, D)."""
+        known = [expected_statistics(sums[:, :N_EXPECTED], n_visible), axis_height[:, None]]
+        features = [torch.cat(known, 1)[:, self._told]]
+        if self.attention is not None:
+            features.append(sums[:, N_EXPECTED + 1 :] / (sums[:, N_EXPECTED : N_EXPECTED + 1] + 1e-6))
+        joined = torch.cat(features, 1)
+        if self.training and len(joined) < 2:  # one view has no spread of its own; a process's share may be empty
+            standard = self.standard
+            joined = batch_norm(joined, standard.running_mean, standard.running_var, standard.weight, standard.bias)
+        else:
+            joined = self.standard(joined)
+        return (self.linear(joined) + self.decide(joined)).squeeze(-1)
 
 
 def expected_statistics(sums: Tensor, n_visible: Tensor) -> Tensor:

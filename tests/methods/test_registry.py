@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
@@ -19,7 +20,7 @@ from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.learning.weights import read_weights, write_weights
 from wheretolook.methods import registry
-from wheretolook.methods.registry import all_methods, load_scorer, make_scorer, methods_named, scorers
+from wheretolook.methods.registry import all_methods, best_weights, load_scorer, make_scorer, methods_named, scorers
 from wheretolook.methods.visible import METHODS
 from wheretolook.utils.errors import ConfigError, WeightsError
 from wheretolook.utils.tracking import client
@@ -279,3 +280,22 @@ def test_an_attribute_that_maps_do_not_know_is_named(tmp_path: Path) -> None:
         load_scorer(tmp_path / "set.safetensors", localization_map)
     views = poses_looking_along(np.zeros((1, 3)), np.ones((1, 3)))
     assert make_scorer("visible", localization_map).score(views).shape == (1,)
+
+
+def test_weights_of_many_cameras_come_before_those_of_one(tmp_path: Path) -> None:
+    """Precision on views of many cameras is lower than on those of one, so that it does not tell which is better."""
+    localization_map = LocalizationMap(make_landmarks(np.random.default_rng(0), 50), CAMERA)
+    for name in ("set", "matchability", "mlp-2d+z"):
+        for suffix in ("safetensors", "json"):
+            shutil.copy(WEIGHTS / f"{name}.{suffix}", tmp_path)
+    for precision, camera, best in ((0.1, None, "set"), (0.1, CAMERA.record(), "mlp-2d+z")):
+        path = tmp_path / "set.safetensors"
+        tensors, header = read_weights(path)
+        header.pop("format_version")
+        write_weights(path, header.pop("method"), tensors, {**header, "camera": camera})
+        record = json.loads(path.with_suffix(".json").read_text())
+        record["metrics"]["val_average_precision"] = precision
+        path.with_suffix(".json").write_text(json.dumps(record))
+        assert best_weights(tmp_path).stem == best
+        if best == "set":
+            assert load_scorer(tmp_path, localization_map).name == "set"

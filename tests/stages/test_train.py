@@ -16,7 +16,7 @@ import torch
 
 from learning_options import changed, train_config
 from synthetic_dataset import make_dataset
-from wheretolook.dataset.folders import Dataset
+from wheretolook.dataset.folders import RELEASE_FILE, Dataset
 from wheretolook.inputs.bins import InputStatistics
 from wheretolook.learning.data import BatchLoader, ViewpointDataModule, balance_classes, hold_out_locations
 from wheretolook.learning.fit import EpochRecord
@@ -295,6 +295,15 @@ def test_other_datasets_are_learnt_from_too(dataset: Dataset, store: str) -> Non
     Dataset(other.root, tuple(replace(scene, camera=wider) for scene in other.scenes)).save()
     with pytest.raises(ConfigError, match="not one camera looks in this dataset"):
         train(dataset, config, tracking, progress=False)
+
+
+def test_a_release_may_ship_weights_of_another_dataset(dataset: Dataset) -> None:
+    about = {"dataset": "cameras", "dataset_fingerprint": "0" * 16}
+    assert not was_trained_on(dataset, about)
+    released = Dataset(dataset.root.parent / "released", dataset.scenes)
+    released.root.mkdir()
+    (released.root / RELEASE_FILE).write_text("{}")
+    assert was_trained_on(released, about) and not was_trained_on(released, {**about, "dataset": "released"})
 
 
 def test_the_same_seed_gives_the_same_weights(dataset: Dataset, store: str) -> None:

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from wheretolook.dataset.folders import Dataset, SceneFolder
+from wheretolook.dataset.folders import RELEASE_FILE, Dataset, SceneFolder
 from wheretolook.learning.config import DECIDING, SharedConfig
 from wheretolook.learning.old_names import with_name
 from wheretolook.learning.scenes import with_also
@@ -42,14 +42,15 @@ def about_training(dataset: Dataset, method: str, config: SharedConfig, options:
     """
     shared = {name: value for name, value in asdict(config).items() if name in DECIDING}
     seen = [scene for scene in dataset.scenes if scene.split != "test"]
-    cameras = [camera.record() for camera in dataset.cameras]
+    cameras = dataset.cameras
     about: dict[str, Any] = {
         "dataset": dataset.name,
         "dataset_fingerprint": training_fingerprint(dataset),
         "landmarks": {_name(scene, dataset): fingerprint(scene.landmarks) for scene in seen},
         "code_version": VERSION,
         "method": method,
-        "camera": cameras[0] if len(cameras) == 1 else cameras,
+        # of several, there may be thousands, the dataset's fingerprint knows which they are
+        "camera": cameras[0].record() if len(cameras) == 1 else f"{len(cameras)} cameras",
         "config": {**asdict(options), **shared},
     }
     if config.also:
@@ -87,10 +88,10 @@ def training_fingerprint(dataset: Dataset) -> str:
 def was_trained_on(dataset: Dataset, training: Mapping[str, Any]) -> bool:
     """Whether weights with a record of training were trained on what a dataset, and others beside it, now hold.
 
-    Where another dataset that they learnt from is not at hand, the dataset's own scenes tell. Of weights that learnt
-    from datasets of other names alone, and were put here to be used, there is nothing to compare.
+    Where another dataset that they learnt from is not at hand, the dataset's own scenes tell. A release may also ship
+    weights that have learnt from other datasets alone: of these there is nothing to compare.
     """
-    if training.get("dataset", dataset.name) != dataset.name:
+    if (dataset.root / RELEASE_FILE).is_file() and training.get("dataset", dataset.name) != dataset.name:
         return True
     also = training.get("also", ())
     if also and not all((dataset.root.parent / name / "dataset.json").is_file() for name in also):

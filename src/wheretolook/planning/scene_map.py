@@ -13,7 +13,13 @@ from wheretolook.dataset.scene import Scene
 from wheretolook.geometry.camera import camera_of_record
 from wheretolook.geometry.lattices import ViewLattice
 from wheretolook.learning.provenance import was_trained_on
-from wheretolook.learning.weights import method_of_weights, read_record, read_training, read_weights
+from wheretolook.learning.weights import (
+    method_of_weights,
+    read_record,
+    read_training,
+    read_weights,
+    serves_every_camera,
+)
 from wheretolook.methods.base import Scorer, same_field_of_view
 from wheretolook.methods.registry import fallback, find, load_scorer, make_scorer, members, methods_named, scorers
 from wheretolook.planning.map_building import build_viewpoint_map
@@ -72,7 +78,7 @@ def default_weights(dataset: Dataset, say: Callable[[str], None] = print, kinds:
     """
     kinds = kinds or {name for name, method in scorers().items() if method.weights == name}
     for root in (dataset.root, dataset.root.parent / RELEASE):
-        fitting: dict[Path, float] = {}
+        fitting: dict[Path, tuple[bool, float]] = {}
         for path in sorted((root / "weights").glob("*.safetensors")):
             try:
                 if method_of_weights(path) not in kinds:
@@ -87,7 +93,7 @@ def default_weights(dataset: Dataset, say: Callable[[str], None] = print, kinds:
             if root == dataset.root and not was_trained_on(dataset, training):
                 say(f"not used: {path}: trained on other data than the dataset now holds")
             elif trained is None or all(same_field_of_view(trained, camera) for camera in dataset.cameras):
-                fitting[path] = precision
+                fitting[path] = serves_every_camera(path), precision  # as in `methods.registry.best_weights`
         if fitting:
             return max(fitting, key=lambda path: fitting[path])
     return None

@@ -1,0 +1,171 @@
+"""Which scorer to ship for any camera: regret, AUC and calibration over unlike scenes and over fields of view.
+
+    python tests/benchmarks/study_cameras.py data/cameras --split val --weights data/release/weights --out cameras.csv
+    python tests/benchmarks/study_cameras.py data/test-45 data/test-60 ... --split test --weights ...
+
+Each dataset has been labelled; the first line is the choice on the val scenes of `configs/cameras.yaml`, the second the
+test by angle: datasets of the same scenes and maps, made with `--camera.fov_deg 45 --map.camera '{fov_deg: 90}'` and so
+on. Scenes of a kind (`building-537` is of the kind building) are averaged first, then kinds; views of narrow (below 60
+degrees across) and wide cameras (above 95) count as two more kinds where a scene has several cameras. Intervals are of
+95 % over locations, neighbours resampled together; differences are paired, against the first method.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from sklearn.metrics import roc_auc_score
+
+from wheretolook.dataset.folders import Dataset
+from wheretolook.evaluation.calibration import expected_calibration_error
+from wheretolook.evaluation.config import EvaluateConfig
+from wheretolook.evaluation.scoring import score_scenes
+from wheretolook.geometry.camera import field_of_view_deg
+from wheretolook.geometry.poses import Float, camera_centers
+from wheretolook.learning.weights import method_of_weights
+from wheretolook.viewpoints.table import CAMERA_ID, is_good, poses
+
+NARROW_DEG, WIDE_DEG = 60, 95
+LIMITS = 0.05, 0.4  # metres and degrees
+RIGHT = 0.5, 5.0  # a pose that is the view's, however exact
+SQUARE_M = 1.0  # locations in one square of the floor are resampled together
+DRAWS = 2000
+
+
+@dataclass(frozen=True)
+class Group:
+    """Views that are judged together: of a scene, or by some cameras.
+
+    Args:
+        kind: what it is averaged with.
+        name: of the scene or the cameras.
+        rows: (V,) of the views in their table.
+    """
+
+    kind: str
+    name: str
+    rows: NDArray[Any]
+
+
+def scored(root: Path, split: str, methods: tuple[str, ...], weights: list[Path]) -> pd.DataFrame:
+    """All labelled views of a split: what they are, and a column for each method."""
+    dataset = Dataset.load(root)
+    scenes = dataset.split(split)
+    tables = [scene.read_table() for scene in scenes]
+    served = {path: method_of_weights(path) for path in weights}
+    config = EvaluateConfig(methods=methods, reference="")
+    scores, _ = score_scenes(dataset, scenes, tables, config, served, "cpu", True, None)
+    parts = []
+    for scene, table in zip(scenes, tables, strict=True):
+        cameras = scene.cameras()
+        numbers = table[CAMERA_ID] if CAMERA_ID in table else pd.Series(0, index=table.index)
+        across = {number: field_of_view_deg(camera)[0] for number, camera in cameras.items()}
+        squares = np.floor(camera_centers(poses(table))[:, :2] / SQUARE_M).astype(int)
+        about = {
+            "dataset": root.name,
+            "scene": scene.name,
+            "kind": scene.name.rsplit("-", 1)[0] if scene.name[-1].isdigit() else "others'",
+            "location": scene.name + " " + table["location_id"].astype(str),
+            "square": [f"{scene.name} {x} {y}" for x, y in squares],
+            "across": numbers.map(across) if len(across) > 1 else next(iter(across.values())),
+            "good": is_good(table, *LIMITS),
+            "right": is_good(table, *RIGHT),
+            "inliers": table["n_inliers"],
+            "n_landmarks": len(scene.read_landmarks()),
+        }
+        parts.append(pd.DataFrame(about))
+    return pd.concat(parts, ignore_index=True).assign(**scores)
+
+
+def groups(views: pd.DataFrame) -> list[Group]:
+    """Scenes by kind, and the narrow and the wide cameras where scenes have several."""
+    found = [
+        Group(str(part["kind"].iloc[0]), str(scene), part.index.to_numpy())
+        for scene, part in views.groupby("scene", sort=False)
+    ]
+    if views.groupby("scene")["across"].nunique().max() > 1:
+        across = views["across"].to_numpy()
+        found += [
+            Group(name, f"{name} cameras", np.flatnonzero(chosen))
+            for name, chosen in (("narrow", across < NARROW_DEG), ("wide", across > WIDE_DEG))
+        ]
+    return found
+
+
+def regrets(views: pd.DataFrame, method: str) -> pd.DataFrame:
+    """What the best view of each location by a method loses, 0 or 1, with the location's square."""
+    order = views.assign(score=views[method]).sort_values("score", ascending=False, kind="stable")
+    best = order.groupby("location")["good"].first()
+    one = views.groupby("location").agg(good=("good", "any"), square=("square", "first"))
+    return pd.DataFrame({"regret": one["good"].astype(float) - best.astype(float), "square": one["square"]})
+
+
+def summary(views: pd.DataFrame, methods: list[str]) -> pd.DataFrame:
+    """A row for each group and method, and the mean over kinds."""
+    rows: list[dict[str, Any]] = []
+    draws: dict[tuple[str, str], Float] = {}
+    for group in groups(views):
+        part = views.loc[group.rows]
+        for method in methods:
+            lost = regrets(part, method)
+            squares = lost.groupby("square")["regret"].agg(["sum", "size"]).to_numpy()
+            chosen = np.random.default_rng(0).integers(len(squares), size=(DRAWS, len(squares)))
+            total = squares[chosen].sum(1)
+            draws[group.name, method] = 100 * total[:, 0] / total[:, 1]
+            row = {"kind": group.kind, "group": group.name, "method": method, "n_locations": len(lost)}
+            row |= {"n_views": len(part), "good": part["good"].mean(), "regret": 100 * lost["regret"].mean()}
+            row["auc"] = roc_auc_score(part["good"], part[method])
+            if part[method].min() >= 0 and part[method].max() <= 1 and not method.startswith("expected"):
+                row["ece"] = expected_calibration_error(part[method].to_numpy(), part["good"].to_numpy())
+            if method == "expected-inliers":
+                right = part[part["right"]]
+                row["real_over_expected"] = right["inliers"].sum() / (right[method] * right["n_landmarks"]).sum()
+            rows.append(row)
+    table = pd.DataFrame(rows)
+    of_kinds = table.groupby(["kind", "method"], sort=False)[["regret", "auc", "ece"]].mean().reset_index()
+    means = of_kinds.groupby("method", sort=False)[["regret", "auc", "ece"]].mean().reset_index()
+    kinds = table.drop_duplicates("group")[["kind", "group"]]
+    for method in methods:
+        for kind, names in kinds.groupby("kind", sort=False)["group"]:
+            draws[f"all {kind}", method] = np.mean([draws[name, method] for name in names], 0)
+        draws["mean", method] = np.mean([draws[f"all {kind}", method] for kind in kinds["kind"].unique()], 0)
+    of_kinds = of_kinds.assign(group="all " + of_kinds["kind"])
+    table = pd.concat([table, of_kinds, means.assign(kind="mean", group="mean")], ignore_index=True)
+    for index, group_name, method in zip(table.index, table["group"], table["method"], strict=True):
+        drawn = draws[group_name, method]
+        table.loc[index, ["regret_low", "regret_high"]] = np.quantile(drawn, (0.025, 0.975))
+        difference = drawn - draws[group_name, methods[0]]
+        table.loc[index, ["more_low", "more_high"]] = np.quantile(difference, (0.025, 0.975))
+    return table
+
+
+def main() -> None:
+    """Score, print and write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("datasets", nargs="+", type=Path)
+    parser.add_argument("--split", default="val")
+    parser.add_argument("--weights", type=Path, default=Path("data/release/weights"), help="folder of weights")
+    parser.add_argument("--methods", nargs="+", default=["set", "expected-inliers", "bins", "visible"])
+    parser.add_argument("--out", type=Path, help="CSV file for the table")
+    args = parser.parse_args()
+    paths = [path for path in sorted(args.weights.glob("*.safetensors")) if not path.stem.startswith("mlp")]
+    tables = []
+    for root in args.datasets:
+        table = summary(scored(root, args.split, tuple(args.methods), paths), args.methods)
+        table.insert(0, "dataset", root.name)
+        tables.append(table)
+        print(f"\n{root.name}, {args.split}")
+        shown = table[(table["group"] == "mean") | table["group"].str.startswith("all ")]
+        print(shown.drop(columns=["dataset"]).to_string(index=False, float_format=lambda x: f"{x:.3f}"))
+        if args.out:
+            pd.concat(tables).round(4).to_csv(args.out, index=False)
+
+
+if __name__ == "__main__":
+    main()

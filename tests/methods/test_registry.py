@@ -292,7 +292,7 @@ def test_weights_of_many_cameras_come_before_those_of_one(tmp_path: Path) -> Non
         path = tmp_path / "set.safetensors"
         tensors, header = read_weights(path)
         header.pop("format_version")
-        write_weights(path, header.pop("method"), tensors, {**header, "camera": camera})
+        write_weights(path, "set", tensors, {**header, "camera": camera})
         record = json.loads(path.with_suffix(".json").read_text())
         record["metrics"]["val_average_precision"] = precision
         path.with_suffix(".json").write_text(json.dumps(record))

@@ -6,14 +6,16 @@
 All photographs are mapped once, as `wheretolook map --images` does, or from the poses beside them (7-Scenes layout:
 frame-*.color.*, .depth.png, .pose.txt with world_from_cam in metres). Such poses choose the pairs to match and the
 first triangulation; bundle adjustment then refines them and the focal length, and the result is fitted to them. Then
-blocks of consecutive photographs are left out, from a few to half of all. Of each, the rest is triangulated anew at the
-poses of the full map, from the same matches, and every photograph left out is localized by the project's localizer.
-It is good within 5 cm and 0.4 degrees of its pose in the full map. A map without a scale is brought to a median depth
-of 5 m; there the limit is 1 % of the median depth of the landmarks that the photograph observes.
+blocks of consecutive photographs are left out, from a few to half of all (`--largest`). Each time the rest is
+triangulated anew at the poses of the full map, from the same matches, and every photograph left out is localized by the
+project's localizer on that map. It is good within 5 cm and 0.4 degrees of its pose in the full map. A map without a
+scale is brought to a median depth of 5 m; there the limit is 1 % of the median depth of the landmarks that the
+photograph observes.
 
 The table has, for each method: AUC over all photographs left out, with a 95 % interval by resampling blocks; the
 expected calibration error (ECE) of probabilities; and, of `expected-inliers`, real over expected inliers: of the views
-localized well, and of all views, where those not localized well count as none. Photographs must have one camera.
+localized well, and of all views, where those not localized well count as none; and the share of views that are like
+those the method has learnt from. Photographs must have one camera.
 `--work` keeps maps and labels, so that other weights are quickly scored; remove it if photographs or settings change.
 `views.csv` in it has every view.
 """
@@ -23,6 +25,7 @@ from __future__ import annotations
 import argparse
 import tempfile
 import time
+import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -62,6 +65,7 @@ from wheretolook.mapping.triangulation import (
 )
 from wheretolook.methods.registry import check_method, make_scorer
 from wheretolook.utils.colmap import quiet_colmap
+from wheretolook.utils.errors import OutOfRangeWarning
 from wheretolook.utils.processes import Processes
 from wheretolook.viewpoints.table import LOCALIZED
 from wheretolook.visibility.hidden_points import HiddenPointRemoval
@@ -195,9 +199,9 @@ def full_map(args: argparse.Namespace) -> FullMap:
     return FullMap(model, database, features.names, features.stored, camera, poses, limit_m)
 
 
-def blocks(n: int, number: int) -> list[tuple[int, int]]:
-    """First and one past the last row of `number` blocks among n, from a few rows to half of all, spread over them."""
-    sizes = np.rint(np.geomspace(max(2, n / 16), n / 2, number)).astype(int)
+def blocks(n: int, number: int, largest: float) -> list[tuple[int, int]]:
+    """First and one past the last row of blocks among n, from a few rows to a share of all, spread over them."""
+    sizes = np.rint(np.geomspace(max(2, n / 16), n * largest, number)).astype(int)
     starts = [round(((i + 1) * 0.6180339887) % 1 * (n - size)) for i, size in enumerate(sizes)]
     return [(start, start + int(size)) for start, size in zip(starts, sizes, strict=True)]
 
@@ -232,7 +236,9 @@ def score_blocks(full: FullMap, args: argparse.Namespace) -> pd.DataFrame:
     """Every photograph of every block, with its label and a column of scores for each method."""
     occlusion: OcclusionModel = HiddenPointRemoval(threads=1) if args.occlusion == "hidden-points" else NoOcclusion()
     rows, parts = list(full.poses), []
-    for number, (first, last) in enumerate(tqdm(blocks(len(rows), args.blocks), "leave out", unit="block")):
+    for number, (first, last) in enumerate(
+        tqdm(blocks(len(rows), args.blocks, args.largest), "leave out", unit="block")
+    ):
         left_out = rows[first:last]
         landmarks, views = without(full, left_out, args.work / "blocks" / f"{first}-{last}")
         mapped = np.stack([pose for row, pose in full.poses.items() if row not in left_out]).astype(np.float32)
@@ -241,7 +247,10 @@ def score_blocks(full: FullMap, args: argparse.Namespace) -> pd.DataFrame:
         for name in args.methods:
             needs = check_method(name).weights
             weights = args.weights / f"{needs}.safetensors" if needs else None
-            views[name] = make_scorer(name, reduced, weights=weights).score(looked)
+            scorer = make_scorer(name, reduced, weights=weights)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", OutOfRangeWarning)  # the table tells how many views are in range
+                views[name], views[f"{name} in range"] = scorer.score(looked), scorer.in_range(looked)
         parts.append(views.assign(block=number))
     return pd.concat(parts, ignore_index=True)
 
@@ -263,6 +272,7 @@ def summarize(scene: str, views: pd.DataFrame, methods: Iterable[str], resamples
         row = {"scene": scene, "method": name, "views": len(views), "good": int(good.sum()), "blocks": len(of_block)}
         row |= {"auc": auc(views, name), "auc_low": float(low), "auc_high": float(high), "ece": float("nan")}
         row |= {"real_over_expected_good": float("nan"), "real_over_expected_all": float("nan")}
+        row["in_range"] = float(views[f"{name} in range"].mean())
         if is_probability(name):
             row["ece"] = expected_calibration_error(views[name].to_numpy(), good)
         if name == EXPECTED:
@@ -286,6 +296,7 @@ def main() -> None:
     parser.add_argument("--methods", nargs="+", default=["set", EXPECTED, "bins", "visible"], help="what to compare")
     parser.add_argument("--occlusion", choices=("hidden-points", "none"), default="hidden-points")
     parser.add_argument("--blocks", type=int, default=12, help="number of blocks (default: %(default)s)")
+    parser.add_argument("--largest", type=float, default=0.5, help="share in the largest block (default: %(default)s)")
     parser.add_argument("--max-side-px", type=int, default=1600, help="longer side of --images (default: %(default)s)")
     parser.add_argument("--focal-px", type=float, default=525.0, help="first guess for --poses (default: %(default)s)")
     parser.add_argument("--resamples", type=int, default=1000, help="of the blocks (default: %(default)s)")

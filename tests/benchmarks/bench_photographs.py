@@ -150,7 +150,7 @@ def map_known_poses(folder: Path, work: Path, focal_px: float) -> None:
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = 0
     options = pycolmap.BundleAdjustmentOptions(print_summary=False)
-    options.ceres.solver_options.num_threads = 1
+    options.ceres.solver_options.num_threads, options.ceres.solver_options.function_tolerance = 1, 1e-6
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     with quiet_colmap("ERROR"):
         matcher = pycolmap.GeometricVerifierOptions(num_threads=1)
@@ -158,7 +158,11 @@ def map_known_poses(folder: Path, work: Path, focal_px: float) -> None:
         for _ in tqdm(range(ROUNDS), "map: adjust", unit="round"):
             adjusted = dict(enumerate(colmap_poses(work, model)))
             model = triangulate(posed_model(model.cameras[1], names, adjusted, stored), database)
-            pycolmap.bundle_adjustment(model, options)
+            adjusting = pycolmap.BundleAdjustmentConfig()
+            for number in model.images:
+                adjusting.add_image(number)
+            adjusting.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+            pycolmap.create_default_bundle_adjuster(options, adjusting, model).solve()
     moved = fit_similarity(camera_centers(colmap_poses(work, model)), camera_centers(poses))
     moved.transform_model(model)
     off_m, off_deg = pose_error(colmap_poses(work, model), poses)

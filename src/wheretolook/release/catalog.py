@@ -231,7 +231,7 @@ _BENCH = "python tests/benchmarks/bench_visibility.py{} --out cpu.json && python
 _LOG_RELEASE = "wheretolook log-release --config {config}"
 
 _SET, _PAPERS, _WIDEST = ((("dataset", "{dataset}"), ("method", method)) for method in ("set", "mlp-2d+z", "mlp-2d+3d"))
-_TRAIN_SET = "wheretolook train --config configs/release-set.yaml"
+_TRAIN_SET = "wheretolook demo --config configs/cameras.yaml"
 _TRAIN_WIDEST = f"{_TRAIN} --train.methods '[mlp-2d+3d]'"
 
 ITEMS: tuple[Item, ...] = (

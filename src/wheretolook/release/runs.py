@@ -110,7 +110,7 @@ def _log_missing(dataset: Dataset, tracking: TrackingConfig, say: Say) -> Releas
         method = record["about"]["method"]
         history = histories.get(method)
         found = _train_run(tracking, path, record, history is not None)
-        runs.train[method] = keep(f"the training of {method}", found, _log_training, path, record, history)
+        runs.train[method] = keep(f"the training of {method}", found, _log_training, dataset, path, record, history)
     learners, paths = (LEARNERS_CSV, "learners", _log_learners), (PATHS_CSV, "paths", _log_paths)
     for file, stage, log_file in (learners, paths, (RUNTIMES_CSV, "benchmark", _log_benchmark)):
         if (results / file).is_file():
@@ -179,11 +179,16 @@ def _log_evaluation(
     return run
 
 
-def _log_training(path: Path, record: dict[str, Any], history: pd.DataFrame | None, tracking: TrackingConfig) -> str:
-    """A train run without its weights, which lie in the release."""
-    about = record["about"]
+def _log_training(
+    dataset: Dataset, path: Path, record: dict[str, Any], history: pd.DataFrame | None, tracking: TrackingConfig
+) -> str:
+    """A train run as of the release, in which its weights lie, wherever they have learnt."""
+    about, learnt_from = {**record["about"], "dataset": dataset.name}, {}
+    if record["about"]["dataset"] != dataset.name:
+        learnt_from = {"learnt_from": record["about"]["dataset"]}
     tags = {**TAGS, "trained_as": str(record["run_id"])}
-    with start_run(tracking, f"train {about['method']}", "train", params_of(about), tags=tags) as (mlflow, run):
+    with start_run(tracking, f"train {about['method']}", "train", params_of(about) | learnt_from, tags=tags) as started:
+        mlflow, run = started
         log(mlflow, run, metrics={f"kept_{name}": value for name, value in record["metrics"].items()})
         mlflow.log_artifact(run, str(path))
         if history is not None:

@@ -5,6 +5,8 @@
 #     text_representation:
 #       extension: .py
 #       format_name: percent
+#       format_version: '1.3'
+#       jupytext_version: 1.19.6
 #   kernelspec:
 #     display_name: Python 3
 #     language: python
@@ -44,9 +46,10 @@ paper_architecture_table(run.data.params).style.hide()
 # %% [markdown]
 # ## What was trained
 #
-# The newest run of each method, the best first, on viewpoints of an apartment that none has learnt from. `set` looks
-# at landmarks one by one and knows what they are like; `mlp-2d`, `mlp-2d+z` and `mlp-2d+3d` are the paper's network,
-# `mlp-released` is it as the paper's released code trains it.
+# The newest run of each method, on viewpoints of scenes that it has not learnt from: `set` on eight of all kinds,
+# looked at by many cameras, the others on one apartment. `set` looks at landmarks one by one and knows what they are
+# like; `mlp-2d`, `mlp-2d+z` and `mlp-2d+3d` are the paper's network, `mlp-released` is it as the paper's released code
+# trains it.
 
 # %%
 from wheretolook.learning.runs import trained

@@ -222,7 +222,9 @@ def without(full: FullMap, left_out: list[int], folder: Path) -> tuple[Landmarks
     localizer, labels = Localizer(landmarks, full.camera, extractor=MAP.extractor), []
     for row in left_out:
         pixels, descriptors = full.stored[row]  # as the extractor gave them, but for the rounding that matching does
-        keypoints = Keypoints(pixels, descriptors / np.float32(512), np.ones(len(pixels), np.float32))
+        keypoints = Keypoints(
+            pixels.astype(np.float32), descriptors / np.float32(512), np.ones(len(pixels), np.float32)
+        )
         found = localizer.estimate(keypoints, *localizer.match([keypoints])[0])
         pose = np.full((3, 4), np.nan) if found.cam_from_world is None else found.cam_from_world
         error_m, error_deg = (float(error) for error in pose_error(pose, full.poses[row]))
@@ -259,13 +261,17 @@ def score_blocks(full: FullMap, args: argparse.Namespace) -> pd.DataFrame:
     return pd.concat(parts, ignore_index=True)
 
 
+SHARES = ("expected-inliers", "visible")  # methods that give a share of the map's landmarks
+
+
 def auc(views: pd.DataFrame, method: str) -> float:
     """Area under the ROC curve; NaN where all views are of one class."""
     return float(roc_auc_score(views["good"], views[method])) if views["good"].nunique() == 2 else float("nan")
 
 
 def summarize(scene: str, views: pd.DataFrame, methods: Iterable[str], resamples: int) -> pd.DataFrame:
-    """The table: one row for each method."""
+    """The table: one row for each method. Shares of a map's landmarks are counted: blocks have maps of their own."""
+    views = views.assign(**{name: views[name] * views["n_landmarks"] for name in methods if name in SHARES})
     rng, good = np.random.default_rng(0), views["good"].to_numpy(dtype=bool)
     of_block: list[NDArray[np.int64]] = [np.asarray(rows) for rows in views.groupby("block").indices.values()]
     draws = rng.integers(0, len(of_block), (resamples, len(of_block)))
@@ -280,7 +286,7 @@ def summarize(scene: str, views: pd.DataFrame, methods: Iterable[str], resamples
         if is_probability(name):
             row["ece"] = expected_calibration_error(views[name].to_numpy(), good)
         if name == EXPECTED:
-            real, expected = views["n_inliers"].to_numpy() * good, (views[name] * views["n_landmarks"]).to_numpy()
+            real, expected = views["n_inliers"].to_numpy() * good, views[name].to_numpy()
             row["real_over_expected_good"] = real.sum() / expected[good].sum()
             row["real_over_expected_all"] = real.sum() / expected.sum()
         rows.append(row)

@@ -25,15 +25,18 @@ from sklearn.metrics import roc_auc_score
 from wheretolook.dataset.folders import Dataset
 from wheretolook.evaluation.calibration import expected_calibration_error
 from wheretolook.evaluation.config import EvaluateConfig
+from wheretolook.evaluation.scores import is_probability
 from wheretolook.evaluation.scoring import score_scenes
 from wheretolook.geometry.camera import field_of_view_deg
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.learning.weights import method_of_weights
+from wheretolook.viewpoints.config import Split
 from wheretolook.viewpoints.table import CAMERA_ID, is_good, poses
 
 NARROW_DEG, WIDE_DEG = 60, 95
 LIMITS = 0.05, 0.4  # metres and degrees
 RIGHT = 0.5, 5.0  # a pose that is the view's, however exact
+SHARES = ("expected-inliers", "visible")  # these give shares of a map's landmarks, which differ in number by scene
 SQUARE_M = 1.0  # locations in one square of the floor are resampled together
 DRAWS = 2000
 
@@ -53,7 +56,7 @@ class Group:
     rows: NDArray[Any]
 
 
-def scored(root: Path, split: str, methods: tuple[str, ...], weights: list[Path]) -> pd.DataFrame:
+def scored(root: Path, split: Split, methods: tuple[str, ...], weights: list[Path]) -> pd.DataFrame:
     """All labelled views of a split: what they are, and a column for each method."""
     dataset = Dataset.load(root)
     scenes = dataset.split(split)
@@ -80,7 +83,8 @@ def scored(root: Path, split: str, methods: tuple[str, ...], weights: list[Path]
             "n_landmarks": len(scene.read_landmarks()),
         }
         parts.append(pd.DataFrame(about))
-    return pd.concat(parts, ignore_index=True).assign(**scores)
+    views = pd.concat(parts, ignore_index=True).assign(**scores)
+    return views.assign(**{name: views[name] * views["n_landmarks"] for name in SHARES if name in views})
 
 
 def groups(views: pd.DataFrame) -> list[Group]:
@@ -106,26 +110,41 @@ def regrets(views: pd.DataFrame, method: str) -> pd.DataFrame:
     return pd.DataFrame({"regret": one["good"].astype(float) - best.astype(float), "square": one["square"]})
 
 
+def _drawn_squares(views: pd.DataFrame) -> tuple[dict[str, int], NDArray[np.float64]]:
+    """The columns of squares, and how often each is drawn, (DRAWS, squares): each scene's as often as it has some.
+
+    All groups and methods go by the same draws, since they share locations.
+    """
+    rng = np.random.default_rng(0)
+    columns: dict[str, int] = {}
+    parts = []
+    for _, part in views.groupby("scene", sort=False):
+        squares = part["square"].unique()
+        columns |= {str(square): len(columns) + k for k, square in enumerate(squares)}
+        parts.append(rng.multinomial(len(squares), np.full(len(squares), 1 / len(squares)), DRAWS))
+    return columns, np.concatenate(parts, 1).astype(float)
+
+
 def summary(views: pd.DataFrame, methods: list[str]) -> pd.DataFrame:
     """A row for each group and method, and the mean over kinds."""
     rows: list[dict[str, Any]] = []
     draws: dict[tuple[str, str], Float] = {}
+    known, drawn = _drawn_squares(views)
     for group in groups(views):
         part = views.loc[group.rows]
         for method in methods:
             lost = regrets(part, method)
-            squares = lost.groupby("square")["regret"].agg(["sum", "size"]).to_numpy()
-            chosen = np.random.default_rng(0).integers(len(squares), size=(DRAWS, len(squares)))
-            total = squares[chosen].sum(1)
+            squares = lost.groupby("square")["regret"].agg(["sum", "size"])
+            total = drawn[:, [known[square] for square in squares.index]] @ squares.to_numpy()
             draws[group.name, method] = 100 * total[:, 0] / total[:, 1]
             row = {"kind": group.kind, "group": group.name, "method": method, "n_locations": len(lost)}
             row |= {"n_views": len(part), "good": part["good"].mean(), "regret": 100 * lost["regret"].mean()}
             row["auc"] = roc_auc_score(part["good"], part[method])
-            if part[method].min() >= 0 and part[method].max() <= 1 and not method.startswith("expected"):
+            if is_probability(method):
                 row["ece"] = expected_calibration_error(part[method].to_numpy(), part["good"].to_numpy())
             if method == "expected-inliers":
                 right = part[part["right"]]
-                row["real_over_expected"] = right["inliers"].sum() / (right[method] * right["n_landmarks"]).sum()
+                row["real_over_expected"] = right["inliers"].sum() / right[method].sum()
             rows.append(row)
     table = pd.DataFrame(rows)
     of_kinds = table.groupby(["kind", "method"], sort=False)[["regret", "auc", "ece"]].mean().reset_index()
@@ -138,9 +157,9 @@ def summary(views: pd.DataFrame, methods: list[str]) -> pd.DataFrame:
     of_kinds = of_kinds.assign(group="all " + of_kinds["kind"])
     table = pd.concat([table, of_kinds, means.assign(kind="mean", group="mean")], ignore_index=True)
     for index, group_name, method in zip(table.index, table["group"], table["method"], strict=True):
-        drawn = draws[group_name, method]
-        table.loc[index, ["regret_low", "regret_high"]] = np.quantile(drawn, (0.025, 0.975))
-        difference = drawn - draws[group_name, methods[0]]
+        of_row = draws[group_name, method]
+        table.loc[index, ["regret_low", "regret_high"]] = np.quantile(of_row, (0.025, 0.975))
+        difference = of_row - draws[group_name, methods[0]]
         table.loc[index, ["more_low", "more_high"]] = np.quantile(difference, (0.025, 0.975))
     return table
 

@@ -49,7 +49,7 @@ def about_training(dataset: Dataset, method: str, config: SharedConfig, options:
         "landmarks": {_name(scene, dataset): fingerprint(scene.landmarks) for scene in seen},
         "code_version": VERSION,
         "method": method,
-        # of several, there may be thousands, the dataset's fingerprint knows which they are
+        # there may be thousands: the dataset's fingerprint tells which
         "camera": cameras[0].record() if len(cameras) == 1 else f"{len(cameras)} cameras",
         "config": {**asdict(options), **shared},
     }

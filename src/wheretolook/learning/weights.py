@@ -64,7 +64,7 @@ def method_of_weights(path: str | Path) -> str:
     return name_of_header(read_weights(Path(path))[1])
 
 
-def serves_every_camera(path: str | Path) -> bool:
+def learnt_with_many_cameras(path: str | Path) -> bool:
     """Whether weights have learnt with several cameras, and so name none; see `read_weights`."""
     return read_weights(Path(path))[1].get("camera", "") is None
 

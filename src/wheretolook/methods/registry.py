@@ -156,7 +156,7 @@ def load_scorer(weights: str | Path, localization_map: LocalizationMap) -> Score
     """The learned scorer of weights for a map: `load_scorer(weights, map).score(cam_from_world)`.
 
     The weights are a file that the train stage wrote, in which stands what method it is; or a folder of such files, of
-    which the one with the best validation average precision is taken. Raises a WeightsError if the file cannot be used,
+    which `best_weights` takes one. Raises a WeightsError if the file cannot be used,
     or was trained for another field of view than the map's camera; a MapError if the map lacks what the method needs.
     """
     path = best_weights(weights) if Path(weights).is_dir() else Path(weights)
@@ -171,13 +171,13 @@ def best_weights(folder: str | Path) -> Path:
 
     Raises a WeightsError if there are none, or a record of training is missing or damaged.
     """
-    from wheretolook.learning.weights import read_record, serves_every_camera
+    from wheretolook.learning.weights import learnt_with_many_cameras, read_record
 
     paths = [path for path in sorted(Path(folder).glob("*.safetensors")) if not _scores_nothing(path.stem)]
     if not paths:
         raise WeightsError("there are no weights of a scorer", path=folder, fix="Run the train stage first.")
     precision = {path: float(read_record(path)["metrics"]["val_average_precision"]) for path in paths}
-    return max(paths, key=lambda path: (serves_every_camera(path), precision[path]))
+    return max(paths, key=lambda path: (learnt_with_many_cameras(path), precision[path]))
 
 
 def _scores_nothing(name: str) -> bool:

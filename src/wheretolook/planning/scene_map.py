@@ -14,11 +14,11 @@ from wheretolook.geometry.camera import camera_of_record
 from wheretolook.geometry.lattices import ViewLattice
 from wheretolook.learning.provenance import was_trained_on
 from wheretolook.learning.weights import (
+    learnt_with_many_cameras,
     method_of_weights,
     read_record,
     read_training,
     read_weights,
-    serves_every_camera,
 )
 from wheretolook.methods.base import Scorer, same_field_of_view
 from wheretolook.methods.registry import fallback, find, load_scorer, make_scorer, members, methods_named, scorers
@@ -93,7 +93,7 @@ def default_weights(dataset: Dataset, say: Callable[[str], None] = print, kinds:
             if root == dataset.root and not was_trained_on(dataset, training):
                 say(f"not used: {path}: trained on other data than the dataset now holds")
             elif trained is None or all(same_field_of_view(trained, camera) for camera in dataset.cameras):
-                fitting[path] = serves_every_camera(path), precision  # as in `methods.registry.best_weights`
+                fitting[path] = learnt_with_many_cameras(path), precision  # as in `methods.registry.best_weights`
         if fitting:
             return max(fitting, key=lambda path: fitting[path])
     return None

@@ -99,7 +99,7 @@ def release_card(release: Dataset, defaults: Mapping[str, Any]) -> str:
     lines += [
         f"{everything['n_views']:,} labelled viewpoints at {everything['n_locations']:,} locations of "
         f"{len(release.scenes)} scenes, the landmarks they were localized against, and the weights of the best scorer "
-        f"trained on them ({shipped}). Enough to train and to evaluate; meshes, COLMAP models "
+        f"({shipped}). Enough to train and to evaluate; meshes, COLMAP models "
         "and descriptors are left out, so nothing here can be labelled anew without making the scenes again.",
         f"```sh\nwheretolook evaluate --config {config}   # the scores below, in minutes on two cores, no GPU\n```",
         _HOW_TO_USE.format(root=root),
@@ -291,16 +291,18 @@ def _learner_text(network: Path) -> list[str]:
     lines, options, further = [], [], []
     for ships, record in records:
         label, config = _label(record), record["about"]["config"]
-        lines.append([label, "yes" if ships else "no", *_validated(record, _LEARNER_METRICS)])
+        learnt_from = str(record["about"]["dataset"])
+        lines.append([label, "yes" if ships else "no", learnt_from, *_validated(record, _LEARNER_METRICS)])
         own = {name: x for name, x in config.items() if name not in DECIDING}
         if ships and own:
             options.append(f"{label}: {_pairs(own)}, seed {config['seed']}.")
         if record["about"].get("also"):
             further.append(f"{label}: {', '.join(record['about']['also'])}.")
-    header = ["beside it", "ships", *[name.replace("_", " ") for name in _LEARNER_METRICS]]
+    header = ["beside it", "ships", "dataset", *[name.replace("_", " ") for name in _LEARNER_METRICS]]
     return [
-        "Learnt from the same viewpoints, with what is known of each landmark (matchability: whether the localizer "
-        "finds a landmark, from the stored matches; its metrics are of landmarks, not of viewpoints):",
+        "With what is known of each landmark (matchability: whether the localizer finds a landmark, from the stored "
+        "matches; its metrics are of landmarks, not of viewpoints). The dataset is that of the viewpoints learnt from, "
+        "whose validation views the metrics are of:",
         markdown_table(header, lines),
         "Options of those that ship. " + " ".join(options),
         *(["From further datasets beside this one: " + " ".join(further)] if further else []),
@@ -332,7 +334,7 @@ def _pairs(values: Mapping[str, Any]) -> str:
     texts = []
     for name, value in values.items():
         if isinstance(value, Sequence) and not isinstance(value, str):
-            value = " × ".join(map(str, value))
+            value = (", " if value and isinstance(value[0], str) else " × ").join(map(str, value))
         texts.append(f"{name} {'none' if value is None else value}")
     return ", ".join(texts)
 

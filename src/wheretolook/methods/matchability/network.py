@@ -102,7 +102,7 @@ def bearing_precision(values: Tensor, attributes: tuple[str, ...] = ATTRIBUTES) 
     """How sharply each landmark (..., A) tells where it is seen, (...): one over its bearing's variance, by the pixels.
 
     A keypoint is off by a pixel, and the landmark by what a pixel of the images that mapped it covers: whichever is
-    larger there counts most. None where pixels are not among the attributes, as in weights learnt with one camera.
+    larger there counts most. None where pixels are not among the attributes, as in weights of before there were any.
     """
     if "pixel_angle" not in attributes:
         return None

@@ -84,10 +84,9 @@ class SetNetwork(LandmarkNetwork):
     numbers. All of these are sums over landmarks, so in training a random sample of them, scaled up, will do.
 
     `width` and `head` are units of the layers that look at single landmarks and of those that decide; `hidden` names
-    attributes not to look at. Of "across", "down" and "distance" the information remains. `told` names what those that
-    decide are told of a view, of `EXPECTED` and "axis_height": the less, the better it holds in scenes unlike those
-    learnt from. What a view is told to be otherwise, those layers learn by heart for the scenes that they know, and
-    choose worse elsewhere than the expected inliers alone.
+    attributes not to look at. Of "across", "down" and "distance" the information remains. `told` names the
+    statistics of a view, of `EXPECTED` and "axis_height", that the deciding layers are given. Given more, they learn
+    their training scenes by heart and choose worse elsewhere than the expected inliers alone.
     """
 
     def __init__(
@@ -133,7 +132,7 @@ class SetNetwork(LandmarkNetwork):
     def learn(self, options: SetConfig, count: float, *inputs: Tensor) -> tuple[Tensor, Tensor]:
         """Logits (B,) of the inputs of `forward`, and a loss beside theirs, with which the chances stay true.
 
-        The sixth input tells which landmarks were found, (B, K), NaN where that is not known. The `count` of views
+        The fifth input tells which landmarks were found, (B, K), NaN where that is not known. The `count` of views
         divides the loss, and the landmarks that a step looks at of a view.
         """
         values, taken, n_visible, axis_height, found = inputs

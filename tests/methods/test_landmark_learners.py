@@ -120,12 +120,12 @@ def test_chances_are_learnt_beside_the_labels_from_known_matches_only() -> None:
     found = torch.full((3, 5), torch.nan)
     found[0], found[1, :2] = torch.tensor([1.0, 0, 0, 1, 0]), 1.0
     views = values, taken, taken, torch.zeros(3)
-    logits, loss = network.learn(SetConfig(landmark_loss=0.5, landmarks=10), 4.0, *views, found)
+    logits, loss = network.learn_more(SetConfig(landmark_loss=0.5, landmarks=10), 4.0, *views, found)
     torch.testing.assert_close(logits, network(*views))
     chance = network.matchability(values).sigmoid()
     missed = -(found * chance.log() + (1 - found) * (1 - chance).log())
     assert float(loss) == pytest.approx(0.5 * float(missed.nansum()) / (4 * 10), rel=1e-5)
-    assert float(network.learn(SetConfig(), 4.0, *views, torch.full_like(found, torch.nan))[1]) == 0
+    assert float(network.learn_more(SetConfig(), 4.0, *views, torch.full_like(found, torch.nan))[1]) == 0
 
 
 def test_views_without_landmarks_are_scored() -> None:

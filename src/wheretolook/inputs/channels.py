@@ -18,6 +18,10 @@ size on the landmark's surface that a pixel covers, over that when it was mapped
 ATTRIBUTES = POSE_ATTRIBUTES + MAP_ATTRIBUTES
 """All that is known of a landmark in a view."""
 
+OF_SIZE = ("distance", "mapped_distance", "mapped_pixel_size")
+"""Attributes that tell how large a scene is, logarithms of metres: they change when it is enlarged. Matching does not
+depend on that, so what learns chances of being found does not look at them unless told to."""
+
 LANDMARK_CHANNELS = ("mapped_angle", "distance_ratio", *MAP_ATTRIBUTES)
 """Channels of what landmarks are like, on request only: two of `POSE_ATTRIBUTES`, and what the map knows. A bin's mean
 is NaN where one of its landmarks' values is not known."""

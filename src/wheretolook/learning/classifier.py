@@ -48,7 +48,7 @@ class Augmented(Protocol):
 class LearnsMore(Protocol):
     """A network that learns something beside the labels of views."""
 
-    def learn(self, options: Any, count: float, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+    def learn_more(self, options: Any, count: float, *inputs: Tensor) -> tuple[Tensor, Tensor]:
         """Logits (B,) of a batch's inputs, and a further loss, a sum that the `count` of views divides."""
 
 
@@ -56,8 +56,8 @@ class ViewpointClassifier(LightningModule):
     """Learns whether a viewpoint localizes, from batches of inputs of a network that gives logits (B,).
 
     A network with a method `augment(options, *inputs)` gets its inputs through that while it learns; one with a method
-    `learn` adds a loss of its own, which the logged ones leave out. The seed is of dropout and noise, where several
-    processes train.
+    `learn_more` adds a loss of its own, which the logged ones leave out. The seed is of dropout and noise, where
+    several processes train.
 
     Logged every epoch: `{train,val}_loss`, `{train,val}_bce`, `l2` (the weighted penalty), `train_average_precision`
     (with dropout on), `val_average_precision`, `val_roc_auc` and `val_calibration_error`. Balancing the classes shifts
@@ -92,7 +92,7 @@ class ViewpointClassifier(LightningModule):
         count = total / self.trainer.world_size
         more: Tensor | float = 0.0
         if isinstance(self.network, LearnsMore):
-            logits, more = self.network.learn(self.options, count, *inputs)
+            logits, more = self.network.learn_more(self.options, count, *inputs)
         else:
             logits = self(*inputs)
         penalty = self.options.l2 * weight_penalty(self.network)

@@ -16,6 +16,7 @@ from tqdm.auto import tqdm
 
 from wheretolook.dataset.folders import Dataset, SceneFolder, views_by_camera
 from wheretolook.geometry.poses import Float
+from wheretolook.inputs.channels import OF_SIZE
 from wheretolook.inputs.landmarks_in_view import ATTRIBUTES, LandmarkDescriber, ViewLandmarks
 from wheretolook.learning.config import SharedConfig
 from wheretolook.learning.data import Batch, TensorViews, ViewsDataModule, labelled_rows, validation_views
@@ -25,8 +26,7 @@ from wheretolook.learning.scenes import training_scenes
 from wheretolook.learning.training_range import TrainingRange, camera_quantities, view_quantities
 from wheretolook.viewpoints.table import LOCALIZED, is_good, poses
 
-DISTANCES = [ATTRIBUTES.index(name) for name in ("distance", "mapped_distance", "mapped_pixel_size")]
-"""Attributes that are logarithms of distances: those that change when a scene is enlarged."""
+DISTANCES = [ATTRIBUTES.index(name) for name in OF_SIZE]
 
 NEAR = 0.5, 5.0
 """Metres and degrees within which a pose is that of the view, and its inliers are right. Elsewhere the map looks alike:

@@ -64,9 +64,14 @@ def method_of_weights(path: str | Path) -> str:
     return name_of_header(read_weights(Path(path))[1])
 
 
-def learnt_with_many_cameras(path: str | Path) -> bool:
-    """Whether weights have learnt with several cameras, and so name none; see `read_weights`."""
-    return read_weights(Path(path))[1].get("camera", "") is None
+def preference(path: str | Path) -> tuple[bool, float]:
+    """What the best of several weights has most of: many cameras learnt with, then validation average precision.
+
+    Those that have learnt with many cameras come before all that know one: their precision is that on harder views.
+    Raises a WeightsError if the file or its record cannot be read.
+    """
+    many = read_weights(Path(path))[1].get("camera", "") is None
+    return many, float(read_record(path)["metrics"]["val_average_precision"])
 
 
 def save_in_half(path: Path) -> None:

@@ -165,19 +165,16 @@ def load_scorer(weights: str | Path, localization_map: LocalizationMap) -> Score
 
 
 def best_weights(folder: str | Path) -> Path:
-    """The weights of a folder that score views by themselves and have the best validation average precision.
-
-    Those that have learnt with many cameras come before all that know one: their precision is that on harder views.
+    """The best weights of a folder that score views by themselves, see `wheretolook.learning.weights.preference`.
 
     Raises a WeightsError if there are none, or a record of training is missing or damaged.
     """
-    from wheretolook.learning.weights import learnt_with_many_cameras, read_record
+    from wheretolook.learning.weights import preference
 
     paths = [path for path in sorted(Path(folder).glob("*.safetensors")) if not _scores_nothing(path.stem)]
     if not paths:
         raise WeightsError("there are no weights of a scorer", path=folder, fix="Run the train stage first.")
-    precision = {path: float(read_record(path)["metrics"]["val_average_precision"]) for path in paths}
-    return max(paths, key=lambda path: (learnt_with_many_cameras(path), precision[path]))
+    return max(paths, key=preference)
 
 
 def _scores_nothing(name: str) -> bool:

@@ -13,13 +13,7 @@ from wheretolook.dataset.scene import Scene
 from wheretolook.geometry.camera import camera_of_record
 from wheretolook.geometry.lattices import ViewLattice
 from wheretolook.learning.provenance import was_trained_on
-from wheretolook.learning.weights import (
-    learnt_with_many_cameras,
-    method_of_weights,
-    read_record,
-    read_training,
-    read_weights,
-)
+from wheretolook.learning.weights import method_of_weights, preference, read_training, read_weights
 from wheretolook.methods.base import Scorer, same_field_of_view
 from wheretolook.methods.registry import fallback, find, load_scorer, make_scorer, members, methods_named, scorers
 from wheretolook.planning.map_building import build_viewpoint_map
@@ -86,14 +80,14 @@ def default_weights(dataset: Dataset, say: Callable[[str], None] = print, kinds:
                 header, training = read_weights(path)[1], read_training(path)
                 serves_all = not scorers()[method_of_weights(path)].one_camera
                 trained = None if serves_all else camera_of_record(header["camera"])
-                precision = float(read_record(path)["metrics"]["val_average_precision"])
+                preferred = preference(path)
             except (WeightsError, ConfigError, KeyError, TypeError, ValueError) as error:
                 say(f"not used: {path}: {error}")
                 continue
             if root == dataset.root and not was_trained_on(dataset, training):
                 say(f"not used: {path}: trained on other data than the dataset now holds")
             elif trained is None or all(same_field_of_view(trained, camera) for camera in dataset.cameras):
-                fitting[path] = learnt_with_many_cameras(path), precision  # as in `methods.registry.best_weights`
+                fitting[path] = preferred
         if fitting:
             return max(fitting, key=lambda path: fitting[path])
     return None

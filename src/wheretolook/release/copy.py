@@ -97,12 +97,12 @@ def trained_weights(release: Dataset) -> dict[Path, Method]:
 
 
 def choose_weights_to_ship(release: Dataset) -> Choice:
-    """Choose by the best validation average precision; what has learnt with many cameras is best.
+    """Choose the paper's network by validation average precision, and the best of all by `preference`.
 
     Raises WeightsError if the paper's network has no weights, or if weights or their record do not fit the release.
     """
     from wheretolook.learning.provenance import was_trained_on
-    from wheretolook.learning.weights import learnt_with_many_cameras, read_record, read_training
+    from wheretolook.learning.weights import preference, read_record, read_training
 
     folder = release.root / "weights"
     fix = f"Run `wheretolook train --config configs/{release.name}.yaml`."
@@ -120,7 +120,7 @@ def choose_weights_to_ship(release: Dataset) -> Choice:
         raise WeightsError("there are no weights to ship of the paper's network", path=folder, fix=fix)
     network = max(networks, key=lambda path: precision[path])
     able = [path for path, method in methods.items() if path == network or method.ships == "best"]
-    best = max(able, key=lambda path: (learnt_with_many_cameras(path), precision[path]))
+    best = max(able, key=preference)
     shelved = tuple(path for path in precision if path not in (network, best))
     return Choice(network, best, shelved, {path.stem: value for path, value in precision.items()})
 

@@ -5,13 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import inf
 
-from wheretolook.inputs.channels import ATTRIBUTES
+from wheretolook.inputs.channels import ATTRIBUTES, OF_SIZE
 from wheretolook.learning.config import FittingConfig, check_at_least
 from wheretolook.utils.errors import ConfigError
-
-OF_SIZE = ("distance", "mapped_distance", "mapped_pixel_size")
-"""Attributes that tell how large a scene is. Matching does not depend on that, so they are not looked at: what has been
-learnt holds in halls and in dolls' houses."""
 
 
 @dataclass(frozen=True)

@@ -129,7 +129,7 @@ class SetNetwork(LandmarkNetwork):
         """
         return self._seen(values, self.matchability(values), taken, n_visible, axis_height)
 
-    def learn(self, options: SetConfig, count: float, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+    def learn_more(self, options: SetConfig, count: float, *inputs: Tensor) -> tuple[Tensor, Tensor]:
         """Logits (B,) of the inputs of `forward`, and a loss beside theirs, with which the chances stay true.
 
         The fifth input tells which landmarks were found, (B, K), NaN where that is not known. The `count` of views

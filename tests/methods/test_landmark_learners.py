@@ -36,7 +36,13 @@ from wheretolook.methods.matchability.network import MatchabilityNetwork, bearin
 from wheretolook.methods.registry import load_scorer, make_scorer
 from wheretolook.methods.set.config import SetConfig
 from wheretolook.methods.set.learn import of_size
-from wheretolook.methods.set.network import EXPECTED, SetNetwork, expected_statistics, information_matrices
+from wheretolook.methods.set.network import (
+    EXPECTED,
+    SetNetwork,
+    expected_cells,
+    expected_statistics,
+    information_matrices,
+)
 from wheretolook.methods.set.score import SetScorer
 from wheretolook.stages.evaluate import evaluate_methods as evaluate
 from wheretolook.stages.train import train_methods as train
@@ -102,6 +108,19 @@ def test_expectations_in_closed_form() -> None:
         if value is not None:
             assert found[name] == pytest.approx(value, rel=1e-5), name
     assert found["expected_share"] == pytest.approx(p.mean(), rel=1e-5)
+
+
+def test_expected_cells_in_closed_form() -> None:
+    """Two landmarks share a cell, one lies elsewhere, one is 90 degrees off; another view has one, a third none."""
+    degrees = np.array([[1.0, 1.0], [5.0, 3.0], [-40.0, 20.0], [89.99, 0.0], [0.5, 0.5]])
+    values = torch.zeros(5, len(ATTRIBUTES), dtype=torch.float64)
+    values[:, :2] = torch.from_numpy(np.tan(np.deg2rad(degrees)))
+    chance = np.array([0.3, 0.6, 0.25, 0.5, 0.9])
+    odds = torch.from_numpy(np.log(chance / (1 - chance)))
+    views, each = torch.tensor([0, 0, 0, 0, 1]), torch.tensor([1.0, 2.0, 1.0], dtype=torch.float64)
+    found = expected_cells(values, odds, views, each)
+    # the second view's landmark stands for two: it is missed only if both are
+    np.testing.assert_allclose(found, [1 - 0.7 * 0.4 + 0.25 + 0.5, 1 - 0.1**2, 0], rtol=1e-12)
 
 
 def test_more_landmarks_leave_less_error_to_expect() -> None:

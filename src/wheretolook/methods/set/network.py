@@ -8,9 +8,9 @@ from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import batch_norm, binary_cross_entropy_with_logits
+from torch.nn.functional import batch_norm, binary_cross_entropy_with_logits, logsigmoid
 
-from wheretolook.inputs.landmarks_in_view import ViewLandmarks
+from wheretolook.inputs.landmarks_in_view import ATTRIBUTES, ViewLandmarks
 from wheretolook.learning.landmark_views import AttributeStatistics
 from wheretolook.methods.matchability.network import (
     N_EXPECTED,
@@ -68,10 +68,22 @@ EXPECTED = (
 )
 """What `expected_statistics` gives of a view."""
 
-ALL_TOLD = (*EXPECTED, "axis_height")
+TOLD_ONCE = (*EXPECTED, "axis_height")
+"""What the deciding layers of weights are told that do not say what they are."""
 
-TOLD = ("log_expected_inliers", "log_visible", "log_position_variance", "log_orientation_variance")
-"""What the layers that decide are told of a view: chosen on the val scenes of configs/cameras.yaml."""
+ALL_TOLD = (*TOLD_ONCE, "log_expected_cells")  # the last: log(1 + cells of the sphere with a landmark to be found)
+
+TOLD = (
+    "log_expected_inliers",
+    "log_visible",
+    "log_position_variance",
+    "log_orientation_variance",
+    "log_expected_cells",
+)
+"""What the layers that decide are told of a view: chosen by cross-validation over configs/cameras.yaml's scenes."""
+
+CELLS = 30
+"""Cells that 180 degrees are cut into, across and down: 6 degrees each, the same for every camera."""
 
 
 class SetNetwork(LandmarkNetwork):
@@ -81,11 +93,12 @@ class SetNetwork(LandmarkNetwork):
     information that the view can be expected to have on its pose, and its inverse to the expected covariance: how far
     off position and orientation will be, which is what a label asks. So the probability is the attention by which
     landmarks are pooled; on request further attention pools what else there may be to know of them, in `pooled`
-    numbers. All of these are sums over landmarks, so in training a random sample of them, scaled up, will do.
+    numbers. It also tells over how many cells of the view the landmarks spread that will be found. All of these are
+    made of sums over landmarks, so in training a random sample of them, scaled up, will do.
 
     `width` and `head` are units of the layers that look at single landmarks and of those that decide; `hidden` names
     attributes not to look at. Of "across", "down" and "distance" the information remains. `told` names the
-    statistics of a view, of `EXPECTED` and "axis_height", that the deciding layers are given. Given more, they learn
+    statistics of a view, of `ALL_TOLD`, that the deciding layers are given. Given more, they learn
     their training scenes by heart and choose worse elsewhere than the expected inliers alone.
     """
 
@@ -102,6 +115,7 @@ class SetNetwork(LandmarkNetwork):
         options = {"width": width, "pooled": pooled, "head": head, "dropout": dropout}
         super().__init__(statistics, **options, hidden=hidden, told=told)
         self._told = [ALL_TOLD.index(name) for name in told]
+        self._cells = "log_expected_cells" in told
         self.matchability = MatchabilityNetwork(statistics, width, hidden)
         self.attention = None
         if pooled:
@@ -117,8 +131,8 @@ class SetNetwork(LandmarkNetwork):
 
     @classmethod
     def of_description(cls, stored: Mapping[str, Any]) -> Self:
-        """The untrained network of a description; one that names nothing that it is told is told all."""
-        return super().of_description({**stored, "options": {"told": ALL_TOLD, **stored["options"]}})
+        """The untrained network of a description; one that names nothing that it is told is told `TOLD_ONCE`."""
+        return super().of_description({**stored, "options": {"told": TOLD_ONCE, **stored["options"]}})
 
     def forward(
         self, values: Tensor, taken: Tensor, n_visible: Tensor, axis_height: Tensor, found: Tensor | None = None
@@ -145,13 +159,20 @@ class SetNetwork(LandmarkNetwork):
     def _seen(self, values: Tensor, log_odds: Tensor, taken: Tensor, n_visible: Tensor, axis_height: Tensor) -> Tensor:
         there = torch.arange(values.shape[1], device=values.device) < taken[:, None]
         sums = (self.parts(values, log_odds) * there[..., None]).sum(1)
-        return self.logits(sums * (n_visible / taken.clamp(min=1))[:, None], n_visible, axis_height)
+        each = n_visible / taken.clamp(min=1)
+        cells = None
+        if self._cells:
+            views = torch.arange(len(values), device=values.device)[:, None].expand_as(log_odds)[there]
+            cells = expected_cells(values[there], log_odds[there], views, each, self.attributes)
+        return self.logits(sums * each[:, None], n_visible, axis_height, cells)
 
     def score(self, landmarks: ViewLandmarks, n_visible: Tensor, axis_height: Tensor) -> Tensor:
         """Logits (B,) from described landmarks, which may be a part of those that each view sees; see `forward`."""
         values, log_odds = landmarks.values, self.matchability(landmarks.values)
         sums = torch.segment_reduce(self.parts(values, log_odds), "sum", lengths=landmarks.counts, initial=0.0)
-        return self.logits(sums * (n_visible / landmarks.counts.clamp(min=1))[:, None], n_visible, axis_height)
+        each = n_visible / landmarks.counts.clamp(min=1)
+        cells = expected_cells(values, log_odds, landmarks.views, each, self.attributes) if self._cells else None
+        return self.logits(sums * each[:, None], n_visible, axis_height, cells)
 
     def parts(self, values: Tensor, log_odds: Tensor) -> Tensor:
         """What each landmark (..., A) adds to its view's sums, (..., D), by its log-odds of being found (...,)."""
@@ -162,9 +183,11 @@ class SetNetwork(LandmarkNetwork):
         weight = attended[..., :1].clamp(-8, 8).exp()
         return torch.cat([expected, weight, weight * attended[..., 1:]], -1)
 
-    def logits(self, sums: Tensor, n_visible: Tensor, axis_height: Tensor) -> Tensor:
-        """Logits (B,) from the sums over each view's landmarks (B, D)."""
+    def logits(self, sums: Tensor, n_visible: Tensor, axis_height: Tensor, cells: Tensor | None = None) -> Tensor:
+        """Logits (B,) from the sums over each view's landmarks (B, D), and `expected_cells` (B,) if told of them."""
         known = [expected_statistics(sums[:, :N_EXPECTED], n_visible), axis_height[:, None]]
+        if cells is not None:
+            known.append(cells.log1p()[:, None])
         features = [torch.cat(known, 1)[:, self._told]]
         if self.attention is not None:
             features.append(sums[:, N_EXPECTED + 1 :] / (sums[:, N_EXPECTED : N_EXPECTED + 1] + 1e-6))
@@ -175,6 +198,24 @@ class SetNetwork(LandmarkNetwork):
         else:
             joined = self.standard(joined)
         return (self.linear(joined) + self.decide(joined)).squeeze(-1)
+
+
+def expected_cells(
+    values: Tensor, log_odds: Tensor, views: Tensor, each: Tensor, attributes: tuple[str, ...] = ATTRIBUTES
+) -> Tensor:
+    """Cells of 6 degrees in which a landmark can be expected to be found, (B,), of B views.
+
+    A view that finds a hundred landmarks in one corner knows its pose worse than one that finds them all over the
+    image. Landmarks have `values` (E, A) and `log_odds` of being found (E,), and are of the `views` (E,); each of them
+    stands for `each` (B,) landmarks in its view.
+    """
+    across, down = (values[:, attributes.index(name)].atan() for name in ("across", "down"))
+    column, row = (((angle / torch.pi + 0.5) * CELLS).long().clamp(0, CELLS - 1) for angle in (across, down))
+    place = (views * CELLS + row) * CELLS + column
+    # a sum of the logarithms of the chances that none is found
+    none = torch.zeros(len(each) * CELLS**2, dtype=log_odds.dtype, device=log_odds.device)
+    none = none.index_add(0, place, logsigmoid(-log_odds)).view(len(each), CELLS**2)
+    return -torch.expm1(none * each[:, None]).sum(1)
 
 
 def expected_statistics(sums: Tensor, n_visible: Tensor) -> Tensor:

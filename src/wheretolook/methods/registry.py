@@ -154,7 +154,7 @@ def make_scorer(
 
 
 @overload
-def load_scorer(localization_map: LocalizationMap, /) -> Scorer: ...
+def load_scorer(localization_map: LocalizationMap) -> Scorer: ...
 
 
 @overload
@@ -162,7 +162,7 @@ def load_scorer(weights: str | Path | None, localization_map: LocalizationMap) -
 
 
 def load_scorer(
-    weights: str | Path | LocalizationMap | None, localization_map: LocalizationMap | None = None
+    weights: str | Path | LocalizationMap | None = None, localization_map: LocalizationMap | None = None
 ) -> Scorer:
     """The learned scorer of a map: `load_scorer(map).score(cam_from_world)`, or with `load_scorer(weights, map)`.
 

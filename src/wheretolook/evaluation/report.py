@@ -65,11 +65,12 @@ def best_in_words(scores: pd.DataFrame) -> str:
     interval of their difference where one is the reference, else by whether the intervals of their shares overlap.
     """
     main, key = main_rows(scores), threshold_keys(scores)[0]
-    rows = main[(main["scene"] == ALL) & (main["top_n"] == main["top_n"].iloc[0])].set_index("method", drop=False)
-    methods = [name for name in rows.index if name != ORACLE and method_group(name) != "probes"]
+    pooled = main[(main["scene"] == ALL) & (main["top_n"] == main["top_n"].iloc[0])]
+    rows: dict[str, Row] = {row["method"]: row for row in pooled.to_dict("records")}
+    methods = [name for name in rows if name != ORACLE and method_group(name) != "probes"]
     ranked = [name for name in methods if not by_chance(name)]
-    ranked.sort(key=lambda name: -rows.loc[name, f"raw_{key}"])  # of equals the first in the table
-    n_views, n_locations, n = (int(rows[name].iloc[0]) for name in ("n_views", "n_locations", "top_n"))
+    ranked.sort(key=lambda name: -rows[name][f"raw_{key}"])  # of equals the first in the table
+    n_views, n_locations, n = (int(rows[ORACLE][name]) for name in ("n_views", "n_locations", "top_n"))
     at = "at " if n == 1 else ""
     of = (
         f" of {n_locations} locations"
@@ -78,7 +79,7 @@ def best_in_words(scores: pd.DataFrame) -> str:
     )
 
     def times(name: str) -> str:
-        return at + f"{rows.loc[name, f'raw_{key}'] * n_views:.1f}".removesuffix(".0")
+        return at + f"{rows[name][f'raw_{key}'] * n_views:.1f}".removesuffix(".0")
 
     others = [*ranked[1:2], *(name for name in methods if by_chance(name))]
     told = [f"{method_style(name).label} {times(name)}" for name in others]
@@ -87,7 +88,7 @@ def best_in_words(scores: pd.DataFrame) -> str:
         f"{best[:1].upper()}{best[1:]} chose a view that localizes within {threshold_label(key)} {times(ranked[0])}{of}"
     )
     text += f"; {', '.join([*told, f'and the oracle, which knows, {times(ORACLE)}'])}."
-    return f"{text} {_told_apart(rows.loc[ranked[0]], rows.loc[ranked[1]], key)}" if len(ranked) > 1 else text
+    return f"{text} {_told_apart(rows[ranked[0]], rows[ranked[1]], key)}" if len(ranked) > 1 else text
 
 
 def _told_apart(first: Row, second: Row, key: str) -> str:

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from tqdm.auto import tqdm
@@ -76,7 +77,7 @@ def compare(experiment: Experiment, say: Say, tick: Tick) -> None:
     results, stamp = results_folder(dataset, config), experiment.root / STAMP
     folders = (experiment.root / "weights", shipped(WEIGHTS))
     files = config.weights or [path for folder in folders for path in sorted(folder.glob("*.safetensors"))]
-    made_from = [dataset.fingerprint(), [fingerprint(path) for path in files if path.is_file()]]
+    made_from: list[Any] = [dataset.fingerprint(), [fingerprint(path) for path in files if path.is_file()]]
     made_from += [asdict(config), asdict(experiment.occlusion), VERSION]
     scores, report = results / SCORES_CSV, results / SCORES_MD
 

@@ -9,13 +9,13 @@ import time
 import traceback
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from itertools import pairwise
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from wheretolook.utils.errors import ConfigError, OutOfRangeWarning, WhereToLookError
 from wheretolook.utils.options import Option, all_options, check_names, grouped, names_in, nearest, short_lines
+from wheretolook.utils.shipped import or_shipped, shipped, shipped_configs
 from wheretolook.utils.version import VERSION
 
 if TYPE_CHECKING:
@@ -173,7 +173,6 @@ Without --config it is configs/release.yaml, whose runs are logged first. Tables
 """The sub-commands, in the order of the line of stages."""
 
 _SHORT = {"--engine": "--label.engine", "--images": "--map.photographs.images"}  # flags of every stage
-_RUN_THERE = "Run in the project's folder, or give the path of a YAML file with --config."
 _COMMON = "name data device"  # the options that matter to every stage
 
 USAGE = """\
@@ -278,15 +277,22 @@ def parse_experiment(command: str, arguments: list[str]) -> Experiment | None:
     known |= {flag.removeprefix("--"): Option(flag, "") for flag in short}
     check_names(names, known, MOVED, "--")
     if "config" not in names and STAGES[command].config:
-        path = Path(f"configs/{STAGES[command].config}.yaml")
-        if not path.is_file():
-            raise ConfigError("the default configuration is not here", path=path, fix=_RUN_THERE)
-        arguments = ["--config", str(path), *arguments]
-    files = [value for flag, value in pairwise(arguments) if flag == "--config"]
-    files += [argument.removeprefix("--config=") for argument in arguments if argument.startswith("--config=")]
-    for name in files:
-        _check_file(Path(name), options)
-    return _parsed(command, arguments, ", ".join(files) or None)
+        arguments = ["--config", str(shipped(f"configs/{STAGES[command].config}.yaml")), *arguments]
+    arguments = [part for one in arguments for part in (one.split("=", 1) if one.startswith("--config=") else [one])]
+    places = [number for number, flag in enumerate(arguments[:-1], 1) if flag == "--config"]
+    for place in places:
+        arguments[place] = str(or_shipped(arguments[place]))
+        _check_file(Path(arguments[place]), options)
+    return _with_shipped_weights(_parsed(command, arguments, ", ".join(arguments[place] for place in places) or None))
+
+
+def _with_shipped_weights(experiment: Experiment) -> Experiment:
+    """The experiment with weights that are named as they lie in the project's folder found from any other."""
+    found: dict[str, Any] = {"evaluate": tuple(map(or_shipped, experiment.evaluate.weights))}
+    for name in ("viewpoint_map", "plan", "paths"):
+        weights = getattr(experiment, name).weights
+        found[name] = weights and or_shipped(weights)
+    return replace(experiment, **{name: replace(getattr(experiment, name), weights=w) for name, w in found.items()})
 
 
 def _check_file(path: Path, options: Mapping[str, Option]) -> None:
@@ -298,9 +304,8 @@ def _check_file(path: Path, options: Mapping[str, Option]) -> None:
     try:
         content = yaml.safe_load(path.read_text()) or {}
     except FileNotFoundError as error:
-        there = sorted(map(str, Path("configs").glob("*.yaml")))
-        near = nearest(str(path), there)
-        fix = f"Did you mean {near}?" if near else f"Here are {', '.join(there)}." if there else _RUN_THERE
+        near, there = nearest(str(path), shipped_configs()), ", ".join(shipped_configs())
+        fix = f"Did you mean {near}?" if near else f"Give the path of a YAML file, or one that ships: {there}."
         raise ConfigError("there is no such file", path=path, fix=fix) from error
     except (UnicodeDecodeError, yaml.YAMLError) as error:
         raise ConfigError(f"this is no YAML: {' '.join(str(error).split())}", path=path) from error

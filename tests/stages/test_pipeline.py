@@ -96,19 +96,68 @@ def test_every_stage_leaves_its_result(demo: Path) -> None:
         assert len(pycolmap.Reconstruction(scene.map).points3D) > 100
         assert not (scene.folder / "shards").exists()
     scores = pd.read_csv(dataset.root / "results" / "scores.csv")
-    assert {"random", "visible", "bins", "fisher-trace-exact", "mlp-2d", "mlp-2d+3d", "set", "oracle"} == set(
-        scores["method"]
-    )
+    rules = {"random", "visible", "bins", "fisher-trace-exact", "oracle"}
+    assert {*rules, "mlp-2d", "mlp-2d+3d", "set", "set that ships"} == set(scores["method"])
     for picture in ("scores.png", "overview.png"):
         assert (dataset.root / "results" / picture).stat().st_size > 10_000
     run_of_evaluation = newest_run(TrackingConfig(str(demo / "mlruns")), "evaluate")
     assert run_of_evaluation is not None and run_of_evaluation.info.status == "FINISHED"
 
 
-def test_run_again_it_reuses_what_is_there(demo: Path) -> None:
-    before = {path: path.stat().st_mtime_ns for path in results(demo) if path.parent.name != "results"}
+def test_run_again_it_reuses_what_is_there(demo: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = {path: path.stat().st_mtime_ns for path in results(demo)}
+    runs = all_runs(demo)
     assert run("demo", demo) == 0
-    assert {path: path.stat().st_mtime_ns for path in before} == before
+    assert {path: path.stat().st_mtime_ns for path in results(demo)} == before
+    assert all_runs(demo) == runs
+    said = capsys.readouterr().out
+    assert "[evaluate] reusing" in said and said.startswith(f"Data go to {demo / 'data' / 'tiny'}, runs to ")
+
+
+def all_runs(folder: Path) -> set[str]:
+    """Ids of all runs in the store."""
+    mlflow = client(TrackingConfig(str(folder / "mlruns")))
+    experiments = [one.experiment_id for one in mlflow.search_experiments()]
+    return {one.info.run_id for one in mlflow.search_runs(experiments, max_results=1000)}
+
+
+def test_the_demo_ends_in_a_sentence_a_picture_and_what_to_do_next(
+    copy: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("demo", copy) == 0
+    end = capsys.readouterr().out.partition("\nDone in ")[2]
+    root = copy / "data" / "tiny"
+    scores = pd.read_csv(root / "results" / "scores.csv")
+    pooled = scores[scores["scene"] == "all"].set_index("method")
+    sentence, _, places = end.partition("\n\n")[2].partition("\n\n")
+    best = pooled.drop(index=["oracle", "random"])["good_0.05m_0.4deg"].max()
+    text = " ".join(sentence.split())
+    assert f"at {best:.0f} of {pooled['n_locations'].iloc[0]} locations; " in text
+    assert f"and the oracle, which knows, at {pooled.loc['oracle', 'good_0.05m_0.4deg']:.0f}." in text
+    assert "95 % interval" in text or "too few" in text
+    shown = dict(line.split(maxsplit=1) for line in places.replace("your own map", "next").splitlines() if line)
+    for name in ("picture", "tables"):
+        assert Path(shown[name]).is_file()
+    assert shown["next"].startswith("wheretolook select --map ") and "mlflow ui" in shown["runs"]
+
+
+def test_what_has_changed_is_compared_anew(copy: Path) -> None:
+    root = copy / "data" / "tiny"
+    overview, report = root / "results" / "overview.png", root / "results" / "scores.md"
+
+    def drawn(*options: str) -> int:
+        assert run("demo", copy, *options) == 0
+        assert report.read_text().startswith("# Localization score")
+        return overview.stat().st_mtime_ns
+
+    times = [drawn()]  # the store has moved with the copy
+    assert drawn() == times[0]
+    report.write_text("mine")
+    times.append(drawn())
+    for suffix in ("safetensors", "json"):
+        shutil.copy(root / "weights" / f"set.{suffix}", root / "weights" / f"kept.{suffix}")
+    times += [drawn(), drawn("--evaluate.resamples", "30")]
+    assert times == sorted({*times})
 
 
 def test_all_methods_are_trained_and_compared(copy: Path) -> None:
@@ -200,6 +249,7 @@ def test_what_a_table_says_is_what_its_features_hold(demo: Path) -> None:
 def test_every_occlusion_model_scores_the_same_viewpoints(copy: Path) -> None:
     root = copy / "data" / "tiny"
     stored = pd.read_csv(root / "results" / "scores.csv")
+    stored = stored[stored["method"] != "set that ships"].reset_index(drop=True)  # beside it in the demo alone
     assert set(stored["occlusion"]) == {"mesh"}
     assert run("evaluate", copy, "--evaluate.occlusions", "[mesh,tsdf,hidden-points,none]") == 0
     scores = pd.read_csv(root / "results" / "scores.csv")

@@ -19,6 +19,7 @@ from wheretolook.planning.scene_map import default_weights
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.scenes.loading import save_glb
 from wheretolook.utils.files import write_json
+from wheretolook.utils.shipped import WEIGHTS, shipped
 
 LANDMARKS = room_landmarks(200)
 SHIPPED = Path(__file__).parents[2] / "data" / "release" / "weights"
@@ -47,7 +48,7 @@ def run(folder: Path, *options: str) -> int:
 
 def test_a_scenes_map_is_that_of_its_scorer(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = dataset / "a.map"
-    assert run(dataset, "--scene", "a", "--out", str(out)) == 0
+    assert run(dataset, "--scene", "a", "--method", "bins", "--out", str(out)) == 0
     assert "60 directions at" in capsys.readouterr().out
     found, expected = ViewpointMap.load(out), build(LANDMARKS)
     np.testing.assert_allclose([found.grid.lower, found.grid.upper], [(0, 0, 0), ROOM], atol=1e-6)
@@ -75,7 +76,16 @@ def test_the_papers_network_scores_for_its_field_of_view_alone(dataset: Path) ->
     rooms = Dataset.load(dataset / "data" / "rooms")
     assert default_weights(rooms) == weights / "mlp-2d+z.safetensors"
     narrow = tuple(replace(scene, camera=replace(CAMERA, focal_px=70.0)) for scene in rooms.scenes)
-    assert default_weights(replace(rooms, scenes=narrow)) is None
+    assert default_weights(replace(rooms, scenes=narrow)) == shipped(WEIGHTS) / "set.safetensors"
+    assert default_weights(replace(rooms, scenes=narrow), kinds=["mlp-2d+z"]) is None
+
+
+def test_without_any_weights_those_that_ship_score(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(dataset, "--scene", "a") == 0
+    assert f"scored by {shipped(WEIGHTS) / 'set.safetensors'}" in capsys.readouterr().out
+    named = ("--weights", f"{WEIGHTS}/mlp-2d+z.safetensors")
+    assert run(dataset, "--scene", "a", *named) == 0
+    assert "scored by mlp-2d+z" in capsys.readouterr().out
 
 
 def test_the_best_weights_there_are_score(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:

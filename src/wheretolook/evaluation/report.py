@@ -9,7 +9,7 @@ from typing import Any
 import pandas as pd
 
 from wheretolook.evaluation.score_table import main_rows, methods_of, reference_of, threshold_keys
-from wheretolook.evaluation.scores import RELEASED_DIVISOR
+from wheretolook.evaluation.scores import RELEASED_DIVISOR, by_chance
 from wheretolook.methods.styles import ORACLE, method_group, method_style
 from wheretolook.utils.markdown import markdown_table
 from wheretolook.viewpoints.thresholds import ALL, threshold_label
@@ -56,6 +56,60 @@ def score_markdown(scores: pd.DataFrame, title: str = "Localization score") -> s
             _table(rows, [*_score_columns(keys, 1), *_RANKING], "probe"),
         ]
     return "\n\n".join(parts) + "\n"
+
+
+def best_in_words(scores: pd.DataFrame) -> str:
+    """Which method chose good views most often, and whether the intervals tell it from the next, in two sentences.
+
+    By the first N, threshold, occlusion model and set of candidates of a score table. Two methods are told apart by the
+    interval of their difference where one is the reference, else by whether the intervals of their shares overlap.
+    """
+    main, key = main_rows(scores), threshold_keys(scores)[0]
+    pooled = main[(main["scene"] == ALL) & (main["top_n"] == main["top_n"].iloc[0])]
+    rows: dict[str, Row] = {row["method"]: row for row in pooled.to_dict("records")}
+    methods = [name for name in rows if name != ORACLE and method_group(name) != "probes"]
+    ranked = [name for name in methods if not by_chance(name)]
+    ranked.sort(key=lambda name: -rows[name][f"raw_{key}"])  # of equals the first in the table
+    n_views, n_locations, n = (int(rows[ORACLE][name]) for name in ("n_views", "n_locations", "top_n"))
+    at = "at " if n == 1 else ""
+    of = (
+        f" of {n_locations} locations"
+        if n == 1
+        else f" of {n_views} times ({n} views at each of {n_locations} locations)"
+    )
+
+    def times(name: str) -> str:
+        return at + f"{rows[name][f'raw_{key}'] * n_views:.1f}".removesuffix(".0")
+
+    others = [*ranked[1:2], *(name for name in methods if by_chance(name))]
+    told = [f"{method_style(name).label} {times(name)}" for name in others]
+    best = method_style(ranked[0]).label
+    text = (
+        f"{best[:1].upper()}{best[1:]} chose a view that localizes within {threshold_label(key)} {times(ranked[0])}{of}"
+    )
+    text += f"; {', '.join([*told, f'and the oracle, which knows, {times(ORACLE)}'])}."
+    return f"{text} {_told_apart(rows[ranked[0]], rows[ranked[1]], key)}" if len(ranked) > 1 else text
+
+
+def _told_apart(first: Row, second: Row, key: str) -> str:
+    """Whether the intervals of two rows, of which the first has the higher share, tell them apart, in a sentence."""
+    names, n_locations = (first["method"], second["method"]), first["n_locations"]
+    reference = first.get("reference", "")
+    if reference in names:
+        row, sign = (second, -1) if reference == names[0] else (first, 1)
+        low, high = sorted(sign * row[f"difference_{end}_{key}"] for end in ("low", "high"))
+        why = f"the 95 % interval of their difference is {_signed(low)} to {_signed(high)} points"
+        apart = low > 0
+    else:
+        low, high = first[f"raw_low_{key}"], second[f"raw_high_{key}"]
+        apart = low > high
+        ends = [_ends(row, "raw", key).strip() for row in (first, second)]
+        why = f"the 95 % intervals of their shares {'do not overlap' if apart else 'overlap'}, {' and '.join(ends)}"
+    if pd.isna(low) or pd.isna(high):
+        why = "there are too few for an interval"
+    if apart:
+        return f"The first is better than the second by more than chance: {why}."
+    return f"By {n_locations} locations it cannot be told which of the first two is better: {why}."
 
 
 def _about(main: pd.DataFrame) -> str:

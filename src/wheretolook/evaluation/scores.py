@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from sklearn.metrics import average_precision_score, roc_auc_score
 
 from wheretolook.evaluation.bootstrap import LocationBootstrap
 from wheretolook.evaluation.calibration import expected_calibration_error, scale_probability
@@ -196,6 +195,8 @@ def _quotient(top: Float, bottom: Float | float) -> Float:
 
 
 def _ranking_metrics(good: NDArray[np.bool_], scores: Float) -> dict[str, float]:
+    from sklearn.metrics import average_precision_score, roc_auc_score  # takes a second, and reading a table needs none
+
     measures = {"average_precision": average_precision_score, "roc_auc": roc_auc_score}
     if good.all() or not good.any():
         return dict.fromkeys(measures, float("nan"))

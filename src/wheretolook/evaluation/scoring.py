@@ -22,10 +22,12 @@ from wheretolook.methods.base import Scorer
 from wheretolook.methods.registry import learned, make_scorer, members, methods_named, scorers
 from wheretolook.utils.errors import TableError, WeightsError
 from wheretolook.utils.files import fingerprint
+from wheretolook.utils.shipped import WEIGHTS, shipped
 from wheretolook.viewpoints.table import poses
 from wheretolook.visibility.config import OcclusionConfig
 
 BLOCK = 4096  # views binned and scored at a time
+SHIPPED = "that ships"  # stands after the method's name where the weights that ship are compared beside others
 Weights = Mapping[Path, str]  # files of weights, and the name of the method that each serves
 
 
@@ -41,7 +43,7 @@ def choose_weights(dataset: Dataset, config: EvaluateConfig, models: Sequence[Tr
     if models is not None:
         paths = [model if isinstance(model, Path) else model.path for model in models]
     else:
-        paths = list(config.weights) or _own_weights(dataset)
+        paths = list(config.weights) or own_weights(dataset)
     served = {path: method_of_weights(path) for path in paths}
     folder = dataset.root / "weights"
     if not served:
@@ -57,7 +59,7 @@ def choose_weights(dataset: Dataset, config: EvaluateConfig, models: Sequence[Tr
     return {path: kind for path, kind in served.items() if kind in wanted}
 
 
-def _own_weights(dataset: Dataset) -> list[Path]:
+def own_weights(dataset: Dataset) -> list[Path]:
     """The weights in the dataset's folder, which must be trained on what the dataset now holds."""
     paths = {name: weights_path(dataset, name) for name in learned()}
     found = {name: path for name, path in paths.items() if path.is_file()}
@@ -140,5 +142,6 @@ def _scorers(localization_map: LocalizationMap, config: EvaluateConfig, weights:
         for path in paths if method.weights else [None]:
             scorer = make_scorer(method.name, localization_map, config.seed, path, config.heading)
             # two files of one method are told apart by their names
-            found[f"{method.name} {path}" if method.name in found else method.name] = scorer
+            which = SHIPPED if path is not None and path.parent == shipped(WEIGHTS) else path
+            found[f"{method.name} {which}" if method.name in found else method.name] = scorer
     return found

@@ -16,8 +16,9 @@ from tqdm.auto import tqdm
 
 from wheretolook.dataset.folders import Dataset, SceneFolder, views_by_camera
 from wheretolook.geometry.poses import Float
-from wheretolook.inputs.channels import OF_SIZE
-from wheretolook.inputs.landmarks_in_view import ATTRIBUTES, LandmarkDescriber, ViewLandmarks
+from wheretolook.inputs.channels import ATTRIBUTES, OF_SIZE
+from wheretolook.inputs.landmarks_in_view import LandmarkDescriber, ViewLandmarks
+from wheretolook.learning.attribute_statistics import AttributeStatistics
 from wheretolook.learning.config import SharedConfig
 from wheretolook.learning.data import Batch, TensorViews, ViewsDataModule, labelled_rows, validation_views
 from wheretolook.learning.fit import home_device
@@ -33,27 +34,6 @@ NEAR = 0.5, 5.0
 what agrees there are wrong matches."""
 
 BLOCK = 2048  # views described at a time: some million landmarks
-
-
-@dataclass(frozen=True)
-class AttributeStatistics:
-    """Mean and standard deviation of what is known of each landmark, over those in view while training."""
-
-    mean: tuple[float, ...]  # (A,), 0 for what is not known of any
-    std: tuple[float, ...]  # (A,), 1 where it would be 0
-    attributes: tuple[str, ...] = ATTRIBUTES  # names of the A attributes
-
-    @classmethod
-    def of(cls, values: Tensor) -> AttributeStatistics:
-        """Statistics over landmarks (E, len(ATTRIBUTES)), some numbers NaN."""
-        means, stds = [], []
-        for column in values.unbind(1):
-            known = column[~column.isnan()].double()
-            mean = float(known.mean()) if len(known) else 0.0
-            std = float((known - mean).square().mean().sqrt()) if len(known) else 0.0
-            means.append(mean)
-            stds.append(std if std > 1e-6 else 1.0)
-        return cls(tuple(means), tuple(stds))
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,9 +7,10 @@ Tables had two columns, `method` and `inputs` ("fisher" and "trace gp", "mlp" an
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import pandas as pd
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 def name_of(method: str, inputs: str = "") -> str:

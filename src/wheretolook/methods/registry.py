@@ -8,10 +8,11 @@ from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, overload
 
 from wheretolook.methods.method import Method, ScorerOptions
 from wheretolook.utils.errors import CameraError, ConfigError, WeightsError
+from wheretolook.utils.shipped import WEIGHTS, or_shipped, shipped
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -152,14 +153,33 @@ def make_scorer(
     return _build(method, localization_map, ScorerOptions(seed, path, heading))
 
 
-def load_scorer(weights: str | Path, localization_map: LocalizationMap) -> Scorer:
-    """The learned scorer of weights for a map: `load_scorer(weights, map).score(cam_from_world)`.
+@overload
+def load_scorer(localization_map: LocalizationMap) -> Scorer: ...
 
-    The weights are a file that the train stage wrote, in which stands what method it is; or a folder of such files, of
-    which `best_weights` takes one. Raises a WeightsError if the file cannot be used,
-    or was trained for another field of view than the map's camera; a MapError if the map lacks what the method needs.
+
+@overload
+def load_scorer(weights: str | Path | None, localization_map: LocalizationMap) -> Scorer: ...
+
+
+def load_scorer(
+    weights: str | Path | LocalizationMap | None = None, localization_map: LocalizationMap | None = None
+) -> Scorer:
+    """The learned scorer of a map: `load_scorer(map).score(cam_from_world)`, or with `load_scorer(weights, map)`.
+
+    Without weights, or with None, the best of those that ship score. Else they are a file that the train stage wrote,
+    in which stands what method it is; or a folder of such files, of which `best_weights` takes one; what ships is found
+    under its name, such as `data/release/weights`, from any folder.
+
+    Raises a WeightsError if the file cannot be used, or was trained for another field of view than the map's camera; a
+    MapError if the map lacks what the method needs.
     """
-    path = best_weights(weights) if Path(weights).is_dir() else Path(weights)
+    if weights is not None and not isinstance(weights, (str, Path)):
+        weights, localization_map = None, weights
+    if localization_map is None:
+        fix = "Call load_scorer(localization_map), or load_scorer(weights, localization_map)."
+        raise ConfigError("a scorer needs a map", fix=fix)
+    path = shipped(WEIGHTS) if weights is None else or_shipped(weights)
+    path = best_weights(path) if path.is_dir() else path
     method = _of_weights("a scorer", [method for method in scorers().values() if method.name == method.weights], path)
     return _build(method, localization_map, ScorerOptions(weights=path))
 

@@ -24,7 +24,7 @@ class ViewpointMapConfig(ViewLattice):
         method: method that scores the views. See `wheretolook evaluate --list-methods`; empty for the one that the
             weights are of, or bins if there are none.
         weights: file of weights that the train stage wrote, for a method that has learnt. Unless a method is named,
-            the best of the dataset, or else of the release, for cameras with their field of view.
+            the best of the dataset, or else of those that ship, for cameras with their field of view.
         out: folder to write; empty for `<data>/<name>/<scene>/viewpoint-map`. Only with a scene.
     """
 
@@ -91,7 +91,7 @@ class PathsConfig(ViewLattice):
         methods: methods to compare: forward, the shortest path, and some that score views. See `wheretolook evaluate
             --list-methods`. Scores that are no probabilities enter by their ranks.
         weights: file of weights, for a method that has learnt. By default, and for methods of another kind, the best of
-            each method in the dataset, or else in the release.
+            each method in the dataset, or else of those that ship.
         max_turn_deg: along a path that is given, the camera turns by no more from one waypoint to the next.
         max_error_m: a view is good if it localizes with a smaller error of its position.
         max_error_deg: and with a smaller error of its orientation.

@@ -20,6 +20,7 @@ from wheretolook.planning.map_building import build_viewpoint_map
 from wheretolook.planning.path_planning import Space
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.utils.errors import ConfigError, WeightsError
+from wheretolook.utils.shipped import WEIGHTS, shipped
 
 REACH = 2  # a voxel borrows from voxels at most this many away along each axis
 
@@ -66,14 +67,15 @@ def weights_for(
 
 
 def default_weights(dataset: Dataset, say: Callable[[str], None] = print, kinds: Collection[str] = ()) -> Path | None:
-    """The best weights of a dataset, or else of the release beside it, that serve its cameras.
+    """The best weights of a dataset, or else of the release beside it, or else that ship, that serve its cameras.
 
     They are of one of the methods named by `kinds`; empty for all that score views by themselves.
     """
     kinds = kinds or {name for name, method in scorers().items() if method.weights == name}
-    for root in (dataset.root, dataset.root.parent / RELEASE):
+    own = dataset.root / "weights"
+    for folder in (own, dataset.root.parent / RELEASE / "weights", shipped(WEIGHTS)):
         fitting: dict[Path, tuple[bool, float]] = {}
-        for path in sorted((root / "weights").glob("*.safetensors")):
+        for path in sorted(folder.glob("*.safetensors")):
             try:
                 if method_of_weights(path) not in kinds:
                     continue
@@ -84,7 +86,7 @@ def default_weights(dataset: Dataset, say: Callable[[str], None] = print, kinds:
             except (WeightsError, ConfigError, KeyError, TypeError, ValueError) as error:
                 say(f"not used: {path}: {error}")
                 continue
-            if root == dataset.root and not was_trained_on(dataset, training):
+            if folder == own and not was_trained_on(dataset, training):
                 say(f"not used: {path}: trained on other data than the dataset now holds")
             elif trained is None or all(same_field_of_view(trained, camera) for camera in dataset.cameras):
                 fitting[path] = preferred

@@ -1,11 +1,15 @@
-"""The whole line from one command: all stages, an estimate of what remains, and where each result lies."""
+"""The whole line from one command: all stages, an estimate of what remains, and in the end what came out."""
 
 from __future__ import annotations
 
+import json
+import textwrap
 import time
 from collections.abc import Callable
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from tqdm.auto import tqdm
@@ -13,17 +17,24 @@ from tqdm.auto import tqdm
 from wheretolook import stages
 from wheretolook.config import Experiment
 from wheretolook.dataset.folders import Dataset
-from wheretolook.dataset.stamps import STAGES
+from wheretolook.dataset.stamps import STAGES, stage_key
+from wheretolook.evaluation.report import best_in_words
+from wheretolook.evaluation.results import SCORES_CSV, SCORES_MD, SCORES_PNG, results_folder
+from wheretolook.evaluation.scores import read_scores
 from wheretolook.geometry.poses import camera_centers, poses_looking_along
-from wheretolook.methods.registry import load_scorer, methods_named, scorers
-from wheretolook.stages.inputs import open_scene
+from wheretolook.methods.registry import best_weights, load_scorer, methods_named, scorers
+from wheretolook.stages.inputs import Say, Tick, dataset_after, open_scene
 from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.files import fingerprint, write_json
+from wheretolook.utils.shipped import WEIGHTS, shipped
 from wheretolook.utils.tracking import ui_command
+from wheretolook.utils.version import VERSION
 
 SECONDS = {"scenes": 5.0, "map": 15.0, "sample": 1.0, "label": 75.0, "train": 25.0, "evaluate": 6.0}
 """Rough cost of a stage on two cores (the first four for each scene), from which the share done is estimated."""
 
 OVERVIEW = "overview.png"
+STAMP = "compared.json"  # in the dataset's folder: what the demo's comparison was made from
 
 
 def run_demo(experiment: Experiment) -> None:
@@ -34,7 +45,7 @@ def run_demo(experiment: Experiment) -> None:
     config = experiment.scenes
     n_scenes = config.train + config.val + config.test + len(config.meshes)
     cost = {name: seconds * (n_scenes if name in STAGES else 1) for name, seconds in SECONDS.items()}
-    functions = (stages.make_scenes, stages.make_maps, stages.sample, stages.label, stages.train, stages.evaluate)
+    functions = (stages.make_scenes, stages.make_maps, stages.sample, stages.label, stages.train, compare)
     steps: dict[str, Callable[..., object]] = dict(zip(SECONDS, functions, strict=True))
     if config.train == 0 and not any(mesh.split == "train" for mesh in config.meshes):
         del steps["train"], cost["train"]  # all scenes are evaluated, with weights from elsewhere
@@ -42,6 +53,7 @@ def run_demo(experiment: Experiment) -> None:
         if any(method.weights for method in asked) and not experiment.evaluate.weights:
             fix = "Name weights in evaluate.weights, or leave methods that have learnt out of evaluate.methods."
             raise ConfigError("no scene to learn from, and no weights to evaluate", fix=fix)
+    print(f"Data go to {experiment.root.resolve()}, runs to {experiment.tracking.root}.")
     start = time.monotonic()
     layout = "{desc}: {percentage:3.0f}%|{bar}| {elapsed} elapsed, about {remaining} remain"
     with tqdm(total=sum(cost.values()), desc="demo", bar_format=layout, smoothing=0) as bar:
@@ -49,10 +61,45 @@ def run_demo(experiment: Experiment) -> None:
             bar.set_description_str(f"demo {number}/{len(steps)} {name}")
             step(experiment, say=partial(_say, name), tick=partial(_tick, bar, SECONDS[name]))
         given, own = experiment.evaluate.weights, experiment.root / "weights"
-        if given or any(own.glob("*.safetensors")):
+        known = (experiment.root / "results" / OVERVIEW).is_file()  # `compare` removes one that is out of date
+        if not known and (given or any(own.glob("*.safetensors"))):
             draw_overview(experiment, given[-1] if given else own)
         bar.set_description_str("demo")
-    _say_where(experiment, time.monotonic() - start)
+    _say_end(experiment, time.monotonic() - start)
+
+
+def compare(experiment: Experiment, say: Say, tick: Tick) -> None:
+    """The evaluate stage, with the weights that ship beside the dataset's own. What is there already is kept.
+
+    Raises as `wheretolook.stages.evaluate.evaluate_methods`.
+    """
+    dataset, config, tracking = dataset_after(experiment, "label"), experiment.evaluate, experiment.tracking
+    results, stamp = results_folder(dataset, config), experiment.root / STAMP
+    folders = (experiment.root / "weights", shipped(WEIGHTS))
+    files = config.weights or [path for folder in folders for path in sorted(folder.glob("*.safetensors"))]
+    made_from: list[Any] = [dataset.fingerprint(), [fingerprint(path) for path in files if path.is_file()]]
+    made_from += [asdict(config), asdict(experiment.occlusion), VERSION]
+    scores, report = results / SCORES_CSV, results / SCORES_MD
+
+    def made() -> dict[str, str]:
+        content = [fingerprint(path) for path in (scores, report)]
+        return {"key": stage_key("evaluate", [*made_from, *content]), "runs": str(tracking.root)}
+
+    try:
+        known = json.loads(stamp.read_text()) == made() and (tracking.root / "mlflow.db").is_file()
+    except (OSError, ValueError):
+        known = False
+    if not known:
+        from wheretolook.evaluation.scoring import own_weights
+        from wheretolook.stages.evaluate import evaluate_methods
+
+        models = list(config.weights) or [*own_weights(dataset), best_weights(shipped(WEIGHTS))]
+        (results / OVERVIEW).unlink(missing_ok=True)
+        device, occlusion = experiment.warp_device, experiment.occlusion
+        evaluate_methods(dataset, config, tracking, models, device=device, occlusion=occlusion, show=False)
+        write_json(stamp, made())
+    say(f"{'reusing' if known else 'all methods compared ->'} {report}")
+    tick(1)
 
 
 def draw_overview(experiment: Experiment, weights: Path) -> None:
@@ -96,11 +143,14 @@ def _tick(bar: tqdm, seconds: float, work: float) -> None:
     bar.update(seconds * work)
 
 
-def _say_where(experiment: Experiment, seconds: float) -> None:
-    scene, results = Dataset.load(experiment.root).scenes[-1], experiment.root / "results"
-    places = {"score table": results / "scores.md", "score figure": results / "scores.png"}
-    places |= {"overview": results / OVERVIEW, "trained weights": experiment.root / "weights", "a scene": scene.mesh}
-    places |= {"its COLMAP map": scene.map, "its viewpoints": scene.table}
-    print(f"\nDone in {seconds / 60:.1f} minutes.")
-    for name, place in {**places, "compare runs": ui_command(experiment.tracking)}.items():
-        print(f"  {name:<16}{place}")
+def _say_end(experiment: Experiment, seconds: float) -> None:
+    """What came out: who chose best, one picture, where the tables are, and what to do with a map of one's own."""
+    results = results_folder(Dataset.load(experiment.root), experiment.evaluate)
+    print(f"\nDone in {f'{seconds / 60:.1f} minutes' if seconds >= 60 else f'{seconds:.0f} s'}.\n")
+    print(textwrap.fill(best_in_words(read_scores(results / SCORES_CSV)), 100))
+    picture = experiment.root / "results" / OVERVIEW
+    print(f"""
+  picture       {picture if picture.is_file() else results / SCORES_PNG}
+  tables        {results / SCORES_MD}
+  runs          {ui_command(experiment.tracking)}
+  your own map  wheretolook select --map SPARSE --at FILE --out FILE""")

@@ -37,6 +37,7 @@ def evaluate_methods(
     progress: bool = True,
     device: str = "cpu",
     occlusion: OcclusionConfig = OcclusionConfig(),
+    show: bool = True,
 ) -> pd.DataFrame:
     """Compare all methods on the scenes of one split.
 
@@ -49,9 +50,9 @@ def evaluate_methods(
     model, and hold for all rows; without val scenes, or when these are evaluated, they are not known.
 
     The scenes need not be of the dataset the models were trained on. `models` are compared instead of those that
-    `config.weights` tells; `progress` shows a bar, and prints the table at the end; `occlusion` has the settings of the
-    models that `config.occlusions` names. Returns the tables of `wheretolook.evaluation.scores.score_table`, one below
-    the other, with columns `occlusion` and `candidates`.
+    `config.weights` tells; `progress` shows a bar, and prints the table at the end unless `show` is off; `occlusion`
+    has the settings of the models that `config.occlusions` names. Returns the tables of
+    `wheretolook.evaluation.scores.score_table`, one below the other, with columns `occlusion` and `candidates`.
 
     Raises:
         TableError: there is no scene of the split, a viewpoint has no label, or all labels of a candidate set are of
@@ -69,7 +70,7 @@ def evaluate_methods(
     folder = results_folder(dataset, config)
     write_results(folder, found.table, found.calibration, title)
     log_evaluation(dataset, found, config, tracking, occlusion, folder)
-    if progress:
+    if progress and show:
         print(score_markdown(found.table, title))
     return found.table
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from wheretolook.inputs.landmarks_in_view import ATTRIBUTES
-from wheretolook.learning.landmark_views import AttributeStatistics
+from wheretolook.learning.attribute_statistics import AttributeStatistics
 from wheretolook.learning.trained_network import StoredNetwork
 from wheretolook.utils.errors import WeightsError
 

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn.functional import batch_norm, binary_cross_entropy_with_logits, logsigmoid
 
 from wheretolook.inputs.landmarks_in_view import ATTRIBUTES, ViewLandmarks
-from wheretolook.learning.landmark_views import AttributeStatistics
+from wheretolook.learning.attribute_statistics import AttributeStatistics
 from wheretolook.methods.matchability.network import (
     N_EXPECTED,
     LandmarkNetwork,

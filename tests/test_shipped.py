@@ -1,0 +1,108 @@
+"""What ships with the package is found under its name in any folder, and scores without being asked for."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import wheretolook
+from synthetic_dataset import CAMERA, make_landmarks
+from wheretolook import LocalizationMap, load_scorer, poses_looking_along
+from wheretolook.cli import main, parse_experiment
+from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.files import fingerprint
+from wheretolook.utils.shipped import WEIGHTS, or_shipped, shipped, shipped_configs
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder that everything is started in."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def localization_map() -> LocalizationMap:
+    return LocalizationMap(make_landmarks(np.random.default_rng(0), 200), CAMERA)
+
+
+def test_what_ships_is_what_lies_in_the_project() -> None:
+    assert shipped_configs() == sorted(f"configs/{path.name}" for path in (ROOT / "configs").glob("*.yaml"))
+    weights = [path.name for path in sorted((ROOT / WEIGHTS).glob("*.safetensors"))]
+    assert "set.safetensors" in weights
+    for name in [*shipped_configs(), *(f"{WEIGHTS}/{name}" for name in weights)]:
+        assert fingerprint(shipped(name)) == fingerprint(ROOT / name)
+    with pytest.raises(ConfigError, match=r"configs/none\.yaml: this file does not ship"):
+        shipped("configs/none.yaml")
+
+
+def test_files_of_ones_own_come_first(elsewhere: Path) -> None:
+    name = "configs/demo.yaml"
+    assert or_shipped(name) == shipped(name)
+    for path in ("configs/none.yaml", "../configs/demo.yaml", str(elsewhere / name)):
+        assert or_shipped(path) == Path(path)
+    (elsewhere / "configs").mkdir()
+    (elsewhere / name).write_text("name: mine\n")
+    assert or_shipped(name) == Path(name)
+    experiment = parse_experiment("map", ["--config", name])
+    assert experiment is not None and experiment.name == "mine"
+    # the demo is ours, whatever lies in that folder
+    demo = parse_experiment("demo", [])
+    assert demo is not None and demo.name == "demo"
+
+
+@pytest.mark.parametrize("given", [["--config", "configs/small.yaml"], ["--config=configs/small.yaml"]])
+@pytest.mark.usefixtures("elsewhere")
+def test_the_commands_of_the_help_run_in_any_folder(given: list[str]) -> None:
+    named = ["--evaluate.weights", f"[{WEIGHTS}/mlp-2d+z.safetensors]", "--plan.weights", "mine.safetensors"]
+    experiment = parse_experiment("evaluate", [*given, *named])
+    assert experiment is not None and experiment.name == "small"
+    assert experiment.evaluate.weights == (shipped(WEIGHTS) / "mlp-2d+z.safetensors",)
+    assert experiment.plan.weights == Path("mine.safetensors") and experiment.paths.weights is None
+    assert experiment.root == Path("data/small")  # in this folder
+
+
+@pytest.mark.usefixtures("elsewhere")
+def test_a_missing_configuration_names_those_that_ship(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["map", "--config", "configs/smal.yaml"]) == 2
+    assert "Did you mean configs/small.yaml?" in capsys.readouterr().err
+    assert main(["map", "--config", "x"]) == 2
+    assert "one that ships: configs/apartments.yaml, " in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("elsewhere")
+def test_a_map_is_scored_by_the_weights_that_ship(localization_map: LocalizationMap) -> None:
+    rng = np.random.default_rng(1)
+    views = poses_looking_along(rng.uniform((-1, -1, 1), (1, 1, 2), (20, 3)), rng.normal(size=(20, 3)))
+    scorer = load_scorer(localization_map)
+    assert scorer.name == "set"
+    expected = load_scorer(ROOT / WEIGHTS / "set.safetensors", localization_map).score(views)
+    for same in (scorer, load_scorer(None, localization_map), load_scorer(WEIGHTS, localization_map)):
+        np.testing.assert_array_equal(same.score(views), expected)
+    assert load_scorer(localization_map=localization_map).name == "set"
+    with pytest.raises(ConfigError, match="needs a map"):
+        load_scorer(WEIGHTS)  # type: ignore[call-overload]
+
+
+def test_public_names_are_there_and_cost_nothing_until_they_are_used() -> None:
+    code = """import sys
+import wheretolook
+print(sorted(name for name in sys.modules if name.partition(".")[0] not in sys.stdlib_module_names))
+print([name for name in wheretolook.__all__ if not hasattr(wheretolook, name)])
+from wheretolook import load_scorer
+from wheretolook.methods.set.score import SetScorer
+print([name for name in ("lightning", "mlflow", "sklearn", "matplotlib", "ray") if name in sys.modules])"""
+    path = str(Path(wheretolook.__file__).parents[1])
+    code = f"import sys; sys.path.insert(0, {path!r})\n{code}"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    own, missing, heavy = done.stdout.splitlines()
+    modules = [name for name in eval(own) if name.startswith("wheretolook")]
+    assert modules == ["wheretolook", "wheretolook.utils", "wheretolook.utils.version"]
+    assert not {"torch", "numpy", "warp", "pandas"} & set(eval(own))
+    assert missing == "[]" and heavy == "[]"

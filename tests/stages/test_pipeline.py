@@ -37,7 +37,7 @@ from wheretolook.space.tsdf_space import TsdfSpace
 from wheretolook.stages.inputs import open_scene
 from wheretolook.utils.errors import TableError
 from wheretolook.utils.files import fingerprint
-from wheretolook.utils.tracking import artifact, client, newest_run
+from wheretolook.utils.tracking import artifact, client, finished_runs, newest_run
 from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import is_good, poses, read_table, write_table
 from wheretolook.visibility.hidden_points import HiddenPointRemoval
@@ -107,8 +107,11 @@ def test_every_stage_leaves_its_result(demo: Path) -> None:
 
 def test_run_again_it_reuses_what_is_there(demo: Path) -> None:
     before = {path: path.stat().st_mtime_ns for path in results(demo) if path.parent.name != "results"}
+    tracking, stages = TrackingConfig(str(demo / "mlruns")), ("label", "train", "evaluate")
+    runs = [one.info.run_id for stage in stages for one in finished_runs(tracking, stage)]
     assert run("demo", demo) == 0
     assert {path: path.stat().st_mtime_ns for path in before} == before
+    assert [one.info.run_id for stage in stages for one in finished_runs(tracking, stage)] == runs
 
 
 def test_all_methods_are_trained_and_compared(copy: Path) -> None:
@@ -378,6 +381,7 @@ def test_planned_paths_are_rendered_and_localized(copy: Path, capsys: pytest.Cap
     before = (root / "paths" / "views.parquet").read_bytes()
     assert run("compare-paths", copy, *options) == 0
     assert "reusing" in capsys.readouterr().out and (root / "paths" / "views.parquet").read_bytes() == before
+    assert len(list(finished_runs(TrackingConfig(str(copy / "mlruns")), "paths"))) == 1  # nothing new to log
     assert run("compare-paths", copy, "--paths.scenes", "[nowhere]") == 2
     assert "There are" in capsys.readouterr().err
 

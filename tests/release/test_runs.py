@@ -109,13 +109,13 @@ def test_each_dataset_and_purpose_has_an_experiment_that_says_what_to_look_at(
     tracking = logged[1]
     found = {experiment.name: experiment for experiment in experiments(client(tracking), tracking)}
     released = ("evaluation", "learners", "paths", "training")
-    assert found.keys() == {"interiors: evaluation", "runtimes", *(f"release: {purpose}" for purpose in released)}
+    assert found.keys() == {"interiors: evaluation", "benchmarks", *(f"release: {purpose}" for purpose in released)}
     for experiment in found.values():
         note, ids = experiment.tags["mlflow.note.content"], [experiment.experiment_id]
         logged_here = client(tracking).search_runs(ids, max_results=1000)
         metrics = {name for run in logged_here for name in run.data.metrics}
         named = {*re.findall(r"`((?:1|regret|kept|average_precision|times)_[a-z_]+|localized)`", note)}
-        assert (named and named <= metrics) or experiment.name == "runtimes", (experiment.name, named - metrics)
+        assert (named and named <= metrics) or experiment.name == "benchmarks", (experiment.name, named - metrics)
         for query in re.findall(r"`(params\.[^`]*)`", note):
             assert client(tracking).search_runs(ids, query), query
 

@@ -88,8 +88,8 @@ How the labels came out, a run for each time. `positive_…` are the shares of v
 with `train_` or `test_` in front, of that split. `seconds_…` is the time of each step; `labels.md` is an artifact.""",
     ),
     "benchmark": Purpose(
-        "runtimes",
-        "Seconds of the visibility check, a metric for each step and device; tables and figures are artifacts.",
+        "benchmarks",
+        "Measurements. `visibility check`: seconds, a metric for each step and device; tables are artifacts.",
     ),
 }
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -14,10 +15,12 @@ from wheretolook.figures.paths import paths_figure
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.planning.config import PathConfig, PathsConfig
 from wheretolook.planning.path_comparison import ComparedPaths, Ways, draw_pairs, plan_pairs
-from wheretolook.planning.path_report import summarize_paths
+from wheretolook.planning.path_report import log_paths, summarize_paths
 from wheretolook.planning.scene_map import shares_below
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.utils.errors import ConfigError, PlanningError, SceneError
+from wheretolook.utils.tracking import client, finished_runs
+from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import poses
 
 QUICK = PathsConfig(
@@ -172,6 +175,19 @@ def test_what_failed_leaves_the_ratio_alone() -> None:
     assert table.loc["set", "times_forward_low"] == table.loc["set", "times_forward_high"] == pytest.approx(1)
     nothing = summarize_paths(paths, views.assign(error_m=9.0), QUICK).set_index("method")
     assert np.isnan(nothing.loc["set", "times_forward"]) and nothing.loc["set", "localized"] == 0
+
+
+def test_the_same_comparison_is_logged_once(tmp_path: Path) -> None:
+    tracking, summary = TrackingConfig(str(tmp_path / "mlruns")), summarize_paths(*_labelled(), QUICK)
+    summary.to_csv(tmp_path / "paths.csv", index=False)
+    runs = [log_paths({"dataset": "a", "seed": seed}, summary, tmp_path, tracking) for seed in (0, 0, 1)]
+    assert runs[0] == runs[1] != runs[2]
+    assert [run.info.run_id for run in finished_runs(tracking, "paths")] == [runs[2], runs[0]]
+    parent = client(tracking).get_run(runs[0])
+    assert parent.info.run_name == "all methods (paths a)" and parent.data.tags["best"] == "set"
+    assert parent.data.metrics["localized"] == pytest.approx(0.5)  # as by hand, above
+    other = summary.assign(localized=1.0)
+    assert log_paths({"dataset": "a", "seed": 1}, other, tmp_path, tracking) not in runs
 
 
 def test_the_figure_shows_every_share() -> None:

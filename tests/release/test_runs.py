@@ -15,12 +15,23 @@ from wheretolook.dataset.folders import Dataset
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.results import latest_scores
 from wheretolook.evaluation.scores import read_scores
+from wheretolook.figures.config import FiguresConfig
 from wheretolook.learning.runs import HISTORY_CSV, histories, keep_histories, trained
+from wheretolook.release.catalog import write_items
 from wheretolook.release.notebook import open_store
 from wheretolook.release.runs import ReleaseRuns, log_release
 from wheretolook.stages.evaluate import evaluate_methods as evaluate
 from wheretolook.utils.errors import MissingRunError
-from wheretolook.utils.tracking import client, experiment_ids, finished_runs, newest_artifact, newest_run
+from wheretolook.utils.tracking import (
+    artifact,
+    client,
+    experiment_ids,
+    experiments,
+    finished_runs,
+    newest_artifact,
+    newest_run,
+    start_run,
+)
 from wheretolook.utils.tracking_config import TrackingConfig
 
 PAGE = Path(__file__).parents[2] / "mlruns" / "README.md"
@@ -71,19 +82,91 @@ def test_rows_over_all_scenes_are_nested(logged: tuple[Dataset, TrackingConfig, 
     scores = read_scores(release.root / "results" / "scores.csv")
     nested = children(tracking, runs.evaluate["release"])
     assert len(nested) == 2 * (len(METHODS) + 1)
-    params, metrics = nested["mlp-2d+z (none)"]
+    params, metrics = nested["mlp-2d+z, none (evaluate release)"]
     assert params["occlusion"] == "none" and params["dataset"] == "release" and params["scenes"] == "scene-0 scene-1"
     rows = scores.query("method == 'mlp-2d+z' and occlusion == 'none'").set_index(["top_n", "scene"])
     for n in (1, 5, 10):
         assert metrics[f"top-{n}/raw_0.05m_0.4deg"] == rows.loc[(n, "all"), "raw_0.05m_0.4deg"]
-        assert metrics[f"top-{n}/scene-1/regret_5m_10deg"] == rows.loc[(n, "scene-1"), "regret_5m_10deg"]
+        assert metrics[f"top-{n}/regret_5m_10deg"] == rows.loc[(n, "all"), "regret_5m_10deg"]
+        assert metrics[f"top-{n}/scene-1/regret_0.05m_0.4deg"] == rows.loc[(n, "scene-1"), "regret_0.05m_0.4deg"]
+    assert sorted(metrics)[:3] == ["1_auc", "1_regret", "1_share"]
+    assert metrics["1_regret"] == metrics["top-1/regret_0.05m_0.4deg"]
+    assert metrics["1_share"] == metrics["top-1/raw_0.05m_0.4deg"] and metrics["1_auc"] == metrics["roc_auc"]
     learners = children(tracking, str(runs.learners))
-    assert {*learners} == {"bins 0", "set apartments 0", "set apartments 1"}
-    assert learners["set apartments 1"][1]["regret_test"] == pytest.approx(0.2)
-    assert learners["set apartments 1"][1]["average_precision/c"] == pytest.approx(0.9)
+    names = ("bins, seed 0", "set, apartments, seed 0", "set, apartments, seed 1")
+    assert {*learners} == {f"{name} (learners release)" for name in names}
+    last = learners["set, apartments, seed 1 (learners release)"][1]
+    assert last["regret_test"] == last["1_regret"] == pytest.approx(0.2)
+    assert last["average_precision/c"] == last["average_precision_others"] == pytest.approx(0.9)
     assert children(tracking, str(runs.paths)).keys() == {
-        f"paths {task} {method}" for task in ("planned", "given") for method in ("forward", "bins")
+        f"{method}, {task} (paths release)" for task in ("planned", "given") for method in ("forward", "bins")
     }
+
+
+def test_each_dataset_and_purpose_has_an_experiment_that_says_what_to_look_at(
+    logged: tuple[Dataset, TrackingConfig, ReleaseRuns],
+) -> None:
+    tracking = logged[1]
+    found = {experiment.name: experiment for experiment in experiments(client(tracking), tracking)}
+    released = ("evaluation", "learners", "paths", "training")
+    assert found.keys() == {"interiors: evaluation", "benchmarks", *(f"release: {purpose}" for purpose in released)}
+    for experiment in found.values():
+        note, ids = experiment.tags["mlflow.note.content"], [experiment.experiment_id]
+        logged_here = client(tracking).search_runs(ids, max_results=1000)
+        metrics = {name for run in logged_here for name in run.data.metrics}
+        named = {*re.findall(r"`((?:1|regret|kept|average_precision|times)_[a-z_]+|localized)`", note)}
+        assert (named and named <= metrics) or experiment.name == "benchmarks", (experiment.name, named - metrics)
+        for query in re.findall(r"`(params\.[^`]*)`", note):
+            assert client(tracking).search_runs(ids, query), query
+
+
+def test_parents_carry_the_numbers_of_the_best(logged: tuple[Dataset, TrackingConfig, ReleaseRuns]) -> None:
+    release, tracking, runs = logged
+    parent = client(tracking).get_run(runs.evaluate["release"]).data
+    scores = read_scores(release.root / "results" / "scores.csv")
+    rows = scores.query("scene == 'all' and top_n == 1 and occlusion == 'mesh' and method not in ('oracle', 'random')")
+    best = rows.loc[rows["regret_0.05m_0.4deg"].idxmin()]
+    assert parent.tags["best"] == best["method"] and sorted(parent.metrics)[:3] == ["1_auc", "1_regret", "1_share"]
+    assert parent.metrics["1_regret"] == best["regret_0.05m_0.4deg"] == rows["regret_0.05m_0.4deg"].min()
+    assert parent.metrics["1_share"] == best["raw_0.05m_0.4deg"] and parent.metrics["1_auc"] == best["roc_auc"]
+    assert len(parent.metrics) == 6
+    learners = client(tracking).get_run(str(runs.learners)).data
+    assert learners.metrics.keys() == {"1_auc", "1_regret"} and learners.tags["best"] in ("bins", "set, apartments")
+    paths = client(tracking).get_run(str(runs.paths)).data
+    assert paths.tags["best"] in ("forward", "bins") and paths.metrics["localized"] == 0.5
+    (trained_run,) = (client(tracking).get_run(run) for run in runs.train.values())
+    assert trained_run.info.run_name == "mlp-2d+3d (train release)" and trained_run.data.metrics["1_auc"] == 0.8
+
+
+def test_a_store_of_an_older_version_serves_on(tmp_path: Path) -> None:
+    """All its runs lie in one experiment, with other names of runs and fewer metrics: read, and left as they are."""
+    release, folder = make_release(tmp_path / "data" / "release"), str(tmp_path / "mlruns")
+    old, tracking = TrackingConfig(folder, "wheretolook"), TrackingConfig(folder)
+    runs, mlflow = log_release(release, old), client(old)
+    mlflow.update_run(runs.evaluate["release"], name="evaluate release")
+    mlflow.delete_tag(runs.evaluate["release"], "best")
+    assert log_release(release, tracking) == ReleaseRuns(**{**vars(runs), "new": 0})
+    assert [one.name for one in experiments(mlflow, tracking)] == ["wheretolook"]
+    pd.testing.assert_frame_equal(latest_scores(tracking, "release"), latest_scores(old, "release"))
+    config = FiguresConfig(tmp_path / "figures", ("scores", "table_vs_others", "paths", "runtimes"), ("png",))
+    assert write_items(release, tracking, config, lambda text: None) == {}
+    drawn = {path.name for path in (tmp_path / "figures").iterdir()}
+    assert drawn >= {"scores.png", "table_vs_others.md", "paths.png", "runtimes.png"}
+    assert artifact(old, str(runs.paths), "figures/paths.png").is_file()
+    assert mlflow.get_run(runs.evaluate["release"]).info.run_name == "evaluate release"
+    with start_run(tracking, "later", "paths", {"dataset": "release"}) as (_, later):
+        pass
+    assert [run.info.run_id for run in finished_runs(tracking, "paths")] == [later, runs.paths]
+    assert [run.info.run_id for run in finished_runs(old, "paths")] == [runs.paths]  # the option still limits it
+
+
+def test_a_deleted_experiment_does_not_come_back(store: tuple[Dataset, TrackingConfig]) -> None:
+    release, tracking = store
+    (paths,) = (one for one in experiments(client(tracking), tracking) if one.name == "release: paths")
+    client(tracking).delete_experiment(paths.experiment_id)
+    assert log_release(release, tracking).new == 1 and log_release(release, tracking).new == 0
+    names = [one.name for one in experiments(client(tracking), tracking)]
+    assert "release: paths" not in names and f"release: paths at {tracking.root}" in names
 
 
 def test_a_release_is_logged_as_its_evaluation_was(tmp_path: Path) -> None:
@@ -141,7 +224,7 @@ def test_an_interrupted_run_is_not_taken_for_a_finished_one(store: tuple[Dataset
     mlflow = client(tracking)
 
     def names(condition: str) -> list[str]:
-        found = mlflow.search_runs(list(experiment_ids(mlflow, tracking).values()), condition, max_results=10_000)
+        found = mlflow.search_runs(experiment_ids(mlflow, tracking), condition, max_results=10_000)
         return sorted(one.info.run_name for one in found)
 
     before = names("tags.stage = 'paths'")
@@ -170,14 +253,11 @@ def test_searches_of_the_page_on_runs_find_something(logged: tuple[Dataset, Trac
     queries = re.findall(r"^```\n(tags.*?)\n```", text, re.MULTILINE)
     queries += re.findall(r"^\| [a-z][^|]* \| `+ ?((?:tags|params|metrics).*?) ?`+(?: \||,)", text, re.MULTILINE)
     assert len(queries) == 7
-    experiment = client(tracking).get_experiment_by_name(tracking.experiment)
-    assert experiment is not None
+    ids = experiment_ids(client(tracking), tracking)
     for query in queries:
-        assert client(tracking).search_runs([experiment.experiment_id], query), query
-    best = client(tracking).search_runs(
-        [experiment.experiment_id], queries[0], order_by=["metrics.`top-1/regret_0.05m_0.4deg` ASC"]
-    )
-    values = [run.data.metrics["top-1/regret_0.05m_0.4deg"] for run in best]
+        assert client(tracking).search_runs(ids, query), query
+    best = client(tracking).search_runs(ids, queries[0], order_by=["metrics.`1_regret` ASC"])
+    values = [run.data.metrics["1_regret"] for run in best]
     assert values == sorted(values) and len(values) == len(METHODS)
     for picture in re.findall(r"\]\((images/.*?)\)", text):
         assert (PAGE.parent / picture).stat().st_size < 150_000

@@ -106,7 +106,8 @@ def test_evaluation_writes_prints_and_logs(
             assert chosen[f"good_{key}"].sum() == pytest.approx(row[f"good_{key}"])
             assert chosen[f"any_{key}"].mean() == pytest.approx(row[f"any_{key}"])
         assert chosen["best_score"].isna().all() == (params["method"] in ("random", "oracle"))
-        for name in ("regret_0.25m_2deg", "regret_low_0.25m_2deg", "any_5m_10deg", "normalized_0.5m_5deg"):
+        assert metrics["1_regret"] == pytest.approx(pooled.loc[(params["method"], 1)]["regret_0.05m_0.4deg"])
+        for name in ("regret_0.25m_2deg", "regret_low_0.05m_0.4deg", "any_5m_10deg", "normalized_0.5m_5deg"):
             assert metrics[f"top-{n}/{name}"] == pytest.approx(row[name])
         assert params["candidates"] == "all"
         assert {"split", "seed", "thresholds", "weights", "reference", "dataset_fingerprint"} <= set(params)
@@ -120,7 +121,7 @@ def test_evaluation_writes_prints_and_logs(
     (query,) = re.findall(r"`(tags\.stage = \"evaluate\"[^`]*)`", readme)
     query = query.replace('params.dataset = "release"', 'params.dataset = "tiny"')
     (best,) = client(tracking).search_runs(
-        [parent.info.experiment_id], query, order_by=["metrics.`top-1/regret_0.05m_0.4deg`"], max_results=1
+        [parent.info.experiment_id], query, order_by=["metrics.`1_regret`"], max_results=1
     )
     assert best.data.params["method"] != "oracle"
     assert best.data.metrics["top-1/regret_0.05m_0.4deg"] == pooled.loc[("bins", 1)]["regret_0.05m_0.4deg"] == 0
@@ -284,7 +285,9 @@ def test_candidates_are_chosen_by_visibility(tmp_path: Path) -> None:
 
     parent = newest_run(tracking, "evaluate", {"dataset": "ranked"})
     both = client(tracking).search_runs([parent.info.experiment_id], "params.candidates = 'best 4'")  # type: ignore[union-attr]
-    assert {run.info.run_name for run in both} >= {"visible (mesh, best 4)", "oracle (mesh, best 4)"}
+    assert {run.info.run_name for run in both} >= {
+        f"{method}, mesh, best 4 (evaluate ranked)" for method in ("visible", "oracle")
+    }
     chosen = pd.read_parquet(Path(both[0].info.artifact_uri) / "locations.parquet")
     assert len(chosen) == 2 * 2 * 13 and 3 not in set(chosen["location_id"])
 
@@ -307,6 +310,35 @@ def test_the_same_seed_gives_the_same_table(dataset: Dataset, tmp_path: Path) ->
         assert (dataset.root / "results" / "scores.csv").read_bytes() == csv
     finally:
         write_table(table, scene.table)
+
+
+def test_the_same_evaluation_is_logged_once(dataset: Dataset, tmp_path: Path) -> None:
+    tracking = TrackingConfig(str(tmp_path / "mlruns"))
+
+    def ids() -> list[str]:
+        return [run.info.run_id for run in finished_runs(tracking, "evaluate")]
+
+    evaluate(dataset, RULES, tracking, progress=False)
+    (first,) = ids()
+    evaluate(dataset, RULES, tracking, progress=False)
+    assert ids() == [first]
+    other = replace(RULES, seed=RULES.seed + 1)
+    evaluate(dataset, other, tracking, progress=False)
+    evaluate(dataset, RULES, tracking, progress=False)  # again, so that the newest tells what lies in the folder
+    runs = list(finished_runs(tracking, "evaluate"))
+    assert len(runs) == 3 and runs[0].data.params["seed"] == str(RULES.seed) and runs[-1].info.run_id == first
+    assert latest_scores(tracking, dataset.name) is not None
+    artifact(tracking, runs[0].info.run_id, "scores.csv").unlink()
+    evaluate(dataset, RULES, tracking, progress=False)
+    assert len(ids()) == 4
+    scene = dataset.split("test")[0]
+    table = scene.read_table()
+    try:
+        write_table(table.iloc[: -len(table) // 4], scene.table)
+        evaluate(dataset, RULES, tracking, progress=False)
+    finally:
+        write_table(table, scene.table)
+    assert len(ids()) == 5
 
 
 def test_bad_input_is_named(dataset: Dataset, tmp_path: Path) -> None:

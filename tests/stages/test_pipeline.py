@@ -37,7 +37,7 @@ from wheretolook.space.tsdf_space import TsdfSpace
 from wheretolook.stages.inputs import open_scene
 from wheretolook.utils.errors import TableError
 from wheretolook.utils.files import fingerprint
-from wheretolook.utils.tracking import artifact, client, newest_run
+from wheretolook.utils.tracking import artifact, client, finished_runs, newest_run
 from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import is_good, poses, read_table, write_table
 from wheretolook.visibility.hidden_points import HiddenPointRemoval
@@ -428,6 +428,7 @@ def test_planned_paths_are_rendered_and_localized(copy: Path, capsys: pytest.Cap
     before = (root / "paths" / "views.parquet").read_bytes()
     assert run("compare-paths", copy, *options) == 0
     assert "reusing" in capsys.readouterr().out and (root / "paths" / "views.parquet").read_bytes() == before
+    assert len(list(finished_runs(TrackingConfig(str(copy / "mlruns")), "paths"))) == 1  # nothing new to log
     assert run("compare-paths", copy, "--paths.scenes", "[nowhere]") == 2
     assert "There are" in capsys.readouterr().err
 

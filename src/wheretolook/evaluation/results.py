@@ -15,13 +15,26 @@ import pandas as pd
 from wheretolook.dataset.folders import Dataset, SceneFolder
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.ranking import TestViews
+from wheretolook.evaluation.score_table import main_rows, methods_of, threshold_keys
 from wheretolook.evaluation.scores import Choices, by_chance, read_scores
 from wheretolook.evaluation.views import CandidateSet
 from wheretolook.geometry.poses import Float
 from wheretolook.methods.registry import methods_named, scorers
+from wheretolook.methods.styles import ORACLE
 from wheretolook.utils.files import fingerprint
-from wheretolook.utils.tracking import NestedRun, artifact, log, log_nested, newest_run, start_run
+from wheretolook.utils.tracking import (
+    FINGERPRINT_TAG,
+    NestedRun,
+    artifact,
+    fingerprint_of,
+    log,
+    log_nested,
+    logged_last,
+    newest_run,
+    start_run,
+)
 from wheretolook.utils.tracking_config import TrackingConfig
+from wheretolook.utils.tracking_layout import ALL_METHODS, AUC, BEST_TAG, REGRET, SHARE, joined
 from wheretolook.viewpoints.thresholds import ALL, threshold_key
 from wheretolook.visibility.config import OcclusionConfig
 
@@ -79,34 +92,59 @@ _NAMED = ("method", "occlusion", "candidates")  # what names a nested run
 _OF_ALL_VIEWS = ("n_locations", "average_precision", "roc_auc", "ece", "ece_scaled", "temperature")
 """Columns of a score table that do not depend on N."""
 
-_OF_CHOSEN = re.compile("(raw|any|normalized|p)_(?!low_|high_)|(regret|difference)_")
-"""Beginning of the columns that are logged for each N. `scores.csv`, an artifact, has the other intervals and counts;
-each metric costs MLflow 0.3 ms."""
+_OF_CHOSEN = re.compile("(raw|any|normalized|regret)_(?!low_|high_)")
+"""Beginning of the columns that are logged for each N and threshold. `scores.csv`, an artifact, has all others; each
+metric costs MLflow 0.3 ms and is another column to look past."""
 
-_OF_SCENE = re.compile("regret_(?!low_|high_)")  # beginning of the columns that are logged for each N and scene
+_AT_FIRST = ("regret_low", "regret_high", "difference", "difference_low", "difference_high", "p")
+"""Columns that are logged for each N at the first threshold alone, the strictest."""
 
 
 def runs_of_rows(table: pd.DataFrame, params: Mapping[str, Any]) -> Iterator[NestedRun]:
     """The runs that log joined score tables: one for each method, occlusion model and candidate set.
 
-    Their parameters are those given and the row's own. Metrics are named by N, the scene unless it is all of them, and
-    the column, such as `top-1/regret_0.05m_0.4deg` and `top-5/apartment-210/regret_5m_10deg`, or by the column if N
-    does not matter.
+    Their parameters are those given and the row's own. Metrics are those of `first_metrics`, and others named by N, the
+    scene unless it is all of them, and the column, such as `top-5/any_5m_10deg` and
+    `top-1/apartment-210/regret_0.05m_0.4deg`, or by the column if N does not matter.
     """
+    strictest = threshold_keys(table)[0]
+    at_first = {f"{name}_{strictest}" for name in _AT_FIRST}
+    of_pooled = [name for name in map(str, table.columns) if _OF_CHOSEN.match(name) or name in at_first]
+    of_all_views = [name for name in _OF_ALL_VIEWS if name in table]
+    of_scene = [f"regret_{strictest}"] if f"regret_{strictest}" in table else []
     for key, rows in table.groupby(list(_NAMED), sort=False):
         own = dict(zip(_NAMED, map(str, key), strict=True))
-        numbers: dict[str, float] = {}
-        for row in rows.to_dict("records"):
-            pooled, place = row["scene"] == ALL, f"top-{row['top_n']}"
-            if pooled:
-                numbers |= {name: float(row[name]) for name in _OF_ALL_VIEWS if name in row}
-            for name, value in ((str(name), value) for name, value in row.items()):
-                if pooled and _OF_CHOSEN.match(name):
-                    numbers[f"{place}/{name}"] = float(value)
-                elif not pooled and _OF_SCENE.match(name):
-                    numbers[f"{place}/{row['scene']}/{name}"] = float(value)
-        candidates = f", {own['candidates']}" if own["candidates"] != ALL else ""
-        yield NestedRun(f"{own['method']} ({own['occlusion']}{candidates})", {**params, **own}, numbers)
+        pooled = rows[rows["scene"] == ALL]
+        numbers = first_metrics(pooled) | pooled.iloc[0][of_all_views].astype(float).to_dict()
+        for part, columns in ((pooled, of_pooled), (rows[rows["scene"] != ALL], of_scene)):
+            values = part[columns].to_numpy(np.float64)
+            for n, scene, row in zip(part["top_n"], part["scene"], values, strict=True):
+                place = f"top-{n}" if scene == ALL else f"top-{n}/{scene}"
+                numbers |= {f"{place}/{name}": float(x) for name, x in zip(columns, row, strict=True)}
+        candidates = own["candidates"] if own["candidates"] != ALL else ""
+        yield NestedRun(joined(own["method"], own["occlusion"], candidates), {**params, **own}, numbers)
+
+
+def first_metrics(rows: pd.DataFrame) -> dict[str, float]:
+    """Metrics to sort runs by, of one method's rows: the first view chosen over all scenes, at the first threshold."""
+    strictest = threshold_keys(rows)[0]
+    columns = {REGRET: f"regret_{strictest}", SHARE: f"raw_{strictest}", AUC: "roc_auc"}
+    first = rows[(rows["scene"] == ALL) & (rows["top_n"] == rows["top_n"].min())]
+    return {name: float(first[column].iloc[0]) for name, column in columns.items() if column in first}
+
+
+def best_of(table: pd.DataFrame) -> tuple[dict[str, str], dict[str, float]]:
+    """The method with the least regret under a table's first conditions, as a tag, and its `first_metrics`.
+
+    Random choice and the oracle do not count, since they need no scores; both are empty if there is no other.
+    """
+    main = main_rows(table)
+    found = {name: first_metrics(main[main["method"] == name]) for name in methods_of(main)}
+    found = {name: metrics for name, metrics in found.items() if name != ORACLE and not by_chance(name)}
+    if not found:
+        return {}, {}
+    best = min(found, key=lambda name: found[name].get(REGRET, -found[name][SHARE]))
+    return {BEST_TAG: best}, found[best]
 
 
 def _runs_with_locations(
@@ -155,7 +193,8 @@ def log_evaluation(
 ) -> None:
     """Log an evaluation: a run with the files in the folder `results`, and nested in it those of `runs_of_rows`.
 
-    The settings of occlusion models are logged if the configuration names any.
+    The settings of occlusion models are logged if the configuration names any. Nothing is logged if the newest
+    evaluation of the dataset was of the same and found the same.
     """
     views, scenes = evaluation.views, evaluation.scenes
     params = evaluation_params(dataset, scenes, evaluation.weights)
@@ -165,9 +204,14 @@ def log_evaluation(
     for method in methods_named(config.methods, scorers()) if len(dataset.cameras) == 1 else []:
         params |= method.params(dataset.camera)
     positives = float(views.good[:, 0].mean())
-    metrics = {"n_locations": views.n_locations, "n_views": len(views.good), "positives": positives}
-    name, tags = f"evaluate {dataset.name}", {"dataset": dataset.name}
-    with TemporaryDirectory() as folder, start_run(tracking, name, "evaluate", params, tags=tags) as (client, run):
+    mark = fingerprint_of(params, evaluation.table.to_csv(index=False), evaluation.calibration.to_csv(index=False))
+    if logged_last(tracking, "evaluate", dataset.name, mark, SCORES_CSV) is not None:
+        return
+    best, metrics = best_of(evaluation.table)
+    metrics |= {"n_locations": views.n_locations, "n_views": len(views.good), "positives": positives}
+    tags = {"dataset": dataset.name, FINGERPRINT_TAG: mark, **best}
+    opened = start_run(tracking, ALL_METHODS, "evaluate", params, tags=tags)
+    with TemporaryDirectory() as folder, opened as (client, run):
         log(client, run, metrics=metrics)
         for file in results.iterdir():
             if file.is_file():

@@ -14,6 +14,7 @@ from wheretolook.learning.old_names import name_of_variant, with_name, with_name
 from wheretolook.utils.files import write_text
 from wheretolook.utils.tracking import artifact, client, finished_runs
 from wheretolook.utils.tracking_config import TrackingConfig
+from wheretolook.utils.tracking_layout import AUC
 
 if TYPE_CHECKING:
     from mlflow.entities import Run
@@ -29,6 +30,12 @@ LOG_AT_MOST = 1000  # metrics MLflow takes at a time
 def params_of(about: Mapping[str, Any]) -> dict[str, Any]:
     """Parameters of a train run, from what its weights' record tells about it."""
     return {name: about[name] for name in ("method", "dataset", "dataset_fingerprint")} | about["config"]
+
+
+def kept_metrics(metrics: Mapping[str, float]) -> dict[str, float]:
+    """Metrics of a train run that tell about the weights kept, given those of their epoch; that to sort by first."""
+    first = {AUC: metrics["val_roc_auc"]} if "val_roc_auc" in metrics else {}
+    return first | {f"kept_{name}": value for name, value in metrics.items()}
 
 
 def method_of_run(run: Run) -> str:

@@ -12,8 +12,18 @@ from numpy.typing import NDArray
 
 from wheretolook.planning.config import FORWARD, PathsConfig
 from wheretolook.utils.markdown import markdown_table
-from wheretolook.utils.tracking import NestedRun, Tags, log_nested, start_run
+from wheretolook.utils.tracking import (
+    FINGERPRINT_TAG,
+    NestedRun,
+    Tags,
+    fingerprint_of,
+    log,
+    log_nested,
+    logged_last,
+    start_run,
+)
 from wheretolook.utils.tracking_config import TrackingConfig
+from wheretolook.utils.tracking_layout import ALL_METHODS, BEST_TAG, joined
 from wheretolook.viewpoints.table import LOCALIZED
 from wheretolook.viewpoints.thresholds import ALL
 
@@ -128,10 +138,19 @@ def log_paths(
     """Log a comparison: a run with its files, and in it one for each task and method over all scenes.
 
     `params` describe the comparison, `summary` is of `summarize_paths`, `results` the folder of the files, of which
-    missing ones are left out. Returns the id of the run.
+    missing ones are left out. Returns the id of the run, which has the numbers of the method of whose planned paths the
+    largest share localizes. If the newest comparison of the dataset was of the same and found the same, nothing is
+    logged, and the id is that of its run.
     """
+    mark = fingerprint_of(params, summary.to_csv(index=False))
+    if (known := logged_last(tracking, "paths", params["dataset"], mark, PATHS_CSV)) is not None:
+        return known
     pooled = summary[summary["scene"] == summary["scene"].iloc[-1]]
-    with start_run(tracking, f"paths {params['dataset']}", "paths", params, tags=tags) as (client, run):
+    best = pooled[pooled["task"] == pooled["task"].iloc[0]].sort_values("localized", ascending=False).iloc[0]
+    all_tags = {**(tags or {}), FINGERPRINT_TAG: mark, BEST_TAG: str(best["method"])}
+    first = {name: float(best[name]) for name in ("localized", "times_forward", "times_forward_length")}
+    with start_run(tracking, ALL_METHODS, "paths", params, tags=all_tags) as (client, run):
+        log(client, run, metrics=first)
         for name in (PATHS_CSV, PATHS_MD, PATHS_PNG):
             if (results / name).is_file():
                 client.log_artifact(run, str(results / name))
@@ -139,6 +158,6 @@ def log_paths(
         for row in pooled.to_dict("records"):
             about = {**params, "task": row["task"], "method": row["method"]}
             numbers = {str(key): float(value) for key, value in row.items() if key not in ("scene", "task", "method")}
-            nested.append(NestedRun(f"paths {row['task']} {row['method']}", about, numbers))
+            nested.append(NestedRun(joined(row["method"], row["task"]), about, numbers))
         log_nested(tracking, run, "paths", nested, tags)
     return run

@@ -32,7 +32,7 @@ def log_runtimes(
     machines = " + ".join(dict.fromkeys(map(str, sizes["name"])))
     with (
         TemporaryDirectory() as folder,
-        start_run(tracking, "visibility runtimes", "benchmark", {"machines": machines}, tags=tags) as (client, run),
+        start_run(tracking, "visibility check", "benchmark", {"machines": machines}, tags=tags) as (client, run),
     ):
         log(client, run, metrics=metrics)
         if file is None:

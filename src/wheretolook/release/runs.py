@@ -17,9 +17,17 @@ from typing import Any
 import pandas as pd
 
 from wheretolook.dataset.folders import Dataset
-from wheretolook.evaluation.results import SCORES_CSV, evaluation_params, runs_of_rows
+from wheretolook.evaluation.results import SCORES_CSV, best_of, evaluation_params, runs_of_rows
 from wheretolook.evaluation.scores import read_scores
-from wheretolook.learning.runs import HISTORY_CSV, TRAINING_CSV, log_history, params_of, read_histories, records
+from wheretolook.learning.runs import (
+    HISTORY_CSV,
+    TRAINING_CSV,
+    kept_metrics,
+    log_history,
+    params_of,
+    read_histories,
+    records,
+)
 from wheretolook.learning.runs import train_runs as runs_of_training
 from wheretolook.methods.registry import learned
 from wheretolook.planning.path_report import PATHS_CSV, log_paths
@@ -28,6 +36,7 @@ from wheretolook.release.card import GENERALIZATION_CSV
 from wheretolook.utils.tracking import NestedRun, artifact, experiment_ids, finished_runs, log, log_nested, start_run
 from wheretolook.utils.tracking import client as client_of
 from wheretolook.utils.tracking_config import TrackingConfig
+from wheretolook.utils.tracking_layout import ALL_METHODS, AUC, BEST_TAG, REGRET, joined
 from wheretolook.viewpoints.table import UNLABELLED, is_good
 from wheretolook.viewpoints.thresholds import ALL
 
@@ -75,7 +84,7 @@ def _alone(tracking: TrackingConfig) -> Iterator[None]:
 def _forget_halves(tracking: TrackingConfig) -> None:
     """Delete the unfinished runs of a release, and those nested in them."""
     mlflow = client_of(tracking)
-    experiments = list(experiment_ids(mlflow, tracking).values())
+    experiments = experiment_ids(mlflow, tracking)
 
     def matching(condition: str) -> list[str]:
         found = mlflow.search_runs(experiments, condition, max_results=10_000) if experiments else ()
@@ -169,9 +178,10 @@ def _choices(table: pd.DataFrame) -> Values:
 def _log_evaluation(
     name: str, table: pd.DataFrame, params: Values, metrics: Values, files: list[Path], tracking: TrackingConfig
 ) -> str:
-    tags = {**TAGS, "dataset": name}
-    metrics |= {"n_locations": float(table.loc[table["scene"] == ALL, "n_locations"].iloc[0])}
-    with start_run(tracking, f"evaluate {name}", "evaluate", params, tags=tags) as (mlflow, run):
+    best, first = best_of(table)
+    metrics |= {**first, "n_locations": float(table.loc[table["scene"] == ALL, "n_locations"].iloc[0])}
+    tags = {**TAGS, "dataset": name, **best}
+    with start_run(tracking, ALL_METHODS, "evaluate", params, tags=tags) as (mlflow, run):
         log(mlflow, run, metrics=metrics)
         for path in files:
             mlflow.log_artifact(run, str(path))
@@ -187,9 +197,8 @@ def _log_training(
     if record["about"]["dataset"] != dataset.name:
         learnt_from = {"learnt_from": record["about"]["dataset"]}
     tags = {**TAGS, "trained_as": str(record["run_id"])}
-    with start_run(tracking, f"train {about['method']}", "train", params_of(about) | learnt_from, tags=tags) as started:
-        mlflow, run = started
-        log(mlflow, run, metrics={f"kept_{name}": value for name, value in record["metrics"].items()})
+    with start_run(tracking, about["method"], "train", params_of(about) | learnt_from, tags=tags) as (mlflow, run):
+        log(mlflow, run, metrics=kept_metrics(record["metrics"]))
         mlflow.log_artifact(run, str(path))
         if history is not None:
             history = history.drop(columns="method").dropna(axis=1, how="all")
@@ -199,7 +208,10 @@ def _log_training(
 
 
 def _log_learners(dataset: Dataset, tracking: TrackingConfig) -> str:
-    """The comparison of learners: nested, one run for each, what it learnt from, and seed."""
+    """The comparison of learners: nested, one run for each, what it learnt from, and seed.
+
+    The run itself has the metrics to sort by of the learner with the least regret, the mean over its seeds.
+    """
     path = dataset.root / "results" / LEARNERS_CSV
     table = pd.read_csv(path, dtype=str, keep_default_na=False)
     nested = []
@@ -209,11 +221,23 @@ def _log_learners(dataset: Dataset, tracking: TrackingConfig) -> str:
             values = pd.to_numeric(rows[measure])
             means = values.groupby(rows["split"]).mean()
             numbers |= {f"{measure}_{split}": float(mean) for split, mean in means.items()}
-            numbers |= {f"{measure}/{scene}": float(one) for scene, one in zip(rows["scene"], values, strict=True)}
+            if measure in ("average_precision", "regret"):
+                numbers |= {f"{measure}/{scene}": float(x) for scene, x in zip(rows["scene"], values, strict=True)}
+        sorted_by = {REGRET: "regret_test", AUC: "roc_auc_test"}
+        numbers |= {name: numbers[measure] for name, measure in sorted_by.items() if measure in numbers}
         named = dict(zip(("learner", "learnt_from", "seed"), map(str, key), strict=True))
-        nested.append(NestedRun(" ".join(filter(None, named.values())), {"dataset": dataset.name, **named}, numbers))
+        seed = f"seed {named['seed']}" if named["seed"] else ""
+        what = joined(named["learner"], named["learnt_from"], seed)
+        nested.append(NestedRun(what, {"dataset": dataset.name, **named}, numbers))
+    by_learner = [{"what": joined(one.params["learner"], one.params["learnt_from"]), **one.metrics} for one in nested]
+    means = pd.DataFrame(by_learner).groupby("what").mean().filter((REGRET, AUC))
+    tags, first = dict(TAGS), {}
+    if REGRET in means:
+        best = means[REGRET].idxmin()
+        tags[BEST_TAG], first = str(best), means.loc[best].to_dict()
     about = {"dataset": dataset.name}
-    with start_run(tracking, f"learners {dataset.name}", "learners", about, tags=TAGS) as (mlflow, run):
+    with start_run(tracking, "all learners", "learners", about, tags=tags) as (mlflow, run):
+        log(mlflow, run, metrics=first)
         mlflow.log_artifact(run, str(path))
         log_nested(tracking, run, "learners", nested, TAGS)
     return run

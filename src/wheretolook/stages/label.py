@@ -135,7 +135,7 @@ def log_labels(
     for row in summary.shares[summary.shares["scene"] == ALL].to_dict("records"):
         prefix = "" if row["split"] == ALL else f"{row['split']}_"
         metrics |= {f"{prefix}{name}": value for name, value in row.items() if name not in ("scene", "split")}
-    with start_run(tracking, f"label {dataset.name}", "label", params, tags={"dataset": dataset.name}) as (client, run):
+    with start_run(tracking, "all scenes", "label", params, tags={"dataset": dataset.name}) as (client, run):
         log(client, run, metrics=metrics)
         for name in (LABELS_CSV, LABELS_MD, LABELS_PNG):
             client.log_artifact(run, str(folder / name))

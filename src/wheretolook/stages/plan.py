@@ -15,6 +15,7 @@ from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.stages.inputs import Say, Tick, dataset_after, open_scene
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.tracking import log, start_run
+from wheretolook.utils.tracking_layout import joined
 from wheretolook.viewpoints.table import pose_columns
 
 if TYPE_CHECKING:
@@ -91,7 +92,7 @@ def _log(
     params["score_weight"] = config.planner.score_weight
     metrics = {"length_m": path.length_m, "turn_deg": path.turn_deg, "score": float(path.scores.mean())}
     tags = {"dataset": dataset.name}
-    with start_run(experiment.tracking, f"plan {scene}", "plan", params, tags=tags) as (client, run):
+    with start_run(experiment.tracking, joined(scene, methods[-1]), "plan", params, tags=tags) as (client, run):
         log(client, run, metrics=metrics)
         for file in files:
             client.log_artifact(run, str(file))

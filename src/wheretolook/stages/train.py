@@ -79,17 +79,17 @@ def _train(
     from wheretolook.learning.fit import RunLog
     from wheretolook.learning.learner import Task
     from wheretolook.learning.provenance import TrainedModel, weights_path
-    from wheretolook.learning.runs import params_of
+    from wheretolook.learning.runs import kept_metrics, params_of
 
     assert method.learn is not None
-    path, title = weights_path(dataset, method.name), f"train {method.name}"
+    path, title = weights_path(dataset, method.name), f"train {method.name}"  # the title is that of its progress bar
     params = {**params_of(about), "devices": config.devices}
-    with start_run(tracking, title, "train", params) as (client, run_id), isolate_rng():
+    with start_run(tracking, method.name, "train", params) as (client, run_id), isolate_rng():
         seed_everything(config.seed, verbose=False)
         options, run_log = config.options_of(method), RunLog(tracking, run_id)
         learnt = method.learn(Task(dataset, method.name, config, options, title, run_log=run_log, **shared))
         learnt.model.save(path, about)
-        log(client, run_id, params=learnt.counts, metrics={f"kept_{name}": x for name, x in learnt.metrics.items()})
+        log(client, run_id, params=learnt.counts, metrics=kept_metrics(learnt.metrics))
         _log_artifacts(client, run_id, path, learnt.history, method.name)
         content = {"about": about, "weights_sha256": sha256(path), "run_id": run_id, "metrics": learnt.metrics}
         write_json(path.with_suffix(".json"), content)

@@ -1,11 +1,15 @@
 """Where runs are logged: an MLflow store of one SQLite file and one folder of artifacts, both in one place.
 
+`wheretolook.utils.tracking_layout` says which experiment a run goes to and how it is named.
+
 MLflow keeps absolute paths of artifacts. A store that was moved stays readable here, since a run's artifacts lie in a
 folder named by its id; MLflow's UI shows those of earlier runs only at the old place.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
 import logging
 import math
 import os
@@ -17,18 +21,20 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
+from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from wheretolook.utils.errors import MissingRunError
 from wheretolook.utils.tracking_config import TrackingConfig
+from wheretolook.utils.tracking_layout import experiment_name, note_of, run_name
 from wheretolook.utils.version import VERSION
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from mlflow import MlflowClient
-    from mlflow.entities import Run
+    from mlflow.entities import Experiment, Run
 
 Values = Mapping[str, Any] | None  # parameters or metrics by name
 Tags = Mapping[str, str] | None  # tags by name, or the texts that MLflow keeps of parameters
@@ -37,6 +43,10 @@ STAGE_TAG = "stage"
 """Tag of every run this package logs: "label", "train", "evaluate", "plan", "paths", "learners" or "benchmark"."""
 
 PARENT_TAG = "mlflow.parentRunId"  # tag by which MLflow knows what run another is nested in
+FINGERPRINT_TAG = "fingerprint"  # of what a run was made from and what came out, see `fingerprint_of`
+LAYOUT_TAG, LAYOUT = "made_by", "wheretolook"  # of experiments of a dataset and purpose, not of other programs
+OLD_EXPERIMENT = "wheretolook"  # all runs lay here before datasets and purposes had experiments of their own
+KIND_TAG, KIND = "mlflow.experimentKind", "custom_model_development"  # MLflow then opens on the table of runs
 AT_ONCE = 800  # metrics logged at a time: MLflow takes 1000 of metrics and parameters together
 PAGE = 50  # runs searched at a time
 
@@ -48,40 +58,57 @@ def client(tracking: TrackingConfig) -> MlflowClient:
     return mlflow_client
 
 
-def experiment_ids(mlflow_client: MlflowClient, tracking: TrackingConfig) -> dict[str, str]:
-    """Ids of the experiments that hold the store's runs, by where their artifacts lay when the runs were logged."""
-    return {
-        str(experiment.artifact_location): str(experiment.experiment_id)
+def experiments(mlflow_client: MlflowClient, tracking: TrackingConfig) -> list[Experiment]:
+    """All experiments with runs of the store, also with those logged at another place or by earlier versions."""
+    name = tracking.experiment or OLD_EXPERIMENT
+    return [
+        experiment
         for experiment in mlflow_client.search_experiments()
-        if experiment.name == tracking.experiment or experiment.name.startswith(f"{tracking.experiment} at ")
-    }
+        if experiment.name == name
+        or experiment.name.startswith(f"{name} at ")
+        or (not tracking.experiment and experiment.tags.get(LAYOUT_TAG) == LAYOUT)
+    ]
 
 
-def experiment_id(mlflow_client: MlflowClient, tracking: TrackingConfig) -> str:
-    """Id of the experiment that new runs go to, which is created if there is none.
+def experiment_ids(mlflow_client: MlflowClient, tracking: TrackingConfig) -> list[str]:
+    """Ids of `experiments`."""
+    return [str(experiment.experiment_id) for experiment in experiments(mlflow_client, tracking)]
+
+
+def experiment_id(mlflow_client: MlflowClient, tracking: TrackingConfig, stage: str, dataset: str = "") -> str:
+    """Id of the experiment that new runs of a stage about a dataset go to, which is created if there is none.
 
     An experiment keeps the absolute path that its artifacts go to. In a store that was moved, new runs therefore go to
-    another experiment, named after the new place.
+    another experiment, named after the new place; likewise where the experiment was deleted, as MLflow keeps its name.
     """
-    found = experiment_ids(mlflow_client, tracking)
-    if tracking.artifacts in found:
-        return found[tracking.artifacts]
-    name = f"{tracking.experiment} at {tracking.root}" if found else tracking.experiment
-    return str(mlflow_client.create_experiment(name, artifact_location=tracking.artifacts))
+    layout, note = experiment_name(stage, dataset), note_of(stage)
+    tags = {KIND_TAG: KIND} | ({} if tracking.experiment else {LAYOUT_TAG: LAYOUT, "mlflow.note.content": note})
+    name = tracking.experiment or layout
+    elsewhere = f"{name} at {tracking.root}"
+    for candidate in chain((name, elsewhere), (f"{elsewhere} {number}" for number in count(2))):
+        known = mlflow_client.get_experiment_by_name(candidate)  # also a deleted one
+        if known is None:
+            location = tracking.artifacts
+            return str(mlflow_client.create_experiment(candidate, artifact_location=location, tags=tags))
+        if known.lifecycle_stage == "active" and known.artifact_location == tracking.artifacts:
+            return str(known.experiment_id)
+    raise AssertionError  # there is always another name
 
 
 @contextmanager
 def start_run(
-    tracking: TrackingConfig, name: str, stage: str, params: Values = None, tags: Tags = None
+    tracking: TrackingConfig, what: str, stage: str, params: Values = None, tags: Tags = None
 ) -> Iterator[tuple[MlflowClient, str]]:
     """Open a run, and close it as finished, failed (any exception) or killed (Ctrl-C).
 
-    The stage, such as "train", is stored as a tag beside `tags`. Yields the client and the run's id, for
+    The run is named by `what` was run, its stage, such as "train", and the parameter `dataset`, if there is one; these
+    two decide its experiment. The stage is stored as a tag beside `tags`. Yields the client and the run's id, for
     `client.log_metric(run_id, ...)` and its kin.
     """
-    mlflow_client = client(tracking)
+    mlflow_client, dataset = client(tracking), str((params or {}).get("dataset", ""))
     all_tags = {STAGE_TAG: stage, **code_version(), **(tags or {})}
-    with _open_run(mlflow_client, experiment_id(mlflow_client, tracking), name, all_tags) as run_id:
+    experiment = experiment_id(mlflow_client, tracking, stage, dataset)
+    with _open_run(mlflow_client, experiment, run_name(what, stage, dataset), all_tags) as run_id:
         log(mlflow_client, run_id, params)
         yield mlflow_client, run_id
 
@@ -113,9 +140,9 @@ def log(mlflow_client: MlflowClient, run_id: str, params: Values = None, metrics
 
 @dataclass(frozen=True)
 class NestedRun:
-    """A run within another, before it is logged: its name, parameters, metrics and files."""
+    """A run within another, before it is logged: what was run, parameters, metrics and files."""
 
-    name: str
+    what: str  # and under which conditions, see `wheretolook.utils.tracking_layout.joined`
     params: Mapping[str, Any]
     metrics: Mapping[str, float]
     files: Sequence[Path] = ()
@@ -128,10 +155,11 @@ def log_nested(tracking: TrackingConfig, parent: str, stage: str, runs: Iterable
     half a minute. Each is logged when the one before is done. Metrics that are not finite are left out.
     """
     mlflow_client = client(tracking)
-    experiment = experiment_id(mlflow_client, tracking)
+    experiment = str(mlflow_client.get_run(parent).info.experiment_id)
     all_tags = {STAGE_TAG: stage, **code_version(), **(tags or {}), PARENT_TAG: parent}
     for run in runs:
-        with _open_run(mlflow_client, experiment, run.name, all_tags) as run_id:
+        name = run_name(run.what, stage, str(run.params.get("dataset", "")))
+        with _open_run(mlflow_client, experiment, name, all_tags) as run_id:
             log(mlflow_client, run_id, run.params, run.metrics)
             for file in run.files:
                 mlflow_client.log_artifact(run_id, str(file))
@@ -154,18 +182,36 @@ def finished_runs(
     if not (tracking.root / "mlflow.db").is_file():
         return
     mlflow_client = client(tracking)
-    experiments = list(experiment_ids(mlflow_client, tracking).values())
+    searched = experiment_ids(mlflow_client, tracking)
     query = f"tags.{STAGE_TAG} = '{stage}' AND tags.`{PARENT_TAG}` IS NULL AND attributes.status = 'FINISHED'"
     order = ["attributes.start_time DESC"]
     token: str | None = None
-    while experiments and token != "":
-        page = mlflow_client.search_runs(experiments, query, max_results=PAGE, order_by=order, page_token=token)
+    while searched and token != "":
+        page = mlflow_client.search_runs(searched, query, max_results=PAGE, order_by=order, page_token=token)
         for run in page:
             fits = all(run.data.tags.get(key) == str(value) for key, value in (tags or {}).items())
             fits &= all(run.data.params.get(key) == str(value) for key, value in (params or {}).items())
             if fits and (not file or artifact(tracking, run.info.run_id, file).is_file()):
                 yield run
         token = page.token or ""
+
+
+def fingerprint_of(params: Mapping[str, Any], *results: str) -> str:
+    """16 hexadecimal digits that change with any parameter of a run, as MLflow keeps it, and any of its results."""
+    texts = {str(name): str(value) for name, value in params.items()}
+    return hashlib.sha256(json.dumps([sorted(texts.items()), *results]).encode()).hexdigest()[:16]
+
+
+def logged_last(tracking: TrackingConfig, stage: str, dataset: str, fingerprint: str, file: str) -> str | None:
+    """Id of the newest finished run of a stage about a dataset if it has this fingerprint and this file, or None.
+
+    Then there is nothing new to log. An older run with the fingerprint does not count: what reads the newest run, as
+    figures do, must find this one.
+    """
+    run = newest_run(tracking, stage, params={"dataset": dataset})
+    if run is None or run.data.tags.get(FINGERPRINT_TAG) != fingerprint:
+        return None
+    return str(run.info.run_id) if artifact(tracking, run.info.run_id, file).is_file() else None
 
 
 def newest_artifact(tracking: TrackingConfig, stage: str, file: str, dataset: str = "") -> Path:

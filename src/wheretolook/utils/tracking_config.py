@@ -12,11 +12,12 @@ class TrackingConfig:
 
     Args:
         folder: folder of the MLflow store. Made when needed; holds `mlflow.db` and `artifacts/`.
-        experiment: name of the MLflow experiment that the runs belong to.
+        experiment: name of one MLflow experiment that all runs belong to; if not given, each dataset and purpose has
+            its own, such as `release: evaluation` (`wheretolook.utils.tracking_layout`), and older ones are read, too.
     """
 
     folder: str = "mlruns"
-    experiment: str = "wheretolook"
+    experiment: str = ""
 
     @property
     def root(self) -> Path:

@@ -191,6 +191,7 @@ stages, in order; each reads what the one before it left in <data>/<name>/
   wheretolook label --config configs/paper.yaml --engine ray     on a Ray cluster; the default is local
   wheretolook evaluate --list-methods    what can be compared
   wheretolook viewpoint-map --config configs/demo.yaml --scene apartment-000 --out room.map
+  wheretolook export --map SPARSE --out FOLDER        what a robot needs to score views, without PyTorch
   wheretolook figures --list             figures and tables of the paper; `wheretolook figures` draws them
   wheretolook --version
 """
@@ -224,8 +225,12 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _run(command: str, arguments: list[str]) -> int:
+    if command == "export":
+        from wheretolook.robot.command import run
+
+        return run(arguments)
     if command not in STAGES:
-        near = nearest(command, STAGES)
+        near = nearest(command, [*STAGES, "export"])
         fix = f"Did you mean {near}?" if near else f"Use one of {', '.join(STAGES)}."
         raise ConfigError("unknown stage", value=command, fix=fix)
     if command == "evaluate" and "--list-methods" in arguments:

@@ -83,20 +83,22 @@ class LandmarkDescriber:
         device = self._points.device
         starts, rows = starts.to(device), indices.to(device, torch.int64)
         rotations, centers = split_poses(np.asarray(cam_from_world, dtype=np.float64))
-        from_centers, axes = torch.from_numpy(centers).to(device), torch.from_numpy(rotations).to(device, torch.float32)
+        from_centers, axes = torch.from_numpy(centers).to(device), torch.from_numpy(rotations).to(device)
         if len(starts) > 2:  # a single view needs no index of views
             views = torch.arange(len(starts) - 1, device=device).repeat_interleave(starts.diff())
             from_centers, axes = from_centers[views], axes[views]
         offsets = (self._points[rows] - from_centers).float()
         distance = offsets.norm(dim=1)
-        x, y, z = (offsets[:, None] @ axes.mT)[:, 0].unbind(1)
+        # in double precision and rounded once, so that every machine places a landmark at the same point of the image
+        x, y, z = (offsets.double()[:, None] @ axes.mT)[:, 0].unbind(1)
+        across, down = (x / z).float(), (y / z).float()
         map_values = self._attributes[rows]
         log_distance = distance.log()
         mapped_angle = (offsets * self._directions[rows]).sum(1) / distance
         ratio = log_distance - map_values[:, MAP_ATTRIBUTES.index("mapped_distance")]
         pixel_angle = torch.full_like(ratio, -log(self.localization_map.camera.mean_focal_px))
         size_ratio = log_distance + pixel_angle - map_values[:, MAP_ATTRIBUTES.index("mapped_pixel_size")]
-        pose_values = torch.stack([x / z, y / z, log_distance, mapped_angle, ratio, pixel_angle, size_ratio], dim=1)
+        pose_values = torch.stack([across, down, log_distance, mapped_angle, ratio, pixel_angle, size_ratio], dim=1)
         values = torch.cat([pose_values, map_values], dim=1)
         if self.attributes != ATTRIBUTES:
             values = values[:, self._columns]

@@ -169,7 +169,9 @@ class SetNetwork(LandmarkNetwork):
     def score(self, landmarks: ViewLandmarks, n_visible: Tensor, axis_height: Tensor) -> Tensor:
         """Logits (B,) from described landmarks, which may be a part of those that each view sees; see `forward`."""
         values, log_odds = landmarks.values, self.matchability(landmarks.values)
-        sums = torch.segment_reduce(self.parts(values, log_odds), "sum", lengths=landmarks.counts, initial=0.0)
+        # summed in double precision: in single, the sums of two machines may differ by more than scores should
+        parts = self.parts(values, log_odds).double()
+        sums = torch.segment_reduce(parts, "sum", lengths=landmarks.counts, initial=0.0)
         each = n_visible / landmarks.counts.clamp(min=1)
         cells = expected_cells(values, log_odds, landmarks.views, each, self.attributes) if self._cells else None
         return self.logits(sums * each[:, None], n_visible, axis_height, cells)
@@ -191,7 +193,7 @@ class SetNetwork(LandmarkNetwork):
         features = [torch.cat(known, 1)[:, self._told]]
         if self.attention is not None:
             features.append(sums[:, N_EXPECTED + 1 :] / (sums[:, N_EXPECTED : N_EXPECTED + 1] + 1e-6))
-        joined = torch.cat(features, 1)
+        joined = torch.cat(features, 1).float()
         if self.training and len(joined) < 2:  # one view has no spread of its own; a process's share may be empty
             standard = self.standard
             joined = batch_norm(joined, standard.running_mean, standard.running_var, standard.weight, standard.bias)
@@ -209,7 +211,8 @@ def expected_cells(
     image. Landmarks have `values` (E, A) and `log_odds` of being found (E,), and are of the `views` (E,); each of them
     stands for `each` (B,) landmarks in its view.
     """
-    across, down = (values[:, attributes.index(name)].atan() for name in ("across", "down"))
+    # in double precision, so that a landmark near the border of a cell lies in the same one on every machine
+    across, down = (values[:, attributes.index(name)].double().atan() for name in ("across", "down"))
     column, row = (((angle / torch.pi + 0.5) * CELLS).long().clamp(0, CELLS - 1) for angle in (across, down))
     place = (views * CELLS + row) * CELLS + column
     # a sum of the logarithms of the chances that none is found

@@ -1,0 +1,1 @@
+"""The default scorer on a robot, without PyTorch: what is exported, and the one file that runs there."""

@@ -1,0 +1,131 @@
+"""`wheretolook export`: a map and the weights as a robot needs them."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn
+
+from wheretolook.utils.errors import ConfigError
+
+if TYPE_CHECKING:
+    from wheretolook.geometry.camera import Camera
+    from wheretolook.geometry.poses import Float
+    from wheretolook.space.free_space import FreeSpace
+
+WEIGHTS = Path("data/release/weights/set.safetensors")
+MOST_PLACES = 20_000
+
+_TEXT = """\
+Write what a robot needs to score views of a map with NumPy and onnxruntime, without PyTorch.
+
+The folder then holds the network (scorer.onnx), the landmarks (landmarks.npz), the camera (robot.json), and
+wheretolook_robot.py, which reads and explains them. Copy it to the robot; `pip install numpy onnxruntime` there."""
+
+_MORE = """\
+A robot has no mesh to look for walls in. With --mesh it is stored which landmarks can be seen from each free place of a
+grid, and the robot takes those of the nearest place; without, it sees landmarks through walls.
+
+Example:
+  wheretolook export --map sparse/0 --mesh house.glb --spacing 0.5 --out robot
+  cd robot && python -c "from wheretolook_robot import RobotScorer; print(RobotScorer('.').best((1, 2, 1.5)))"
+"""
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise ConfigError(message, fix="`wheretolook export --help` lists the options.")
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run the command. Returns the exit code; raises a WhereToLookError on bad input."""
+    parser = _Parser(
+        "wheretolook export",
+        description=_TEXT,
+        epilog=_MORE,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.add_argument("--map", type=Path, required=True, metavar="SPARSE", help="COLMAP model, in metres, z up")
+    parser.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="where to write")
+    parser.add_argument("--weights", type=Path, default=WEIGHTS, metavar="FILE", help="of the method set (%(default)s)")
+    parser.add_argument(
+        "--camera",
+        metavar="CAMERA",
+        help="the robot's, as COLMAP writes a pinhole, 'PINHOLE WIDTH HEIGHT FX FY CX CY'; by default the map's own, "
+        "if it has but one, as the pinhole of its rectified images",
+    )
+    parser.add_argument(
+        "--database", type=Path, metavar="FILE", help="the map's: its descriptors tell which landmarks look alike"
+    )
+    parser.add_argument("--mesh", type=Path, metavar="FILE", help="mesh of the scene, for occlusion")
+    parser.add_argument("--spacing", type=float, default=0.5, metavar="METRES", help="of that grid (%(default)s)")
+    given = parser.parse_args(arguments)
+    if not 0 < given.spacing < float("inf"):
+        raise ConfigError("the spacing must be positive", value=given.spacing, fix="Give it in metres.")
+    _export(given)
+    return 0
+
+
+def _export(given: argparse.Namespace) -> None:
+    from wheretolook.inputs.localization_map import LocalizationMap
+    from wheretolook.mapping.landmarks import load_colmap_landmarks
+    from wheretolook.robot.export import export_robot, pinhole_of
+    from wheretolook.visibility.occlusion import MeshOcclusion, NoOcclusion, OcclusionModel
+
+    occlusion: OcclusionModel = NoOcclusion()
+    places = None
+    if given.mesh is not None:
+        from wheretolook.scenes.loading import load_mesh
+        from wheretolook.space.free_space import FreeSpace
+
+        space = FreeSpace(load_mesh(given.mesh))
+        places = _places(space, given.spacing)
+        occlusion = MeshOcclusion(space.raycaster, two_sided=space.two_sided)
+    named = None if given.camera is None else _camera(given.camera)
+    found = LocalizationMap.from_colmap(given.map, named, occlusion=occlusion)
+    if given.database is not None:
+        found = replace(found, landmarks=load_colmap_landmarks(given.map, given.database))
+    camera = pinhole_of(found.camera)
+    if camera != found.camera:
+        print("the map's camera has distortion, the robot's is the pinhole of its rectified images; or give --camera")
+    export_robot(found.of_camera(camera), given.weights, given.out, places)
+    print(f"{len(found.landmarks):,} landmarks, a camera of {camera.width} x {camera.height} px: {given.out}")
+    if places is None:
+        print("without --mesh the robot sees landmarks through walls")
+    else:
+        print(f"what is unoccluded is stored for {len(places):,} free places, {given.spacing:g} m apart")
+
+
+def _camera(text: str) -> Camera:
+    """The camera of COLMAP's text, with blanks or commas between. Raises ConfigError."""
+    from wheretolook.geometry.camera import camera_of
+
+    try:
+        model, width, height, *params = text.replace(",", " ").split()
+        return camera_of(model, int(width), int(height), [float(value) for value in params])
+    except ValueError as error:
+        fix = "Write it as 'PINHOLE WIDTH HEIGHT FX FY CX CY', in pixels."
+        raise ConfigError("this is no camera", value=text, fix=fix) from error
+
+
+def _places(space: FreeSpace, spacing_m: float) -> Float:
+    """Free places (L, 3) m on a grid over the mesh. Raises ConfigError if there are none, or too many."""
+    import numpy as np
+
+    low, high = space.bounds
+    counts = np.maximum(1, np.ceil((high - low) / spacing_m)).astype(np.int64)
+    if counts.prod() > 100 * MOST_PLACES:
+        raise ConfigError("the grid is too fine for this mesh", value=spacing_m, fix="Give a larger --spacing.")
+    # in the middle between both bounds
+    axes = [(a + b) / 2 + (np.arange(n) - (n - 1) / 2) * spacing_m for a, b, n in zip(low, high, counts, strict=True)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    free = grid[space.is_free(grid)]
+    if len(free) == 0:
+        fix = "Give a smaller --spacing, or a mesh with free space above a floor (metres, z up)."
+        raise ConfigError("no place of the grid is free", value=spacing_m, fix=fix)
+    if len(free) > MOST_PLACES:
+        raise ConfigError(f"the grid has {len(free):,} free places", value=spacing_m, fix="Give a larger --spacing.")
+    return free

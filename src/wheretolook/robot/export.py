@@ -1,0 +1,121 @@
+"""Writes what a robot needs to score views of a map: the network, the landmarks, and the file that reads them."""
+
+from __future__ import annotations
+
+import shutil
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+from tqdm.auto import tqdm
+
+from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera, describe_camera
+from wheretolook.geometry.poses import Float
+from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.learning.trained_network import TrainedNetwork
+from wheretolook.learning.training_range import TrainingRange, camera_quantities
+from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
+from wheretolook.methods.set.network import SetNetwork
+from wheretolook.methods.set.score import MOST
+from wheretolook.utils.errors import CameraError, ConfigError
+from wheretolook.utils.files import sha256, write_json
+from wheretolook.utils.npz_files import save_npz
+from wheretolook.utils.version import VERSION
+
+FORMAT_VERSION = 1  # of the folder, as in wheretolook_robot.py
+RECTIFIED = {"SIMPLE_RADIAL": 1, "RADIAL": 1, "OPENCV": 2, "FULL_OPENCV": 2}
+"""COLMAP's perspective models with distortion, and how many focal lengths their parameters begin with."""
+BLOCK = 64  # places whose occlusion is asked for at a time
+
+
+def export_robot(
+    localization_map: LocalizationMap,
+    weights: str | Path,
+    out: str | Path,
+    places: Float | None = None,
+    progress: bool = True,
+) -> Path:
+    """Write scorer.onnx, landmarks.npz, robot.json and wheretolook_robot.py, which documents them, into a folder.
+
+    Args:
+        localization_map: landmarks and a pinhole camera; its occlusion model is asked at the places only.
+        weights: of the method `set`.
+        out: the folder; files of these names are replaced.
+        places: (L, 3) m, where it is computed and stored which landmarks nothing hides. None for no occlusion.
+        progress: whether to show a bar.
+
+    Returns:
+        The folder.
+
+    Raises:
+        CameraError: the camera is not a pinhole.
+        ConfigError: the package onnx is not installed.
+        WeightsError: the weights are not of the method `set`, or are damaged.
+    """
+    camera = localization_map.camera
+    if not isinstance(camera, PinholeCamera):
+        fix = "Give the pinhole of the robot's rectified images."
+        raise CameraError("a robot's camera must be a pinhole", value=describe_camera(camera), fix=fix)
+    if find_spec("onnx") is None:
+        raise ConfigError("exporting needs the package onnx", fix="Install it: pip install 'wheretolook[robot]'.")
+    from wheretolook.robot.graph import set_graph
+
+    out, weights = Path(out), Path(weights)
+    trained = TrainedNetwork.load(weights, SetNetwork, "set")
+    content = set_graph(trained).SerializeToString()
+    known = trained.training_range
+    known = TrainingRange.of_camera(trained.camera) if known is None else known
+    landmarks = localization_map.landmarks
+    at = np.empty((0, 3)) if places is None else np.asarray(places, dtype=np.float64).reshape(-1, 3)
+    arrays = {
+        "points": landmarks.points,
+        "directions": landmarks.mapping_direction,
+        "attributes": landmarks.attributes(),
+        "places": at,
+        "unoccluded": _unoccluded(localization_map, at, progress),
+    }
+    about = {
+        "format_version": FORMAT_VERSION,
+        "wheretolook": VERSION,
+        "weights_sha256": sha256(weights),
+        "n_landmarks": len(landmarks),
+        "camera": {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")},
+        "attributes": list(trained.network.attributes),
+        "map_attributes": list(MAP_ATTRIBUTES),
+        "most": MOST,
+        "range": known.record(),
+        "serves_camera": bool(known.contains(camera_quantities(camera)[None])[0]),
+    }
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "scorer.onnx").write_bytes(content)
+    save_npz(out / "landmarks.npz", arrays)
+    shutil.copyfile(Path(__file__).with_name("wheretolook_robot.py"), out / "wheretolook_robot.py")
+    write_json(out / "robot.json", about)
+    return out
+
+
+def pinhole_of(camera: Camera) -> PinholeCamera:
+    """The pinhole of a camera's rectified images: the same size, focal lengths and principal point.
+
+    Raises a CameraError if the model is a fisheye's or a panorama's, of which there is no such pinhole.
+    """
+    if isinstance(camera, PinholeCamera):
+        return camera
+    if isinstance(camera, ColmapCamera) and camera.model in RECTIFIED:
+        focal = camera.params[: RECTIFIED[camera.model]]
+        return PinholeCamera(camera.width, camera.height, focal[0], focal[-1], camera.principal_point)
+    fix = "Say which pinhole the robot's rectified images have, with --camera."
+    raise CameraError("this camera has no pinhole of its own", value=describe_camera(camera), fix=fix)
+
+
+def _unoccluded(localization_map: LocalizationMap, places: Float, progress: bool) -> np.ndarray:
+    """Bits (L, ceil(N / 8)) uint8 of what nothing hides from places (L, 3) m."""
+    points = localization_map.landmarks.points
+    packed = np.empty((len(places), (len(points) + 7) // 8), dtype=np.uint8)
+    with tqdm(total=len(places), desc="occlusion", unit="place", disable=not progress or len(places) == 0) as bar:
+        for begin in range(0, len(places), BLOCK):
+            rows = slice(begin, begin + BLOCK)
+            mask = localization_map.occlusion.unoccluded(places[rows], points)
+            packed[rows] = np.packbits(mask, axis=1)
+            bar.update(len(mask))
+    return packed

@@ -1,0 +1,106 @@
+"""`wheretolook export`, from a COLMAP model to a folder that scores."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+from box_scenes import furnished_room
+from wheretolook.cli import main
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.poses import poses_looking_along
+from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.methods.registry import load_scorer
+from wheretolook.robot.wheretolook_robot import RobotScorer
+from wheretolook.scenes.loading import save_glb
+
+WEIGHTS = Path("data/release/weights/set.safetensors").absolute()
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> Path:
+    """A COLMAP model of 60 points on a wall of the furnished room, seen by three cameras with distortion."""
+    rng = np.random.default_rng(0)
+    points = np.column_stack([np.full(60, 0.02), rng.uniform(1, 4, 60), rng.uniform(0.5, 2.5, 60)])
+    camera = pycolmap.Camera(
+        camera_id=1, model="SIMPLE_RADIAL", width=320, height=240, params=[160.0, 160.0, 120.0, -0.02]
+    )
+    found = pycolmap.Reconstruction()
+    found.add_camera_with_trivial_rig(camera)
+    centers = [(3.5, 1.5, 1.5), (3.5, 2.5, 1.2), (3.5, 3.5, 1.5)]
+    for number, pose in enumerate(poses_looking_along(centers, [(-1.0, 0, 0)] * 3), start=1):
+        pixels = camera.img_from_cam(points @ pose[:, :3].T + pose[:, 3])
+        image = pycolmap.Image(name=f"{number}.png", camera_id=1, image_id=number, keypoints=pixels)
+        found.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:, :3]), pose[:, 3]))
+    for row, point in enumerate(points):
+        track = pycolmap.Track()
+        for number in (1, 2, 3):
+            track.add_element(number, row)
+        found.add_point3D(point, track, np.zeros(3, np.uint8))
+    folder = tmp_path / "sparse"
+    folder.mkdir()
+    found.write_binary(str(folder))
+    return folder
+
+
+def test_from_a_model_to_scores(model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "robot"
+    assert main(["export", "--map", str(model), "--out", str(out), "--weights", str(WEIGHTS)]) == 0
+    said = capsys.readouterr().out
+    assert "60 landmarks" in said and "rectified" in said and "through walls" in said
+    robot = RobotScorer(out)
+    assert robot.camera == {"width": 320, "height": 240, "fx": 160.0, "fy": 160.0, "cx": 160.0, "cy": 120.0}
+    view = robot.best((2.5, 2.5, 1.5), directions=100)
+    assert view.direction[0] < -0.7 and view.n_visible > 40
+
+
+def test_a_mesh_and_a_camera_of_the_robot(model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    mesh, out = tmp_path / "room.glb", tmp_path / "robot"
+    save_glb(furnished_room(), mesh)
+    given = ["--map", str(model), "--out", str(out), "--weights", str(WEIGHTS), "--mesh", str(mesh)]
+    assert main(["export", *given, "--spacing", "1", "--camera", "PINHOLE,640,480,400,410,320,240"]) == 0
+    assert "free places, 1 m apart" in capsys.readouterr().out
+    robot = RobotScorer(out)
+    assert robot.camera["fy"] == 410 and len(robot.places) > 20
+    # places are a metre apart, inside the room and clear of the table top
+    apart = np.linalg.norm(robot.places[:, None] - robot.places, axis=2)
+    assert np.isclose(apart[apart > 0].min(), 1) and (robot.places > 0).all()
+    exact = LocalizationMap.from_colmap(model, mesh=mesh)
+    views = poses_looking_along(robot.places, np.tile((-1.0, 0, -0.2), (len(robot.places), 1)))
+    expected = load_scorer(WEIGHTS, exact.of_camera(PinholeCamera(640, 480, 400.0, 410.0))).score(views)
+    np.testing.assert_allclose(robot.score(views), expected, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["--map", "nowhere"], "nowhere"),
+        (["--camera", "PINHOLE 640"], "PINHOLE WIDTH HEIGHT"),
+        (["--camera", "OPENCV_FISHEYE,320,240,160,160,160,120,0,0,0,0"], "no pinhole of its own"),
+        (["--weights", "none.safetensors"], "none.safetensors"),
+        (["--mesh", "none.glb"], "none.glb"),
+        (["--spacing", "-1"], "spacing must be positive"),
+        (["--spacing", "wide"], "invalid float"),
+        (["--size", "3"], "unrecognized"),
+    ],
+)
+def test_bad_input_is_told(
+    options: list[str], says: str, model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = ["--map", str(model), "--out", str(tmp_path / "robot"), "--weights", str(WEIGHTS)]
+    assert main(["export", *given, *options]) == 2
+    assert says in capsys.readouterr().err
+    assert not (tmp_path / "robot").exists()
+
+
+def test_help_and_a_mistyped_name(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="0"):
+        main(["export", "--help"])
+    assert "through walls" in capsys.readouterr().out
+    assert main(["exprot"]) == 2
+    assert "Did you mean export?" in capsys.readouterr().err
+    assert main(["export", "--out", "x"]) == 2
+    assert "--map" in capsys.readouterr().err

@@ -115,7 +115,7 @@ def runs_of_rows(table: pd.DataFrame, params: Mapping[str, Any]) -> Iterator[Nes
     for key, rows in table.groupby(list(_NAMED), sort=False):
         own = dict(zip(_NAMED, map(str, key), strict=True))
         pooled = rows[rows["scene"] == ALL]
-        numbers = first_metrics(pooled) | pooled.iloc[0][of_all_views].astype(float).to_dict()
+        numbers = first_metrics(pooled) | {name: float(pooled[name].iloc[0]) for name in of_all_views}
         for part, columns in ((pooled, of_pooled), (rows[rows["scene"] != ALL], of_scene)):
             values = part[columns].to_numpy(np.float64)
             for n, scene, row in zip(part["top_n"], part["scene"], values, strict=True):

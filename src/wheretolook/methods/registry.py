@@ -154,7 +154,7 @@ def make_scorer(
 
 
 @overload
-def load_scorer(localization_map: LocalizationMap) -> Scorer: ...
+def load_scorer(localization_map: LocalizationMap, /) -> Scorer: ...
 
 
 @overload

@@ -230,11 +230,11 @@ def _log_learners(dataset: Dataset, tracking: TrackingConfig) -> str:
         what = joined(named["learner"], named["learnt_from"], seed)
         nested.append(NestedRun(what, {"dataset": dataset.name, **named}, numbers))
     by_learner = [{"what": joined(one.params["learner"], one.params["learnt_from"]), **one.metrics} for one in nested]
-    means = pd.DataFrame(by_learner).groupby("what").mean().filter((REGRET, AUC))
+    of_learner = pd.DataFrame(by_learner).groupby("what").mean().filter((REGRET, AUC))
     tags, first = dict(TAGS), {}
-    if REGRET in means:
-        best = means[REGRET].idxmin()
-        tags[BEST_TAG], first = str(best), means.loc[best].to_dict()
+    if REGRET in of_learner:
+        best = str(of_learner[REGRET].idxmin())
+        tags[BEST_TAG], first = best, of_learner.loc[best].to_dict()
     about = {"dataset": dataset.name}
     with start_run(tracking, "all learners", "learners", about, tags=tags) as (mlflow, run):
         log(mlflow, run, metrics=first)

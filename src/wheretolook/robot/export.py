@@ -5,8 +5,10 @@ from __future__ import annotations
 import shutil
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera, describe_camera
@@ -67,7 +69,7 @@ def export_robot(
     known = TrainingRange.of_camera(trained.camera) if known is None else known
     landmarks = localization_map.landmarks
     at = np.empty((0, 3)) if places is None else np.asarray(places, dtype=np.float64).reshape(-1, 3)
-    arrays = {
+    arrays: dict[str, NDArray[Any]] = {
         "points": landmarks.points,
         "directions": landmarks.mapping_direction,
         "attributes": landmarks.attributes(),

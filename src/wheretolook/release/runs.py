@@ -234,7 +234,7 @@ def _log_learners(dataset: Dataset, tracking: TrackingConfig) -> str:
     tags, first = dict(TAGS), {}
     if REGRET in of_learner:
         best = str(of_learner[REGRET].idxmin())
-        tags[BEST_TAG], first = best, of_learner.loc[best].to_dict()
+        tags[BEST_TAG], first = best, {str(name): float(of_learner[name][best]) for name in of_learner}
     about = {"dataset": dataset.name}
     with start_run(tracking, "all learners", "learners", about, tags=tags) as (mlflow, run):
         log(mlflow, run, metrics=first)

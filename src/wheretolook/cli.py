@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from wheretolook.utils.errors import ConfigError, OutOfRangeWarning, WhereToLookError
+from wheretolook.utils.errors import ConfigError, MapWarning, OutOfRangeWarning, WhereToLookError
 from wheretolook.utils.options import Option, all_options, check_names, grouped, names_in, nearest, short_lines
 from wheretolook.utils.shipped import or_shipped, shipped, shipped_configs
 from wheretolook.utils.version import VERSION
@@ -377,7 +377,8 @@ def _quieten() -> None:
     os.environ.setdefault("GLOG_minloglevel", "2")
     os.environ.setdefault("PYTHONWARNINGS", "ignore")  # for worker processes
     warnings.simplefilter("ignore")
-    warnings.simplefilter("default", OutOfRangeWarning)  # the user's own views, not chatter
+    for kind in (OutOfRangeWarning, MapWarning):  # the user's own views and map, not chatter
+        warnings.simplefilter("default", kind)
     warnings.formatwarning = lambda message, *_, **__: f"wheretolook: warning: {message}\n"
     for name in ("lightning", "lightning.pytorch", "lightning.fabric", "mlflow", "alembic"):
         logging.getLogger(name).setLevel(logging.ERROR)

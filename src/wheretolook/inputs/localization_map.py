@@ -81,7 +81,7 @@ class LocalizationMap:
             from wheretolook.space.free_space import FreeSpace
             from wheretolook.visibility.occlusion import MeshOcclusion
 
-            space = FreeSpace(load_mesh(Path(mesh)), device=device)
+            space = FreeSpace(load_mesh(Path(mesh), colored=False), device=device)
             occlusion = MeshOcclusion(space.raycaster, two_sided=space.two_sided)
         return cls(landmarks, camera, occlusion, device, poses.astype(np.float32))
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import re
 import struct
 from dataclasses import dataclass
 from pathlib import Path
@@ -73,7 +75,11 @@ def read_model(model_dir: str | Path) -> Any:
             (reconstruction.read_binary if suffix == ".bin" else reconstruction.read_text)(str(folder))
     except (ValueError, IndexError, RuntimeError, MemoryError, KeyError) as error:
         raise MapError(f"pycolmap cannot read the model: {error}", path=folder, fix=_REBUILD) from error
-    if suffix == ".bin":
+    if suffix == ".txt":
+        found = (reconstruction.num_cameras(), reconstruction.num_images(), reconstruction.num_points3D())
+        for name, number in zip(MODEL_FILES, found, strict=True):
+            _check_text_count(folder / f"{name}.txt", number)
+    else:
         images, cameras = reconstruction.images.values(), reconstruction.cameras.values()
         _check_size(folder / "cameras.bin", 8 + sum(24 + 8 * len(c.params) for c in cameras))
         _check_size(folder / "images.bin", 8 + sum(73 + len(i.name.encode()) + 24 * i.num_points2D() for i in images))
@@ -128,6 +134,17 @@ def camera_of_model(reconstruction: Any, path: Path, camera_id: int | None = Non
         fix = f"It has {', '.join(map(str, known))}."
         raise MapError("the model has no such camera", path=path, value=camera_id, fix=fix)
     return known[camera_id]
+
+
+def registered_names(reconstruction: Any) -> dict[int, str]:
+    """Names of the images with a pose, by id, in the order of ids."""
+    return {number: image.name for number, image in sorted(reconstruction.images.items()) if image.has_pose}
+
+
+def describe_intrinsics(camera: Any) -> dict[str, Any]:
+    """Model, size and parameters of a pycolmap camera, as values of JSON."""
+    size = {"model": camera.model_name, "width": camera.width, "height": camera.height}
+    return {**size, "params": [float(value) for value in camera.params]}
 
 
 def holds_model(folder: Path) -> bool:
@@ -189,7 +206,7 @@ def _stored_points(reconstruction: Any) -> _StoredPoints:
 
 
 def _point_starts(data: bytes) -> NDArray[np.int64]:
-    """Offsets of the points in the content of a points3D.bin, and where the last one ends; -1 for that if it does not."""
+    """Offsets of the points in the content of a points3D.bin, and where the last one ends; -1 if its end is missing."""
     count, end = struct.unpack_from("<Q", data)[0], 8
     starts = []
     for _ in range(count):
@@ -209,6 +226,15 @@ def _check_count(path: Path, least_bytes: int) -> None:
         head = file.read(8)
     if len(head) < 8 or struct.unpack("<Q", head)[0] * least_bytes > size - 8:
         raise MapError("the file is truncated or corrupt", path=path, value=f"{size} bytes", fix=_REBUILD)
+
+
+def _check_text_count(path: Path, found: int) -> None:
+    """Compare with the number that COLMAP writes at the top of a text file, if it is there."""
+    with path.open(errors="replace") as file:
+        head = "".join(line for line in itertools.islice(file, 6) if line.startswith("#"))
+    told = re.search(r"# Number of \w+: (\d+)", head)
+    if told and found < int(told[1]):
+        raise MapError(f"the file is truncated: it tells of {told[1]}", path=path, value=found, fix=_REBUILD)
 
 
 def _check_points(path: Path) -> None:

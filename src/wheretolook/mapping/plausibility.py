@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,6 +14,9 @@ from wheretolook.geometry.poses import camera_centers
 from wheretolook.mapping.gravity import estimate_gravity
 from wheretolook.utils.errors import MapWarning
 
+if TYPE_CHECKING:
+    from wheretolook.rendering.raycasting import MeshRaycaster
+
 DISTANCE_M = (0.2, 50.0)
 """Median distance from mapping cameras to landmarks in maps of places where people walk, from desks to squares."""
 SPACING_M = 5.0
@@ -20,6 +24,8 @@ SPACING_M = 5.0
 TILT_DEG = {"level": 25.0, "mean": 50.0}
 """Angle between z and up as the cameras were held, by how that is known (`Gravity.method`): people roll a camera by a
 few degrees, but may tilt all their photographs of a thing the same way."""
+MESH_DISTANCE_M = (0.3, 100.0)
+"""Median distance of landmarks to the mesh of the same place that is too far, and the farthest that is measured."""
 _LOOKING_DOWN = 0.7  # mean of the cameras' directions along -z; how such cameras are turned says nothing about up
 
 
@@ -32,6 +38,19 @@ def warn_of_frame(model: str | Path, mapping_distance_m: ArrayLike, cam_from_wor
     for doubt in (scale_doubt(mapping_distance_m, camera_centers(poses)), axes_doubt(poses)):
         if doubt:
             warnings.warn(f"{model}: {doubt}", MapWarning, stacklevel=3)
+
+
+def warn_of_mesh(mesh: str | Path, points: ArrayLike, raycaster: MeshRaycaster) -> None:
+    """Warn with a `MapWarning` if a map's landmarks (N, 3) are mostly far from the surface that a mesh shows."""
+    at = np.asarray(points, dtype=np.float64)
+    off_m = float(np.median(raycaster.distance_to_surface(at, MESH_DISTANCE_M[1])))
+    if off_m > MESH_DISTANCE_M[0]:
+        far = f"{off_m:.2f} m" if np.isfinite(off_m) else f"more than {MESH_DISTANCE_M[1]:g} m"
+        text = (
+            f"{mesh}: half of the landmarks are {far} or more from the mesh, so it seems to be in another frame than "
+        )
+        text += "the model. Try --map.existing.mesh_up y (glTF's own), or export both in the same frame"
+        warnings.warn(text, MapWarning, stacklevel=2)
 
 
 def scale_doubt(mapping_distance_m: ArrayLike, centers: ArrayLike) -> str:

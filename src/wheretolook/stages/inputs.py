@@ -12,6 +12,7 @@ from wheretolook.config import Experiment
 from wheretolook.dataset.folders import RELEASE_FILE, Dataset, SceneFolder
 from wheretolook.dataset.scene import Scene, SceneConfig
 from wheretolook.dataset.stamps import read_stamp
+from wheretolook.geometry.camera import CameraConfig
 from wheretolook.utils.errors import ConfigError, MapError, SceneError, TableError
 from wheretolook.utils.files import fingerprint
 from wheretolook.utils.options import recorded
@@ -34,7 +35,8 @@ def dataset_after(experiment: Experiment, needs: str) -> Dataset:
     dataset = Dataset.load(experiment.root)
     if needs != "label":
         refuse_release(experiment.root)
-    others = [scene.camera for scene in dataset.scenes if scene.camera != experiment.camera.camera]
+    wanted, unnamed = experiment.camera.camera, experiment.camera == CameraConfig()
+    others = [scene.camera for scene in dataset.scenes if scene.camera != wanted and not (scene.own_camera and unnamed)]
     if others:
         fix = "Run the scenes stage with this configuration, or give the experiment another name."
         problem = "the dataset was made with another camera"

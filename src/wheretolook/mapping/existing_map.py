@@ -118,7 +118,8 @@ def map_existing(
         with clock("filter_and_write"):
             n_removed = 0
             if worst_px:
-                model.update_point_3d_errors()
+                if not all(point.has_error() for point in model.points3D.values()):
+                    model.update_point_3d_errors()
                 fix = "Raise map.existing.max_reprojection_error_px, or check the model's poses and intrinsics."
                 n_removed = building.remove_inaccurate(model, worst_px, settings.model, fix)
             if anew:

@@ -26,7 +26,7 @@ from wheretolook.planning.config import PathConfig, PlanConfig, ViewpointMapConf
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.scenes.loading import save_glb
 from wheretolook.space.config import MappedSpaceConfig
-from wheretolook.utils.errors import ConfigError, MapError, MapWarning
+from wheretolook.utils.errors import ConfigError, MapError, MapWarning, SceneError
 from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.config import SampleConfig
 
@@ -111,13 +111,16 @@ def test_from_a_model_to_a_planned_path(tmp_path, with_mesh):
     to_cameras = np.linalg.norm(free[:, None] - camera_centers(colmap_poses(folder)), axis=2).min(1)
     assert (to_cameras.max() <= 0.6) is not with_mesh  # a mesh frees the whole room
     assert views.origin.occlusion == ("mesh" if with_mesh else "hidden-points")
-    ends = free[[np.argmin(free @ [1, 1, 0]), np.argmax(free @ [1, 1, 0])]]
+    ends = [free[np.argmin(np.linalg.norm(free - end, axis=1))] for end in ((1.5, 2, 1.4), (4.5, 3, 1.4))]
     config = PlanConfig(
         scene="flat", start=tuple(ends[0]), goal=tuple(ends[1]), method="visible", film="none",
-        planner=PathConfig(time_s=0.5), grid=(6, 5, 3), directions=30,
+        planner=PathConfig(time_s=2.0), grid=(6, 5, 3), directions=30,
     )  # fmt: skip
     path = stages.plan(replace(experiment, plan=config), said.append)
     assert np.isfinite(path.scores).all() and (scene.folder / "path" / "path.png").is_file()
+
+    with pytest.raises(MapError if with_mesh else SceneError, match="no descriptors" if with_mesh else "photographs"):
+        stages.label(experiment)
 
     said.clear()
     stages.make_maps(experiment, said.append)
@@ -148,7 +151,7 @@ def test_the_filter_that_is_asked_for_is_counted(tmp_path):
     (scene,) = stages.make_maps(
         experiment_of(folder, tmp_path / "data", max_reprojection_error_px=0.5), said.append
     ).scenes
-    assert 100 < n_bad < 500 and f"from 36 images, {n_bad} points left out" in " ".join(said)
+    assert 100 < n_bad < 700 and f"from 36 images, {n_bad} points left out" in " ".join(said)
     assert len(scene.read_landmarks()) == read_model(scene.map).num_points3D() == model.num_points3D() - n_bad
     config = MapConfig(existing=ExistingModelConfig(folder, max_reprojection_error_px=1e-6))
     with pytest.raises(MapError, match=r"no landmark.*map\.existing\.max_reprojection_error_px"):

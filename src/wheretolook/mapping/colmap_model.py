@@ -11,7 +11,9 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
+from tqdm.auto import tqdm
 
 from wheretolook.geometry.camera import Camera, cameras_by_id, mean_focal_px, only_camera
 from wheretolook.geometry.poses import Float
@@ -21,6 +23,7 @@ from wheretolook.utils.npz_files import load_npz, save_npz
 
 CAMERAS_FILE = "cameras.npz"  # lies beside the landmarks, small enough to travel without the COLMAP model
 MODEL_FILES = ("cameras", "images", "points3D")
+_LARGE_BYTES = 500e6  # of a model that takes so long to read that a bar shows how far it is
 _REBUILD = "Copy or build the model again."
 # The least bytes of an entry: an image with an empty name and no 2D points, a rig of one sensor, a frame of one image.
 _LEAST_BYTES = {"images.bin": 73, "rigs.bin": 8, "frames.bin": 68}
@@ -64,15 +67,19 @@ def read_model(model_dir: str | Path) -> Any:
     for name in MODEL_FILES:
         if not (folder / (name + suffix)).is_file():
             raise MapError("a file of the COLMAP model is missing", path=folder / (name + suffix), fix=_REBUILD)
-    if suffix == ".bin":
-        # From a damaged file pycolmap may read a count so large that it does not come back.
-        for name, least in _LEAST_BYTES.items():
-            _check_count(folder / name, least)
-        _check_points(folder / "points3D.bin")
+    n_bytes = sum((folder / (name + suffix)).stat().st_size for name in MODEL_FILES)
+    bar = tqdm(total=2, desc=f"model of {n_bytes / 1e9:.1f} GB: read", unit="step", disable=n_bytes < _LARGE_BYTES)
     reconstruction = pycolmap.Reconstruction()
     try:
-        with quiet_colmap():
+        with bar, quiet_colmap():
+            if suffix == ".bin":
+                # From a damaged file pycolmap may read a count so large that it does not come back.
+                for name, least in _LEAST_BYTES.items():
+                    _check_count(folder / name, least)
+                _check_points(folder / "points3D.bin")
+            bar.update()
             (reconstruction.read_binary if suffix == ".bin" else reconstruction.read_text)(str(folder))
+            bar.update()
     except (ValueError, IndexError, RuntimeError, MemoryError, KeyError) as error:
         raise MapError(f"pycolmap cannot read the model: {error}", path=folder, fix=_REBUILD) from error
     if suffix == ".txt":
@@ -92,7 +99,7 @@ def model_arrays(reconstruction: Any) -> ModelArrays:
     Raises MapError if a track names an image that has no pose.
     """
     stored = _stored_points(reconstruction)
-    if not (stored.errors_px >= 0).all():  # COLMAP writes -1 for an error that is not known
+    if not (stored.errors_px[stored.lengths > 0] >= 0).all():  # COLMAP writes -1 for an error that is not known
         reconstruction.update_point_3d_errors()
         stored = _stored_points(reconstruction)
     image_ids = np.array(sorted(i for i, image in reconstruction.images.items() if image.has_pose), dtype=np.int64)
@@ -192,10 +199,14 @@ def _stored_points(reconstruction: Any) -> _StoredPoints:
         reconstruction.write_binary(folder)
         data = np.fromfile(Path(folder) / "points3D.bin", dtype=np.uint8)
     starts = _point_starts(data.tobytes())
-    fixed = starts[:-1, None] + np.arange(_POINT_BYTES)
-    heads = data[fixed].view(_POINT).reshape(-1)
-    in_track = np.ones(len(data), dtype=bool)
-    in_track[:8] = in_track[fixed] = False
+    heads = np.zeros(0, dtype=_POINT)
+    if len(starts) > 1:
+        heads = sliding_window_view(data, _POINT_BYTES)[starts[:-1]].view(_POINT).reshape(-1)
+    step = np.zeros(len(data) + 1, dtype=np.int8)  # up where a point begins, down where its track does
+    step[starts[:-1]] += 1
+    step[starts[:-1] + _POINT_BYTES] -= 1
+    in_track = np.cumsum(step[:-1], dtype=np.int8) == 0
+    in_track[:8] = False
     elements = data[in_track].view("<u4").reshape(-1, 2).astype(np.int64)
     lengths, order = heads["n"].astype(np.int64), np.argsort(heads["id"])
     ends = np.cumsum(lengths)

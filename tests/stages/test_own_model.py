@@ -111,7 +111,7 @@ def test_from_a_model_to_a_planned_path(tmp_path, with_mesh):
     to_cameras = np.linalg.norm(free[:, None] - camera_centers(colmap_poses(folder)), axis=2).min(1)
     assert (to_cameras.max() <= 0.6) is not with_mesh  # a mesh frees the whole room
     assert views.origin.occlusion == ("mesh" if with_mesh else "hidden-points")
-    ends = [free[np.argmin(np.linalg.norm(free - end, axis=1))] for end in ((1.5, 2, 1.4), (4.5, 3, 1.4))]
+    ends = [free[np.argmin(np.linalg.norm(free - end, axis=1))] for end in ((4.5, 2.5, 1.5), (4.5, 3.5, 1.5))]
     config = PlanConfig(
         scene="flat", start=tuple(ends[0]), goal=tuple(ends[1]), method="visible", film="none",
         planner=PathConfig(time_s=2.0), grid=(6, 5, 3), directions=30,

@@ -193,7 +193,7 @@ def _posed_model(source: Any, features: PhotographFeatures) -> Any:
     """A reconstruction of the same cameras, names and poses, of the size of the features; image i has the id i + 1."""
     import pycolmap
 
-    model, sizes = pycolmap.Reconstruction(), {}
+    model, sizes = pycolmap.Reconstruction(), dict[int, list[int]]()
     images = [source.images[number] for number in registered_names(source)]
     for image, size in zip(images, features.sizes.tolist(), strict=True):
         if sizes.setdefault(image.camera_id, size) != size:

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from wheretolook.geometry.poses import camera_centers
+from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.mapping.gravity import estimate_gravity
 from wheretolook.utils.errors import MapWarning
 
@@ -86,5 +86,5 @@ def axes_doubt(cam_from_world: ArrayLike) -> str:
     )
 
 
-def _rounded(up: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.round(up, 2) + 0.0  # no -0.00
+def _rounded(up: Float) -> Float:
+    return np.asarray(np.round(up, 2) + 0.0)  # no -0.00

@@ -174,7 +174,7 @@ def _map_existing(experiment: Experiment, say: Say, tick: Tick) -> Dataset:
         how = (scene.folder / "photographs", _seed(scene), experiment.n_workers, experiment.warp_device)
         report = map_existing(experiment.map, scene.map, *how, reconstruction=model)
         scene.mesh.unlink(missing_ok=True)
-        if loaded is not None:
+        if settings.mesh is not None and loaded is not None:
             caster = MeshRaycaster(loaded, experiment.warp_device)
             warn_of_mesh(settings.mesh, scene.read_landmarks().points, caster)
             save_glb(loaded, scene.mesh)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from wheretolook.utils.errors import ConfigError, OutOfRangeWarning, WhereToLookError
+from wheretolook.utils.errors import ConfigError, MapWarning, OutOfRangeWarning, WhereToLookError
 from wheretolook.utils.options import Option, all_options, check_names, grouped, names_in, nearest, short_lines
 from wheretolook.utils.shipped import or_shipped, shipped, shipped_configs
 from wheretolook.utils.version import VERSION
@@ -49,12 +49,17 @@ STAGES = {
     ),
     "map": Stage(
         "make_maps",
-        "Build a COLMAP map of every scene from renders along a walk, or of a folder of photographs: --images FOLDER.",
-        "map.n_images map.keep_images map.extractor.method images map.photographs.name map.photographs.max_side_px "
-        "map.photographs.camera_model map.photographs.camera_params map.photographs.scale.marker_size_m "
-        "map.photographs.scale.positions label.workers",
+        "Build a COLMAP map of every scene by renders, or of photographs: --images. Or take one of your own: --model.",
+        "model mesh database images map.existing.name map.existing.camera_id map.n_images map.extractor.method "
+        "map.photographs.name map.photographs.scale.positions label.workers",
         ("map", "scenes.free_space", "label.workers"),
         "--name photos --images FOLDER",
+        {f"--{name}": f"--map.existing.{name}" for name in ("model", "mesh", "database")},
+        notes="""\
+A model of your own, from COLMAP or hloc, in metres with z up, becomes a scene for sample, viewpoint-map and plan:
+  wheretolook map --name mymap --model sparse/0 --mesh scan.glb --database database.db
+Mesh and database may be left out. With --images its landmarks are triangulated anew. Not upright, or not in metres?
+--map.existing.level true, --map.photographs.scale.positions FILE. Its own camera looks, unless --camera names one.""",
     ),
     "sample": Stage(
         "sample",
@@ -188,6 +193,7 @@ stages, in order; each reads what the one before it left in <data>/<name>/
   wheretolook demo                 is configs/demo.yaml unless --config names another
   wheretolook map --config configs/demo.yaml --map.n_images 120
   wheretolook map --name photos --images FOLDER       a scene known from photographs alone
+  wheretolook map --name mymap --model sparse/0       a scene from a COLMAP model of your own
   wheretolook label --config configs/paper.yaml --engine ray     on a Ray cluster; the default is local
   wheretolook evaluate --list-methods    what can be compared
   wheretolook viewpoint-map --config configs/demo.yaml --scene apartment-000 --out room.map
@@ -377,7 +383,8 @@ def _quieten() -> None:
     os.environ.setdefault("GLOG_minloglevel", "2")
     os.environ.setdefault("PYTHONWARNINGS", "ignore")  # for worker processes
     warnings.simplefilter("ignore")
-    warnings.simplefilter("default", OutOfRangeWarning)  # the user's own views, not chatter
+    for kind in (OutOfRangeWarning, MapWarning):  # the user's own views and map, not chatter
+        warnings.simplefilter("default", kind)
     warnings.formatwarning = lambda message, *_, **__: f"wheretolook: warning: {message}\n"
     for name in ("lightning", "lightning.pytorch", "lightning.fabric", "mlflow", "alembic"):
         logging.getLogger(name).setLevel(logging.ERROR)

@@ -12,7 +12,7 @@ import pytest
 from wheretolook.features.keypoints import quantize_descriptors, unit_descriptors
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks, nearest_other_cosine
-from wheretolook.utils.errors import MapError
+from wheretolook.utils.errors import MapError, MapWarning
 
 # Three cameras on a line, 2 m apart, that look along +y; two intrinsics. Points in front of them.
 CENTERS = np.array([[-2.0, 0.0, 1.0], [0.0, 0.0, 1.0], [2.0, 0.0, 1.0]])
@@ -88,7 +88,8 @@ def model_dir(tmp_path: Path) -> Path:
 def test_attributes_of_a_hand_written_model(tmp_path, text):
     model, _ = hand_written_model()
     model.write_text(str(tmp_path)) if text else model.write_binary(str(tmp_path))
-    landmarks = load_colmap_landmarks(tmp_path)
+    with pytest.warns(MapWarning, match=r"3 of 4 points are landmarks; left out: 1 with .* more than 0\.5 px"):
+        landmarks = load_colmap_landmarks(tmp_path, max_reprojection_error_px=0.5)
     # Point 30 is 2 px off in every image and so beyond 0.5 px.
     np.testing.assert_array_equal(landmarks.ids, [10, 20, 40])
     np.testing.assert_allclose(landmarks.points, POINTS[[0, 1, 3]], atol=1e-12)
@@ -122,14 +123,14 @@ def test_errors_written_by_colmap_are_taken_as_they_are(tmp_path):
     model.update_point_3d_errors()
     model.points3D[10].error = 7.5
     model.write_binary(str(tmp_path))
-    assert list(load_colmap_landmarks(tmp_path).ids) == [20, 40]
+    assert list(load_colmap_landmarks(tmp_path, max_reprojection_error_px=0.5).ids) == [20, 40]
 
 
 def test_descriptors_are_means_over_the_track(tmp_path, model_dir):
     model, keypoints = hand_written_model()
     descriptors = random_descriptors([len(k) for k in keypoints])
     database = write_database(tmp_path / "database.db", model, keypoints, descriptors)
-    landmarks = load_colmap_landmarks(model_dir, database)
+    landmarks = load_colmap_landmarks(model_dir, database, max_reprojection_error_px=0.5)
     # Keypoints in the order in which the points were added, after an unused one.
     seen = {10: [(0, 1), (1, 1), (2, 1)], 20: [(1, 2), (2, 2)], 40: [(0, 3), (2, 4)]}
     expected = []

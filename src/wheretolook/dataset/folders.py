@@ -40,6 +40,7 @@ class SceneFolder:
     folder: Path  # `<data>/<dataset>/<scene>`
     split: Split  # the whole scene belongs to it
     camera: Camera = PinholeCamera()  # the one that looks, where a viewpoint names none of `cameras.txt`
+    own_camera: bool = False  # whether that is the map's own, which settings that name no camera leave as it is
 
     @property
     def name(self) -> str:
@@ -96,7 +97,7 @@ class SceneFolder:
 
     @property
     def is_photographed(self) -> bool:
-        """Whether the scene is known from photographs alone.
+        """Whether the scene is known from photographs alone, or a model of such.
 
         Raises MapError if it has no mesh, and its map's report is damaged.
         """
@@ -239,7 +240,10 @@ class Dataset:
 
     def save(self) -> None:
         """Write `dataset.json`, which makes the folder a dataset."""
-        scenes: list[dict[str, Any]] = [{"name": scene.name, "split": scene.split} for scene in self.scenes]
+        scenes: list[dict[str, Any]] = []
+        for scene in self.scenes:
+            own = {"own_camera": True} if scene.own_camera else {}
+            scenes.append({"name": scene.name, "split": scene.split, **own})
         content: dict[str, Any] = {"scenes": scenes}
         if len({scene.camera for scene in self.scenes}) == 1:
             content = {"camera": self.scenes[0].camera.record(), **content}
@@ -257,7 +261,8 @@ class Dataset:
             scenes = []
             for entry in content["scenes"]:
                 camera = camera_of_record(entry["camera"] if "camera" in entry else content["camera"])
-                scenes.append(SceneFolder(root / entry["name"], entry["split"], camera))
+                own = bool(entry.get("own_camera", False))
+                scenes.append(SceneFolder(root / entry["name"], entry["split"], camera, own))
             return cls(root, tuple(scenes))
         except FileNotFoundError as error:
             raise TableError("this folder is no dataset", path=path, fix="Run the scenes stage first.") from error

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.geometry.camera import Camera, ColmapCamera, cameras_by_id, only_camera
+from wheretolook.geometry.camera import Camera, ColmapCamera
 from wheretolook.geometry.poses import Float, camera_centers, check_poses
 from wheretolook.inputs.bins import BinnedViews, bin_views, count_bins
-from wheretolook.mapping.colmap_model import colmap_poses, read_model
+from wheretolook.mapping.colmap_model import camera_of_model, colmap_poses, read_model
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
-from wheretolook.utils.errors import MapError
+from wheretolook.mapping.plausibility import warn_of_frame
 from wheretolook.visibility import frustum
 from wheretolook.visibility.frustum import LandmarkSets, PosedViews
 from wheretolook.visibility.occlusion import NoOcclusion, OcclusionModel
@@ -43,10 +43,13 @@ class LocalizationMap:
         camera: Camera | int | None = None,
         mesh: str | Path | None = None,
         occlusion: OcclusionModel | None = None,
-        max_reprojection_error_px: float = 0.5,
+        max_reprojection_error_px: float | None = None,
         device: str = "cpu",
+        database: str | Path | None = None,
     ) -> LocalizationMap:
-        """From any COLMAP model (binary or text) in metres, z up.
+        """From any COLMAP model (version 3 or 4, binary or text) in metres, z up.
+
+        A `MapWarning` says which points are left out, and if the model seems not to be in metres or not to have z up.
 
         Args:
             model: folder of the model.
@@ -55,30 +58,32 @@ class LocalizationMap:
             mesh: a mesh of the scene, for true occlusion.
             occlusion: another model, such as `HiddenPointRemoval()` where there is nothing but the landmarks, or
                 `TsdfOcclusion` where there are depth images. With neither, landmarks are seen through walls.
-            max_reprojection_error_px: landmarks with a larger mean error are left out.
+            max_reprojection_error_px: landmarks with a larger mean error are left out. None for all that the model's
+                own mapper kept.
             device: where kernels run.
+            database: the COLMAP database the model was built from, or hloc's features in HDF5, for the landmarks'
+                ambiguity, which is unknown without.
 
         Raises:
-            MapError: no usable model in the folder, no such camera in it, or several and none is named.
+            MapError: no usable model in the folder, no such camera in it, or several and none is named; or the database
+                is unreadable or another's.
             SceneError: the mesh cannot be used.
         """
-        found, worst_px = read_model(model), max_reprojection_error_px
-        landmarks = load_colmap_landmarks(Path(model), max_reprojection_error_px=worst_px, reconstruction=found)
+        found = read_model(model)
+        landmarks = load_colmap_landmarks(Path(model), database, max_reprojection_error_px, device, found)
+        poses = colmap_poses(model, found)
+        warn_of_frame(model, landmarks.mapping_distance_m, poses)
         if camera is None or isinstance(camera, int):
-            known = cameras_by_id(found.cameras, Path(model))
-            if camera is not None and camera not in known:
-                fix = f"It has {', '.join(map(str, known))}."
-                raise MapError("the model has no such camera", path=model, value=camera, fix=fix)
-            camera = only_camera(known, Path(model)) if camera is None else known[camera]
+            camera = camera_of_model(found, Path(model), camera)
         occlusion = occlusion or NoOcclusion()
         if mesh is not None:
             from wheretolook.scenes.loading import load_mesh
             from wheretolook.space.free_space import FreeSpace
             from wheretolook.visibility.occlusion import MeshOcclusion
 
-            space = FreeSpace(load_mesh(Path(mesh)), device=device)
+            space = FreeSpace(load_mesh(Path(mesh), colored=False), device=device)
             occlusion = MeshOcclusion(space.raycaster, two_sided=space.two_sided)
-        return cls(landmarks, camera, occlusion, device, colmap_poses(model, found).astype(np.float32))
+        return cls(landmarks, camera, occlusion, device, poses.astype(np.float32))
 
     def of_camera(self, camera: Camera) -> LocalizationMap:
         """The same map, looked at with another camera."""

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
+import re
 import struct
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
+from tqdm.auto import tqdm
 
-from wheretolook.geometry.camera import mean_focal_px
+from wheretolook.geometry.camera import Camera, cameras_by_id, mean_focal_px, only_camera
 from wheretolook.geometry.poses import Float
 from wheretolook.utils.colmap import quiet_colmap
 from wheretolook.utils.errors import MapError
@@ -18,10 +23,13 @@ from wheretolook.utils.npz_files import load_npz, save_npz
 
 CAMERAS_FILE = "cameras.npz"  # lies beside the landmarks, small enough to travel without the COLMAP model
 MODEL_FILES = ("cameras", "images", "points3D")
+_LARGE_BYTES = 500e6  # of a model that takes so long to read that a bar shows how far it is
 _REBUILD = "Copy or build the model again."
 # The least bytes of an entry: an image with an empty name and no 2D points, a rig of one sensor, a frame of one image.
 _LEAST_BYTES = {"images.bin": 73, "rigs.bin": 8, "frames.bin": 68}
-_POINT_BYTES = 51  # id, position, colour, error, track length; the track's elements follow
+# A point, which the track's elements follow: image id and index of the keypoint, uint32 each.
+_POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("n", "<u8")])
+_POINT_BYTES, _TRACK_LENGTH = _POINT.itemsize, struct.Struct("<Q")
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,23 +61,32 @@ def read_model(model_dir: str | Path) -> Any:
         raise MapError("there is no such folder", path=folder, fix=fix)
     suffix = next((s for s in (".bin", ".txt") if any((folder / (n + s)).is_file() for n in MODEL_FILES)), None)
     if suffix is None:
-        fix = "Give the folder that holds cameras, images and points3D (.bin or .txt)."
+        inside = [path.parent for path in sorted(folder.glob("**/images.*")) if holds_model(path.parent)][:5]
+        fix = f"Give the folder that holds cameras, images and points3D (.bin or .txt){_listed(inside)}."
         raise MapError("no COLMAP model here", path=folder, fix=fix)
     for name in MODEL_FILES:
         if not (folder / (name + suffix)).is_file():
             raise MapError("a file of the COLMAP model is missing", path=folder / (name + suffix), fix=_REBUILD)
-    if suffix == ".bin":
-        # From a damaged file pycolmap may read a count so large that it does not come back.
-        for name, least in _LEAST_BYTES.items():
-            _check_count(folder / name, least)
-        _check_points(folder / "points3D.bin")
+    n_bytes = sum((folder / (name + suffix)).stat().st_size for name in MODEL_FILES)
+    bar = tqdm(total=2, desc=f"model of {n_bytes / 1e9:.1f} GB: read", unit="step", disable=n_bytes < _LARGE_BYTES)
     reconstruction = pycolmap.Reconstruction()
     try:
-        with quiet_colmap():
+        with bar, quiet_colmap():
+            if suffix == ".bin":
+                # From a damaged file pycolmap may read a count so large that it does not come back.
+                for name, least in _LEAST_BYTES.items():
+                    _check_count(folder / name, least)
+                _check_points(folder / "points3D.bin")
+            bar.update()
             (reconstruction.read_binary if suffix == ".bin" else reconstruction.read_text)(str(folder))
+            bar.update()
     except (ValueError, IndexError, RuntimeError, MemoryError, KeyError) as error:
         raise MapError(f"pycolmap cannot read the model: {error}", path=folder, fix=_REBUILD) from error
-    if suffix == ".bin":
+    if suffix == ".txt":
+        found = (reconstruction.num_cameras(), reconstruction.num_images(), reconstruction.num_points3D())
+        for name, number in zip(MODEL_FILES, found, strict=True):
+            _check_text_count(folder / f"{name}.txt", number)
+    else:
         images, cameras = reconstruction.images.values(), reconstruction.cameras.values()
         _check_size(folder / "cameras.bin", 8 + sum(24 + 8 * len(c.params) for c in cameras))
         _check_size(folder / "images.bin", 8 + sum(73 + len(i.name.encode()) + 24 * i.num_points2D() for i in images))
@@ -81,69 +98,26 @@ def model_arrays(reconstruction: Any) -> ModelArrays:
 
     Raises MapError if a track names an image that has no pose.
     """
-    points = reconstruction.points3D
-    point_ids = np.array(sorted(points), dtype=np.int64)
-    ordered = [points[i] for i in point_ids]
-    if not all(p.has_error() for p in ordered):
+    stored = _stored_points(reconstruction)
+    if not (stored.errors_px[stored.lengths > 0] >= 0).all():  # COLMAP writes -1 for an error that is not known
         reconstruction.update_point_3d_errors()
+        stored = _stored_points(reconstruction)
     image_ids = np.array(sorted(i for i, image in reconstruction.images.items() if image.has_pose), dtype=np.int64)
     images = [reconstruction.images[i] for i in image_ids]
-    tracks = [p.track.elements for p in ordered]
-    elements = [(element.image_id, element.point2D_idx) for track in tracks for element in track]
-    observations = np.array(elements, dtype=np.int64).reshape(-1, 2)
-    if not np.isin(observations[:, 0], image_ids).all():
+    if not np.isin(stored.elements[:, 0], image_ids).all():
         raise MapError("points were observed by images without a pose", fix=_REBUILD)
     return ModelArrays(
-        point_ids=point_ids,
-        points=np.array([p.xyz for p in ordered], dtype=np.float64).reshape(-1, 3),
-        errors_px=np.array([p.error for p in ordered], dtype=np.float64),
+        point_ids=stored.ids,
+        points=stored.points,
+        errors_px=stored.errors_px,
         image_ids=image_ids,
         image_names=[image.name for image in images],
         image_centers=np.array([image.projection_center() for image in images], dtype=np.float64).reshape(-1, 3),
         image_focal_px=np.array([mean_focal_px(reconstruction.cameras[image.camera_id]) for image in images]),
-        observation_start=np.concatenate([[0], np.cumsum([len(t) for t in tracks], dtype=np.int64)]).astype(np.int64),
-        observation_image=np.searchsorted(image_ids, observations[:, 0]),
-        observation_keypoint=observations[:, 1],
+        observation_start=np.concatenate([[0], np.cumsum(stored.lengths)]).astype(np.int64),
+        observation_image=np.searchsorted(image_ids, stored.elements[:, 0]),
+        observation_keypoint=stored.elements[:, 1],
     )
-
-
-def read_descriptors(
-    database: str | Path, model_dir: str | Path, reconstruction: Any, model: ModelArrays
-) -> list[NDArray[np.uint8]]:
-    """Descriptors (K, 128) uint8 of the model's images, in the order of `model.image_ids`, joined by image name.
-
-    Raises MapError if the database is missing, unreadable, or not the one the model was built from.
-    """
-    import pycolmap
-
-    path = Path(database)
-    if not path.is_file():
-        fix = "Give the database.db the model was built from, or none."
-        raise MapError("there is no such database", path=path, fix=fix)
-    mismatch = f"Give the database that {model_dir} was built from, or none."
-    descriptors = []
-    try:
-        with quiet_colmap(), pycolmap.Database.open(str(path)) as db:
-            stored = {image.name: image.image_id for image in db.read_all_images()}
-            for image_id, name in zip(model.image_ids, model.image_names, strict=True):
-                if name not in stored:
-                    raise MapError("the database lacks an image of the model", path=path, value=name, fix=mismatch)
-                image = reconstruction.images[int(image_id)]
-                keypoints = np.asarray(db.read_keypoints(stored[name]), dtype=np.float64)
-                values = np.asarray(db.read_descriptors(stored[name]).data)
-                if len(keypoints) != image.num_points2D() or len(values) != image.num_points2D():
-                    problem = f"the database and the model disagree on the number of keypoints of {name}"
-                    raise MapError(problem, path=path, value=(len(values), image.num_points2D()), fix=mismatch)
-                ends = [image.points2D[0].xy, image.points2D[-1].xy] if len(keypoints) else []
-                if len(keypoints) and np.abs(keypoints[[0, -1], :2] - ends).max() > 0.01:
-                    problem = "the database holds other keypoints than the model"
-                    raise MapError(problem, path=path, value=name, fix=mismatch)
-                if values.ndim != 2 or values.shape[1] != 128 or values.dtype != np.uint8:
-                    raise MapError("the descriptors are not SIFT", path=path, value=values.shape, fix=mismatch)
-                descriptors.append(values)
-    except (ValueError, IndexError, RuntimeError) as error:
-        raise MapError(f"pycolmap cannot read the database: {error}", path=path, fix=mismatch) from error
-    return descriptors
 
 
 def colmap_poses(model_dir: str | Path, reconstruction: Any = None) -> Float:
@@ -156,6 +130,28 @@ def colmap_poses(model_dir: str | Path, reconstruction: Any = None) -> Float:
     if not posed:
         raise MapError("the map has no images", path=model_dir, value=0, fix="Run the map stage again.")
     return np.stack([image.cam_from_world().matrix() for image in posed])
+
+
+def camera_of_model(reconstruction: Any, path: Path, camera_id: int | None = None) -> Camera:
+    """A camera of a pycolmap model: that of a camera_id, or the only one. MapError, naming the model, if none is it."""
+    known = cameras_by_id(reconstruction.cameras, path)
+    if camera_id is None:
+        return only_camera(known, path)
+    if camera_id not in known:
+        fix = f"It has {', '.join(map(str, known))}."
+        raise MapError("the model has no such camera", path=path, value=camera_id, fix=fix)
+    return known[camera_id]
+
+
+def registered_names(reconstruction: Any) -> dict[int, str]:
+    """Names of the images with a pose, by id, in the order of ids."""
+    return {number: image.name for number, image in sorted(reconstruction.images.items()) if image.has_pose}
+
+
+def describe_intrinsics(camera: Any) -> dict[str, Any]:
+    """Model, size and parameters of a pycolmap camera, as values of JSON."""
+    size = {"model": camera.model_name, "width": camera.width, "height": camera.height}
+    return {**size, "params": [float(value) for value in camera.params]}
 
 
 def holds_model(folder: Path) -> bool:
@@ -182,6 +178,57 @@ def load_mapping_poses(path: str | Path) -> Float:
     return np.asarray(poses, dtype=np.float32)
 
 
+def _listed(folders: list[Path]) -> str:
+    return f", such as {', '.join(map(str, folders))}" if folders else ""
+
+
+@dataclass(frozen=True, eq=False)
+class _StoredPoints:
+    """What points3D.bin holds, sorted by id."""
+
+    ids: NDArray[np.int64]  # (P,)
+    points: NDArray[np.float64]  # (P, 3)
+    errors_px: NDArray[np.float64]  # (P,)
+    lengths: NDArray[np.int64]  # (P,) of the tracks
+    elements: NDArray[np.int64]  # (O, 2) image id and index of the keypoint, track after track
+
+
+def _stored_points(reconstruction: Any) -> _StoredPoints:
+    """Points and tracks of a reconstruction, by way of a file: asked for one by one, 500,000 take a quarter minute."""
+    with TemporaryDirectory() as folder:
+        reconstruction.write_binary(folder)
+        data = np.fromfile(Path(folder) / "points3D.bin", dtype=np.uint8)
+    starts = _point_starts(data.tobytes())
+    heads = np.zeros(0, dtype=_POINT)
+    if len(starts) > 1:
+        heads = sliding_window_view(data, _POINT_BYTES)[starts[:-1]].view(_POINT).reshape(-1)
+    step = np.zeros(len(data) + 1, dtype=np.int8)  # up where a point begins, down where its track does
+    step[starts[:-1]] += 1
+    step[starts[:-1] + _POINT_BYTES] -= 1
+    in_track = np.cumsum(step[:-1], dtype=np.int8) == 0
+    in_track[:8] = False
+    elements = data[in_track].view("<u4").reshape(-1, 2).astype(np.int64)
+    lengths, order = heads["n"].astype(np.int64), np.argsort(heads["id"])
+    ends = np.cumsum(lengths)
+    rows = np.repeat((ends - lengths)[order] - np.cumsum(lengths[order]) + lengths[order], lengths[order])
+    elements = elements[rows + np.arange(len(rows))]
+    heads = heads[order]
+    return _StoredPoints(heads["id"].astype(np.int64), heads["xyz"], heads["error"], lengths[order], elements)
+
+
+def _point_starts(data: bytes) -> NDArray[np.int64]:
+    """Offsets of the points in the content of a points3D.bin, and where the last one ends; -1 if its end is missing."""
+    count, end = struct.unpack_from("<Q", data)[0], 8
+    starts = []
+    for _ in range(count):
+        starts.append(end)
+        if end + _POINT_BYTES > len(data):
+            end = -1
+            break
+        end += _POINT_BYTES + 8 * _TRACK_LENGTH.unpack_from(data, end + _POINT_BYTES - 8)[0]
+    return np.array([*starts, end], dtype=np.int64)
+
+
 def _check_count(path: Path, least_bytes: int) -> None:
     if not path.is_file():
         return  # models from before COLMAP 3.12 have no rigs and frames
@@ -192,15 +239,18 @@ def _check_count(path: Path, least_bytes: int) -> None:
         raise MapError("the file is truncated or corrupt", path=path, value=f"{size} bytes", fix=_REBUILD)
 
 
+def _check_text_count(path: Path, found: int) -> None:
+    """Compare with the number that COLMAP writes at the top of a text file, if it is there."""
+    with path.open(errors="replace") as file:
+        head = "".join(line for line in itertools.islice(file, 6) if line.startswith("#"))
+    told = re.search(r"# Number of \w+: (\d+)", head)
+    if told and found < int(told[1]):
+        raise MapError(f"the file is truncated: it tells of {told[1]}", path=path, value=found, fix=_REBUILD)
+
+
 def _check_points(path: Path) -> None:
     _check_count(path, _POINT_BYTES)
-    data, end = path.read_bytes(), 8
-    for _ in range(struct.unpack_from("<Q", data)[0]):
-        if end + _POINT_BYTES > len(data):
-            end = len(data) + 1
-            break
-        end += _POINT_BYTES + 8 * struct.unpack_from("<Q", data, end + _POINT_BYTES - 8)[0]
-    _check_size(path, end)
+    _check_size(path, int(_point_starts(path.read_bytes())[-1]))
 
 
 def _check_size(path: Path, expected: int) -> None:

@@ -179,6 +179,52 @@ class PhotographsConfig:
 
 
 @dataclass(frozen=True)
+class ExistingModelConfig:
+    """A COLMAP model of one's own, of known poses, from which a scene is made instead of from a mesh or photographs.
+
+    Its world is taken to be in metres, z up; `photographs.scale` and `level` make it so. With `photographs.images`, the
+    folder of its images, its landmarks are triangulated anew at its poses, from keypoints of `extractor`.
+
+    Args:
+        model: folder of the model.
+        name: name of the scene; the folder's own if empty. For sparse/0 and the like that of the folder above.
+        database: the COLMAP database that the model was built from, or hloc's features in HDF5. Descriptors tell how
+            easily landmarks are mistaken for one another, and queries are matched with them.
+        mesh: textured mesh of the scene in the model's frame, for free space, occlusion and labels. Without one, free
+            space is where `scenes.mapped_space` says, and hidden-point removal tells what is occluded.
+        mesh_up: which axis of the mesh's file is the model's z: x, y or z, with a minus sign if it points down.
+        camera_id: the camera of the model that will look, where it has several and `camera` names none.
+        level: turn the model upright by how its cameras were held.
+        max_reprojection_error_px: landmarks with a larger mean reprojection error are removed; 0 for all that the
+            model's own mapper kept.
+    """
+
+    model: Path | None = None
+    name: str = ""
+    database: Path | None = None
+    mesh: Path | None = None
+    mesh_up: str = "z"
+    camera_id: int | None = None
+    level: bool = False
+    max_reprojection_error_px: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.max_reprojection_error_px < inf:
+            value = self.max_reprojection_error_px
+            raise ConfigError("existing.max_reprojection_error_px must not be negative", value=value)
+
+    @property
+    def scene_name(self) -> str:
+        """Name of the scene's folder."""
+        assert self.model is not None
+        parts = [part for part in self.model.resolve().parts[1:] if part not in _NO_NAMES and not part.isdigit()]
+        return self.name or (parts[-1] if parts else "model")
+
+
+_NO_NAMES = ("sparse", "model", "models", "sfm", "colmap", "map")  # folders of models whose names say nothing
+
+
+@dataclass(frozen=True)
 class MapConfig:
     """How a scene is mapped.
 
@@ -192,6 +238,8 @@ class MapConfig:
             paper's 0.5 px).
         photographs: a folder of photographs to map instead of a mesh; of the other settings, only `extractor` and
             `keep_database` then count.
+        existing: a model of one's own to take instead; then only `extractor`, `keep_database` and `photographs.images`
+            and `.scale` count besides.
         camera: the camera that maps, if not the one that looks, such as `{width: 1280, height: 720, fov_deg: 70}`.
         draw_camera: draw the camera that maps from the scene's seed, as `sample.cameras` draws those that look.
         keep_images: keep the rendered images, as `images/` in the map's folder.
@@ -214,6 +262,7 @@ class MapConfig:
     two_view_landmarks: bool = True
     max_reprojection_error_px: float = 0.5
     photographs: PhotographsConfig = field(default_factory=PhotographsConfig)
+    existing: ExistingModelConfig = field(default_factory=ExistingModelConfig)
     camera: CameraConfig | None = None
     draw_camera: bool = False
     keep_images: bool = False

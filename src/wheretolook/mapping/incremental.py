@@ -60,17 +60,21 @@ def photograph_features(
     processes: Processes,
     device: str = "cpu",
     progress: bool = True,
+    names: list[str] | None = None,
+    turned: bool = True,
 ) -> PhotographFeatures:
-    """Keypoints of all photographs in a folder, by the project's extractor: a later localization uses the same.
+    """Keypoints of photographs in a folder, by the project's extractor: a later localization uses the same.
 
-    Raises MapError if there are fewer than two photographs, or one cannot be read.
+    Of all photographs in it, unless names are given; read as `read_photograph` does. Raises MapError if one cannot be
+    read, or the folder holds fewer than two.
     """
-    names = list_photographs(folder)
+    names = list_photographs(folder) if names is None else names
     files = [(name, (folder / name).stat().st_size, (folder / name).stat().st_mtime_ns) for name in names]
-    key, path = _key([files, max_side_px, asdict(extractor)]), work / "features.npz"
+    how = [] if turned else ["as stored"]
+    key, path = _key([files, max_side_px, asdict(extractor), *how]), work / "features.npz"
     kept = _load(path, key)
     if kept is None:
-        kept = _extract(folder, names, max_side_px, KeypointExtractor(extractor, device), processes, progress)
+        kept = _extract(folder, names, max_side_px, KeypointExtractor(extractor, device), processes, progress, turned)
         save_npz(path, {"key": np.array(key), **kept})
     ends = np.cumsum(kept["counts"])[:-1]
     pixels, descriptors, colors = (np.split(kept[name], ends) for name in ("pixels", "descriptors", "colors"))
@@ -116,13 +120,19 @@ def map_incrementally(
 
 
 def _extract(
-    folder: Path, names: list[str], max_side_px: int, extractor: KeypointExtractor, processes: Processes, progress: bool
+    folder: Path,
+    names: list[str],
+    max_side_px: int,
+    extractor: KeypointExtractor,
+    processes: Processes,
+    progress: bool,
+    turned: bool = True,
 ) -> dict[str, NDArray[Any]]:
     full_sizes, sizes = [], []
 
     def images() -> Iterator[NDArray[np.uint8]]:
         for name in names:
-            rgb = photographs.read_photograph(folder / name)
+            rgb = photographs.read_photograph(folder / name, turned)
             reduced = photographs.reduce_photograph(rgb, max_side_px)
             full_sizes.append(rgb.shape[1::-1])
             sizes.append(reduced.shape[1::-1])

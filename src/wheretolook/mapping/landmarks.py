@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,17 +10,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from numpy.typing import DTypeLike, NDArray
+from tqdm.auto import tqdm
 
 from wheretolook.features.keypoints import quantize_descriptors, unit_descriptors
 from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
-from wheretolook.mapping.colmap_model import ModelArrays, model_arrays, read_descriptors, read_model
-from wheretolook.utils.errors import MapError
+from wheretolook.mapping.colmap_model import ModelArrays, model_arrays, read_model
+from wheretolook.mapping.descriptors import read_descriptors
+from wheretolook.utils.errors import MapError, MapWarning
 from wheretolook.utils.npz_files import load_npz, save_npz
 
 if TYPE_CHECKING:
     import pycolmap
 
 _BLOCK = 4096  # landmarks whose tracks are gathered at a time
+_SILENT_S = 2.0  # progress is shown of what takes longer
 _TILE = 512  # descriptors along a side of a product that stays in the cache
 
 
@@ -108,15 +112,16 @@ def _floats(values: dict[str, NDArray[Any]], points: DTypeLike, others: DTypeLik
 def load_colmap_landmarks(
     model_dir: str | Path,
     database: str | Path | None = None,
-    max_reprojection_error_px: float = 0.5,
+    max_reprojection_error_px: float | None = None,
     device: str = "cpu",
     reconstruction: pycolmap.Reconstruction | None = None,
 ) -> Landmarks:
     """Landmarks of a COLMAP model (binary or text) in metres, with their attributes. Its images may have many cameras.
 
-    The database the model was built from gives descriptors and ambiguity, by a search of the nearest descriptors on a
-    torch device. Landmarks with a larger mean reprojection error are left out (the paper's 0.5). `reconstruction` is
-    the model, if it has been read already.
+    The features the model was built from (`read_descriptors`) give descriptors and ambiguity, by a search of the
+    nearest descriptors on a torch device. What the model's own mapper kept is kept, unless a largest mean reprojection
+    error is given; a `MapWarning` counts the points that are left out. `reconstruction` is the model, if it has been
+    read already.
 
     Raises MapError if the folder, a file or the database is missing, corrupt or does not match, or no landmark is left.
     """
@@ -128,7 +133,8 @@ def load_colmap_landmarks(
     observed = np.diff(model.observation_start) > 0
     if not observed.any():
         raise MapError("no point of the model has a track", path=model_dir, fix="Triangulate the model from keypoints.")
-    keep = np.flatnonzero(observed & (model.errors_px <= max_reprojection_error_px))
+    worst_px = np.inf if max_reprojection_error_px is None else max_reprojection_error_px
+    keep = np.flatnonzero(observed & (model.errors_px <= worst_px))
     if len(keep) == 0:
         problem = f"all {observed.sum()} points have more than {max_reprojection_error_px} px mean reprojection error"
         least = f"least {model.errors_px[observed].min():.2f} px"
@@ -136,14 +142,26 @@ def load_colmap_landmarks(
         raise MapError(problem, path=model_dir, value=least, fix=fix)
     if not np.isfinite(model.points[keep]).all():
         raise MapError("some points are not finite", path=model_dir, fix="Triangulate the model again.")
+    _tell_left_out(observed, len(keep), worst_px, model_dir)
     model = _select_points(model, keep)
     descriptors, ambiguity = None, np.full(len(keep), np.nan, dtype=np.float32)
-    if database is not None:
-        descriptors = _mean_descriptors(model, read_descriptors(database, model_dir, reconstruction, model))
+    observations = None if database is None else read_descriptors(database, model_dir, reconstruction, model)
+    if observations is not None:
+        descriptors = _mean_descriptors(model, observations)
         ambiguity = nearest_other_cosine(descriptors, device)
     track_length, errors_px = np.diff(model.observation_start).astype(np.int32), model.errors_px.astype(np.float32)
     attributes: Any = {**_viewing_geometry(model), "descriptors": descriptors, "ambiguity": ambiguity}
     return Landmarks(model.point_ids, model.points, track_length, errors_px, **attributes)
+
+
+def _tell_left_out(observed: NDArray[np.bool_], n_kept: int, worst_px: float, model_dir: str | Path) -> None:
+    n_unobserved, n_inaccurate = int((~observed).sum()), int(observed.sum()) - n_kept
+    if not n_unobserved + n_inaccurate:
+        return
+    reasons = [f"{n_inaccurate:,} with a mean reprojection error of more than {worst_px:g} px"] if n_inaccurate else []
+    reasons += [f"{n_unobserved:,} that no image observes"] if n_unobserved else []
+    text = f"{model_dir}: {n_kept:,} of {len(observed):,} points are landmarks; left out: {', '.join(reasons)}"
+    warnings.warn(text, MapWarning, stacklevel=3)
 
 
 def nearest_other_cosine(descriptors: NDArray[np.uint8], device: str = "cpu") -> NDArray[np.float32]:
@@ -158,7 +176,8 @@ def nearest_other_cosine(descriptors: NDArray[np.uint8], device: str = "cpu") ->
     best = torch.full((n,), -torch.inf, device=device)
     torch.set_num_threads(1)  # products are small: several threads would mostly wait for one another
     try:
-        for i in range(0, n, _TILE):
+        tiles = tqdm(range(0, n, _TILE), "landmarks: ambiguity", delay=_SILENT_S, unit="block")
+        for i in tiles:
             for j in range(i, n, _TILE):  # each pair of tiles once: its product serves rows and columns
                 rows, columns = slice(i, min(i + _TILE, n)), slice(j, min(j + _TILE, n))
                 cosine = values[rows] @ values[columns].T
@@ -207,13 +226,11 @@ def _viewing_geometry(model: ModelArrays) -> dict[str, NDArray[np.float32]]:
     }
 
 
-def _mean_descriptors(model: ModelArrays, by_image: list[NDArray[np.uint8]]) -> NDArray[np.uint8]:
-    first_row = np.cumsum([0, *(len(d) for d in by_image)])
-    rows = first_row[model.observation_image] + model.observation_keypoint
-    stored, start = np.concatenate(by_image), model.observation_start
-    mean = np.empty((len(start) - 1, stored.shape[1]), dtype=np.uint8)
+def _mean_descriptors(model: ModelArrays, observations: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    start = model.observation_start
+    mean = np.empty((len(start) - 1, observations.shape[1]), dtype=np.uint8)
     for i in range(0, len(mean), _BLOCK):
         last = min(i + _BLOCK, len(mean))
-        track = unit_descriptors(stored[rows[start[i] : start[last]]])
+        track = unit_descriptors(observations[start[i] : start[last]])
         mean[i:last] = quantize_descriptors(unit_descriptors(np.add.reduceat(track, start[i:last] - start[i])))
     return mean

@@ -33,12 +33,15 @@ def list_photographs(folder: Path) -> list[str]:
     return names
 
 
-def read_photograph(path: Path) -> NDArray[np.uint8]:
-    """Pixels (H, W, 3) uint8 RGB, upright as the EXIF orientation says. Raises MapError if the file cannot be read."""
+def read_photograph(path: Path, turned: bool = True) -> NDArray[np.uint8]:
+    """Pixels (H, W, 3) uint8 RGB, turned upright as the EXIF orientation says, or as they are stored.
+
+    Raises MapError if the file cannot be read.
+    """
     import cv2
 
     try:
-        bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
+        bgr = cv2.imread(str(path), cv2.IMREAD_COLOR if turned else cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error as error:
         raise MapError(f"cannot read this photograph: {error.err}", path=path, fix="Remove it.") from error
     if bgr is None:

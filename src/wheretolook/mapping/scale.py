@@ -16,7 +16,7 @@ from wheretolook.geometry.poses import Float
 from wheretolook.mapping.markers import Marker
 from wheretolook.utils.errors import ConfigError, MapError
 
-Source = Literal["markers", "distance", "positions", "unknown"]
+Source = Literal["markers", "distance", "positions", "model", "unknown"]
 REPORT_FILE = "report.json"
 _FLAT = 1e-6  # points whose second largest spread is below this share of the largest lie on a line
 
@@ -66,7 +66,8 @@ def fit_similarity(source: ArrayLike, target: ArrayLike) -> Similarity:
 class MapScale:
     """The scale of a map from photographs; `scale` in its `report.json`."""
 
-    source: Source = "unknown"  # what the scale comes from; "unknown" if the map is not in metres
+    # What the scale comes from: "model" if it is that of a model of one's own, "unknown" if the map is not in metres.
+    source: Source = "unknown"
     factor: float = 1.0  # metres in a unit of COLMAP's own frame; 1 if unknown
     # How far each marker's side (in percent) or photograph's position (in metres) is off; empty for a single distance.
     residuals: dict[str, float] = field(default_factory=dict)
@@ -86,6 +87,8 @@ class MapScale:
         """One clause for a log."""
         if not self.is_metric:
             return "scale UNKNOWN: no markers, distance or positions were given, so lengths are not in metres"
+        if self.source == "model":
+            return "scale as in the model, its unit taken for a metre"
         text = f"scale from {self.source}"
         if self.residuals:
             off = np.abs(list(self.residuals.values()))

@@ -49,11 +49,29 @@ def triangulate_known_poses(
     processes: Processes,
     progress: bool,
 ) -> Any:
+    """Triangulate what images (I) of one camera see from known poses (I, 3, 4); see `triangulate_model`."""
+    model, stored = _posed_model(camera, cam_from_world), [stored_keypoints(found) for found in keypoints]
+    return triangulate_model(database, model, stored, colors, pairs, config, clock, seed, processes, progress)
+
+
+def triangulate_model(
+    database: Path,
+    model: Any,
+    stored: Sequence[Stored],
+    colors: Sequence[NDArray[np.uint8]],
+    pairs: NDArray[np.int64],
+    config: MapConfig,
+    clock: Callable[[str], AbstractContextManager[None]],
+    seed: int,
+    processes: Processes,
+    progress: bool,
+) -> Any:
     """Match pairs of images, verify the matches against the known poses, and triangulate.
 
-    Makes a COLMAP database of keypoints, descriptors, matches and verified matches. Takes poses (I, 3, 4), which stay
-    as they are, keypoints and their colours (N_i, 3) uint8 of each image, and pairs (P, 2) of images to match, i < j.
-    The processes match, as many threads verify; `clock` times a step.
+    Makes a COLMAP database of keypoints, descriptors, matches and verified matches. Takes a `pycolmap.Reconstruction`
+    of images with poses, which stay as they are, and no points, image i with the id i + 1; keypoints and their colours
+    (N_i, 3) uint8 of each image, and pairs (P, 2) of images to match, i < j. The processes match, as many threads
+    verify; `clock` times a step.
 
     Returns a `pycolmap.Reconstruction`, not yet filtered by reprojection error.
     """
@@ -63,11 +81,9 @@ def triangulate_known_poses(
     seed %= 2**31  # COLMAP keeps it in an int
     pycolmap.set_random_seed(seed)
     with clock("database"):
-        model = _posed_model(camera, cam_from_world)
-        for index, found in enumerate(keypoints):
-            points = [pycolmap.Point2D(p) for p in found.pixels.astype(np.float64)]
+        for index, (pixels, _) in enumerate(stored):
+            points = [pycolmap.Point2D(p) for p in pixels.astype(np.float64)]
             model.images[index + 1].points2D = pycolmap.Point2DList(points)
-        stored = [stored_keypoints(found) for found in keypoints]
         fill_database(database, model, stored)
     with clock("match"), pycolmap.Database.open(str(database)) as db:
         matches = match_pairs(stored, pairs, folder, processes, progress)

@@ -48,7 +48,7 @@ class _Part:
     colored: bool  # whether the file says anything about its colour
 
 
-def load_mesh(path: str | PathLike[str], up: str = "z") -> TexturedMesh:
+def load_mesh(path: str | PathLike[str], up: str = "z", colored: bool = True) -> TexturedMesh:
     """Read a scene in metres from a file or a Habitat-Matterport folder.
 
     Each material of the file becomes a texture; one without an image becomes a texture of one pixel in its colour.
@@ -57,7 +57,8 @@ def load_mesh(path: str | PathLike[str], up: str = "z") -> TexturedMesh:
     Takes a .glb, .ply (with texture coordinates and a `TextureFile`, or coloured vertices or faces) or .obj file (with
     its .mtl), or a folder `<id>-<name>` that holds `<name>.glb`, as in the Habitat-Matterport dataset. `up` is the axis
     of the file that points up: "z", "y", "x" or one of these with a minus sign. glTF prescribes y, but many scans are z
-    up nevertheless. A scene with the wrong axis has no free space.
+    up nevertheless. A scene with the wrong axis has no free space. Where nothing is rendered, the mesh need not be
+    `colored`.
 
     Raises SceneError if the file is missing, unreadable, empty, flat, not finite, without any texture or colour, or
     refers to a texture that is missing or in a format that is not supported; ConfigError if `up` is no such axis.
@@ -73,7 +74,7 @@ def load_mesh(path: str | PathLike[str], up: str = "z") -> TexturedMesh:
         raise SceneError("the mesh cannot be read", path=file, value=str(error), fix="Check the file") from error
     if not parts:
         raise SceneError("the file has no triangles", path=file, fix="Export the scene as a triangle mesh")
-    if not any(part.colored for part in parts):
+    if colored and not any(part.colored for part in parts):
         fix = "Export it with its textures; a map cannot be built from a plain surface"
         raise SceneError("the mesh has no texture and no colours", path=file, fix=fix)
     mesh = _merge(parts, np.array(_Z_UP_FROM[up], dtype=np.float64))

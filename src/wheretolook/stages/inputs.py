@@ -12,6 +12,7 @@ from wheretolook.config import Experiment
 from wheretolook.dataset.folders import RELEASE_FILE, Dataset, SceneFolder
 from wheretolook.dataset.scene import Scene, SceneConfig
 from wheretolook.dataset.stamps import read_stamp
+from wheretolook.geometry.camera import CameraConfig
 from wheretolook.utils.errors import ConfigError, MapError, SceneError, TableError
 from wheretolook.utils.files import fingerprint
 from wheretolook.utils.options import recorded
@@ -34,7 +35,8 @@ def dataset_after(experiment: Experiment, needs: str) -> Dataset:
     dataset = Dataset.load(experiment.root)
     if needs != "label":
         refuse_release(experiment.root)
-    others = [scene.camera for scene in dataset.scenes if scene.camera != experiment.camera.camera]
+    wanted, unnamed = experiment.camera.camera, experiment.camera == CameraConfig()
+    others = [scene.camera for scene in dataset.scenes if scene.camera != wanted and not (scene.own_camera and unnamed)]
     if others:
         fix = "Run the scenes stage with this configuration, or give the experiment another name."
         problem = "the dataset was made with another camera"
@@ -73,14 +75,22 @@ def naming_scene(path: Path) -> Iterator[None]:
 
 
 def extractor_of(scene: SceneFolder) -> ExtractorConfig:
-    """The keypoint extractor the map was made with: queries must use the same. Raises MapError without its report."""
+    """The keypoint extractor the map was made with: queries must use the same.
+
+    Raises MapError without the map's report, or if its landmarks have no descriptors to match queries with.
+    """
     from wheretolook.features.keypoints import ExtractorConfig
 
     path = scene.map / "report.json"
     try:
-        return recorded(ExtractorConfig, json.loads(path.read_text())["config"]["extractor"])
+        report = json.loads(path.read_text())
+        extractor = recorded(ExtractorConfig, report["config"]["extractor"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise MapError("the map's report is missing or damaged", path=path, fix="Run the map stage again.") from error
+    if not report.get("has_descriptors", True):
+        fix = "Run the map stage again with --database, or with --images to triangulate anew."
+        raise MapError("the landmarks have no descriptors, so nothing can be localized", path=scene.map, fix=fix)
+    return extractor
 
 
 def existing(path: Path, error: type[SceneError] | type[MapError], stage: str) -> str:

@@ -1,34 +1,48 @@
-"""The map stage: a COLMAP model of every scene, or of a folder of photographs."""
+"""The map stage: a COLMAP model of every scene, of a folder of photographs, or from a model of one's own."""
 
 from __future__ import annotations
 
 import zlib
 from dataclasses import asdict, replace
+from typing import Any
 
 import numpy as np
 
 from wheretolook.config import NOT_SCENES, Experiment, check_folder_name
 from wheretolook.dataset.folders import Dataset, SceneFolder
-from wheretolook.dataset.stamps import is_done, read_stamp, stage_key, write_stamp
-from wheretolook.geometry.camera import Camera, PinholeCamera, draw_camera
-from wheretolook.mapping.config import MapConfig
+from wheretolook.dataset.stamps import forget_stamp, is_done, read_stamp, stage_key, write_stamp
+from wheretolook.geometry.camera import Camera, CameraConfig, PinholeCamera, describe_camera, draw_camera
+from wheretolook.mapping.config import MapConfig, ScaleConfig
 from wheretolook.mapping.scale import read_scale
-from wheretolook.stages.inputs import Say, Tick, dataset_after, existing, naming_scene, open_scene, refuse_release
-from wheretolook.utils.errors import ConfigError, SceneError
+from wheretolook.stages.inputs import (
+    Say,
+    Tick,
+    dataset_after,
+    existing,
+    mesh_fingerprint,
+    naming_scene,
+    open_scene,
+    refuse_release,
+)
+from wheretolook.utils.errors import ConfigError, MapError, SceneError
 from wheretolook.utils.files import fingerprint
 
 
 def make_maps(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> Dataset:
     """Stage 2: a COLMAP model of every scene with its landmarks' attributes, `<scene>/map/`.
 
-    With `map.photographs.images`, of one scene, made of the photographs there, which needs no mesh. Raises
-    SceneError or MapError if a mesh cannot be read, or no landmark could be triangulated.
+    With `map.photographs.images`, of one scene, made of the photographs there, which needs no mesh. With
+    `map.existing.model`, of one scene made from that model, with or without a mesh. Raises SceneError or MapError if a
+    mesh or a model cannot be read, or no landmark could be triangulated.
     """
+    if experiment.map.existing.model is not None:
+        refuse_release(experiment.root)
+        return _map_existing(experiment, say, tick)
     if experiment.map.photographs.images is not None:
         refuse_release(experiment.root)
         return _map_photographs(experiment, say, tick)
     dataset = dataset_after(experiment, "scenes")
-    apart = ("photographs", "camera", "draw_camera")  # the camera follows by itself
+    apart = ("photographs", "existing", "camera", "draw_camera")  # the camera follows by itself
     settings = {name: value for name, value in asdict(experiment.map).items() if name not in apart}
     for files in dataset.scenes:
         scene = open_scene(experiment, dataset, files)
@@ -120,6 +134,78 @@ def _map_photographs(experiment: Experiment, say: Say, tick: Tick) -> Dataset:
     return dataset
 
 
+def _map_existing(experiment: Experiment, say: Say, tick: Tick) -> Dataset:
+    """Make a scene of the model in `map.existing.model`: `<scene>/map/`, and `<scene>/mesh.glb` if a mesh is given.
+
+    The scene joins those of the dataset that are made of photographs or models too. Raises what `map_existing` does,
+    ConfigError if the dataset holds other scenes, and SceneError if the mesh cannot be used.
+    """
+    from wheretolook.mapping.colmap_model import read_model
+
+    settings, photographs, root = experiment.map.existing, experiment.map.photographs, experiment.root
+    assert settings.model is not None
+    name = settings.scene_name
+    check_folder_name("a scene's name, map.existing.name,", name, NOT_SCENES)
+    if settings.mesh is not None and (settings.level or photographs.scale != ScaleConfig()):
+        fix = "Give a model and a mesh that are both in metres with z up."
+        raise ConfigError("a model that is turned or scaled leaves its mesh", value=str(settings.mesh), fix=fix)
+    model = read_model(settings.model)
+    scene = _with_own_camera(SceneFolder(root / name, "test", experiment.camera.camera), model, experiment)
+    dataset = _with_photographs(scene, experiment)
+    tables = [photographs.scale.marker_table, photographs.scale.positions, settings.database]
+    files = [*sorted(settings.model.iterdir()), *(path for path in tables if path is not None)]
+    if photographs.images is not None:
+        files += [photographs.images / image.name for _, image in sorted(model.images.items())]
+    stats = [(path, path.stat()) for path in files if path.is_file()]
+    made_from = [(str(path), stat.st_size, stat.st_mtime_ns) for path, stat in stats]
+    mesh = [] if settings.mesh is None else [mesh_fingerprint(settings.mesh)]
+    chosen = {name: value for name, value in asdict(experiment.map).items() if name not in ("camera", "draw_camera")}
+    key = stage_key("map", [chosen, _seed(scene), made_from, mesh])
+    if is_done(scene, "map", key, scene.landmarks, scene.mapping_cameras, *([scene.mesh] if mesh else [])):
+        say(f"{scene.name}: reusing {scene.map}")
+    else:
+        from wheretolook.mapping.existing_map import map_existing
+        from wheretolook.mapping.plausibility import warn_of_mesh
+        from wheretolook.rendering.raycasting import MeshRaycaster
+        from wheretolook.scenes.loading import load_mesh, save_glb
+
+        loaded = None if settings.mesh is None else load_mesh(settings.mesh, settings.mesh_up, colored=False)
+        forget_stamp(scene, "map")
+        how = (scene.folder / "photographs", _seed(scene), experiment.n_workers, experiment.warp_device)
+        report = map_existing(experiment.map, scene.map, *how, reconstruction=model)
+        scene.mesh.unlink(missing_ok=True)
+        if settings.mesh is not None and loaded is not None:
+            caster = MeshRaycaster(loaded, experiment.warp_device)
+            warn_of_mesh(settings.mesh, scene.read_landmarks().points, caster)
+            save_glb(loaded, scene.mesh)
+        write_stamp(scene, "map", key)
+        left_out = f", {report.n_landmarks_removed:,} points left out" if report.n_landmarks_removed else ""
+        anew = ", triangulated anew," if report.triangulated_anew else ""
+        found = f"{report.n_landmarks:,} landmarks{anew} from {report.n_images} images{left_out}"
+        say(f"{scene.name}: {found} -> {scene.map}")
+    scale = read_scale(scene.map)
+    assert scale is not None
+    say(f"{scene.name}: {scale.describe()}; looked at with {describe_camera(scene.camera)}")
+    dataset.save()
+    tick(1)
+    return dataset
+
+
+def _with_own_camera(scene: SceneFolder, model: Any, experiment: Experiment) -> SceneFolder:
+    """The scene with the model's camera, unless the settings name one that looks."""
+    from wheretolook.mapping.colmap_model import camera_of_model
+
+    if experiment.camera != CameraConfig():
+        return scene
+    settings = experiment.map.existing
+    assert settings.model is not None
+    try:
+        return replace(scene, camera=camera_of_model(model, settings.model, settings.camera_id), own_camera=True)
+    except MapError as error:
+        fix = "Name one of the model's, --map.existing.camera_id 1, or describe another, such as --camera.fov_deg 70."
+        raise MapError(error.problem, path=error.path, value=error.value, fix=fix) from error
+
+
 def _with_photographs(scene: SceneFolder, experiment: Experiment) -> Dataset:
     """The experiment's dataset with this scene, which may be there already."""
     root = experiment.root
@@ -127,12 +213,13 @@ def _with_photographs(scene: SceneFolder, experiment: Experiment) -> Dataset:
     if (root / "dataset.json").is_file():
         known = Dataset.load(root)
         scenes += [other for other in known.scenes if other.name != scene.name]
-        if not all(other.is_photographed for other in known.scenes):
+        if not all(read_scale(other.map) for other in known.scenes):  # maps of meshes have none
             problem = "this dataset holds scenes with meshes, which photographs do not join"
             names, fix = [other.name for other in known.scenes], "Give the photographs a dataset of their own: --name."
             raise ConfigError(problem, path=root, value=names, fix=fix)
-        for other in known.scenes:
+        others = [other for other in known.scenes if not (other.own_camera or scene.own_camera)]
+        for other in others:
             if other.camera != scene.camera:  # what was sampled with another camera is no longer valid
                 write_stamp(other, "map", read_stamp(other, "map") or "")
-        scenes = [replace(other, camera=scene.camera) for other in scenes]
+        scenes = [replace(other, camera=scene.camera) if other in others else other for other in scenes]
     return Dataset(root, tuple(sorted(scenes, key=lambda scene: scene.name)))

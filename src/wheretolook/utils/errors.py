@@ -68,5 +68,9 @@ class OutOfRangeWarning(UserWarning):
     """Views are unlike those that a scorer has learnt from, so that its scores are less sure than usual."""
 
 
+class MapWarning(UserWarning):
+    """A map is used, but in part, or may not be what it is taken for: not in metres, or not with z up."""
+
+
 class PlanningError(WhereToLookError):
     """There is no path, or no sequence of views along one that keeps the camera's limits."""

@@ -1,0 +1,347 @@
+"""Models as they come: of other versions and tools, with rigs, several cameras, doubtful frames; and damaged ones."""
+
+from __future__ import annotations
+
+import sqlite3
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+from mapping.test_landmarks import hand_written_model, random_descriptors, write_database
+from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
+from wheretolook.geometry.poses import camera_centers, poses_looking_along
+from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.mapping.colmap_model import colmap_poses, model_arrays, read_model
+from wheretolook.mapping.landmarks import load_colmap_landmarks
+from wheretolook.mapping.plausibility import axes_doubt, scale_doubt
+from wheretolook.utils.errors import MapError, MapWarning
+
+pytestmark = pytest.mark.filterwarnings("error::wheretolook.utils.errors.MapWarning")
+
+
+def walk_in_a_room(n: int = 40) -> np.ndarray:
+    """Poses (n, 3, 4) of a camera that is carried along a room and turned, 1.5 m above the floor."""
+    along = np.linspace(0, 1, n)
+    heading = 6 * np.pi * along
+    centers = np.column_stack([5 * along, 1 + 0.3 * np.sin(heading), np.full(n, 1.5)])
+    return poses_looking_along(centers, np.column_stack([np.cos(heading), np.sin(heading), -0.1 * np.ones(n)]))
+
+
+def written(model: pycolmap.Reconstruction, folder: Path, text: bool = False) -> Path:
+    folder.mkdir(parents=True)
+    (model.write_text if text else model.write_binary)(str(folder))
+    return folder
+
+
+def rig_model() -> pycolmap.Reconstruction:
+    """Two frames of a rig of two cameras 0.2 m apart that look along +y, with points 2 to 5 m ahead."""
+    model, rig = pycolmap.Reconstruction(), pycolmap.Rig(rig_id=1)
+    for camera_id, width in ((1, 640), (2, 320)):
+        params = [width / 2, width / 2, 0.375 * width]
+        model.add_camera(
+            pycolmap.Camera(
+                camera_id=camera_id, model="SIMPLE_PINHOLE", width=width, height=3 * width // 4, params=params
+            )
+        )
+    sensors = [pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera_id) for camera_id in (1, 2)]
+    rig.add_ref_sensor(sensors[0])
+    rig.add_sensor(sensors[1], pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array([-0.2, 0, 0])))
+    model.add_rig(rig)
+    first_poses = poses_looking_along([[0.0, 0, 1], [1.0, 0, 1]], np.tile([0.0, 1, 0], (2, 1)))
+    for frame_id, pose in enumerate(first_poses, 1):
+        frame = pycolmap.Frame(frame_id=frame_id, rig_id=1)
+        frame.rig_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:, :3]), pose[:, 3])
+        for sensor, camera_id in zip(sensors, (1, 2), strict=True):
+            frame.add_data_id(pycolmap.data_t(sensor, 10 * frame_id + camera_id))
+        model.add_frame(frame)
+    points = np.column_stack([np.linspace(-1, 2, 12), np.linspace(2, 5, 12), np.linspace(0.5, 1.5, 12)])
+    for frame_id in (1, 2):
+        for camera_id in (1, 2):
+            image = pycolmap.Image(
+                name=f"cam{camera_id}/{frame_id}.png", camera_id=camera_id, image_id=10 * frame_id + camera_id
+            )
+            image.frame_id = frame_id
+            model.add_image(image)
+    for frame_id in (1, 2):
+        model.register_frame(frame_id)
+    for image_id, image in model.images.items():
+        at = [image.camera.img_from_cam(image.cam_from_world() * point) for point in points]
+        model.images[image_id].points2D = pycolmap.Point2DList([pycolmap.Point2D(pixel) for pixel in at])
+    for row, point in enumerate(points):
+        track = pycolmap.Track()
+        for image_id in model.images:
+            track.add_element(image_id, row)
+        model.add_point3D(point, track)
+    return model
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_a_rig_of_two_cameras_asks_which_one_looks(tmp_path, text):
+    folder = written(rig_model(), tmp_path / "rig", text)
+    with pytest.raises(MapError, match=r"2 cameras, not one \(1: 640 x 480 px.*; 2: 320 x 240 px"):
+        LocalizationMap.from_colmap(folder)
+    with pytest.raises(MapError, match=r"no such camera.*got 7.*It has 1, 2"):
+        LocalizationMap.from_colmap(folder, camera=7)
+    found = LocalizationMap.from_colmap(folder, camera=2)
+    assert found.camera == PinholeCamera(320, 240, 160.0) and len(found.landmarks) == 12
+    centers = camera_centers(found.mapping_poses.astype(np.float64))
+    np.testing.assert_allclose(centers, [[0, 0, 1], [0.2, 0, 1], [1, 0, 1], [1.2, 0, 1]], atol=1e-6)
+    np.testing.assert_array_equal(found.landmarks.track_length, 4)
+    np.testing.assert_allclose(found.landmarks.reprojection_error_px, 0, atol=1e-3)
+
+
+def test_arrays_are_what_pycolmap_says_of_each_point(tmp_path):
+    """Points are read from the file at once; ids here are in no order, and tracks of several lengths."""
+    model = hand_written_model()[0]
+    extra = pycolmap.Track()
+    extra.add_element(1, 0)
+    extra.add_element(3, 0)
+    model.add_point3D_with_id(5, pycolmap.Point3D(xyz=np.array([1.0, 3.0, 0.5]), track=extra))
+    model.update_point_3d_errors()
+    arrays = model_arrays(read_model(written(model, tmp_path / "model")))
+    assert list(arrays.point_ids) == [5, 10, 20, 30, 40]
+    for row, point_id in enumerate(arrays.point_ids):
+        point, span = model.points3D[int(point_id)], slice(*arrays.observation_start[row : row + 2])
+        np.testing.assert_array_equal(arrays.points[row], point.xyz)
+        assert arrays.errors_px[row] == point.error
+        elements = [(element.image_id, element.point2D_idx) for element in point.track.elements]
+        images = arrays.image_ids[arrays.observation_image[span]]
+        assert list(zip(images, arrays.observation_keypoint[span], strict=True)) == elements
+
+
+@pytest.mark.parametrize("old", [False, True])
+def test_what_the_mapper_kept_is_kept_and_what_is_left_out_is_counted(tmp_path, old):
+    offsets_px = np.linspace(0, 3, 60)
+    points = np.column_stack([np.linspace(-1, 1, 60), np.full(60, 3.0), np.ones(60)])
+    model = hand_written_model(offsets_px=offsets_px, tracks=([0, 1, 2],) * 60, points=points)[0]
+    model.add_point3D_with_id(9999, pycolmap.Point3D(xyz=np.array([0.0, 3.0, 1.0]), track=pycolmap.Track()))
+    folder = written(model, tmp_path / "model")
+    if old:  # models from before COLMAP 3.12 have no rigs and frames
+        for name in ("rigs.bin", "frames.bin"):
+            (folder / name).unlink()
+    with pytest.warns(MapWarning, match=r"60 of 61 points are landmarks; left out: 1 that no image observes"):
+        kept = LocalizationMap.from_colmap(folder, PinholeCamera())
+    assert len(kept.landmarks) == 60
+    read = read_model(folder)
+    read.update_point_3d_errors()
+    n_bad = sum(point.error > 0.5 for point in read.points3D.values() if point.track.length())
+    assert 0 < n_bad < 60
+    left_out = f"{60 - n_bad} of 61 points are landmarks; left out: {n_bad} with .* 0.5 px, 1 that no image observes"
+    with pytest.warns(MapWarning, match=left_out):
+        fewer = LocalizationMap.from_colmap(folder, PinholeCamera(), max_reprojection_error_px=0.5)
+    assert len(fewer.landmarks) == 60 - n_bad
+
+
+def test_a_folder_of_models_names_them(tmp_path):
+    for number in "01":
+        written(hand_written_model()[0], tmp_path / "sparse" / number)
+    with pytest.raises(MapError, match=r"no COLMAP model here.*sparse/0, .*sparse/1"):
+        read_model(tmp_path / "sparse")
+
+
+def test_a_text_model_cut_short_is_a_typed_error(tmp_path):
+    """In a process of its own: a library in C++ that gives up would take this one with it."""
+    folders = []
+    for name in ("cameras", "images", "points3D", "rigs", "frames"):
+        for share in (0.3, 0.6, 0.9):
+            path = written(rig_model(), tmp_path / f"{name}-{share}", text=True) / f"{name}.txt"
+            path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+            folders.append(str(path.parent))
+    code = """
+import sys
+from wheretolook.mapping.colmap_model import model_arrays, read_model
+from wheretolook.utils.errors import MapError
+for folder in sys.argv[1:]:
+    try:
+        print(len(model_arrays(read_model(folder)).points))
+    except MapError as error:
+        print(error.path)
+"""
+    done = subprocess.run([sys.executable, "-c", code, *folders], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    for folder, said in zip(folders, done.stdout.splitlines(), strict=True):
+        assert said.startswith(folder), said
+
+
+def test_a_camera_of_a_later_version_is_a_typed_error(tmp_path):
+    folder = written(hand_written_model()[0], tmp_path / "binary")
+    data = bytearray((folder / "cameras.bin").read_bytes())
+    data[12:16] = (999).to_bytes(4, "little")  # the first camera's model
+    (folder / "cameras.bin").write_bytes(bytes(data))
+    with pytest.raises(MapError, match=str(folder)):
+        LocalizationMap.from_colmap(folder)
+    folder = written(hand_written_model()[0], tmp_path / "text", text=True)
+    path = folder / "cameras.txt"
+    path.write_text(path.read_text().replace("SIMPLE_PINHOLE", "QUANTUM"))
+    with pytest.raises(MapError, match=str(folder)):
+        LocalizationMap.from_colmap(folder)
+
+
+def test_images_without_a_pose_and_of_any_name_are_passed_over(tmp_path):
+    model = hand_written_model()[0]
+    model.add_image_with_trivial_frame(pycolmap.Image(name="Küche 1/ä.png", camera_id=1, image_id=77))
+    folder = written(model, tmp_path / "model")
+    found = LocalizationMap.from_colmap(folder, camera=1)
+    assert found.mapping_poses.shape == (3, 3, 4) and len(found.landmarks) == 4
+
+
+def test_a_database_tells_ambiguity_and_is_not_written_to(tmp_path):
+    model, keypoints = hand_written_model()
+    folder = written(model, tmp_path / "model")
+    database = write_database(tmp_path / "db.db", model, keypoints, random_descriptors([len(k) for k in keypoints]))
+    expected = load_colmap_landmarks(folder, database).ambiguity
+    assert np.isfinite(expected).all()
+    with sqlite3.connect(database) as db:  # as COLMAP 3 wrote it
+        db.execute("ALTER TABLE descriptors DROP COLUMN type")
+        for table in ("frame_data", "frames", "rig_sensors", "rigs"):
+            db.execute(f"DROP TABLE {table}")
+        db.execute("PRAGMA user_version = 3900")
+    db.close()
+    before = database.read_bytes()
+    found = LocalizationMap.from_colmap(folder, camera=1, database=database)
+    np.testing.assert_array_equal(found.landmarks.ambiguity, expected)
+    assert database.read_bytes() == before and sorted(path.name for path in tmp_path.iterdir()) == ["db.db", "model"]
+
+
+@pytest.mark.parametrize("kind", ["none", "learnt"])
+def test_without_sift_descriptors_ambiguity_is_unknown_and_that_is_said_once(tmp_path, kind):
+    model, keypoints = hand_written_model()
+    folder = written(model, tmp_path / "model")
+    database = write_database(tmp_path / "db.db", model, keypoints, random_descriptors([len(k) for k in keypoints]))
+    change = {"none": "DELETE FROM descriptors", "learnt": "UPDATE descriptors SET type = 2"}[kind]
+    with sqlite3.connect(database) as db:
+        db.execute(change)
+    db.close()
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        found = LocalizationMap.from_colmap(folder, camera=1, database=database)
+    assert ["ambiguity" in str(warning.message) for warning in said if warning.category is MapWarning] == [True]
+    assert found.landmarks.descriptors is None and np.isnan(found.landmarks.ambiguity).all()
+
+
+def test_databases_that_cannot_be_read(tmp_path):
+    model, keypoints = hand_written_model()
+    folder = written(model, tmp_path / "model")
+    descriptors = random_descriptors([len(k) for k in keypoints])
+    whole = write_database(tmp_path / "whole.db", model, keypoints, descriptors).read_bytes()
+    with sqlite3.connect(tmp_path / "other.db") as db:
+        db.execute("CREATE TABLE images (name TEXT, image_id INTEGER)")
+        db.executemany("INSERT INTO images VALUES (?, ?)", [(f"{i}.png", i) for i in range(3)])
+    db.close()
+    for name, content in {"empty": b"", "garbage": b"\x00garbage" * 999, "half": whole[: len(whole) // 2]}.items():
+        (tmp_path / f"{name}.db").write_bytes(content)
+    for name in ("empty", "garbage", "half", "other"):
+        with pytest.raises(MapError, match=rf"{name}\.db.*database"):
+            LocalizationMap.from_colmap(folder, camera=1, database=tmp_path / f"{name}.db")
+    partly = write_database(tmp_path / "partly.db", model, keypoints, descriptors)
+    with sqlite3.connect(partly) as db:
+        db.execute("DELETE FROM descriptors WHERE image_id = 7")
+    db.close()
+    with pytest.raises(MapError, match=r"1 of 3 images have no SIFT.*2\.png"):
+        LocalizationMap.from_colmap(folder, camera=1, database=partly)
+
+
+def test_features_in_hdf5_need_h5py(tmp_path, monkeypatch):
+    folder = written(hand_written_model()[0], tmp_path / "model")
+    (tmp_path / "feats.h5").write_bytes(b"not HDF5")
+    monkeypatch.setitem(sys.modules, "h5py", None)  # as where it is not installed
+    with pytest.raises(MapError, match=r"feats\.h5.*pip install h5py"):
+        LocalizationMap.from_colmap(folder, camera=1, database=tmp_path / "feats.h5")
+
+
+def test_features_in_hdf5_of_hloc(tmp_path):
+    h5py = pytest.importorskip("h5py")
+    model, keypoints = hand_written_model()
+    folder = written(model, tmp_path / "model")
+    descriptors = random_descriptors([len(k) for k in keypoints])
+    database = write_database(tmp_path / "db.db", model, keypoints, descriptors)
+    with h5py.File(tmp_path / "feats.h5", "w") as file:
+        for i in range(3):
+            group = file.create_group(f"{i}.png")
+            group["keypoints"] = keypoints[i] - 0.5  # hloc counts from the middle of the first pixel
+            lengths = np.linalg.norm(descriptors[i].astype(np.float64), axis=1)
+            group["descriptors"] = (descriptors[i] / lengths[:, None]).T
+    found, expected = (load_colmap_landmarks(folder, path) for path in (tmp_path / "feats.h5", database))
+    np.testing.assert_allclose(found.ambiguity, expected.ambiguity, atol=0.01)
+    with h5py.File(tmp_path / "feats.h5", "a") as file:
+        for i in range(3):
+            del file[f"{i}.png/descriptors"]
+            file[f"{i}.png"]["descriptors"] = np.zeros((256, len(keypoints[i])))  # SuperPoint's
+    with pytest.warns(MapWarning, match="ambiguity"):
+        assert np.isnan(load_colmap_landmarks(folder, tmp_path / "feats.h5").ambiguity).all()
+    (tmp_path / "feats.h5").write_bytes(b"not HDF5")
+    with pytest.raises(MapError, match="cannot read the features"):
+        load_colmap_landmarks(folder, tmp_path / "feats.h5")
+
+
+def test_a_good_map_raises_no_doubt():
+    poses = walk_in_a_room()
+    for distance_m in (0.5, 2.5, 30.0):
+        assert scale_doubt(np.full(100, distance_m), camera_centers(poses)) == ""
+    assert axes_doubt(poses) == ""
+
+
+def test_a_map_of_another_unit_is_doubted():
+    centers = camera_centers(walk_in_a_room())
+    assert "seems not to be in metres: landmarks are 92.5 m" in scale_doubt(np.full(100, 37 * 2.5), 37 * centers)
+    assert "seems not to be in metres: landmarks are 0.0676 m" in scale_doubt(np.full(100, 2.5 / 37), centers / 37)
+    assert "and these 7.6 m" in scale_doubt(np.full(100, 20.0), 50 * centers)  # 0.152 m from one another before
+    assert scale_doubt(np.full(100, 2.5), centers[:1]) == ""  # one camera is no distance from others
+
+
+@pytest.mark.parametrize(
+    "turn, how", [([[1, 0, 0], [0, 0, -1], [0, 1, 0]], "on their side"), (np.diag([1, -1, -1]), "upside down")]
+)
+def test_a_map_that_is_not_upright_is_doubted(turn, how):
+    poses = walk_in_a_room()
+    turned = np.concatenate([poses[:, :, :3] @ np.array(turn, float).T, poses[:, :, 3:]], axis=2)
+    assert f"the cameras lie {how}" in axes_doubt(turned) and "level true" in axes_doubt(turned)
+
+
+def test_cameras_that_look_down_say_nothing_of_up():
+    centers = np.stack(np.meshgrid(np.arange(5.0), np.arange(5.0), [30.0]), -1).reshape(-1, 3)
+    assert axes_doubt(poses_looking_along(centers, np.tile([1e-3, 0, -1.0], (25, 1)))) == ""
+
+
+def test_from_colmap_warns_of_a_scaled_and_turned_model(tmp_path):
+    model = rig_model()
+    LocalizationMap.from_colmap(written(model, tmp_path / "good"), camera=1)  # warnings are errors here
+    model.transform(
+        pycolmap.Sim3d(37.0, pycolmap.Rotation3d(np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])), np.zeros(3))
+    )
+    folder = written(model, tmp_path / "bad")
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        LocalizationMap.from_colmap(folder, camera=1)
+    texts = [str(warning.message) for warning in said if warning.category is MapWarning]
+    assert len(texts) == 2 and all(str(folder) in text for text in texts)
+    assert "not to be in metres" in texts[0] and "map.photographs.scale" in texts[0] and "on their side" in texts[1]
+
+
+def test_poses_of_a_model_are_those_written(tmp_path):
+    folder = written(rig_model(), tmp_path / "model", text=True)
+    assert colmap_poses(folder).shape == (4, 3, 4)
+    with pytest.raises(MapError, match="no such folder"):
+        LocalizationMap.from_colmap(tmp_path / "nowhere")
+
+
+def test_a_camera_with_distortion_is_the_models_own(tmp_path):
+    model = pycolmap.Reconstruction()
+    params = [300.0, 310.0, 320.0, 240.0, 0.01, 0.0, 0.0, 0.0]
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(camera_id=3, model="OPENCV", width=640, height=480, params=params)
+    )
+    source = hand_written_model()[0]
+    for image_id, image in source.images.items():
+        copy = pycolmap.Image(name=image.name, camera_id=3, image_id=image_id)
+        copy.points2D = pycolmap.Point2DList([pycolmap.Point2D(point.xy) for point in image.points2D])
+        model.add_image_with_trivial_frame(copy, image.cam_from_world())
+    for point_id, point in source.points3D.items():
+        model.add_point3D_with_id(point_id, pycolmap.Point3D(xyz=point.xyz, track=point.track))
+    found = LocalizationMap.from_colmap(written(model, tmp_path / "model"))
+    assert isinstance(found.camera, ColmapCamera) and found.camera.params == tuple(params)

@@ -1,0 +1,278 @@
+"""A scene made from a COLMAP model of one's own, through the stages, with and without a mesh; and triangulated anew."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+from box_scenes import box_quads, quads_mesh, random_texture
+from mapping.marker_rooms import CAMERA, MARKERS, hand_held_poses, marker_room, take_photographs
+from wheretolook import stages
+from wheretolook.cli import main
+from wheretolook.config import Experiment, ScenesConfig
+from wheretolook.dataset.folders import Dataset, SceneFolder
+from wheretolook.geometry.camera import CameraConfig, PinholeCamera
+from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
+from wheretolook.mapping.colmap_model import colmap_poses, read_model
+from wheretolook.mapping.config import ExistingModelConfig, KnownDistance, MapConfig, PhotographsConfig, ScaleConfig
+from wheretolook.mapping.existing_map import map_existing
+from wheretolook.planning.config import PathConfig, PlanConfig, ViewpointMapConfig
+from wheretolook.rendering.raycasting import MeshRaycaster
+from wheretolook.scenes.loading import save_glb
+from wheretolook.space.config import MappedSpaceConfig
+from wheretolook.utils.errors import ConfigError, MapError, MapWarning, SceneError
+from wheretolook.utils.tracking_config import TrackingConfig
+from wheretolook.viewpoints.config import SampleConfig
+
+SIZE = (6.0, 5.0, 3.0)
+LOOKS = PinholeCamera(320, 240, 200.0)
+OTHER = PinholeCamera(160, 120, 80.0)
+
+
+def empty_room():
+    return quads_mesh(box_quads((0, 0, 0), SIZE, inward=True), [random_texture(np.random.default_rng(0), 64, 64)])
+
+
+def room_model(n_points: int = 800, cameras: tuple[PinholeCamera, ...] = (LOOKS,)) -> pycolmap.Reconstruction:
+    """Points on the walls of a room of `SIZE`, as a camera saw them that walked around in it at 1.4 m."""
+    rng, model = np.random.default_rng(0), pycolmap.Reconstruction()
+    points, rows = rng.uniform((0, 0, 0), SIZE, (n_points, 3)), np.arange(n_points)
+    wall = rng.integers(0, 2, n_points)  # which axis
+    points[rows, wall] = rng.integers(0, 2, n_points) * np.array(SIZE)[wall]
+    angle = np.linspace(0, 2 * np.pi, 36, endpoint=False)
+    centers = np.array([3.0, 2.5, 1.4]) + np.column_stack([1.6 * np.cos(angle), 1.2 * np.sin(angle), 0 * angle])
+    poses = poses_looking_along(centers, np.column_stack([np.cos(3 * angle), np.sin(3 * angle), 0 * angle]))
+    for number, camera in enumerate(cameras, 1):
+        model.add_camera_with_trivial_rig(pycolmap.Camera(camera_id=number, **camera.colmap.record()))
+    tracks = [pycolmap.Track() for _ in points]
+    for index, pose in enumerate(poses):
+        camera = cameras[index % len(cameras)]
+        at = points @ pose[:, :3].T + pose[:, 3]
+        seen = np.flatnonzero((at[:, 2] > 0) & camera.in_image(camera.project(np.where(at[:, 2:] > 0, at, 1))))
+        number = index % len(cameras) + 1
+        image = pycolmap.Image(name=f"{index:03d}.jpg", camera_id=number, image_id=index + 1)
+        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(pixel) for pixel in camera.project(at[seen])])
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:, :3]), pose[:, 3]))
+        for keypoint, row in enumerate(seen):
+            tracks[row].add_element(index + 1, keypoint)
+    for point, track in zip(points, tracks, strict=True):
+        if track.length() >= 2:
+            model.add_point3D(point, track)
+    return model
+
+
+def save(model: pycolmap.Reconstruction, folder: Path) -> Path:
+    folder.mkdir(parents=True)
+    model.write_text(str(folder))
+    return folder
+
+
+def experiment_of(model: Path, data: Path, **existing: object) -> Experiment:
+    return Experiment(
+        name="mine",
+        data=data,
+        device="cpu",
+        scenes=ScenesConfig(mapped_space=MappedSpaceConfig(max_camera_distance_m=0.6)),
+        map=MapConfig(existing=ExistingModelConfig(model, **existing)),  # type: ignore[arg-type]
+        sample=SampleConfig(grid=(6, 5, 3), directions=40, keep=10, max_locations=6),
+        viewpoint_map=ViewpointMapConfig(grid=(6, 5, 3), directions=30, method="visible"),
+        tracking=TrackingConfig(str(data / "mlruns")),
+    )
+
+
+@pytest.mark.parametrize("with_mesh", [False, True])
+def test_from_a_model_to_a_planned_path(tmp_path, with_mesh):
+    model = room_model()
+    folder = save(model, tmp_path / "flat" / "sparse" / "0")
+    if with_mesh:
+        save_glb(empty_room(), tmp_path / "scan.glb")
+    experiment = experiment_of(folder, tmp_path / "data", mesh=tmp_path / "scan.glb" if with_mesh else None)
+    said: list[str] = []
+    stages.make_maps(experiment, said.append)
+    n_points = model.num_points3D()
+    assert f"flat: {n_points} landmarks from 36 images" in said[0] and "taken for a metre" in said[1]
+    (scene,) = Dataset.load(tmp_path / "data" / "mine").scenes
+    assert scene.name == "flat" and scene.camera == LOOKS and scene.own_camera
+    assert scene.is_photographed is not with_mesh and len(scene.read_landmarks()) == n_points
+    np.testing.assert_allclose(scene.mapping_poses(), colmap_poses(folder), atol=1e-6)
+    assert read_model(scene.map).num_points3D() == n_points
+
+    stages.sample(experiment, said.append)
+    table = scene.read_table()
+    assert table["location_id"].nunique() == 6 and (table["n_visible"] > 0).all()
+    (views,) = stages.viewpoint_map(experiment, said.append).values()
+    free = views.grid.centers()[views.row_of_voxel >= 0]
+    to_cameras = np.linalg.norm(free[:, None] - camera_centers(colmap_poses(folder)), axis=2).min(1)
+    assert (to_cameras.max() <= 0.6) is not with_mesh  # a mesh frees the whole room
+    assert views.origin.occlusion == ("mesh" if with_mesh else "hidden-points")
+    ends = [free[np.argmin(np.linalg.norm(free - end, axis=1))] for end in ((4.5, 2.5, 1.5), (4.5, 3.5, 1.5))]
+    config = PlanConfig(
+        scene="flat", start=tuple(ends[0]), goal=tuple(ends[1]), method="visible", film="none",
+        planner=PathConfig(time_s=2.0), grid=(6, 5, 3), directions=30,
+    )  # fmt: skip
+    path = stages.plan(replace(experiment, plan=config), said.append)
+    assert np.isfinite(path.scores).all() and (scene.folder / "path" / "path.png").is_file()
+
+    with pytest.raises(MapError if with_mesh else SceneError, match="no descriptors" if with_mesh else "photographs"):
+        stages.label(experiment)
+
+    said.clear()
+    stages.make_maps(experiment, said.append)
+    stages.sample(experiment, said.append)
+    assert sum("reusing" in line for line in said) == 2
+
+
+def test_without_its_mesh_the_scene_is_made_anew(tmp_path):
+    folder = save(room_model(), tmp_path / "flat")
+    save_glb(empty_room(), tmp_path / "scan.glb")
+    with_mesh = experiment_of(folder, tmp_path / "data", mesh=tmp_path / "scan.glb")
+    (scene,) = stages.make_maps(with_mesh).scenes
+    assert scene.mesh.is_file() and not scene.is_photographed
+    (scene,) = stages.make_maps(experiment_of(folder, tmp_path / "data")).scenes
+    assert not scene.mesh.exists() and scene.is_photographed
+
+
+def test_the_filter_that_is_asked_for_is_counted(tmp_path):
+    model = room_model()
+    rng = np.random.default_rng(1)
+    for point in model.points3D.values():
+        point.error = rng.uniform(0, 2)
+    n_bad = sum(point.error > 0.5 for point in model.points3D.values())
+    folder = save(model, tmp_path / "flat")
+    said: list[str] = []
+    stages.make_maps(experiment_of(folder, tmp_path / "data"), said.append)
+    assert "left out" not in " ".join(said)
+    (scene,) = stages.make_maps(
+        experiment_of(folder, tmp_path / "data", max_reprojection_error_px=0.5), said.append
+    ).scenes
+    assert 100 < n_bad < 700 and f"from 36 images, {n_bad} points left out" in " ".join(said)
+    assert len(scene.read_landmarks()) == read_model(scene.map).num_points3D() == model.num_points3D() - n_bad
+    config = MapConfig(existing=ExistingModelConfig(folder, max_reprojection_error_px=1e-6))
+    with pytest.raises(MapError, match=r"no landmark.*map\.existing\.max_reprojection_error_px"):
+        map_existing(config, tmp_path / "map", tmp_path / "work")
+    assert not (tmp_path / "map").exists()
+
+
+def test_several_cameras_are_asked_for(tmp_path, capsys):
+    folder = save(room_model(cameras=(LOOKS, OTHER)), tmp_path / "flat")
+    arguments = ["map", "--name", "mine", "--data", str(tmp_path / "data"), "--model", str(folder)]
+    assert main(arguments) == 2
+    assert "2 cameras, not one" in (said := capsys.readouterr().err) and "--map.existing.camera_id" in said
+    (scene,) = stages.make_maps(experiment_of(folder, tmp_path / "data", camera_id=2)).scenes
+    assert scene.camera == OTHER
+    named = replace(experiment_of(folder, tmp_path / "data"), camera=CameraConfig(400, 300, fov_deg=80.0))
+    (scene,) = stages.make_maps(named).scenes
+    assert scene.camera == named.camera.camera and not scene.own_camera
+    with pytest.raises(ConfigError, match="made with another camera"):
+        stages.sample(experiment_of(folder, tmp_path / "data"))
+
+
+def test_scenes_of_models_stand_beside_one_another_with_their_own_cameras(tmp_path):
+    stages.make_maps(experiment_of(save(room_model(), tmp_path / "first"), tmp_path / "data"))
+    second = experiment_of(save(room_model(cameras=(OTHER,)), tmp_path / "second"), tmp_path / "data")
+    stages.make_maps(second)
+    scenes = Dataset.load(tmp_path / "data" / "mine").scenes
+    assert [(scene.name, scene.camera) for scene in scenes] == [("first", LOOKS), ("second", OTHER)]
+    said: list[str] = []
+    stages.sample(second, said.append)
+    assert len(said) == 4 and all("occlusion" in line or "viewpoints" in line for line in said)
+
+
+def test_models_do_not_join_generated_scenes(tmp_path):
+    scene = SceneFolder(tmp_path / "data" / "mine" / "apartment-000", "train")
+    scene.folder.mkdir(parents=True)
+    scene.mesh.write_bytes(b"")
+    Dataset(scene.folder.parent, (scene,)).save()
+    with pytest.raises(ConfigError, match="of their own: --name"):
+        stages.make_maps(experiment_of(save(room_model(), tmp_path / "flat"), tmp_path / "data"))
+
+
+def test_a_turned_and_scaled_model_is_doubted_and_mended(tmp_path):
+    model, truth = room_model(), room_model()
+    turn = pycolmap.Rotation3d(np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]))
+    model.transform(pycolmap.Sim3d(37.0, turn, np.array([5.0, 0, 0])))
+    folder = save(model, tmp_path / "flat")
+    with pytest.warns(MapWarning, match=r"not to be in metres|on their side") as said:
+        map_existing(MapConfig(existing=ExistingModelConfig(folder)), tmp_path / "map", tmp_path / "work")
+    assert len([warning for warning in said if warning.category is MapWarning]) == 2
+
+    def mended(scale: ScaleConfig) -> tuple[Float, dict]:
+        config = MapConfig(existing=ExistingModelConfig(folder, level=True), photographs=PhotographsConfig(scale=scale))
+        map_existing(config, tmp_path / "map", tmp_path / "work")  # warnings are errors here
+        report = json.loads((tmp_path / "map" / "report.json").read_text())
+        return camera_centers(colmap_poses(tmp_path / "map")), report
+
+    centers = camera_centers(colmap_poses("", truth))
+    apart = float(np.linalg.norm(centers[0] - centers[18]))
+    by_distance, report = mended(ScaleConfig(distance=KnownDistance("000.jpg", "018.jpg", apart)))
+    assert report["scale"]["source"] == "distance" and report["scale"]["factor"] == pytest.approx(1 / 37)
+    np.testing.assert_allclose(np.ptp(by_distance[:, 2]), 0, atol=1e-9)  # all at one height again
+    table = tmp_path / "positions.csv"
+    table.write_text("image,x,y,z\n" + "".join(f"{i:03d}.jpg,{x},{y},{z}\n" for i, (x, y, z) in enumerate(centers)))
+    by_positions, report = mended(ScaleConfig(positions=table))
+    np.testing.assert_allclose(by_positions, centers, atol=1e-6)
+    with pytest.raises(ConfigError, match=r"markers are found in photographs.*--images"):
+        mended(ScaleConfig(marker_size_m=0.4))
+
+
+def test_a_mesh_of_another_frame_is_doubted(tmp_path):
+    folder = save(room_model(), tmp_path / "flat")
+    mesh = empty_room()
+    save_glb(replace(mesh, vertices=mesh.vertices + np.float32([0, 0, 40])), tmp_path / "scan.glb")
+    experiment = experiment_of(folder, tmp_path / "data", mesh=tmp_path / "scan.glb")
+    with pytest.warns(MapWarning, match=r"scan\.glb: half of the landmarks are .* m or more from the mesh"):
+        stages.make_maps(experiment)
+    with pytest.raises(ConfigError, match="leaves its mesh"):
+        stages.make_maps(experiment_of(folder, tmp_path / "data", mesh=tmp_path / "scan.glb", level=True))
+
+
+@pytest.mark.parametrize("arguments, said", [
+    (["--model", "nowhere"], "no such folder"),
+    (["--model", "flat", "--mesh", "nowhere.glb"], "nowhere.glb"),
+    (["--model", "flat", "--database", "nowhere.db"], "no such database"),
+    (["--model", "flat", "--images", "nowhere"], "an image of the model is missing"),
+    (["--model", "flat", "--images", ".", "--database", "x.db"], "Leave --database out"),
+])  # fmt: skip
+def test_the_command_line_names_what_is_missing(tmp_path, monkeypatch, capsys, arguments, said):
+    save(room_model(), tmp_path / "flat")
+    monkeypatch.chdir(tmp_path)
+    assert main(["map", "--name", "mine", *arguments]) == 2
+    assert said in capsys.readouterr().err and not (tmp_path / "data" / "mine" / "dataset.json").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("error::wheretolook.utils.errors.MapWarning")
+def test_landmarks_are_triangulated_anew_at_known_poses(tmp_path):
+    """From poses alone, as of a robot or a phone: no points, photographs twice as large as the cameras say."""
+    poses, model = hand_held_poses(), pycolmap.Reconstruction()
+    take_photographs(marker_room(), poses, tmp_path / "photos")
+    half = replace(CAMERA, width=CAMERA.width // 2, height=CAMERA.height // 2, focal_px=CAMERA.focal_px / 2)
+    model.add_camera_with_trivial_rig(pycolmap.Camera(camera_id=5, **half.colmap.record()))
+    for index, pose in enumerate(poses):
+        image = pycolmap.Image(name=f"photo-{index:02d}.png", camera_id=5, image_id=100 - index)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:, :3]), pose[:, 3]))
+    folder = save(model, tmp_path / "flat")
+    config = MapConfig(
+        existing=ExistingModelConfig(folder),
+        photographs=PhotographsConfig(tmp_path / "photos", scale=ScaleConfig(marker_size_m=MARKERS[0].size_m)),
+    )
+    report = map_existing(config, tmp_path / "map", tmp_path / "work", progress=False)
+    assert report.triangulated_anew and report.has_descriptors and report.n_points == 0
+    assert report.scale.source == "markers" and report.scale.factor == pytest.approx(1, abs=0.005)
+    found = read_model(tmp_path / "map")
+    assert found.num_points3D() == report.n_landmarks > 1000
+    assert {camera.width for camera in found.cameras.values()} == {CAMERA.width}
+    by_name = {image.name: image.projection_center() for image in found.images.values()}
+    assert len(by_name) == len(poses)
+    for index, center in enumerate(camera_centers(poses)):
+        np.testing.assert_allclose(by_name[f"photo-{index:02d}.png"], report.scale.factor * center, atol=1e-6)
+    points = np.array([point.xyz for point in found.points3D.values()])
+    off_m = MeshRaycaster(marker_room()).distance_to_surface(points / report.scale.factor, 10.0)
+    assert np.median(off_m) < 0.02
+    shutil.rmtree(tmp_path / "photos")

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wheretolook.geometry.camera import Camera, ColmapCamera, describe_camera
-from wheretolook.geometry.poses import Float
+from wheretolook.geometry.poses import Float, poses_looking_along
 from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS
 from wheretolook.utils.errors import CameraError
 
@@ -51,6 +51,18 @@ class Scorer(ABC):
         All do where nothing was learnt, or nothing is known of the views it was learnt from.
         """
         return np.ones(len(cam_from_world), dtype=bool)
+
+    def score_around(self, locations: Float, directions: Float) -> Float:
+        """Scores (L, D) of cameras without roll at locations (L, 3) m that look along each of directions (D, 3).
+
+        They rank the directions of a location; what stands on samples of landmarks may differ from `score` by little.
+        """
+        at, axes = np.repeat(locations, len(directions), axis=0), np.tile(directions, (len(locations), 1))
+        return self.score(poses_looking_along(at, axes)).reshape(len(locations), len(directions))
+
+    def expected_inliers(self, cam_from_world: Float) -> Float:
+        """How many landmarks poses (B, 3, 4) can be expected to find, (B,); NaN where the method does not tell."""
+        return np.full(len(cam_from_world), np.nan)
 
     def score_binned(self, cam_from_world: Float, binned: BinnedViews) -> Float:
         """What `score` gives, (B,), for poses that the map's `bin_views` has binned already, with all `CHANNELS`."""

@@ -106,6 +106,10 @@ class ExpectedScorer(LandmarkScorer):
             return sums[:, 16] / BINS**2
         return sums[:, 0] / max(1, len(self.localization_map.landmarks))
 
+    def expected_inliers(self, cam_from_world: Float) -> Float:
+        """(B,), the sum of the chances of being found over the landmarks in view."""
+        return self._expectation.sums(self._describer, cam_from_world)[:, 0]
+
 
 class ExpectedFisherScorer(LandmarkScorer):
     """Expected Fisher information of the pose, each landmark in view weighted by its learned chance of being found.

@@ -42,3 +42,13 @@ class SetScorer(LandmarkScorer):
                 scores[rows] = self.trained.calibrated(logits).sigmoid().cpu().numpy()
         self._watch.check(self.name, looked_at)
         return scores
+
+    def expected_inliers(self, cam_from_world: Float) -> Float:
+        """(B,), the sum of the chances of being found over the landmarks in view."""
+        found = np.zeros(len(cam_from_world))
+        for rows, described, n_visible in self._describer.in_blocks(check_poses(cam_from_world), MOST):
+            with torch.inference_mode():
+                chances = self.network.matchability(described.values).sigmoid().double()
+                sums = torch.segment_reduce(chances, "sum", lengths=described.counts, initial=0.0)
+                found[rows] = (sums * n_visible / described.counts.clamp(min=1)).cpu().numpy()
+        return found

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -73,3 +74,10 @@ class SelectedViews:
         from wheretolook.select.formats import save_views
 
         save_views(self, Path(path), format)
+
+
+def joined(parts: Sequence[SelectedViews]) -> SelectedViews:
+    """Views of one camera and method, one after another."""
+    arrays = [field.name for field in fields(SelectedViews) if field.name not in ("waypoint_id", "camera", "method")]
+    values = {name: np.concatenate([getattr(part, name) for part in parts]) for name in arrays}
+    return replace(parts[0], waypoint_id=tuple(name for part in parts for name in part.waypoint_id), **values)

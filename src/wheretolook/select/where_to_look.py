@@ -18,18 +18,25 @@ from wheretolook.planning.sequences import TurnLimit, best_sequence
 from wheretolook.planning.turns import pan_tilt_angles
 from wheretolook.select.shipped import weights_of
 from wheretolook.select.surroundings import grid_waypoints, map_space, surroundings, usable_waypoints
-from wheretolook.select.views import SelectedViews
+from wheretolook.select.views import SelectedViews, joined
 from wheretolook.select.waypoints import Waypoints
 from wheretolook.utils.devices import usable_device
 from wheretolook.utils.errors import ConfigError
+from wheretolook.visibility.remembered import RememberedOcclusion
 
 if TYPE_CHECKING:
     from wheretolook.methods.base import Scorer
 
-VIEWS_AT_ONCE = 8_192  # views scored between two steps of the progress bar, in whole waypoints
+VIEWS_AT_ONCE = {
+    "cpu": 1 << 13,
+    "cuda": 1 << 17,
+}  # views scored between two steps of the progress bar, in whole waypoints
 
-SHORTLIST = 8
-"""Views of a waypoint whose scores are computed again, where those of all directions stand on samples of landmarks."""
+SPARE = 3
+"""Views of a waypoint, beyond those asked for, whose scores are computed again: where many landmarks are in view, the
+scores of all directions stand on other samples of them."""
+
+SIGHT_LINES = 1 << 24  # lines of sight looked at at once when views are told of
 
 
 class WhereToLook:
@@ -117,6 +124,8 @@ class WhereToLook:
             options["database"] = Path(database)
         if max_reprojection_error_px is not None:
             options["max_reprojection_error_px"] = max_reprojection_error_px
+        if hides.name != "none":
+            hides = RememberedOcclusion(hides)
         around = LocalizationMap.from_colmap(model, camera, occlusion=hides, device=device, **options)
         scorer = make_scorer(method, around, weights=weights) if method else load_scorer(str(weights), around)
         return cls(scorer, axes, space)
@@ -178,32 +187,28 @@ class WhereToLook:
         if max_turn_deg is not None:
             chosen = best_sequence(scores, TurnLimit.of(axes, max_turn_deg)).direction_ids[:, None]
         else:
-            chosen = np.argsort(-scores, axis=1, kind="stable")[:, : max(n, SHORTLIST)]
-        poses = poses_looking_along(np.repeat(at, chosen.shape[1], axis=0), axes[chosen.ravel()])
-        exact = self.scorer.score(poses).reshape(chosen.shape)
-        order = np.argsort(-exact, axis=1, kind="stable")[:, :n]
-        per = order.shape[1]
-        taken = (np.arange(len(rows))[:, None] * chosen.shape[1] + order).ravel()
-        self.views = self._describe(
-            waypoints,
-            np.repeat(rows, per),
-            np.tile(np.arange(1, per + 1), len(rows)),
-            poses[taken],
-            exact.ravel()[taken],
-        )
+            chosen = np.argsort(-scores, axis=1, kind="stable")[:, : n + SPARE]
+        step = max(1, SIGHT_LINES // max(1, len(self.localization_map.landmarks)))
+        blocks = [slice(begin, begin + step) for begin in range(0, len(rows), step)]
+        found = [self._described(waypoints, rows[block], axes[chosen[block]], n) for block in blocks]
+        self.views = joined(found)
         return self.views
 
-    def _describe(
-        self, waypoints: Waypoints, rows: NDArray[np.int64], rank: NDArray[np.int64], poses: Float, scores: Float
-    ) -> SelectedViews:
-        scorer = self.scorer
+    def _described(self, waypoints: Waypoints, rows: NDArray[np.int64], axes: Float, n: int) -> SelectedViews:
+        """The n best of views along axes (W, K, 3) at some of the waypoints, with all that is told of them."""
+        scorer, k = self.scorer, axes.shape[1]
+        poses = poses_looking_along(np.repeat(waypoints.points[rows], k, axis=0), axes.reshape(-1, 3))
+        scores = scorer.score(poses).reshape(-1, k)
+        order = np.argsort(-scores, axis=1, kind="stable")[:, :n]
+        taken = (np.arange(len(rows))[:, None] * k + order).ravel()
+        poses, of_waypoint = poses[taken], np.repeat(rows, order.shape[1])
         starts, _ = scorer.localization_map.in_view_on_device(poses)
         return SelectedViews(
-            waypoint=rows,
-            waypoint_id=tuple(waypoints.ids[row] for row in rows),
-            rank=rank,
+            waypoint=of_waypoint,
+            waypoint_id=tuple(waypoints.ids[row] for row in of_waypoint),
+            rank=np.tile(np.arange(1, order.shape[1] + 1), len(rows)),
             cam_from_world=poses,
-            score=scores,
+            score=scores.ravel()[taken],
             expected_inliers=scorer.expected_inliers(poses),
             n_visible=np.diff(starts),
             in_range=scorer.in_range(poses),
@@ -213,7 +218,8 @@ class WhereToLook:
 
     def _scores_around(self, locations: Float, axes: Float, progress: bool) -> Float:
         """Scores (L, D) of all directions (D, 3) at locations (L, 3)."""
-        scores, step = np.empty((len(locations), len(axes))), max(1, VIEWS_AT_ONCE // len(axes))
+        kind = self.localization_map.device.partition(":")[0]
+        scores, step = np.empty((len(locations), len(axes))), max(1, VIEWS_AT_ONCE[kind] // len(axes))
         with tqdm(total=len(locations), desc="score", unit="waypoint", disable=not progress) as bar:
             for begin in range(0, len(locations), step):
                 block = locations[begin : begin + step]

@@ -9,6 +9,7 @@ from wheretolook.geometry.poses import Float, check_poses
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.learning.trained_network import TrainedNetwork
 from wheretolook.methods.landmark_scorer import LandmarkScorer
+from wheretolook.methods.set.around import ScoresAround
 from wheretolook.methods.set.network import SetNetwork
 
 MOST = 1024
@@ -28,13 +29,15 @@ class SetScorer(LandmarkScorer):
         super().__init__(localization_map, trained.network.attributes, trained.training_range, trained.camera)
         self.name, self.trained = trained.method, trained
         self.network = trained.network.to(localization_map.device)
+        self._around: ScoresAround | None = None
+        self._around_axes: Float = np.empty((0, 3))
 
     def score(self, cam_from_world: Float) -> Float:
         """(B,) probabilities in [0, 1]."""
         cam_from_world = check_poses(cam_from_world)
         scores = np.empty(len(cam_from_world))
         looked_at: list[Float] = []
-        for rows, described, n_visible in self._describer.in_blocks(cam_from_world, MOST):
+        for rows, described, n_visible in self.describer.in_blocks(cam_from_world, MOST):
             looked_at += self._look(described, n_visible)
             height = torch.from_numpy(cam_from_world[rows, 2, 2]).to(described.values)
             with torch.inference_mode():
@@ -43,10 +46,18 @@ class SetScorer(LandmarkScorer):
         self._watch.check(self.name, looked_at)
         return scores
 
+    def score_around(self, locations: Float, directions: Float) -> Float:
+        """(L, D) probabilities; where more than `MOST` landmarks are in view, by other ones of them than `score`."""
+        if not ScoresAround.serves(self):
+            return super().score_around(locations, directions)
+        if self._around is None or not np.array_equal(self._around_axes, directions):
+            self._around, self._around_axes = ScoresAround(self, directions, MOST), directions
+        return self._around.score(locations)
+
     def expected_inliers(self, cam_from_world: Float) -> Float:
         """(B,), the sum of the chances of being found over the landmarks in view."""
         found = np.zeros(len(cam_from_world))
-        for rows, described, n_visible in self._describer.in_blocks(check_poses(cam_from_world), MOST):
+        for rows, described, n_visible in self.describer.in_blocks(check_poses(cam_from_world), MOST):
             with torch.inference_mode():
                 chances = self.network.matchability(described.values).sigmoid().double()
                 sums = torch.segment_reduce(chances, "sum", lengths=described.counts, initial=0.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,6 +22,16 @@ BLOCK = 4096  # views scored at a time: about 80 MB of bins
 FIELD_OF_VIEW_TOLERANCE = (
     1e-3  # relative difference in size / focal length, and of the principal point, up to which they are the same
 )
+
+
+@dataclass(frozen=True, eq=False)
+class ViewReport:
+    """What a scorer tells of B views."""
+
+    score: Float  # (B,)
+    expected_inliers: Float  # (B,) landmarks expected to be found; NaN where the method does not tell
+    n_visible: NDArray[np.int64]  # (B,) landmarks in view
+    in_range: NDArray[np.bool_]  # (B,) whether the view is like those that the scorer has learnt from
 
 
 class Scorer(ABC):
@@ -59,6 +70,12 @@ class Scorer(ABC):
         """
         at, axes = np.repeat(locations, len(directions), axis=0), np.tile(directions, (len(locations), 1))
         return self.score(poses_looking_along(at, axes)).reshape(len(locations), len(directions))
+
+    def report(self, cam_from_world: Float) -> ViewReport:
+        """Score poses (B, 3, 4), and tell what there is to know of them."""
+        starts, _ = self.localization_map.in_view_on_device(cam_from_world)
+        n_visible, expected = np.diff(starts), self.expected_inliers(cam_from_world)
+        return ViewReport(self.score(cam_from_world), expected, n_visible, self.in_range(cam_from_world))
 
     def expected_inliers(self, cam_from_world: Float) -> Float:
         """How many landmarks poses (B, 3, 4) can be expected to find, (B,); NaN where the method does not tell."""

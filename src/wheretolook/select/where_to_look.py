@@ -198,20 +198,19 @@ class WhereToLook:
         """The n best of views along axes (W, K, 3) at some of the waypoints, with all that is told of them."""
         scorer, k = self.scorer, axes.shape[1]
         poses = poses_looking_along(np.repeat(waypoints.points[rows], k, axis=0), axes.reshape(-1, 3))
-        scores = scorer.score(poses).reshape(-1, k)
-        order = np.argsort(-scores, axis=1, kind="stable")[:, :n]
+        told = scorer.report(poses)
+        order = np.argsort(-told.score.reshape(-1, k), axis=1, kind="stable")[:, :n]
         taken = (np.arange(len(rows))[:, None] * k + order).ravel()
-        poses, of_waypoint = poses[taken], np.repeat(rows, order.shape[1])
-        starts, _ = scorer.localization_map.in_view_on_device(poses)
+        of_waypoint = np.repeat(rows, order.shape[1])
         return SelectedViews(
             waypoint=of_waypoint,
             waypoint_id=tuple(waypoints.ids[row] for row in of_waypoint),
             rank=np.tile(np.arange(1, order.shape[1] + 1), len(rows)),
-            cam_from_world=poses,
-            score=scores.ravel()[taken],
-            expected_inliers=scorer.expected_inliers(poses),
-            n_visible=np.diff(starts),
-            in_range=scorer.in_range(poses),
+            cam_from_world=poses[taken],
+            score=told.score[taken],
+            expected_inliers=told.expected_inliers[taken],
+            n_visible=told.n_visible[taken],
+            in_range=told.in_range[taken],
             camera=scorer.localization_map.camera,
             method=scorer.name,
         )

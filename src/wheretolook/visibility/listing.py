@@ -10,9 +10,11 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.geometry.camera import Camera, ColmapCamera
-from wheretolook.geometry.poses import Float
+from wheretolook.geometry.poses import Float, split_poses
 from wheretolook.visibility import frustum, listing_kernel
 from wheretolook.visibility.counting import ASKED_AT_ONCE, FrustumCounter
+from wheretolook.visibility.field_of_view import tabulate
+from wheretolook.visibility.frustum import LandmarkSets, PosedViews
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +29,47 @@ class ListedViews:
     image: Any  # (E,) vec2, x / z and y / z in the camera
     offsets: Any  # (M,) vec3, from the location to the landmark, in the world, metres
     rows: Any  # (M,) int32 rows of the points
+
+
+def in_view_by_table(posed: PosedViews, points: Any, device: str = "cpu") -> LandmarkSets:
+    """What `frustum.landmarks_in_view` gives for a COLMAP camera, by a table of its field of view; on the host.
+
+    The table takes a second to make, and the camera is asked only about landmarks near the border of the view. Points
+    are those of `points_on_device`.
+    """
+    assert isinstance(posed.camera, ColmapCamera)
+    wp.load_module(listing_kernel, device=device)
+    field, (rotations, centers) = tabulate(posed.camera), split_poses(posed.cam_from_world)
+    single = rotations.astype(np.float32)
+    inputs = [
+        wp.array(single, dtype=wp.mat33, device=device),
+        wp.array(centers, dtype=wp.vec3d, device=device),
+        wp.array(np.asarray(posed.location_rows, dtype=np.int32), dtype=wp.int32, device=device),
+        points,
+        *frustum.sets_on_device(posed.unoccluded, device),
+        wp.array(field.depth_rad, dtype=wp.float32, device=device),
+        field.size,
+    ]
+    lengths: Any = wp.empty(len(single), dtype=wp.int64, device=device)
+    none: list[Any] = [wp.empty(0, dtype=dtype, device=device) for dtype in (wp.int64, wp.int32)]
+    kernel = listing_kernel.collect_field_kernel
+    wp.launch(kernel, len(single), [*inputs, False, none[0]], [lengths, none[1]], device=device)
+    starts = np.concatenate([[0], np.cumsum(lengths.numpy())])
+    found: Any = wp.empty(int(starts[-1]), dtype=wp.int32, device=device)
+    first: Any = wp.array(starts[:-1], dtype=wp.int64, device=device)
+    wp.launch(kernel, len(single), [*inputs, True, first], [lengths, found], device=device)
+    indices = found.numpy()
+    unsure = np.flatnonzero(indices < 0)
+    indices[unsure] = -1 - indices[unsure]
+    of_view = np.searchsorted(starts, unsure, side="right") - 1
+    kept = np.ones(len(indices), dtype=bool)
+    for begin in range(0, len(unsure), ASKED_AT_ONCE):
+        part = unsure[begin : begin + ASKED_AT_ONCE]
+        views = of_view[begin : begin + ASKED_AT_ONCE]
+        offsets = (posed.points[indices[part]] - centers[views]).astype(np.float32)
+        kept[part] = posed.camera.sees(frustum.rotate(single[views], offsets))
+    lengths = np.diff(starts) - np.bincount(of_view[~kept[unsure]], minlength=len(single))
+    return LandmarkSets(np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32), indices[kept])
 
 
 class FrustumLister(FrustumCounter):

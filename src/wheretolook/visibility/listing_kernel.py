@@ -8,6 +8,7 @@ from __future__ import annotations
 import warp as wp
 
 from wheretolook.visibility.counting_kernel import (
+    FAR,
     SortedLandmarks,
     border_runs,
     cell_of,
@@ -15,7 +16,7 @@ from wheretolook.visibility.counting_kernel import (
     inside_runs,
     near_entries,
 )
-from wheretolook.visibility.frustum_kernel import in_view, inside_sides, least_product, rounding_error
+from wheretolook.visibility.frustum_kernel import in_view, inside_sides, least_product, offset_from, rounding_error
 
 
 @wp.kernel
@@ -146,4 +147,41 @@ def list_field_kernel(
             entries[begin + number] = -1 - entry
             image[begin + number] = image_of(rotation, landmarks.offsets[entry])
         number += wp.int64(1)
+    lengths[view] = number
+
+
+@wp.kernel
+def collect_field_kernel(
+    rotations: wp.array[wp.mat33],
+    centers: wp.array[wp.vec3d],
+    location_rows: wp.array[wp.int32],
+    points: wp.array[wp.vec3d],
+    starts: wp.array[wp.int32],
+    unoccluded: wp.array[wp.int32],
+    depth: wp.array[wp.float32],
+    field_size: wp.int32,
+    write: wp.bool,
+    first: wp.array[wp.int64],
+    lengths: wp.array[wp.int64],
+    indices: wp.array[wp.int32],
+):
+    """As `collect_kernel`, by a table of the field of view. What it cannot decide is listed as -1 - landmark."""
+    view = wp.tid()
+    location = location_rows[view]
+    number = wp.int64(0)
+    begin = wp.int64(0)
+    if write:
+        begin = first[view]
+    for entry in range(starts[location], starts[location + 1]):
+        landmark = unoccluded[entry]
+        offset = offset_from(centers[view], points[landmark])
+        if wp.isfinite(offset):
+            distance = wp.length(offset)
+            inside_by = wp.float32(0.0)
+            if distance > 0.0 and distance < FAR:
+                inside_by = depth[cell_of(rotations[view] * offset, field_size)]
+            if inside_by >= 0.0:
+                if write:
+                    indices[begin + number] = wp.where(inside_by > 0.0, landmark, -1 - landmark)
+                number += wp.int64(1)
     lengths[view] = number

@@ -18,17 +18,25 @@ from wheretolook.visibility.frustum import LandmarkSets, PosedViews
 
 
 @dataclass(frozen=True, eq=False)
-class ListedViews:
-    """The landmarks in view of V views, E in all, and the M landmarks around the locations that they are entries of.
+class Surroundings:
+    """The M landmarks that are unoccluded from a block of locations, sorted into cells, on the lister's device."""
 
-    All but `starts` are Warp arrays on the counter's device.
-    """
+    sorted: Any  # `counting_kernel.SortedLandmarks`
+    rows: Any  # (M,) int32 rows of the points
+
+    @property
+    def offsets(self) -> Any:
+        """(M,) vec3 from the location to the landmark, in the world, metres."""
+        return self.sorted.offsets[: max(1, self.rows.shape[0])]
+
+
+@dataclass(frozen=True, eq=False)
+class ListedViews:
+    """The landmarks in view of V views, E in all."""
 
     starts: NDArray[np.int64]  # (V + 1,); view v has `starts[v]` to `starts[v + 1]` of the next two
-    entries: Any  # (E,) int32 rows of `offsets` and `rows`
-    image: Any  # (E,) vec2, x / z and y / z in the camera
-    offsets: Any  # (M,) vec3, from the location to the landmark, in the world, metres
-    rows: Any  # (M,) int32 rows of the points
+    entries: Any  # (E,) int32 rows of `Surroundings`, on the lister's device
+    image: Any  # (E,) vec2, x / z and y / z in the camera, likewise
 
 
 def in_view_by_table(posed: PosedViews, points: Any, device: str = "cpu") -> LandmarkSets:
@@ -73,68 +81,75 @@ def in_view_by_table(posed: PosedViews, points: Any, device: str = "cpu") -> Lan
 
 
 class FrustumLister(FrustumCounter):
-    """Lists what `FrustumCounter` counts, by the same cells and the same exact tests."""
+    """Lists what `FrustumCounter` counts, by the same cells and the same exact tests.
+
+    Views (V, 2) are given by rows of the locations and of the rotations.
+    """
 
     def __init__(self, camera: Camera, rotations: Float, n_points: int, device: str = "cpu", **options: Any) -> None:
         super().__init__(camera, rotations, n_points, device, **options)
         wp.load_module(listing_kernel, device=self.device)  # only one thread may do that
 
-    def list(
-        self, locations: ArrayLike, points: Any, unoccluded: Any | None, views: NDArray[np.integer[Any]]
-    ) -> ListedViews:
-        """What views (V, 2) see, each a row of locations (L, 3) m and one of the rotations.
+    def surroundings(self, locations: ArrayLike, points: Any, unoccluded: Any | None) -> Surroundings:
+        """What is unoccluded from locations (L, 3) m.
 
         Landmarks (N,) of vec3d and mask (L, N) of bool are Warp arrays on the device; without a mask all lines of sight
         are free.
         """
-        at, device = np.asarray(locations, dtype=np.float64).reshape(-1, 3), self.device
+        at, n_cells = np.asarray(locations, dtype=np.float64).reshape(-1, 3), self.size**2 + 1
         landmarks, places = self._sorted(at, points, unoccluded)
-        n_cells = self.size**2 + 1
-        n_free = int(landmarks.starts[len(at) * n_cells :].numpy()[0])
-        rows: Any = wp.empty(n_free, dtype=wp.int32, device=device)
-        wp.launch(listing_kernel.rows_kernel, places.shape, [places, landmarks.starts, n_cells], [rows], device=device)
-        asked: Any = wp.array(np.asarray(views, dtype=np.int32), dtype=wp.vec2i, device=device)
-        kernel, known = self._kernel(landmarks)
-        none: Any = wp.empty(0, dtype=wp.int64, device=device)
-        lengths: Any = wp.empty(len(views), dtype=wp.int64, device=device)
-        entries: Any = wp.empty(0, dtype=wp.int32, device=device)
-        image: Any = wp.empty(0, dtype=wp.vec2, device=device)
-        wp.launch(kernel, len(views), [asked, *known, False, none], [lengths, entries, image], device=device)
-        starts = np.concatenate([[0], np.cumsum(lengths.numpy())])
-        entries = wp.empty(int(starts[-1]), dtype=wp.int32, device=device)
-        image = wp.empty(int(starts[-1]), dtype=wp.vec2, device=device)
-        first: Any = wp.array(starts[:-1], dtype=wp.int64, device=device)
-        wp.launch(kernel, len(views), [asked, *known, True, first], [lengths, entries, image], device=device)
-        listed = ListedViews(starts, entries, image, landmarks.offsets[: max(n_free, 1)], rows)
-        return self._decided(listed, np.asarray(views)) if isinstance(self.camera, ColmapCamera) else listed
+        rows: Any = wp.empty(int(landmarks.starts[len(at) * n_cells :].numpy()[0]), dtype=wp.int32, device=self.device)
+        inputs = [places, landmarks.starts, n_cells]
+        wp.launch(listing_kernel.rows_kernel, places.shape, inputs, [rows], device=self.device)
+        return Surroundings(landmarks, rows)
 
-    def _kernel(self, landmarks: Any) -> tuple[Any, list[Any]]:
+    def lengths(self, around: Surroundings, views: NDArray[np.integer[Any]]) -> NDArray[np.int64]:
+        """How many landmarks views see, (V,). Those are included that only a COLMAP camera itself could decide."""
+        lengths: Any = wp.empty(len(views), dtype=wp.int64, device=self.device)
+        none = [wp.empty(0, dtype=dtype, device=self.device) for dtype in (wp.int64, wp.int32, wp.vec2)]
+        self._launch(around, views, False, none[0], lengths, none[1], none[2])
+        return np.asarray(lengths.numpy())
+
+    def list(self, around: Surroundings, views: NDArray[np.integer[Any]], lengths: NDArray[np.int64]) -> ListedViews:
+        """What views see, by the lengths (V,) that `lengths` gives of them."""
+        starts = np.concatenate([[0], np.cumsum(lengths)])
+        entries: Any = wp.empty(int(starts[-1]), dtype=wp.int32, device=self.device)
+        image: Any = wp.empty(int(starts[-1]), dtype=wp.vec2, device=self.device)
+        first: Any = wp.array(starts[:-1], dtype=wp.int64, device=self.device)
+        self._launch(
+            around, views, True, first, wp.empty(len(views), dtype=wp.int64, device=self.device), entries, image
+        )
+        listed = ListedViews(starts, entries, image)
+        return self._decided(listed, around, views) if isinstance(self.camera, ColmapCamera) else listed
+
+    def _launch(
+        self, around: Surroundings, views: Any, write: bool, first: Any, lengths: Any, entries: Any, image: Any
+    ) -> None:
+        asked: Any = wp.array(np.asarray(views, dtype=np.int32), dtype=wp.vec2i, device=self.device)
+        outputs = [lengths, entries, image]
         if self._field is not None:
-            return listing_kernel.list_field_kernel, [self._axes, self._depth, self._field.size, landmarks]
+            inputs = [asked, self._axes, self._depth, self._field.size, around.sorted, write, first]
+            wp.launch(listing_kernel.list_field_kernel, len(views), inputs, outputs, device=self.device)
+            return
         least = wp.float64(frustum.MIN_DEPTH_M)
-        return listing_kernel.list_kernel, [self._axes, self._sides, landmarks, self._rounding, least]
+        inputs = [asked, self._axes, self._sides, around.sorted, self._rounding, least, write, first]
+        wp.launch(listing_kernel.list_kernel, len(views), inputs, outputs, device=self.device)
 
-    def _decided(self, listed: ListedViews, views: NDArray[np.integer[Any]]) -> ListedViews:
+    def _decided(self, listed: ListedViews, around: Surroundings, views: NDArray[np.integer[Any]]) -> ListedViews:
         """Without the landmarks that the table left to the camera and the camera does not see."""
         assert isinstance(self.camera, ColmapCamera)
-        entries, lengths = listed.entries.numpy(), np.diff(listed.starts)
+        entries = listed.entries.numpy()
         unsure = np.flatnonzero(entries < 0)
         if len(unsure) == 0:
             return listed
         entries[unsure] = -1 - entries[unsure]
         of_view = np.searchsorted(listed.starts, unsure, side="right") - 1
-        offsets, kept = listed.offsets.numpy(), np.ones(len(entries), dtype=bool)
+        offsets, kept = around.offsets.numpy(), np.ones(len(entries), dtype=bool)
         for begin in range(0, len(unsure), ASKED_AT_ONCE):
             part = slice(begin, begin + ASKED_AT_ONCE)
             rotations = self.rotations[views[of_view[part], 1]]
             kept[unsure[part]] = self.camera.sees(frustum.rotate(rotations, offsets[entries[unsure[part]]]))
-        lost = np.bincount(of_view[~kept[unsure]], minlength=len(lengths))
-        starts = np.concatenate([[0], np.cumsum(lengths - lost)])
-        device = self.device
-        return ListedViews(
-            starts,
-            wp.array(entries[kept], dtype=wp.int32, device=device),
-            wp.array(listed.image.numpy()[kept], dtype=wp.vec2, device=device),
-            listed.offsets,
-            listed.rows,
-        )
+        lost = np.bincount(of_view[~kept[unsure]], minlength=len(views))
+        starts = np.concatenate([[0], np.cumsum(np.diff(listed.starts) - lost)])
+        there: Any = wp.array(entries[kept], dtype=wp.int32, device=self.device)
+        return ListedViews(starts, there, wp.array(listed.image.numpy()[kept], dtype=wp.vec2, device=self.device))

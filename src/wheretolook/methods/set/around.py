@@ -16,13 +16,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 import warp as wp
-from numpy.typing import NDArray
 from torch import Tensor
 
 from wheretolook.geometry.poses import Float, rotation_looking_along
 from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 from wheretolook.methods.matchability.network import N_EXPECTED, bearing_precision
-from wheretolook.visibility.listing import FrustumLister, ListedViews
+from wheretolook.visibility.listing import FrustumLister, ListedViews, Surroundings
 from wheretolook.visibility.occlusion import DevicePoints
 from wheretolook.visibility.sphere_cells import choose_size
 
@@ -126,17 +125,26 @@ class ScoresAround:
     def _score(self, locations: Float) -> Float:
         n_directions, double = len(self.rotations), self.points.double
         mask = self.scorer.localization_map.occlusion.unoccluded_on_device(locations, self.points)
-        counts = self._lister(0).count(locations, double, mask).numpy().reshape(-1)
-        halvings = np.ceil(np.log2(np.maximum(counts, 1) / self.most)).clip(0).astype(int)
-        scores = np.empty(len(counts))
+        pairs = np.stack(np.divmod(np.arange(len(locations) * n_directions), n_directions), axis=1)
+        lister = self._lister(0)
+        around = lister.surroundings(locations, double, mask)
+        in_view = lister.lengths(around, pairs)
+        halvings = np.ceil(np.log2(np.maximum(in_view, 1) / self.most)).clip(0).astype(int)
+        scores = np.empty(len(pairs))
         for level in np.unique(halvings):
             stride, views = 1 << int(level), np.flatnonzero(halvings == level)
-            pairs = np.stack(np.divmod(views, n_directions), axis=1)
-            part = mask if mask is None or level == 0 else mask[:, ::stride].contiguous()
-            listed = self._lister(int(level)).list(locations, double[::stride].contiguous(), part, pairs)
+            lengths = in_view[views]
+            if level:
+                lister = self._lister(int(level))
+                part = None if mask is None else mask[:, ::stride].contiguous()
+                around = lister.surroundings(locations, double[::stride].contiguous(), part)
+                lengths = lister.lengths(around, pairs[views])
+            listed = lister.list(around, pairs[views], lengths)
+            # the share of a sample that the camera does see, where that is for the camera to say, is that of all
+            n_visible = np.diff(listed.starts) / np.maximum(lengths, 1) * in_view[views]
             if self.device.type != "cpu":
                 wp.synchronize_device(self.points.device)  # Torch works on a stream of its own
-            scores[views] = self._of_listed(listed, stride, counts[views], self.directions[pairs[:, 1], 2])
+            scores[views] = self._of_listed(listed, around, stride, n_visible, self.directions[pairs[views, 1], 2])
         return scores.reshape(-1, n_directions)
 
     def _lister(self, level: int) -> FrustumLister:
@@ -150,11 +158,13 @@ class ScoresAround:
                 self._listers[level] = FrustumLister(camera, self.rotations, n_points, self.points.device, **options)
             return self._listers[level]
 
-    def _of_listed(self, listed: ListedViews, stride: int, n_visible: NDArray[Any], heights: Float) -> Float:
+    def _of_listed(
+        self, listed: ListedViews, around: Surroundings, stride: int, n_visible: Float, heights: Float
+    ) -> Float:
         """Scores (V,) of listed views that see `n_visible` (V,) landmarks in all, and whose axes rise by `heights`."""
         scorer, starts = self.scorer, listed.starts
         entries, image = wp.to_torch(listed.entries), wp.to_torch(listed.image)
-        offsets, rows = wp.to_torch(listed.offsets), wp.to_torch(listed.rows)
+        offsets, rows = wp.to_torch(around.offsets), wp.to_torch(around.rows)
         used = torch.zeros(len(rows), dtype=torch.bool, device=self.device)
         used[entries] = True
         place = used.cumsum(0, dtype=torch.int32) - 1
@@ -176,7 +186,7 @@ class ScoresAround:
             sums[begin:end, :16] = found @ told
             begin = end
         kept = torch.from_numpy(np.diff(starts)).to(self.device).clamp(min=1)
-        visible, height = torch.from_numpy(n_visible).to(self.device), torch.from_numpy(heights).to(sums)
+        visible, height = torch.from_numpy(n_visible).to(sums), torch.from_numpy(heights).to(sums)
         logits = scorer.network.logits(sums * (visible / kept)[:, None], visible, height).double()
         return np.asarray(scorer.trained.calibrated(logits).sigmoid().cpu().numpy())
 

@@ -70,9 +70,9 @@ class SetScorer(LandmarkScorer):
             return np.asarray(self.trained.calibrated(logits).sigmoid().cpu().numpy())
 
     def score_around(self, locations: Float, directions: Float) -> Float:
-        """(L, D) probabilities; where more than `MOST` landmarks are in view, by other ones of them than `score`."""
+        """(L, D) probabilities; where many landmarks are in view, by fewer of them than `score`."""
         if not ScoresAround.serves(self):
             return super().score_around(locations, directions)
         if self._around is None or not np.array_equal(self._around_axes, directions):
-            self._around, self._around_axes = ScoresAround(self, directions, MOST), directions
+            self._around, self._around_axes = ScoresAround(self, directions, MOST // 2), directions
         return self._around.score(locations)

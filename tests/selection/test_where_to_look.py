@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from box_scenes import furnished_room
 from selection.room import POINTS, WEIGHTS, write_room
@@ -15,7 +16,11 @@ from wheretolook import WhereToLook as Exported
 from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.poses import rotation_angle_deg, rotation_looking_along
+from wheretolook.learning.trained_network import TrainedNetwork
 from wheretolook.methods.base import Scorer
+from wheretolook.methods.set.around import ScoresAround
+from wheretolook.methods.set.network import TOLD, SetNetwork
+from wheretolook.methods.set.score import SetScorer
 from wheretolook.scenes.loading import save_glb
 from wheretolook.select.where_to_look import WhereToLook
 from wheretolook.utils.errors import ConfigError, MapError, SceneError, TableError, WeightsError, WhereToLookError
@@ -72,6 +77,20 @@ def test_a_sample_of_the_landmarks_ranks_as_all(tmp_path: Path) -> None:
     assert np.corrcoef(slow.ravel(), fast.ravel())[0, 1] > 0.999
     rows = np.arange(len(POINTS))
     assert (slow.max(axis=1) - slow[rows, fast.argmax(axis=1)] < 0.01).all()
+
+
+def test_all_that_a_network_is_told_is_told_at_once(sparse: Path) -> None:
+    around = LocalizationMap.from_colmap(sparse)
+    old = load_scorer(WEIGHTS, around)
+    assert isinstance(old, SetScorer)
+    torch.manual_seed(0)
+    network = SetNetwork(old.network.statistics, hidden=old.network.options["hidden"], told=TOLD)
+    network.matchability.load_state_dict(old.network.matchability.state_dict())
+    scorer = SetScorer(around, TrainedNetwork("set", network, None))
+    assert ScoresAround.serves(scorer)
+    slow, fast = all_scores(scorer, POINTS), scorer.score_around(POINTS, AXES)
+    assert np.ptp(slow) > 0.1
+    np.testing.assert_allclose(fast, slow, atol=1e-4)
 
 
 def test_the_sequence_is_the_best_of_all(sparse: Path) -> None:

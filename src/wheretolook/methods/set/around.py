@@ -8,6 +8,7 @@ information is summed in the world's axes, in which the expected variances that 
 from __future__ import annotations
 
 import os
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 from math import log
 from threading import Lock
@@ -21,6 +22,7 @@ from torch import Tensor
 from wheretolook.geometry.poses import Float, rotation_looking_along
 from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 from wheretolook.methods.matchability.network import N_EXPECTED, bearing_precision
+from wheretolook.methods.set.network import expected_cells
 from wheretolook.visibility.listing import FrustumLister, ListedViews, Surroundings
 from wheretolook.visibility.occlusion import DevicePoints
 from wheretolook.visibility.sphere_cells import choose_size
@@ -28,7 +30,7 @@ from wheretolook.visibility.sphere_cells import choose_size
 if TYPE_CHECKING:
     from wheretolook.methods.set.score import SetScorer
 
-WITHOUT_AXES = {
+SERVED = {
     "log_expected_inliers",
     "log_visible",
     "expected_share",
@@ -36,11 +38,15 @@ WITHOUT_AXES = {
     "log_orientation_variance",
     "log_det_information",
     "axis_height",
+    "log_expected_cells",
 }
-"""What a network may be told of a view that does not depend on the camera's axes."""
+"""What a network may be told of a view: the rest depends on the camera's axes."""
 
 OF_LOCATION = ("distance", "mapped_angle", "distance_ratio", "pixel_size_ratio")
 """Attributes of a landmark that depend on where the camera is, but not on where it looks."""
+
+IMAGE = ("across", "down")
+"""Attributes of a landmark that depend on where the camera looks."""
 
 ROOM = {"cpu": 1 << 13, "cuda": 1 << 22}  # landmarks in view that pass the network at once: fits the cache, or 2 GB
 AROUND = {"cpu": 1, "cuda": 1 << 23}  # landmarks around the locations of a block; of a location at least
@@ -64,7 +70,7 @@ class ScoresAround:
         self.device = matchability.input.mean.device
         with torch.inference_mode():
             weight = self.layers[0].weight * matchability.input.scale
-            self._of_image = self._weight(weight, names, ("across", "down"))
+            self._of_image = self._weight(weight, names, IMAGE)
             self._of_location = self._weight(weight, names, OF_LOCATION)
             of_map = torch.from_numpy(around.landmarks.attributes()[self.points.order]).to(self.device)
             self._mean = self._weight(matchability.input.mean[None], names, OF_LOCATION)[:, 0]
@@ -79,19 +85,25 @@ class ScoresAround:
             # `across` and `down` are given as they are: their means are taken off here
             self._first = (
                 self.layers[0](matchability.input(values))
-                - self._weight(matchability.input.mean[None], names, ("across", "down"))[:, 0] @ self._of_image
+                - self._weight(matchability.input.mean[None], names, IMAGE)[:, 0] @ self._of_image
             )
             mapped = [MAP_ATTRIBUTES.index(name) for name in ("mapped_distance", "mapped_pixel_size")]
             mapped_from = torch.from_numpy(around.landmarks.mapping_direction[self.points.order]).to(self.device)
             self._mapped = torch.cat([mapped_from, of_map[:, mapped]], 1)
+        self._asks_for_cells = "log_expected_cells" in scorer.network.options["told"]
+        with warnings.catch_warnings():  # PyTorch says once that sparse matrices are young
+            warnings.simplefilter("ignore")
+            torch.sparse_csr_tensor(
+                torch.zeros(1, dtype=torch.int32), torch.zeros(0, dtype=torch.int32), torch.zeros(0)
+            )
         self._listers: dict[int, FrustumLister] = {}
         self._lock = Lock()
 
     @staticmethod
     def serves(scorer: SetScorer) -> bool:
-        """Whether a scorer's network is told nothing that depends on the camera's axes."""
+        """Whether a scorer's network is told of views only what is `SERVED`."""
         network = scorer.network
-        return network.attention is None and {*network.options["told"]} <= WITHOUT_AXES
+        return network.attention is None and {*network.options["told"]} <= SERVED
 
     @staticmethod
     def _weight(weight: Tensor, names: tuple[str, ...], wanted: tuple[str, ...]) -> Tensor:
@@ -170,24 +182,29 @@ class ScoresAround:
         place = used.cumsum(0, dtype=torch.int32) - 1
         seen = used.nonzero()[:, 0]
         base, told = self._described(offsets[seen], rows[seen] * stride)
-        sums = torch.zeros((len(n_visible), N_EXPECTED), device=self.device)
+        n, kept = len(n_visible), torch.from_numpy(np.diff(starts)).to(self.device).clamp(min=1)
+        sums, cells = torch.zeros((n, N_EXPECTED), device=self.device), torch.zeros(n, device=self.device)
+        visible, height = torch.from_numpy(n_visible).to(sums), torch.from_numpy(heights).to(sums)
+        each = visible / kept
         weight, bias, last = self.layers[2].weight.T, self.layers[2].bias, self.layers[4]
         begin = 0
-        while begin < len(n_visible):
+        while begin < n:
             end = int(np.searchsorted(starts, starts[begin] + ROOM[self.device.type], side="right")) - 1
-            end = min(max(end, begin + 1), len(n_visible))
-            span = slice(int(starts[begin]), int(starts[end]))
+            end = min(max(end, begin + 1), n)
+            span, views = slice(int(starts[begin]), int(starts[end])), slice(begin, end)
             here = place[entries[span]]
             hidden = base.index_select(0, here).addmm_(image[span], self._of_image).relu_()
             hidden = torch.mm(hidden, weight).add_(bias).relu_()
-            chances = torch.mv(hidden, last.weight[0]).add_(last.bias).sigmoid_()
+            log_odds = torch.mv(hidden, last.weight[0]).add_(last.bias)
             lengths = torch.from_numpy((starts[begin : end + 1] - starts[begin]).astype(np.int32)).to(self.device)
-            found = torch.sparse_csr_tensor(lengths, here, chances, size=(end - begin, len(told)))
-            sums[begin:end, :16] = found @ told
+            found = torch.sparse_csr_tensor(lengths, here, log_odds.sigmoid(), size=(end - begin, len(told)))
+            sums[views, :16] = found @ told
+            if self._asks_for_cells:
+                of_view = torch.arange(end - begin, device=self.device).repeat_interleave(lengths.diff())
+                cells[views] = expected_cells(image[span], log_odds, of_view, each[views], IMAGE)
             begin = end
-        kept = torch.from_numpy(np.diff(starts)).to(self.device).clamp(min=1)
-        visible, height = torch.from_numpy(n_visible).to(sums), torch.from_numpy(heights).to(sums)
-        logits = scorer.network.logits(sums * (visible / kept)[:, None], visible, height).double()
+        spread = cells if self._asks_for_cells else None
+        logits = scorer.network.logits(sums * each[:, None], visible, height, spread).double()
         return np.asarray(scorer.trained.calibrated(logits).sigmoid().cpu().numpy())
 
     def _described(self, offsets: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:

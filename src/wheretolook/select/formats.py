@@ -120,7 +120,7 @@ _DIGITS = {"yaw_deg": ".3f", "pitch_deg": ".3f", "score": ".9g", "expected_inlie
 
 
 def _csv(views: SelectedViews) -> str:
-    lines = []
+    lines: list[str] = []
     for row in _rows(views):
         cells = {name: _cell(name, value) for name, value in row.items()}
         cells["quaternion_xyzw"] = " ".join(cells[name] for name in ("qx", "qy", "qz", "qw"))

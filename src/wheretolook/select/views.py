@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,5 +80,5 @@ class SelectedViews:
 def joined(parts: Sequence[SelectedViews]) -> SelectedViews:
     """Views of one camera and method, one after another."""
     arrays = [field.name for field in fields(SelectedViews) if field.name not in ("waypoint_id", "camera", "method")]
-    values = {name: np.concatenate([getattr(part, name) for part in parts]) for name in arrays}
+    values: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in arrays}
     return replace(parts[0], waypoint_id=tuple(name for part in parts for name in part.waypoint_id), **values)

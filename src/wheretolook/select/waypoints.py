@@ -63,7 +63,7 @@ class Waypoints:
         return cls(at, tuple(ids) or tuple(map(str, range(len(at)))))._checked()
 
     def _checked(self) -> Waypoints:
-        for row in np.flatnonzero(~np.isfinite(self.points).all(axis=1)):
+        for row in np.flatnonzero(~np.isfinite(self.points).all(axis=1)).tolist():
             raise TableError("a waypoint is not finite", path=self.path, value=self.where(row), fix="Correct it.")
         return self
 
@@ -95,7 +95,8 @@ def read_waypoints(path: str | Path) -> Waypoints:
             raise TableError("there are no waypoints below the header", path=path, fix=f"Give {FORMATS}.")
     else:
         columns, name = _numbered(*cells[0], path)
-    points, ids = [], []
+    points: list[list[float]] = []
+    ids: list[str] = []
     for number, row in cells:
         width = len(cells[0][1])
         if len(row) != width or not all(_is_number(row[column]) for column in columns):

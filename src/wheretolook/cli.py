@@ -175,7 +175,7 @@ Without --config it is configs/release.yaml, whose runs are logged first. Tables
 
 OWN = {
     "select": ("wheretolook.select.command", "The best views at places of your own COLMAP model; needs no dataset."),
-    "export": ("wheretolook.robot.command", "Write the scorer as ONNX, for robots without PyTorch."),
+    "export": ("wheretolook.robot.command", "What a robot needs to score views of your own map, without PyTorch."),
 }
 """Sub-commands with options of their own, which are no stages of an experiment: their module, and what they do."""
 
@@ -194,6 +194,7 @@ of your own map, without a dataset:
 {own}
 
   wheretolook select --map sparse/0 --at waypoints.csv --out views.csv
+  wheretolook export --map sparse/0 --out FOLDER
   wheretolook STAGE --help         the options that matter to a stage, with their defaults
   wheretolook STAGE --help-all     every option it reads
   wheretolook demo                 is configs/demo.yaml unless --config names another
@@ -202,7 +203,6 @@ of your own map, without a dataset:
   wheretolook label --config configs/paper.yaml --engine ray     on a Ray cluster; the default is local
   wheretolook evaluate --list-methods    what can be compared
   wheretolook viewpoint-map --config configs/demo.yaml --scene apartment-000 --out room.map
-  wheretolook export --map SPARSE --out FOLDER        what a robot needs to score views, without PyTorch
   wheretolook figures --list             figures and tables of the paper; `wheretolook figures` draws them
   wheretolook --version
 """

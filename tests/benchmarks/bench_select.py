@@ -25,8 +25,8 @@ from wheretolook.geometry.poses import Float, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.methods.registry import load_scorer
-from wheretolook.select.shipped import shipped_weights
 from wheretolook.select.where_to_look import WhereToLook
+from wheretolook.utils.shipped import WEIGHTS, shipped
 from wheretolook.visibility.hidden_points import HiddenPointRemoval
 from wheretolook.visibility.occlusion import NoOcclusion
 from wheretolook.visibility.remembered import RememberedOcclusion
@@ -142,7 +142,7 @@ def main() -> None:
             measure(f"process, {size}", lambda: subprocess.run(command, cwd=folder, check=True), options.repeat)
         return
     around = made_map(options.landmarks, CAMERAS[options.camera], options.hidden_points, options.device)
-    look = WhereToLook(load_scorer(shipped_weights(), around))
+    look = WhereToLook(load_scorer(shipped(WEIGHTS), around))
     start = time.perf_counter()
     look.best(points[:1])
     print(f"the first waypoint, kernels loaded: {time.perf_counter() - start:.3g} s")

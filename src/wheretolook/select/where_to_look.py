@@ -16,10 +16,10 @@ from wheretolook.geometry.poses import Float, check_poses, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.planning.sequences import TurnLimit, best_sequence
 from wheretolook.planning.turns import pan_tilt_angles
-from wheretolook.select.shipped import weights_of
 from wheretolook.select.surroundings import grid_waypoints, map_space, surroundings, usable_waypoints
 from wheretolook.select.views import SelectedViews, joined
 from wheretolook.select.waypoints import Waypoints
+from wheretolook.select.weights import weights_of
 from wheretolook.utils.devices import usable_device
 from wheretolook.utils.errors import ConfigError
 from wheretolook.visibility.remembered import RememberedOcclusion

@@ -1,24 +1,11 @@
-"""The weights that ship, and which of them a method scores with."""
+"""Which file of weights a method scores with: of those given, or of those that ship."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 from wheretolook.utils.errors import WeightsError
-
-_PACKAGE = Path(__file__).resolve().parents[1]
-
-PLACES = (_PACKAGE / "weights", _PACKAGE.parents[1] / "data" / "release" / "weights", Path("data/release/weights"))
-"""Where they may lie: in the installed package, in a copy of the project, in the current folder."""
-
-
-def shipped_weights() -> Path:
-    """The folder of the weights that ship. Raises a WeightsError if there is none."""
-    for place in PLACES:
-        if any(place.glob("*.safetensors")):
-            return place
-    fix = "Give weights of your own (--weights), or a method without any (--method visible)."
-    raise WeightsError("the weights that ship are not here", path=PLACES[0], fix=fix)
+from wheretolook.utils.shipped import WEIGHTS, or_shipped, shipped
 
 
 def weights_of(method: str, given: str | Path | None) -> Path | None:
@@ -33,7 +20,7 @@ def weights_of(method: str, given: str | Path | None) -> Path | None:
     kinds = {known.weights for known in members(method, scorers()) or ([check_method(method)] if method else [])}
     if "" in kinds:
         return None
-    place = shipped_weights() if given is None else Path(given)
+    place = shipped(WEIGHTS) if given is None else or_shipped(given)
     if not place.is_dir():
         if not place.is_file():
             raise WeightsError("there are no weights", path=place, fix="Correct the path.")

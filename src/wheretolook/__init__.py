@@ -1,6 +1,7 @@
 """wheretolook: where to point a camera so that it knows where it is.
 
-`LocalizationMap.from_colmap`, `load_scorer` and `poses_looking_along` score viewpoints of any COLMAP model.
+`WhereToLook` finds the best views at places of any COLMAP model. `LocalizationMap.from_colmap`, `load_scorer` and
+`poses_looking_along` score viewpoints of one.
 """
 
 from __future__ import annotations
@@ -15,14 +16,24 @@ if TYPE_CHECKING:
     from wheretolook.inputs.localization_map import LocalizationMap
     from wheretolook.methods.registry import load_scorer
     from wheretolook.planning.viewpoint_map import ViewpointMap
+    from wheretolook.select.where_to_look import WhereToLook
 
-__all__ = ["LocalizationMap", "PinholeCamera", "ViewpointMap", "__version__", "load_scorer", "poses_looking_along"]
+__all__ = [
+    "LocalizationMap",
+    "PinholeCamera",
+    "ViewpointMap",
+    "WhereToLook",
+    "__version__",
+    "load_scorer",
+    "poses_looking_along",
+]
 
 _HOMES = {
     "LocalizationMap": "wheretolook.inputs.localization_map",
     "PinholeCamera": "wheretolook.geometry.camera",
     "load_scorer": "wheretolook.methods.registry",
     "ViewpointMap": "wheretolook.planning.viewpoint_map",
+    "WhereToLook": "wheretolook.select.where_to_look",
     "poses_looking_along": "wheretolook.geometry.poses",
 }
 

@@ -10,6 +10,7 @@ import traceback
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -177,6 +178,12 @@ Without --config it is configs/release.yaml, whose runs are logged first. Tables
 }
 """The sub-commands, in the order of the line of stages."""
 
+OWN = {
+    "select": ("wheretolook.select.command", "The best views at places of your own COLMAP model; needs no dataset."),
+    "export": ("wheretolook.robot.command", "What a robot needs to score views of your own map, without PyTorch."),
+}
+"""Sub-commands with options of their own, which are no stages of an experiment: their module, and what they do."""
+
 _SHORT = {"--engine": "--label.engine", "--images": "--map.photographs.images"}  # flags of every stage
 _COMMON = "name data device"  # the options that matter to every stage
 
@@ -188,6 +195,11 @@ usage: wheretolook STAGE [--config FILE.yaml] [--GROUP.SETTING VALUE ...] [--deb
 stages, in order; each reads what the one before it left in <data>/<name>/
 {stages}
 
+of your own map, without a dataset:
+{own}
+
+  wheretolook select --map sparse/0 --at waypoints.csv --out views.csv
+  wheretolook export --map sparse/0 --out FOLDER
   wheretolook STAGE --help         the options that matter to a stage, with their defaults
   wheretolook STAGE --help-all     every option it reads
   wheretolook demo                 is configs/demo.yaml unless --config names another
@@ -197,7 +209,6 @@ stages, in order; each reads what the one before it left in <data>/<name>/
   wheretolook label --config configs/paper.yaml --engine ray     on a Ray cluster; the default is local
   wheretolook evaluate --list-methods    what can be compared
   wheretolook viewpoint-map --config configs/demo.yaml --scene apartment-000 --out room.map
-  wheretolook export --map SPARSE --out FOLDER        what a robot needs to score views, without PyTorch
   wheretolook figures --list             figures and tables of the paper; `wheretolook figures` draws them
   wheretolook --version
 """
@@ -210,7 +221,9 @@ def main(arguments: list[str] | None = None) -> int:
     debug = "--debug" in arguments
     arguments = [argument for argument in arguments if argument != "--debug"]
     if not arguments or arguments[0] in ("-h", "--help", "help"):
-        print(USAGE.format(stages="\n".join(f"  {name:<15}{stage.text}" for name, stage in STAGES.items())))
+        stages = "\n".join(f"  {name:<15}{stage.text}" for name, stage in STAGES.items())
+        own = "\n".join(f"  {name:<15}{text}" for name, (_, text) in OWN.items())
+        print(USAGE.format(stages=stages, own=own))
         return 0
     if arguments[0] == "--version":
         print(f"wheretolook {VERSION}")
@@ -231,13 +244,11 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _run(command: str, arguments: list[str]) -> int:
-    if command == "export":
-        from wheretolook.robot.command import run
-
-        return run(arguments)
+    if command in OWN:
+        return int(import_module(OWN[command][0]).run(arguments))
     if command not in STAGES:
-        near = nearest(command, [*STAGES, "export"])
-        fix = f"Did you mean {near}?" if near else f"Use one of {', '.join(STAGES)}."
+        near = nearest(command, [*STAGES, *OWN])
+        fix = f"Did you mean {near}?" if near else f"Use one of {', '.join([*STAGES, *OWN])}."
         raise ConfigError("unknown stage", value=command, fix=fix)
     if command == "evaluate" and "--list-methods" in arguments:
         from wheretolook.methods.registry import describe_methods

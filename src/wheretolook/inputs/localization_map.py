@@ -17,13 +17,18 @@ from wheretolook.mapping.colmap_model import camera_of_model, colmap_poses, read
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
 from wheretolook.mapping.plausibility import warn_of_frame
 from wheretolook.visibility import frustum
-from wheretolook.visibility.frustum import LandmarkSets, PosedViews
+from wheretolook.visibility.frustum import LandmarkSets, PosedViews, landmarks_in_view
+from wheretolook.visibility.listing import in_view_by_table
 from wheretolook.visibility.occlusion import NoOcclusion, OcclusionModel
 
 if TYPE_CHECKING:
     from torch import Tensor
 
 SAME_LOCATION_DECIMALS = 6  # camera centres that agree to this many decimals of a metre share one visibility test
+
+
+WORTH_A_TABLE = 1_000_000
+"""Lines of sight from which on a COLMAP camera's field of view is tabulated, which takes about a second."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +115,7 @@ class LocalizationMap:
 
     def landmarks_in_view(self, cam_from_world: Float) -> LandmarkSets:
         """The landmarks that each of the views (B, 3, 4) sees."""
-        return frustum.landmarks_in_view(self._views(cam_from_world), self.device)
+        return landmarks_in_view(self._views(cam_from_world), self.device)
 
     def in_view_on_device(self, cam_from_world: Float) -> tuple[NDArray[np.int64], Tensor]:
         """What `landmarks_in_view` gives, starts (B + 1,) int64 and indices int32; the latter on the map's device."""
@@ -119,7 +124,11 @@ class LocalizationMap:
 
         views = self._views(cam_from_world)
         if isinstance(self.camera, ColmapCamera):
-            seen = frustum.landmarks_in_view(views)
+            lines = int(np.diff(views.unoccluded.starts)[views.location_rows].sum())
+            by_table = lines >= WORTH_A_TABLE
+            seen = (
+                in_view_by_table(views, self._points_on_device, self.device) if by_table else landmarks_in_view(views)
+            )
             return seen.starts.astype(np.int64), torch.from_numpy(seen.indices).to(self.device)
         starts, indices = frustum.in_view_on_device(views, self._points_on_device, self.device)
         return starts.astype(np.int64), wp.to_torch(indices)

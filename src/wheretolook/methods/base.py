@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wheretolook.geometry.camera import Camera, ColmapCamera, describe_camera
-from wheretolook.geometry.poses import Float
+from wheretolook.geometry.poses import Float, poses_looking_along
 from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS
 from wheretolook.utils.errors import CameraError
 
@@ -21,6 +22,16 @@ BLOCK = 4096  # views scored at a time: about 80 MB of bins
 FIELD_OF_VIEW_TOLERANCE = (
     1e-3  # relative difference in size / focal length, and of the principal point, up to which they are the same
 )
+
+
+@dataclass(frozen=True, eq=False)
+class ViewReport:
+    """What a scorer tells of B views."""
+
+    score: Float  # (B,)
+    expected_inliers: Float  # (B,) landmarks expected to be found; NaN where the method does not tell
+    n_visible: NDArray[np.int64]  # (B,) landmarks in view
+    in_range: NDArray[np.bool_]  # (B,) whether the view is like those that the scorer has learnt from
 
 
 class Scorer(ABC):
@@ -51,6 +62,24 @@ class Scorer(ABC):
         All do where nothing was learnt, or nothing is known of the views it was learnt from.
         """
         return np.ones(len(cam_from_world), dtype=bool)
+
+    def score_around(self, locations: Float, directions: Float) -> Float:
+        """Scores (L, D) of cameras without roll at locations (L, 3) m that look along each of directions (D, 3).
+
+        They rank the directions of a location; what stands on samples of landmarks may differ from `score` by little.
+        """
+        at, axes = np.repeat(locations, len(directions), axis=0), np.tile(directions, (len(locations), 1))
+        return self.score(poses_looking_along(at, axes)).reshape(len(locations), len(directions))
+
+    def report(self, cam_from_world: Float) -> ViewReport:
+        """Score poses (B, 3, 4), and tell what there is to know of them."""
+        starts, _ = self.localization_map.in_view_on_device(cam_from_world)
+        n_visible, expected = np.diff(starts), self.expected_inliers(cam_from_world)
+        return ViewReport(self.score(cam_from_world), expected, n_visible, self.in_range(cam_from_world))
+
+    def expected_inliers(self, cam_from_world: Float) -> Float:
+        """How many landmarks poses (B, 3, 4) can be expected to find, (B,); NaN where the method does not tell."""
+        return np.full(len(cam_from_world), np.nan)
 
     def score_binned(self, cam_from_world: Float, binned: BinnedViews) -> Float:
         """What `score` gives, (B,), for poses that the map's `bin_views` has binned already, with all `CHANNELS`."""

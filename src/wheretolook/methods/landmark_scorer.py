@@ -33,7 +33,7 @@ class LandmarkScorer(Scorer):
     ) -> None:
         super().__init__(localization_map)
         self.training_range = TrainingRange.of_camera(camera) if training_range is None else training_range
-        self._describer = LandmarkDescriber(localization_map, attributes)
+        self.describer = LandmarkDescriber(localization_map, attributes)
         self._of_camera = camera_quantities(localization_map.camera)
         self._serves_camera = bool(self.training_range.contains(self._of_camera[None])[0])
         watching = self.training_range.asks_for_landmarks or not self._serves_camera
@@ -44,7 +44,7 @@ class LandmarkScorer(Scorer):
         cam_from_world = check_poses(cam_from_world)
         inside = np.full(len(cam_from_world), self._serves_camera)
         if self._serves_camera and self.training_range.asks_for_landmarks:
-            for rows, described, n_in_view in self._describer.in_blocks(cam_from_world, self.most):
+            for rows, described, n_in_view in self.describer.in_blocks(cam_from_world, self.most):
                 inside[rows] = self.training_range.contains(view_quantities(described, n_in_view, self._of_camera))
         return inside
 

@@ -96,8 +96,19 @@ class FrustumCounter:
             mask = np.ones((len(at), points.shape[0]), bool) if unoccluded is None else unoccluded.numpy()
             host_counts = count_plain(self.camera, self.rotations, at, points.numpy(), mask, distinct_pixels=True)
             return wp.array(host_counts, dtype=wp.int32, device=self.device)
+        counts: Any = wp.zeros((len(at), len(self.rotations)), dtype=wp.int32, device=self.device)
+        landmarks, _ = self._sorted(at, points, unoccluded)
+        if isinstance(self.camera, ColmapCamera):
+            return self._count_by_field(landmarks, counts)
+        if self.distinct_pixels:
+            return self._count_pixels(landmarks, counts)
+        inputs = [self._sides, landmarks, self._rounding, wp.float64(frustum.MIN_DEPTH_M), self.lanes]
+        wp.launch(counting_kernel.count_kernel, (*counts.shape, self.lanes), inputs, [counts], device=self.device)
+        return counts
+
+    def _sorted(self, at: Float, points: Any, unoccluded: Any | None) -> tuple[Any, Any]:
+        """Landmarks sorted into cells around locations (L, 3), and their places (L, N), see `cell_kernel`."""
         device, n_cells, shape = self.device, self.size**2 + 1, (len(at), points.shape[0])
-        counts: Any = wp.zeros((len(at), len(self.rotations)), dtype=wp.int32, device=device)
         centers: Any = wp.array(at, dtype=wp.vec3d, device=device)
         places: Any = wp.empty(shape, dtype=wp.vec2i, device=device)
         numbers: Any = wp.zeros(len(at) * n_cells + 1, dtype=wp.int32, device=device)
@@ -113,13 +124,7 @@ class FrustumCounter:
         landmarks.size, landmarks.starts, landmarks.offsets = self.size, starts, offsets
         landmarks.inside_starts, landmarks.inside = self.cells.inside.starts, self.cells.inside.cells
         landmarks.border_starts, landmarks.border = self.cells.border.starts, self.cells.border.cells
-        if isinstance(self.camera, ColmapCamera):
-            return self._count_by_field(landmarks, counts)
-        if self.distinct_pixels:
-            return self._count_pixels(landmarks, counts)
-        inputs = [self._sides, landmarks, self._rounding, wp.float64(frustum.MIN_DEPTH_M), self.lanes]
-        wp.launch(counting_kernel.count_kernel, (*counts.shape, self.lanes), inputs, [counts], device=device)
-        return counts
+        return landmarks, places
 
     def _count_pixels(self, landmarks: Any, counts: Any) -> Any:
         assert isinstance(self.camera, PinholeCamera)

@@ -22,6 +22,7 @@ class Views:
     starts: wp.array[wp.int32]  # (L + 1,) first entry of each location in `unoccluded`
     unoccluded: wp.array[wp.int32]  # rows of `points`
     min_depth: wp.float64  # metres
+    rounding: wp.float32  # see `sides_rounding`
 
 
 @wp.func
@@ -99,9 +100,17 @@ def collect_kernel(
     view = wp.tid()
     location = views.location_rows[view]
     count = wp.int32(0)
+    left = views.sides[view, 0]
+    right = views.sides[view, 1]
+    top = views.sides[view, 2]
+    bottom = views.sides[view, 3]
     for entry in range(views.starts[location], views.starts[location + 1]):
-        if in_view(views.sides, view, entry_offset(views, view, entry), views.min_depth):
-            if write:
-                indices[out_starts[view] + count] = views.unoccluded[entry]
-            count += 1
+        offset = entry_offset(views, view, entry)
+        # single precision rejects most; what is left, or not finite, is decided exactly
+        outside = least_product(left, right, top, bottom, offset) < -rounding_error(offset, views.rounding)
+        if not outside:  # noqa: SIM102 (Warp evaluates both sides of an `and`)
+            if in_view(views.sides, view, offset, views.min_depth):
+                if write:
+                    indices[out_starts[view] + count] = views.unoccluded[entry]
+                count += 1
     lengths[view] = count

@@ -100,11 +100,15 @@ class ExpectedScorer(LandmarkScorer):
 
     def score(self, cam_from_world: Float) -> Float:
         """(B,) in [0, 1]."""
-        sums = self._expectation.sums(self._describer, cam_from_world)
+        sums = self._expectation.sums(self.describer, cam_from_world)
         self._watch.check(self.name, [self._expectation.quantities])
         if self.kind == FILLED:
             return sums[:, 16] / BINS**2
         return sums[:, 0] / max(1, len(self.localization_map.landmarks))
+
+    def expected_inliers(self, cam_from_world: Float) -> Float:
+        """(B,), the sum of the chances of being found over the landmarks in view."""
+        return self._expectation.sums(self.describer, cam_from_world)[:, 0]
 
 
 class ExpectedFisherScorer(LandmarkScorer):
@@ -125,6 +129,6 @@ class ExpectedFisherScorer(LandmarkScorer):
 
     def score(self, cam_from_world: Float) -> Float:
         """(B,), not bounded by 1."""
-        numbers = self._expectation.sums(self._describer, cam_from_world)[:, 1:16]
+        numbers = self._expectation.sums(self.describer, cam_from_world)[:, 1:16]
         self._watch.check(self.name, [self._expectation.quantities])
         return metric_of(numbers, self.metric, device=self.localization_map.device)

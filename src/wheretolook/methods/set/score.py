@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from wheretolook.geometry.poses import Float, check_poses
+from wheretolook.inputs.landmarks_in_view import ViewLandmarks
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.learning.trained_network import TrainedNetwork
+from wheretolook.learning.training_range import view_quantities
+from wheretolook.methods.base import ViewReport
 from wheretolook.methods.landmark_scorer import LandmarkScorer
+from wheretolook.methods.set.around import ScoresAround
 from wheretolook.methods.set.network import SetNetwork
 
 MOST = 1024
@@ -28,17 +33,46 @@ class SetScorer(LandmarkScorer):
         super().__init__(localization_map, trained.network.attributes, trained.training_range, trained.camera)
         self.name, self.trained = trained.method, trained
         self.network = trained.network.to(localization_map.device)
+        self._around: ScoresAround | None = None
+        self._around_axes: Float = np.empty((0, 3))
 
     def score(self, cam_from_world: Float) -> Float:
         """(B,) probabilities in [0, 1]."""
         cam_from_world = check_poses(cam_from_world)
         scores = np.empty(len(cam_from_world))
         looked_at: list[Float] = []
-        for rows, described, n_visible in self._describer.in_blocks(cam_from_world, MOST):
+        for rows, described, n_visible in self.describer.in_blocks(cam_from_world, MOST):
             looked_at += self._look(described, n_visible)
-            height = torch.from_numpy(cam_from_world[rows, 2, 2]).to(described.values)
-            with torch.inference_mode():
-                logits = self.network.score(described, n_visible, height).double()
-                scores[rows] = self.trained.calibrated(logits).sigmoid().cpu().numpy()
+            scores[rows] = self._chances(cam_from_world[rows], described, n_visible)
         self._watch.check(self.name, looked_at)
         return scores
+
+    def report(self, cam_from_world: Float) -> ViewReport:
+        """As of every method; without warning of views out of range, which it tells one by one."""
+        cam_from_world = check_poses(cam_from_world)
+        n = len(cam_from_world)
+        told = ViewReport(np.empty(n), np.zeros(n), np.zeros(n, dtype=np.int64), np.full(n, self._serves_camera))
+        for rows, described, n_visible in self.describer.in_blocks(cam_from_world, MOST):
+            told.score[rows] = self._chances(cam_from_world[rows], described, n_visible)
+            told.n_visible[rows] = n_visible.cpu().numpy()
+            told.in_range[rows] &= self.training_range.contains(view_quantities(described, n_visible, self._of_camera))
+            with torch.inference_mode():
+                chances = self.network.matchability(described.values).sigmoid().double()
+                sums = torch.segment_reduce(chances, "sum", lengths=described.counts, initial=0.0)
+                found = sums * n_visible / described.counts.clamp(min=1)
+            told.expected_inliers[rows] = found.cpu().numpy()
+        return told
+
+    def _chances(self, cam_from_world: Float, described: ViewLandmarks, n_visible: Tensor) -> Float:
+        height = torch.from_numpy(cam_from_world[:, 2, 2]).to(described.values)
+        with torch.inference_mode():
+            logits = self.network.score(described, n_visible, height).double()
+            return np.asarray(self.trained.calibrated(logits).sigmoid().cpu().numpy())
+
+    def score_around(self, locations: Float, directions: Float) -> Float:
+        """(L, D) probabilities; where many landmarks are in view, by fewer of them than `score`."""
+        if not ScoresAround.serves(self):
+            return super().score_around(locations, directions)
+        if self._around is None or not np.array_equal(self._around_axes, directions):
+            self._around, self._around_axes = ScoresAround(self, directions, MOST // 2), directions
+        return self._around.score(locations)

@@ -31,7 +31,7 @@ class TreesScorer(LandmarkScorer):
         looked_at: list[Float] = []
         for begin in range(0, len(scores), BLOCK):
             block = cam_from_world[begin : begin + BLOCK]
-            described = self._describer.describe(block)
+            described = self.describer.describe(block)
             looked_at += self._look(described, described.counts)
             pooled = pool(described, block, self.localization_map.camera)
             scores[begin : begin + BLOCK] = self.trees.logits(pooled).sigmoid().cpu().numpy()

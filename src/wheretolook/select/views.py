@@ -1,0 +1,84 @@
+"""Views that were selected: where they are, how they look, what they are worth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wheretolook.geometry.camera import Camera
+from wheretolook.geometry.poses import Float, camera_centers, quaternion_from_rotation
+from wheretolook.planning.turns import pan_tilt_angles
+
+
+@dataclass(frozen=True, eq=False)
+class SelectedViews:
+    """V views: the best of each waypoint, in the order of waypoints, the best of a waypoint first.
+
+    World in metres, z up; camera x right, y down, z forward. `cam_from_world` takes world to camera (world-to-camera);
+    `quaternions_wxyz` and `quaternions_xyzw` are of the opposite, camera-to-world, as robots and TUM files have them.
+    """
+
+    waypoint: NDArray[np.int64]  # (V,) row of the waypoint in what was asked for, from 0
+    waypoint_id: tuple[str, ...]  # V names of the waypoints
+    rank: NDArray[np.int64]  # (V,) 1 for the best view of the waypoint
+    cam_from_world: Float  # (V, 3, 4) float64
+    score: Float  # (V,)
+    expected_inliers: Float  # (V,) landmarks expected to be found; NaN where the method does not tell
+    n_visible: NDArray[np.int64]  # (V,) landmarks in view
+    in_range: NDArray[np.bool_]  # (V,) whether the view is like those that the scorer has learnt from
+    camera: Camera  # the one that looks
+    method: str  # name of the scorer
+
+    def __len__(self) -> int:
+        return len(self.score)
+
+    @property
+    def positions(self) -> Float:
+        """Camera centres in the world, (V, 3) metres."""
+        return camera_centers(self.cam_from_world)
+
+    @property
+    def axes(self) -> Float:
+        """Unit optical axes in the world, (V, 3)."""
+        return np.asarray(self.cam_from_world[:, 2, :3])
+
+    @property
+    def yaw_deg(self) -> Float:
+        """(V,) angle of the optical axis in the level plane: 0 along +x, 90 along +y; 0 straight up or down."""
+        return np.degrees(pan_tilt_angles(self.axes)[0])
+
+    @property
+    def pitch_deg(self) -> Float:
+        """(V,) angle of the optical axis above the level plane: 90 straight up."""
+        return np.degrees(pan_tilt_angles(self.axes)[1])
+
+    @property
+    def quaternions_wxyz(self) -> Float:
+        """Unit quaternions wxyz (V, 4) of the orientation, camera-to-world, w >= 0."""
+        return quaternion_from_rotation(np.swapaxes(self.cam_from_world[:, :, :3], 1, 2))
+
+    @property
+    def quaternions_xyzw(self) -> Float:
+        """The same in the order xyzw."""
+        return np.roll(self.quaternions_wxyz, -1, axis=1)
+
+    def save(self, path: str | Path, format: str | None = None) -> None:
+        """Write a file, see `wheretolook.select.formats`, whose name tells the format unless it is given.
+
+        Raises a ConfigError if there is no such format, or it holds one view of a waypoint and there are several.
+        """
+        from wheretolook.select.formats import save_views
+
+        save_views(self, Path(path), format)
+
+
+def joined(parts: Sequence[SelectedViews]) -> SelectedViews:
+    """Views of one camera and method, one after another."""
+    arrays = [field.name for field in fields(SelectedViews) if field.name not in ("waypoint_id", "camera", "method")]
+    values: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in arrays}
+    return replace(parts[0], waypoint_id=tuple(name for part in parts for name in part.waypoint_id), **values)

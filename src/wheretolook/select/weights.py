@@ -1,0 +1,34 @@
+"""Which file of weights a method scores with: of those given, or of those that ship."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from wheretolook.utils.errors import WeightsError
+from wheretolook.utils.shipped import WEIGHTS, or_shipped, shipped
+
+
+def weights_of(method: str, given: str | Path | None) -> Path | None:
+    """The file of weights that a method scores with, of the file or folder given or of those that ship.
+
+    An empty method stands for that of the best weights; None for a method without any. Raises a ConfigError if there
+    is no such method, a WeightsError if there are no weights of it, or they cannot be read.
+    """
+    from wheretolook.learning.weights import method_of_weights
+    from wheretolook.methods.registry import best_weights, check_method, members, scorers
+
+    kinds = {known.weights for known in members(method, scorers()) or ([check_method(method)] if method else [])}
+    if "" in kinds:
+        return None
+    place = shipped(WEIGHTS) if given is None else or_shipped(given)
+    if not place.is_dir():
+        if not place.is_file():
+            raise WeightsError("there are no weights", path=place, fix="Correct the path.")
+        return place
+    if not method:
+        return best_weights(place)
+    fitting = [path for path in sorted(place.glob("*.safetensors")) if method_of_weights(path) in kinds]
+    if not fitting:
+        fix = "Give a file of weights (--weights), or another method."
+        raise WeightsError(f"there are no weights of {method} here", path=place, fix=fix)
+    return fitting[0]

@@ -1,0 +1,255 @@
+"""Where to look at places of one's own map: the best views by any method of scoring."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from tqdm.auto import tqdm
+
+from wheretolook.geometry.camera import Camera
+from wheretolook.geometry.lattices import Lattice, direction_lattice
+from wheretolook.geometry.poses import Float, check_poses, poses_looking_along
+from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.planning.sequences import TurnLimit, best_sequence
+from wheretolook.planning.turns import pan_tilt_angles
+from wheretolook.select.surroundings import grid_waypoints, map_space, surroundings, usable_waypoints
+from wheretolook.select.views import SelectedViews, joined
+from wheretolook.select.waypoints import Waypoints
+from wheretolook.select.weights import weights_of
+from wheretolook.utils.devices import usable_device
+from wheretolook.utils.errors import ConfigError
+from wheretolook.visibility.remembered import RememberedOcclusion
+
+if TYPE_CHECKING:
+    from wheretolook.methods.base import Scorer
+
+VIEWS_AT_ONCE = {
+    "cpu": 1 << 13,
+    "cuda": 1 << 17,
+}  # views scored between two steps of the progress bar, in whole waypoints
+
+SPARE = 3
+"""Views of a waypoint, beyond those asked for, whose scores are computed again: where many landmarks are in view, the
+scores of all directions stand on other samples of them."""
+
+SIGHT_LINES = 1 << 24  # lines of sight looked at at once when views are told of
+
+
+class WhereToLook:
+    """Scores views of a map, and finds the best ones at any place.
+
+        look = WhereToLook.from_colmap("sparse/0")
+        views = look.best([(1.0, 2.0, 1.5), (1.2, 2.0, 1.5)])
+        views.save("views.csv")
+
+    World in metres, z up. `scorer` is any method on a localization map; `directions` (D, 3) are the optical axes that
+    are looked along at each place, in the world; cameras do not roll. `space` tells where a camera can be, for grids;
+    None for what the map itself tells.
+    """
+
+    def __init__(self, scorer: Scorer, directions: ArrayLike | None = None, space: Any = None) -> None:
+        self.scorer, self._space = scorer, space
+        axes = direction_lattice(500) if directions is None else np.asarray(directions, dtype=np.float64)
+        self.directions = axes / np.linalg.norm(axes, axis=1, keepdims=True)
+        self.views: SelectedViews | None = None  # those found last
+
+    @classmethod
+    def from_colmap(
+        cls,
+        path: str | Path,
+        *,
+        weights: str | Path | None = None,
+        method: str = "",
+        camera: Camera | str | int | None = None,
+        fov_deg: float | None = None,
+        mesh: str | Path | None = None,
+        depth: str | Path | None = None,
+        depth_scale: float = 1000.0,
+        occlusion: str | None = None,
+        database: str | Path | None = None,
+        directions: int = 500,
+        lattice: Lattice = "fibonacci",
+        max_reprojection_error_px: float | None = None,
+        device: str = "auto",
+    ) -> WhereToLook:
+        """From any COLMAP model (binary or text) in metres, z up.
+
+        Args:
+            path: folder of the model.
+            weights: file or folder of weights; None for those that ship.
+            method: name of a method, such as "set" or "visible"; "" for that of the weights.
+            camera: the camera that will look: a camera, a text such as "PINHOLE,640,480,320,320,320,240", or the
+                camera_id of one of the model. None for the model's own.
+            fov_deg: instead, a pinhole of that horizontal field of view in degrees, of 640 x 480 px.
+            mesh: mesh of the scene, for true occlusion.
+            depth: folder of depth images of the model's images, for occlusion by the surface they fuse to; see
+                `wheretolook.select.surroundings.read_depth_images`.
+            depth_scale: units of integer depth images in a metre.
+            occlusion: "mesh", "tsdf" (depth images), "hidden-points" (from the landmarks alone) or "none" (landmarks
+                are seen through walls); None for the first of these that there is something for.
+            database: the model's database, for descriptors and so the landmarks' ambiguity.
+            directions: how many directions are looked along at each place.
+            lattice: how they are spread: "fibonacci" evenly; "yaw-pitch" 6 pitches x 18 yaws as in ActLoc.
+            max_reprojection_error_px: landmarks with a larger mean error are left out; None for the map's own default.
+            device: "auto" for a GPU if there is one, "cpu", or "cuda:0".
+
+        Raises:
+            MapError: no usable model in the folder, or database.
+            SceneError: the mesh or the depth images cannot be used.
+            WeightsError: the weights cannot be used, or there are none.
+            ConfigError: no such method, camera, occlusion, lattice or device.
+        """
+        from wheretolook.methods.registry import load_scorer, make_scorer
+        from wheretolook.select.cameras import camera_of_view, parse_camera
+
+        model, device = Path(path), usable_device(device)
+        if camera is not None and fov_deg is not None:
+            raise ConfigError("a camera is described in two ways", value=fov_deg, fix="Give camera or fov_deg.")
+        axes = direction_lattice(directions, lattice)
+        if isinstance(camera, str):
+            camera = parse_camera(camera)
+        elif fov_deg is not None:
+            camera = camera_of_view(fov_deg)
+        weights = weights_of(method, weights)
+        hides, space = surroundings(
+            None if mesh is None else Path(mesh), None if depth is None else Path(depth), depth_scale, occlusion, model,
+            device,
+        )  # fmt: skip
+        options: dict[str, Any] = {}
+        if database is not None:
+            options["database"] = Path(database)
+        if max_reprojection_error_px is not None:
+            options["max_reprojection_error_px"] = max_reprojection_error_px
+        if hides.name != "none":
+            hides = RememberedOcclusion(hides)
+        around = LocalizationMap.from_colmap(model, camera, occlusion=hides, device=device, **options)
+        scorer = make_scorer(method, around, weights=weights) if method else load_scorer(str(weights), around)
+        return cls(scorer, axes, space)
+
+    @property
+    def localization_map(self) -> LocalizationMap:
+        """The map, with the camera that looks and what hides landmarks."""
+        return self.scorer.localization_map
+
+    @property
+    def space(self) -> Any:
+        """Where a camera can be: by mesh, depth images, or the map alone."""
+        if self._space is None:
+            self._space = map_space(self.localization_map)
+        return self._space
+
+    def grid(self, spacing_m: float) -> Waypoints:
+        """Places so far apart in all free space, in metres, for `best`. Raises ConfigError or SceneError if none."""
+        return grid_waypoints(self.localization_map, self.space, spacing_m)
+
+    def score(self, cam_from_world: ArrayLike) -> Float:
+        """Scores (B,) of poses (B, 3, 4), world-to-camera; higher is better, of learned methods a probability."""
+        return self.scorer.score(check_poses(cam_from_world))
+
+    def best(
+        self,
+        points: ArrayLike | Waypoints,
+        n: int = 1,
+        *,
+        ids: Sequence[str] = (),
+        pitch_deg: tuple[float, float] | None = None,
+        max_turn_deg: float | None = None,
+        skip: bool = False,
+        progress: bool = False,
+    ) -> SelectedViews:
+        """The best view, or the n best, at each of points (W, 3) metres in the world.
+
+        Args:
+            points: where the camera is.
+            n: views of each point.
+            ids: names of the points; counts from 0 unless given.
+            pitch_deg: lowest and highest pitch in degrees, 90 straight up.
+            max_turn_deg: greatest rotation between a view and the next, in the order of the points. The views are then
+                those with the greatest sum of scores of all sequences that keep the limit, exactly
+                (`wheretolook.planning.sequences.best_sequence`).
+            skip: leave out points outside the map or inside geometry.
+            progress: show a progress bar.
+
+        Raises:
+            TableError: points of another shape, not finite, outside the map or inside geometry.
+            ConfigError: n or the limits are no such numbers, or no direction is within the limit on pitch.
+            PlanningError: no sequence keeps the limit on turns.
+        """
+        axes = self._allowed(n, pitch_deg, max_turn_deg)
+        waypoints = Waypoints.of(points, ids)
+        rows = np.flatnonzero(usable_waypoints(self.localization_map, waypoints, skip))
+        at = waypoints.points[rows]
+        scores = self._scores_around(at, axes, progress)
+        if max_turn_deg is not None:
+            chosen = best_sequence(scores, TurnLimit.of(axes, max_turn_deg)).direction_ids[:, None]
+        else:
+            chosen = np.argsort(-scores, axis=1, kind="stable")[:, : n + SPARE]
+        step = max(1, SIGHT_LINES // max(1, len(self.localization_map.landmarks)))
+        blocks = [slice(begin, begin + step) for begin in range(0, len(rows), step)]
+        found = [self._described(waypoints, rows[block], axes[chosen[block]], n) for block in blocks]
+        self.views = joined(found)
+        return self.views
+
+    def _described(self, waypoints: Waypoints, rows: NDArray[np.int64], axes: Float, n: int) -> SelectedViews:
+        """The n best of views along axes (W, K, 3) at some of the waypoints, with all that is told of them."""
+        scorer, k = self.scorer, axes.shape[1]
+        poses = poses_looking_along(np.repeat(waypoints.points[rows], k, axis=0), axes.reshape(-1, 3))
+        told = scorer.report(poses)
+        order = np.argsort(-told.score.reshape(-1, k), axis=1, kind="stable")[:, :n]
+        taken = (np.arange(len(rows))[:, None] * k + order).ravel()
+        of_waypoint = np.repeat(rows, order.shape[1])
+        return SelectedViews(
+            waypoint=of_waypoint,
+            waypoint_id=tuple(waypoints.ids[row] for row in of_waypoint),
+            rank=np.tile(np.arange(1, order.shape[1] + 1), len(rows)),
+            cam_from_world=poses[taken],
+            score=told.score[taken],
+            expected_inliers=told.expected_inliers[taken],
+            n_visible=told.n_visible[taken],
+            in_range=told.in_range[taken],
+            camera=scorer.localization_map.camera,
+            method=scorer.name,
+        )
+
+    def _scores_around(self, locations: Float, axes: Float, progress: bool) -> Float:
+        """Scores (L, D) of all directions (D, 3) at locations (L, 3)."""
+        kind = self.localization_map.device.partition(":")[0]
+        scores, step = np.empty((len(locations), len(axes))), max(1, VIEWS_AT_ONCE[kind] // len(axes))
+        with tqdm(total=len(locations), desc="score", unit="waypoint", disable=not progress) as bar:
+            for begin in range(0, len(locations), step):
+                block = locations[begin : begin + step]
+                scores[begin : begin + step] = self.scorer.score_around(block, axes)
+                bar.update(len(block))
+        return scores
+
+    def _allowed(self, n: int, pitch_deg: tuple[float, float] | None, max_turn_deg: float | None) -> Float:
+        """The directions within the limit on pitch, (D, 3); a ConfigError if there is none, or a number is no limit."""
+        if not isinstance(n, int | np.integer) or n < 1:
+            raise ConfigError("views of a waypoint are a whole number of at least 1", value=n)
+        if max_turn_deg is not None and n > 1:
+            fix = "Ask for one view, or leave the limit out."
+            raise ConfigError("a limit on turns is for one view of each waypoint", value=n, fix=fix)
+        if max_turn_deg is not None and not max_turn_deg >= 0:
+            raise ConfigError("a limit on turns is at least 0 degrees", value=max_turn_deg)
+        if pitch_deg is None:
+            return self.directions
+        low, high = pitch_deg
+        if not -90 <= low <= high <= 90:
+            fix = "Give the lowest and the highest pitch in degrees, such as -30 and 30."
+            raise ConfigError("the limits on pitch do not lie within -90 and 90", value=(low, high), fix=fix)
+        pitch = np.degrees(pan_tilt_angles(self.directions)[1])
+        axes = self.directions[(pitch >= low - 1e-9) & (pitch <= high + 1e-9)]
+        if len(axes) == 0:
+            fix = "Widen it, or look along more directions."
+            raise ConfigError("no direction lies within the limit on pitch", value=(low, high), fix=fix)
+        return axes
+
+    def save(self, path: str | Path, format: str | None = None) -> None:
+        """Write the views found last, as `SelectedViews.save`; a ConfigError if none were."""
+        if self.views is None:
+            raise ConfigError("there are no views to save", path=path, fix="Ask for them first: best(points).")
+        self.views.save(path, format)

@@ -1,0 +1,155 @@
+"""Which landmarks are in view at every location in every direction, one by one: what counts alone do not tell."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike, NDArray
+
+from wheretolook.geometry.camera import Camera, ColmapCamera
+from wheretolook.geometry.poses import Float, split_poses
+from wheretolook.visibility import frustum, listing_kernel
+from wheretolook.visibility.counting import ASKED_AT_ONCE, FrustumCounter
+from wheretolook.visibility.field_of_view import tabulate
+from wheretolook.visibility.frustum import LandmarkSets, PosedViews
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """The M landmarks that are unoccluded from a block of locations, sorted into cells, on the lister's device."""
+
+    sorted: Any  # `counting_kernel.SortedLandmarks`
+    rows: Any  # (M,) int32 rows of the points
+
+    @property
+    def offsets(self) -> Any:
+        """(M,) vec3 from the location to the landmark, in the world, metres."""
+        return self.sorted.offsets[: max(1, self.rows.shape[0])]
+
+
+@dataclass(frozen=True, eq=False)
+class ListedViews:
+    """The landmarks in view of V views, E in all."""
+
+    starts: NDArray[np.int64]  # (V + 1,); view v has `starts[v]` to `starts[v + 1]` of the next two
+    entries: Any  # (E,) int32 rows of `Surroundings`, on the lister's device
+    image: Any  # (E,) vec2, x / z and y / z in the camera, likewise
+
+
+def in_view_by_table(posed: PosedViews, points: Any, device: str = "cpu") -> LandmarkSets:
+    """What `frustum.landmarks_in_view` gives for a COLMAP camera, by a table of its field of view; on the host.
+
+    The table takes a second to make, and the camera is asked only about landmarks near the border of the view. Points
+    are those of `points_on_device`.
+    """
+    assert isinstance(posed.camera, ColmapCamera)
+    wp.load_module(listing_kernel, device=device)
+    field, (rotations, centers) = tabulate(posed.camera), split_poses(posed.cam_from_world)
+    single = rotations.astype(np.float32)
+    inputs = [
+        wp.array(single, dtype=wp.mat33, device=device),
+        wp.array(centers, dtype=wp.vec3d, device=device),
+        wp.array(np.asarray(posed.location_rows, dtype=np.int32), dtype=wp.int32, device=device),
+        points,
+        *frustum.sets_on_device(posed.unoccluded, device),
+        wp.array(field.depth_rad, dtype=wp.float32, device=device),
+        field.size,
+    ]
+    lengths: Any = wp.empty(len(single), dtype=wp.int64, device=device)
+    none: list[Any] = [wp.empty(0, dtype=dtype, device=device) for dtype in (wp.int64, wp.int32)]
+    kernel = listing_kernel.collect_field_kernel
+    wp.launch(kernel, len(single), [*inputs, False, none[0]], [lengths, none[1]], device=device)
+    starts = np.concatenate([[0], np.cumsum(lengths.numpy())])
+    found: Any = wp.empty(int(starts[-1]), dtype=wp.int32, device=device)
+    first: Any = wp.array(starts[:-1], dtype=wp.int64, device=device)
+    wp.launch(kernel, len(single), [*inputs, True, first], [lengths, found], device=device)
+    indices = found.numpy()
+    unsure = np.flatnonzero(indices < 0)
+    indices[unsure] = -1 - indices[unsure]
+    of_view = np.searchsorted(starts, unsure, side="right") - 1
+    kept = np.ones(len(indices), dtype=bool)
+    for begin in range(0, len(unsure), ASKED_AT_ONCE):
+        part = unsure[begin : begin + ASKED_AT_ONCE]
+        views = of_view[begin : begin + ASKED_AT_ONCE]
+        offsets = (posed.points[indices[part]] - centers[views]).astype(np.float32)
+        kept[part] = posed.camera.sees(frustum.rotate(single[views], offsets))
+    lengths = np.diff(starts) - np.bincount(of_view[~kept[unsure]], minlength=len(single))
+    return LandmarkSets(np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32), indices[kept])
+
+
+class FrustumLister(FrustumCounter):
+    """Lists what `FrustumCounter` counts, by the same cells and the same exact tests.
+
+    Views (V, 2) are given by rows of the locations and of the rotations.
+    """
+
+    def __init__(self, camera: Camera, rotations: Float, n_points: int, device: str = "cpu", **options: Any) -> None:
+        super().__init__(camera, rotations, n_points, device, **options)
+        wp.load_module(listing_kernel, device=self.device)  # only one thread may do that
+
+    def surroundings(self, locations: ArrayLike, points: Any, unoccluded: Any | None) -> Surroundings:
+        """What is unoccluded from locations (L, 3) m.
+
+        Landmarks (N,) of vec3d and mask (L, N) of bool are Warp arrays on the device; without a mask all lines of sight
+        are free.
+        """
+        at, n_cells = np.asarray(locations, dtype=np.float64).reshape(-1, 3), self.size**2 + 1
+        landmarks, places = self._sorted(at, points, unoccluded)
+        rows: Any = wp.empty(int(landmarks.starts[len(at) * n_cells :].numpy()[0]), dtype=wp.int32, device=self.device)
+        inputs = [places, landmarks.starts, n_cells]
+        wp.launch(listing_kernel.rows_kernel, places.shape, inputs, [rows], device=self.device)
+        return Surroundings(landmarks, rows)
+
+    def lengths(self, around: Surroundings, views: NDArray[np.integer[Any]]) -> NDArray[np.int64]:
+        """How many landmarks views see, (V,). Those are included that only a COLMAP camera itself could decide."""
+        lengths: Any = wp.empty(len(views), dtype=wp.int64, device=self.device)
+        none = [wp.empty(0, dtype=dtype, device=self.device) for dtype in (wp.int64, wp.int32, wp.vec2)]
+        self._launch(around, views, False, none[0], lengths, none[1], none[2])
+        return np.asarray(lengths.numpy())
+
+    def list(self, around: Surroundings, views: NDArray[np.integer[Any]], lengths: NDArray[np.int64]) -> ListedViews:
+        """What views see, by the lengths (V,) that `lengths` gives of them."""
+        starts = np.concatenate([[0], np.cumsum(lengths)])
+        entries: Any = wp.empty(int(starts[-1]), dtype=wp.int32, device=self.device)
+        image: Any = wp.empty(int(starts[-1]), dtype=wp.vec2, device=self.device)
+        first: Any = wp.array(starts[:-1], dtype=wp.int64, device=self.device)
+        self._launch(
+            around, views, True, first, wp.empty(len(views), dtype=wp.int64, device=self.device), entries, image
+        )
+        listed = ListedViews(starts, entries, image)
+        return self._decided(listed, around, views) if isinstance(self.camera, ColmapCamera) else listed
+
+    def _launch(
+        self, around: Surroundings, views: Any, write: bool, first: Any, lengths: Any, entries: Any, image: Any
+    ) -> None:
+        asked: Any = wp.array(np.asarray(views, dtype=np.int32), dtype=wp.vec2i, device=self.device)
+        outputs = [lengths, entries, image]
+        if self._field is not None:
+            inputs = [asked, self._axes, self._depth, self._field.size, around.sorted, write, first]
+            wp.launch(listing_kernel.list_field_kernel, len(views), inputs, outputs, device=self.device)
+            return
+        least = wp.float64(frustum.MIN_DEPTH_M)
+        inputs = [asked, self._axes, self._sides, around.sorted, self._rounding, least, write, first]
+        wp.launch(listing_kernel.list_kernel, len(views), inputs, outputs, device=self.device)
+
+    def _decided(self, listed: ListedViews, around: Surroundings, views: NDArray[np.integer[Any]]) -> ListedViews:
+        """Without the landmarks that the table left to the camera and the camera does not see."""
+        assert isinstance(self.camera, ColmapCamera)
+        entries = listed.entries.numpy()
+        unsure = np.flatnonzero(entries < 0)
+        if len(unsure) == 0:
+            return listed
+        entries[unsure] = -1 - entries[unsure]
+        of_view = np.searchsorted(listed.starts, unsure, side="right") - 1
+        offsets, kept = around.offsets.numpy(), np.ones(len(entries), dtype=bool)
+        for begin in range(0, len(unsure), ASKED_AT_ONCE):
+            part = slice(begin, begin + ASKED_AT_ONCE)
+            rotations = self.rotations[views[of_view[part], 1]]
+            kept[unsure[part]] = self.camera.sees(frustum.rotate(rotations, offsets[entries[unsure[part]]]))
+        lost = np.bincount(of_view[~kept[unsure]], minlength=len(views))
+        starts = np.concatenate([[0], np.cumsum(np.diff(listed.starts) - lost)])
+        there: Any = wp.array(entries[kept], dtype=wp.int32, device=self.device)
+        return ListedViews(starts, there, wp.array(listed.image.numpy()[kept], dtype=wp.vec2, device=self.device))

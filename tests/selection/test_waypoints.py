@@ -1,0 +1,85 @@
+"""Waypoints are read from every usual format, and what is wrong with a file is told with its line."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from wheretolook.select.waypoints import Waypoints, parse_points, read_waypoints
+from wheretolook.utils.errors import TableError
+
+AT = [[1.5, -2.0, 0.25], [0.0, 3.0, 1.0]]
+
+
+@pytest.mark.parametrize(
+    ("text", "ids", "lines"),
+    [
+        ("x,y,z\n1.5,-2,0.25\n0,3,1\n", ("0", "1"), (2, 3)),
+        ("\ufeffid,X,Y,Z,comment\na,1.5,-2,0.25,first\nb,0,3,1,\n", ("a", "b"), (2, 3)),
+        ("1.5, -2, .25\n\n0, 3, 1\n", ("0", "1"), (1, 3)),
+        ("z;y;x\n0.25;-2;1.5\n1;3;0\n", ("0", "1"), (2, 3)),
+        ("# id x y z\n10 1.5 -2 0.25\n2 0 3 1\n", ("10", "2"), (2, 3)),
+        ("1.5 -2 0.25\n0 3 1\n", ("0", "1"), (1, 2)),
+        (
+            "# timestamp tx ty tz qx qy qz qw\n17.25 1.5 -2 0.25 0 0 0 1\n17.5 0 3 1 0 0 0 1\n",
+            ("17.25", "17.5"),
+            (2, 3),
+        ),
+    ],
+    ids=["csv", "csv-with-id", "csv-without-header", "semicolons", "benchmark", "plain", "tum"],
+)
+def test_formats(text: str, ids: tuple[str, ...], lines: tuple[int, ...], tmp_path: Path) -> None:
+    path = tmp_path / "waypoints"
+    path.write_text(text, encoding="utf-8")
+    found = read_waypoints(path)
+    np.testing.assert_array_equal(found.points, AT)
+    assert (found.ids, found.lines, found.path) == (ids, lines, path)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("", "no waypoints in the file"),
+        ("# x y z\n\n", "no waypoints in the file"),
+        ("x,y,z\n", "below the header"),
+        ("x,y\n1,2\n", "columns of waypoints are missing"),
+        ("1,2,3\n4,5\n", "line 2: 4,5"),
+        ("1 2 3\n4 five 6\n", "line 2: 4 five 6"),
+        ("1 2 3 4 5\n", "these have 5"),
+        ("x,y,z\n1,2,3\n1,nan,3\n", "line 3"),
+        ("1 2 inf\n", "not finite"),
+    ],
+)
+def test_files_that_are_none(text: str, says: str, tmp_path: Path) -> None:
+    path = tmp_path / "waypoints.csv"
+    path.write_text(text)
+    with pytest.raises(TableError, match=says) as caught:
+        read_waypoints(path)
+    assert caught.value.path == path and caught.value.fix
+
+
+def test_a_missing_file_and_one_that_is_no_text(tmp_path: Path) -> None:
+    with pytest.raises(TableError, match="no such file"):
+        read_waypoints(tmp_path / "nothing.csv")
+    (tmp_path / "image").write_bytes(bytes(range(256)))
+    with pytest.raises(TableError, match="text file"):
+        read_waypoints(tmp_path / "image")
+
+
+def test_numbers() -> None:
+    np.testing.assert_array_equal(parse_points(["1.5,-2,.25", " 0,3,1"]).points, AT)
+    for text in ("1,2", "a,b,c", "1,2,3,4"):
+        with pytest.raises(TableError, match="three numbers"):
+            parse_points([text])
+    with pytest.raises(TableError, match="not finite"):
+        parse_points(["1,2,nan"])
+
+
+def test_arrays() -> None:
+    assert Waypoints.of([1, 2, 3]).points.shape == (1, 3)
+    assert Waypoints.of(AT, ("a", "b"))[np.array([False, True])].ids == ("b",)
+    for wrong in (np.zeros((0, 3)), np.zeros((2, 2)), "abc", [[1, 2], [3]]):
+        with pytest.raises(TableError):
+            Waypoints.of(wrong)  # type: ignore[arg-type]
+    with pytest.raises(TableError, match="names"):
+        Waypoints.of(AT, ("a",))

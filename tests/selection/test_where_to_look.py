@@ -1,0 +1,260 @@
+"""The views that are selected are the best ones, of all directions, within the limits."""
+
+from __future__ import annotations
+
+from itertools import pairwise, product
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from box_scenes import furnished_room
+from selection.room import POINTS, WEIGHTS, write_room
+from wheretolook import LocalizationMap, load_scorer, poses_looking_along
+from wheretolook import WhereToLook as Exported
+from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
+from wheretolook.geometry.lattices import direction_lattice
+from wheretolook.geometry.poses import rotation_angle_deg, rotation_looking_along
+from wheretolook.learning.trained_network import TrainedNetwork
+from wheretolook.methods.base import Scorer
+from wheretolook.methods.set.around import ScoresAround
+from wheretolook.methods.set.network import TOLD, SetNetwork
+from wheretolook.methods.set.score import SetScorer
+from wheretolook.scenes.loading import save_glb
+from wheretolook.select.where_to_look import WhereToLook
+from wheretolook.utils.errors import ConfigError, MapError, SceneError, TableError, WeightsError, WhereToLookError
+from wheretolook.visibility.hidden_points import HiddenPointRemoval
+
+AXES = direction_lattice(60)
+
+
+@pytest.fixture(scope="module")
+def scorer(sparse: Path) -> Scorer:
+    """The way to score without the façade."""
+    return load_scorer(WEIGHTS, LocalizationMap.from_colmap(sparse, occlusion=HiddenPointRemoval()))
+
+
+def all_scores(scorer: Scorer, points: np.ndarray) -> np.ndarray:
+    poses = poses_looking_along(np.repeat(points, len(AXES), axis=0), np.tile(AXES, (len(points), 1)))
+    return scorer.score(poses).reshape(len(points), len(AXES))
+
+
+def test_best_views_are_those_of_the_scorer(look: WhereToLook, scorer: Scorer) -> None:
+    scores = all_scores(scorer, POINTS)
+    views = look.best(POINTS, 3)
+    assert Exported is WhereToLook
+    np.testing.assert_allclose(views.score.reshape(-1, 3), -np.sort(-scores, axis=1)[:, :3], rtol=1e-6)
+    np.testing.assert_allclose(views.axes[views.rank == 1], AXES[scores.argmax(axis=1)], atol=1e-9)
+    np.testing.assert_allclose(views.positions, np.repeat(POINTS, 3, axis=0), atol=1e-9)
+    np.testing.assert_array_equal(views.waypoint, np.repeat(np.arange(4), 3))
+    np.testing.assert_array_equal(views.rank, np.tile([1, 2, 3], 4))
+    np.testing.assert_allclose(look.score(views.cam_from_world), views.score, rtol=1e-6)
+    starts, _ = scorer.localization_map.in_view_on_device(views.cam_from_world)
+    np.testing.assert_array_equal(views.n_visible, np.diff(starts))
+    assert (views.expected_inliers > 0).all() and (views.expected_inliers <= views.n_visible).all()
+    np.testing.assert_array_equal(views.in_range, scorer.in_range(views.cam_from_world))
+
+
+@pytest.mark.parametrize("camera", [None, ColmapCamera("SIMPLE_RADIAL", 640, 480, (320.0, 320.0, 240.0, 0.05))])
+@pytest.mark.parametrize("text", [False, True])
+def test_all_directions_at_once_score_as_one_by_one(camera: ColmapCamera | None, text: bool, tmp_path: Path) -> None:
+    around = LocalizationMap.from_colmap(write_room(tmp_path / "sparse", text), camera, occlusion=HiddenPointRemoval())
+    scorer = load_scorer(WEIGHTS, around)
+    slow, fast = all_scores(scorer, POINTS), scorer.score_around(POINTS, AXES)
+    odds = [np.log(scores / (1 - scores)) for scores in (slow, fast)]
+    assert np.ptp(slow) > 0.05
+    np.testing.assert_allclose(odds[0], odds[1], atol=0.02)
+
+
+def test_a_sample_of_the_landmarks_ranks_as_all(tmp_path: Path) -> None:
+    around = LocalizationMap.from_colmap(write_room(tmp_path / "sparse", n=6000))
+    scorer = load_scorer(WEIGHTS, around)
+    poses = poses_looking_along(np.repeat(POINTS, len(AXES), axis=0), np.tile(AXES, (len(POINTS), 1)))
+    starts, _ = around.in_view_on_device(poses)
+    assert np.diff(starts).max() > 1500
+    slow, fast = all_scores(scorer, POINTS), scorer.score_around(POINTS, AXES)
+    assert np.corrcoef(slow.ravel(), fast.ravel())[0, 1] > 0.999
+    rows = np.arange(len(POINTS))
+    assert (slow.max(axis=1) - slow[rows, fast.argmax(axis=1)] < 0.01).all()
+
+
+def test_all_that_a_network_is_told_is_told_at_once(sparse: Path) -> None:
+    around = LocalizationMap.from_colmap(sparse)
+    old = load_scorer(WEIGHTS, around)
+    assert isinstance(old, SetScorer)
+    torch.manual_seed(0)
+    network = SetNetwork(old.network.statistics, hidden=old.network.options["hidden"], told=TOLD)
+    network.matchability.load_state_dict(old.network.matchability.state_dict())
+    scorer = SetScorer(around, TrainedNetwork("set", network, None))
+    assert ScoresAround.serves(scorer)
+    slow, fast = all_scores(scorer, POINTS), scorer.score_around(POINTS, AXES)
+    assert np.ptp(slow) > 0.1
+    np.testing.assert_allclose(fast, slow, atol=1e-4)
+
+
+def test_the_sequence_is_the_best_of_all(sparse: Path) -> None:
+    look = WhereToLook.from_colmap(sparse, weights=WEIGHTS, directions=12, device="cpu")
+    axes, limit = look.directions, 60.0
+    scores = look.scorer.score_around(POINTS, axes)
+    rotations = rotation_looking_along(axes)
+    turns = rotation_angle_deg(rotations[:, None], rotations[None])
+    best = max(
+        (sum(scores[row, choice] for row, choice in enumerate(way)), way)
+        for way in product(range(12), repeat=4)
+        if all(turns[a, b] <= limit for a, b in pairwise(way))
+    )
+    views = look.best(POINTS, max_turn_deg=limit)
+    np.testing.assert_allclose(views.axes, axes[list(best[1])], atol=1e-9)
+    assert best[0] < scores.max(axis=1).sum()  # the limit costs something here
+    turned = rotation_angle_deg(views.cam_from_world[:-1, :, :3], views.cam_from_world[1:, :, :3])
+    assert (turned <= limit + 1e-4).all()
+
+
+def test_limits_on_pitch(look: WhereToLook) -> None:
+    views = look.best(POINTS, 5, pitch_deg=(-20, 10))
+    assert (views.pitch_deg >= -20).all() and (views.pitch_deg <= 10).all()
+    assert len(views) == 20 and len({tuple(axis) for axis in views.axes[:5].round(6)}) == 5
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"n": 0}, "at least 1"),
+        ({"n": 2, "max_turn_deg": 30}, "one view of each waypoint"),
+        ({"max_turn_deg": -1}, "at least 0 degrees"),
+        ({"max_turn_deg": np.nan}, "at least 0 degrees"),
+        ({"pitch_deg": (10, -10)}, "within -90 and 90"),
+        ({"pitch_deg": (0.001, 0.002)}, "no direction lies within"),
+    ],
+)
+def test_limits_that_are_none(look: WhereToLook, options: dict, says: str) -> None:
+    with pytest.raises(ConfigError, match=says):
+        look.best(POINTS, **options)
+
+
+def test_waypoints_outside_the_map(look: WhereToLook) -> None:
+    given = np.concatenate([POINTS[:2], [[300.0, 2.0, 1.5]], POINTS[2:]])
+    with pytest.raises(TableError, match="1 of 5 waypoints") as caught:
+        look.best(given)
+    assert "waypoint 2: (300, 2, 1.5)" in str(caught.value) and "skip" in str(caught.value.fix)
+    views = look.best(given, skip=True)
+    np.testing.assert_array_equal(views.waypoint, [0, 1, 3, 4])
+    np.testing.assert_allclose(views.positions, POINTS, atol=1e-9)
+    with pytest.raises(TableError, match="1 of 1 waypoints"):
+        look.best(given[2], skip=True)
+    with pytest.raises(TableError, match="inside geometry"):
+        look.best(look.localization_map.landmarks.points[3])
+
+
+def test_a_mesh_hides_landmarks_and_holds_waypoints_inside_geometry(sparse: Path, tmp_path: Path) -> None:
+    save_glb(furnished_room(), tmp_path / "room.glb")
+    open_room = WhereToLook.from_colmap(sparse, weights=WEIGHTS, directions=60, occlusion="none", device="cpu")
+    room = WhereToLook.from_colmap(sparse, weights=WEIGHTS, directions=60, mesh=tmp_path / "room.glb", device="cpu")
+    assert room.localization_map.occlusion.name == "mesh"
+    axes = np.tile(AXES, (len(POINTS), 1))
+    poses = poses_looking_along(np.repeat(POINTS, len(AXES), axis=0), axes)
+    seen = [np.diff(w.localization_map.in_view_on_device(poses)[0]) for w in (open_room, room)]
+    assert (seen[1] <= seen[0]).all() and seen[1].sum() < seen[0].sum()
+    with pytest.raises(TableError, match="inside geometry"):
+        room.best((5.0, 1.0, 1.0))  # in the closed cabinet
+    grid = room.grid(1.0)
+    assert len(grid) > 5 and room.space.is_free(grid.points).all()
+    with pytest.raises(ConfigError, match="places"):
+        room.grid(0.001)
+    with pytest.raises(ConfigError, match="length"):
+        room.grid(0)
+
+
+def test_a_grid_without_a_mesh_lies_near_the_images(look: WhereToLook) -> None:
+    grid = look.grid(0.5)
+    assert len(grid) > 10 and look.space.is_free(grid.points).all()
+    assert len(look.best(grid, 2)) == 2 * len(grid)
+
+
+def test_depth_images(sparse: Path, tmp_path: Path) -> None:
+    import cv2
+    import pycolmap
+
+    from wheretolook.rendering.warp_renderer import WarpRenderer
+
+    model, folder = pycolmap.Reconstruction(sparse), tmp_path / "depth"
+    folder.mkdir()
+    renderer, half = WarpRenderer(furnished_room(), "cpu"), PinholeCamera(320, 240, 160.0)
+    for image in model.images.values():
+        depth = renderer.render(half, image.cam_from_world().matrix()[None]).depth_m[0]
+        millimetres = np.nan_to_num(depth, nan=0, posinf=0) * 1000
+        cv2.imwrite(str(folder / image.name.replace(".jpg", ".png")), millimetres.astype(np.uint16))
+    look = WhereToLook.from_colmap(sparse, weights=WEIGHTS, directions=60, depth=folder, device="cpu")
+    assert look.localization_map.occlusion.name == "tsdf" and len(look.best(POINTS)) == 4
+    with pytest.raises(SceneError, match="no depth image"):
+        WhereToLook.from_colmap(sparse, weights=WEIGHTS, depth=tmp_path, device="cpu")
+
+
+def test_cameras(sparse: Path) -> None:
+    def camera(**options: object) -> object:
+        return WhereToLook.from_colmap(
+            sparse, weights=WEIGHTS, occlusion="none", device="cpu", **options
+        ).localization_map.camera
+
+    assert camera() == camera(camera=1) == PinholeCamera(640, 480, 320.0)
+    assert camera(camera="pinhole,320,240,200,200,160,120") == PinholeCamera(320, 240, 200.0)
+    assert camera(fov_deg=60) == PinholeCamera.of_field_of_view(60, 640, 480)
+    assert isinstance(camera(camera="OPENCV,640,480,320,320,320,240,0.1,0,0,0"), ColmapCamera)
+    for text in (
+        "PINHOLE,640,480",
+        "PINHOLE,640,480,0,0,320,240",
+        "PINHOLE,640,480,nan,320,320,240",
+        "PINHOLE,640.5,480,320,320,320,240",
+        "MAGIC,640,480,320",
+        "640,480",
+        "",
+    ):
+        with pytest.raises(ConfigError) as caught:
+            camera(camera=text)
+        assert caught.value.fix
+    for options, says in (({"fov_deg": 180}, "180"), ({"fov_deg": 60, "camera": 1}, "two ways")):
+        with pytest.raises(ConfigError, match=says):
+            camera(**options)
+    with pytest.raises(MapError, match="no such camera"):
+        camera(camera=7)
+
+
+@pytest.mark.parametrize(
+    ("options", "error"),
+    [
+        ({"method": "nothing"}, ConfigError),
+        ({"weights": "nothing.safetensors"}, WeightsError),
+        ({"method": "mlp-2d", "weights": WEIGHTS}, WeightsError),
+        ({"mesh": "nothing.glb"}, SceneError),
+        ({"depth": "nothing"}, SceneError),
+        ({"occlusion": "mesh"}, ConfigError),
+        ({"occlusion": "fog"}, ConfigError),
+        ({"lattice": "square"}, ConfigError),
+        ({"directions": 0}, ConfigError),
+        ({"device": "tpu"}, ConfigError),
+    ],
+)
+def test_bad_options_are_typed(sparse: Path, options: dict, error: type[WhereToLookError]) -> None:
+    with pytest.raises(error):
+        WhereToLook.from_colmap(sparse, **{"weights": WEIGHTS, "device": "cpu", **options})
+
+
+def test_methods_without_weights(sparse: Path) -> None:
+    look = WhereToLook.from_colmap(sparse, method="visible", directions=60, occlusion="none", device="cpu")
+    views = look.best(POINTS)
+    assert views.method == "visible" and np.isnan(views.expected_inliers).all() and views.in_range.all()
+    poses = poses_looking_along(np.repeat(POINTS, len(AXES), axis=0), np.tile(AXES, (len(POINTS), 1)))
+    seen = np.diff(look.localization_map.in_view_on_device(poses)[0]).reshape(len(POINTS), -1)
+    np.testing.assert_array_equal(views.n_visible, seen.max(axis=1))
+
+
+def test_ten_lines(sparse: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    look = Exported.from_colmap(sparse)
+    with pytest.raises(ConfigError, match="no views"):
+        look.save("views.csv")
+    views = look.best([(2.0, 2.0, 1.5)])
+    assert look.score(views.cam_from_world)[0] == pytest.approx(views.score[0], rel=1e-6)
+    look.save("views.csv")
+    assert len(Path("views.csv").read_text().splitlines()) == 2

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.shipped import WEIGHTS, or_shipped
 
 if TYPE_CHECKING:
     from wheretolook.geometry.camera import Camera
     from wheretolook.geometry.poses import Float
     from wheretolook.space.free_space import FreeSpace
 
-WEIGHTS = Path("data/release/weights/set.safetensors")
+SCORER = f"{WEIGHTS}/set.safetensors"
 MOST_PLACES = 20_000
 
 _TEXT = """\
@@ -50,11 +50,13 @@ def run(arguments: Sequence[str]) -> int:
     )
     parser.add_argument("--map", type=Path, required=True, metavar="SPARSE", help="COLMAP model, in metres, z up")
     parser.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="where to write")
-    parser.add_argument("--weights", type=Path, default=WEIGHTS, metavar="FILE", help="of the method set (%(default)s)")
+    parser.add_argument(
+        "--weights", type=Path, default=Path(SCORER), metavar="FILE", help="of the method set (those that ship)"
+    )
     parser.add_argument(
         "--camera",
         metavar="CAMERA",
-        help="the robot's, as COLMAP writes a pinhole, 'PINHOLE WIDTH HEIGHT FX FY CX CY'; by default the map's own, "
+        help="the robot's, as COLMAP writes a pinhole, 'PINHOLE,WIDTH,HEIGHT,FX,FY,CX,CY'; by default the map's own, "
         "if it has but one, as the pinhole of its rectified images",
     )
     parser.add_argument(
@@ -71,7 +73,6 @@ def run(arguments: Sequence[str]) -> int:
 
 def _export(given: argparse.Namespace) -> None:
     from wheretolook.inputs.localization_map import LocalizationMap
-    from wheretolook.mapping.landmarks import load_colmap_landmarks
     from wheretolook.robot.export import export_robot, pinhole_of
     from wheretolook.visibility.occlusion import MeshOcclusion, NoOcclusion, OcclusionModel
 
@@ -85,13 +86,11 @@ def _export(given: argparse.Namespace) -> None:
         places = _places(space, given.spacing)
         occlusion = MeshOcclusion(space.raycaster, two_sided=space.two_sided)
     named = None if given.camera is None else _camera(given.camera)
-    found = LocalizationMap.from_colmap(given.map, named, occlusion=occlusion)
-    if given.database is not None:
-        found = replace(found, landmarks=load_colmap_landmarks(given.map, given.database))
+    found = LocalizationMap.from_colmap(given.map, named, occlusion=occlusion, database=given.database)
     camera = pinhole_of(found.camera)
     if camera != found.camera:
         print("the map's camera has distortion, the robot's is the pinhole of its rectified images; or give --camera")
-    export_robot(found.of_camera(camera), given.weights, given.out, places)
+    export_robot(found.of_camera(camera), or_shipped(given.weights), given.out, places)
     print(f"{len(found.landmarks):,} landmarks, a camera of {camera.width} x {camera.height} px: {given.out}")
     if places is None:
         print("without --mesh the robot sees landmarks through walls")
@@ -107,7 +106,7 @@ def _camera(text: str) -> Camera:
         model, width, height, *params = text.replace(",", " ").split()
         return camera_of(model, int(width), int(height), [float(value) for value in params])
     except ValueError as error:
-        fix = "Write it as 'PINHOLE WIDTH HEIGHT FX FY CX CY', in pixels."
+        fix = "Write it as 'PINHOLE,WIDTH,HEIGHT,FX,FY,CX,CY', in pixels."
         raise ConfigError("this is no camera", value=text, fix=fix) from error
 
 

@@ -181,6 +181,7 @@ Without --config it is configs/release.yaml, whose runs are logged first. Tables
 OWN = {
     "select": ("wheretolook.select.command", "The best views at places of your own COLMAP model; needs no dataset."),
     "export": ("wheretolook.robot.command", "What a robot needs to score views of your own map, without PyTorch."),
+    "benchmark": ("wheretolook.benchmark.command", "The Active Localization Benchmark on its scene folders."),
 }
 """Sub-commands with options of their own, which are no stages of an experiment: their module, and what they do."""
 

@@ -57,7 +57,7 @@ def write_poses(path: Path, ids: Sequence[str], cam_from_world: ArrayLike) -> No
 
 
 def read_poses(path: Path) -> PoseFile:
-    """Read a file of poses. Raises a TableError, with the line, if it is missing or a line is no pose, or ids repeat."""
+    """Read a file of poses. Raises a TableError, with the line, if it is missing, a line is no pose, or ids repeat."""
     ids, values = _read(path, 8, "a pose is id qw qx qy qz tx ty tz")
     table = np.array(values, dtype=np.float64).reshape(-1, 7)
     off = np.abs(np.linalg.norm(table[:, :4], axis=1) - 1) > _UNIT

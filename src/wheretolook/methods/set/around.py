@@ -66,10 +66,11 @@ class ScoresAround:
         around, matchability = scorer.localization_map, scorer.network.matchability
         self.rotations = rotation_looking_along(directions)
         self.points = DevicePoints(around.landmarks.points, around.device)
-        self.layers, names = matchability.layers, matchability.attributes
+        names = matchability.attributes
+        first, self._second, self._last = (layer for layer in matchability.layers if isinstance(layer, torch.nn.Linear))
         self.device = matchability.input.mean.device
         with torch.inference_mode():
-            weight = self.layers[0].weight * matchability.input.scale
+            weight = first.weight * matchability.input.scale
             self._of_image = self._weight(weight, names, IMAGE)
             self._of_location = self._weight(weight, names, OF_LOCATION)
             of_map = torch.from_numpy(around.landmarks.attributes()[self.points.order]).to(self.device)
@@ -84,7 +85,7 @@ class ScoresAround:
                     values[:, column] = self._pixel_angle
             # `across` and `down` are given as they are: their means are taken off here
             self._first = (
-                self.layers[0](matchability.input(values))
+                first(matchability.input(values))
                 - self._weight(matchability.input.mean[None], names, IMAGE)[:, 0] @ self._of_image
             )
             mapped = [MAP_ATTRIBUTES.index(name) for name in ("mapped_distance", "mapped_pixel_size")]
@@ -186,7 +187,7 @@ class ScoresAround:
         sums, cells = torch.zeros((n, N_EXPECTED), device=self.device), torch.zeros(n, device=self.device)
         visible, height = torch.from_numpy(n_visible).to(sums), torch.from_numpy(heights).to(sums)
         each = visible / kept
-        weight, bias, last = self.layers[2].weight.T, self.layers[2].bias, self.layers[4]
+        weight, bias, last = self._second.weight.T, self._second.bias, self._last
         begin = 0
         while begin < n:
             end = int(np.searchsorted(starts, starts[begin] + ROOM[self.device.type], side="right")) - 1

@@ -2,7 +2,7 @@
 # make test   sets everything up and runs linter, type checker and the tests: about six minutes on two cores
 # make test-all   the same and the slow tests too, in a quarter of an hour
 # make ui     opens MLflow on the runs, those of the release included; make lab opens Jupyter on the notebooks
-# make html   runs all notebooks and writes them as pages, notebooks/html
+# make html   runs all notebooks and writes them as pages, notebooks/html; make docs builds the documentation, site/
 # Options: TORCH=cuda for the CUDA build of PyTorch, PYTHON=python3.12 for a certain interpreter. See environment.md.
 
 TORCH ?= cpu
@@ -15,7 +15,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --progre
 CONSTRAINTS := configs/constraints.txt
 READY := $(VENV)/ready-$(TORCH)
 
-.PHONY: demo test test-all setup ui lab html clean help
+.PHONY: demo test test-all setup ui lab html docs clean help
 
 help:
 	@sed -n '1,6s/^# //p' Makefile
@@ -45,6 +45,9 @@ lab: $(READY)
 html: $(READY)
 	@$(BIN)/wheretolook log-release >/dev/null
 	OMP_WAIT_POLICY=PASSIVE $(BIN)/python notebooks/pages.py notebooks notebooks/html
+
+docs: $(READY)
+	$(BIN)/mkdocs build --strict
 
 setup: $(READY)
 
@@ -78,4 +81,4 @@ torch-cuda:
 	{ $(BIN)/python -m pip uninstall --quiet --yes torch; $(PIP) 'torch==$(TORCH_VERSION)'; }
 
 clean:
-	rm -rf $(VENV) build dist .pytest_cache .ruff_cache .mypy_cache
+	rm -rf $(VENV) build dist site .pytest_cache .ruff_cache .mypy_cache

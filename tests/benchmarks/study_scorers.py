@@ -7,7 +7,7 @@
 
 The protocol, fixed before the test scenes were looked at: options are chosen by the mean validation average precision
 over seeds; of all learners the one with the best mean ships, made by the train stage with the best seed; test scenes
-and scenes of others are scored once, with every seed's weights. (For the weights of the table in README it was twice:
+and scenes of others are scored once, with every seed's weights. (For the table in docs/landmarks.md it was twice:
 with two candidates, before the rooms learnt from got patterns that repeat, and then as said.)
 
 Appends one row a training to `<out>/<part>.csv`; rows that are there are not made again. Weights lie in

@@ -1,0 +1,295 @@
+"""The documentation: it builds without a warning, its code runs, its commands are real, its numbers the release's."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tomllib
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pycolmap
+import pytest
+
+from box_scenes import ROOM, furnished_room
+from wheretolook.cli import OWN, STAGES, main, parse_experiment
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.poses import Float, poses_looking_along
+from wheretolook.rendering.warp_renderer import WarpRenderer
+from wheretolook.scenes.loading import save_glb
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+NAMES = [path.name for path in PAGES]
+CAMERA = PinholeCamera(320, 240, 160.0)
+
+NOT_RUN = r"(?:<!-- not run: (?P<why>[^\n]+) -->\n)?"
+BLOCK = re.compile(NOT_RUN + r"^```(?P<language>\w*)\n(?P<code>.*?)^```$", re.M | re.S)
+CHECKED = ("python", "sh")  # in these languages; in others, such as text and toml, there is nothing to run
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    """Blocks of code of a page in a language, but for those that say why they are not run."""
+    found = list(BLOCK.finditer(page.read_text()))
+    return [block["code"] for block in found if block["language"] == language and block["why"] is None]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_every_block_says_its_language_and_few_are_not_run(page: Path) -> None:
+    found = list(BLOCK.finditer(page.read_text()))
+    assert len(found) == page.read_text().count("\n```") // 2, "a fence is not closed, or not at the start of its line"
+    for block in found:
+        assert block["language"], block["code"]
+        assert block["why"] is None or (len(block["why"]) > 10 and block["language"] in CHECKED)
+
+
+# --- the site
+
+
+@pytest.mark.skipif(find_spec("mkdocs") is None, reason="mkdocs is not installed: pip install '.[docs]'")
+def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    site = tmp_path / "site"
+    for page in (ROOT / "docs").glob("*.md"):
+        assert (site / ("" if page.stem == "index" else page.stem) / "index.html").is_file(), page
+    home = (site / "index.html").read_text()
+    (picture,) = re.findall(r'<img[^>]*src="([^"]*pipeline\.webp)"', home)
+    assert (site / picture).read_bytes() == (ROOT / "notebooks" / "images" / "pipeline.webp").read_bytes()
+    assert "WhereToLook" in (site / "api" / "index.html").read_text()
+    assert (site / "data" / "release" / "index.html").is_file()  # linked to, and so taken along
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_links_lead_to_files_and_headings(page: Path) -> None:
+    links = re.findall(r"\]\((?!https?:|mailto:)([^)\s#]*)(?:#([^)\s]+))?\)", page.read_text())
+    for target, heading in links:
+        path = page.parent / target if target else page
+        assert path.is_file(), f"{page.name}: {target}"
+        if heading:
+            texts = re.findall(r"^#+ (.*)$", path.read_text(), re.M)
+            slugs = [re.sub(r"[-\s]+", "-", re.sub(r"[^\w\s-]", "", text).strip().lower()) for text in texts]
+            assert heading in slugs, f"{page.name}: {target}#{heading}"
+
+
+def test_the_readme_is_short_and_names_what_continuous_integration_runs() -> None:
+    text = (ROOT / "README.md").read_text()
+    assert len(text.splitlines()) <= 150 and "make test " in text
+    target = re.search(r"^make (\S+)$", (ROOT / ".ci" / "run").read_text(), re.M)
+    assert target is not None and f"`make {target[1]}`" in text
+
+
+def test_every_command_and_stage_has_its_line() -> None:
+    text = (ROOT / "docs" / "stages.md").read_text()
+    assert [name for name in [*STAGES, *OWN] if f"| `{name}` |" not in text] == []
+
+
+# --- Python blocks: they run on a room of boxes and the weights that ship
+
+
+def write_model(folder: Path, poses: Float, n_points: int = 400) -> None:
+    """A COLMAP model of points on the room's walls, each in all images (N, 3, 4) that it projects into."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform((0, 0, 0), ROOM, (n_points, 3))
+    side = rng.integers(0, 3, n_points), rng.integers(0, 2, n_points)
+    points[np.arange(n_points), side[0]] = np.asarray(ROOM)[side[0]] * side[1]
+    in_camera = np.einsum("nij,pj->npi", poses[:, :, :3], points) + poses[:, None, :, 3]
+    depths = in_camera[..., 2]
+    pixels = CAMERA.project(in_camera)
+    seen = (depths > 0.1) & ((pixels >= 0) & (pixels < (CAMERA.width, CAMERA.height))).all(-1)
+    keypoints = [pixels[row][mask] for row, mask in enumerate(seen)]
+    model = pycolmap.Reconstruction()
+    params = [CAMERA.fx, CAMERA.cx, CAMERA.cy]
+    camera = pycolmap.Camera(
+        camera_id=1, model="SIMPLE_PINHOLE", width=CAMERA.width, height=CAMERA.height, params=params
+    )
+    model.add_camera_with_trivial_rig(camera)
+    for row, pose in enumerate(poses):
+        image = pycolmap.Image(name=f"{row:02}.png", camera_id=1, image_id=row + 1, keypoints=keypoints[row])
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:, :3]), pose[:, 3]))
+    number = np.cumsum(seen, axis=1) - 1  # of a point among the keypoints of an image
+    for point in np.flatnonzero(seen.sum(0) > 1):
+        track = pycolmap.Track()
+        for row in np.flatnonzero(seen[:, point]):
+            track.add_element(int(row) + 1, int(number[row, point]))
+        model.add_point3D(points[point], track, np.zeros(3, np.uint8))
+    model.update_point_3d_errors()
+    folder.mkdir(parents=True)
+    model.write_binary(str(folder))
+
+
+@pytest.fixture(scope="module")
+def users_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What the pages take for granted in the user's folder: a model, a mesh, depth images, waypoints, the release."""
+    folder = tmp_path_factory.mktemp("user")
+    mesh = furnished_room()
+    save_glb(mesh, folder / "scan.glb")
+    angles = np.linspace(0, 2 * np.pi, 16, endpoint=False)
+    outward = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(16)])
+    poses = poses_looking_along((3.0, 2.5, 1.4) + 0.5 * outward, outward)
+    write_model(folder / "sparse" / "0", poses)
+    (folder / "depth").mkdir()
+    for row, depth in enumerate(WarpRenderer(mesh).render(CAMERA, poses).depth_m):
+        np.save(folder / "depth" / f"{row:02}.npy", depth)
+    (folder / "waypoints.csv").write_text("x,y,z\n1.0,2.0,1.5\n2.5,2.0,1.5\n")
+    (folder / "data").mkdir()
+    (folder / "data" / "release").symlink_to(ROOT / "data" / "release")
+    return folder
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")], ids=lambda page: page.name)
+def test_python_blocks_run(page: Path, users_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shutil.copytree(users_folder, tmp_path / "user", symlinks=True)
+    monkeypatch.chdir(tmp_path / "user")
+    names: dict[str, object] = {"__name__": page.stem}
+    for code in blocks(page, "python"):
+        exec(compile(code, str(page), "exec"), names)  # blocks of a page build on one another
+    if page.name in ("README.md", "quickstart.md"):
+        assert len(code.strip().splitlines()) <= 10
+        rows = pd.read_csv("views.csv")
+        assert len(rows) == 2 and rows["score"].between(0, 1).all()
+
+
+# --- shell blocks: options are real
+
+
+def commands(page: Path) -> list[list[str]]:
+    """Commands of a page's shell blocks, without comments and settings of the environment."""
+    found = []
+    for code in blocks(page, "sh"):
+        for line in code.replace("\\\n", " ").splitlines():
+            lexer = shlex.shlex(line, posix=True, punctuation_chars="&|;")
+            lexer.whitespace_split = True
+            words: list[str] = []
+            for word in [*lexer, ";"]:
+                if set(word) <= set("&|;"):
+                    found.append(words)
+                    words = []
+                elif words or not re.match(r"\w+=", word):
+                    words.append(word)
+    return [words for words in found if words]
+
+
+def check_wheretolook(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    """Raises, or fails, if there is no such command or option."""
+    command, *rest = arguments
+    if command in OWN:
+        module = import_module(OWN[command][0])
+        if hasattr(module, "parser"):
+            module.parser().parse_args(rest)
+            return
+        with pytest.raises(SystemExit):
+            main([command, "--help"])
+        known = capsys.readouterr().out
+        assert [word for word in rest if word.startswith("--") and f"{word} " not in known] == []
+        return
+    only = {"evaluate": "--list-methods", "figures": "--list"}
+    if rest == [only.get(command)] or rest == ["--help"]:
+        assert main(arguments) == 0
+        return
+    assert command in STAGES, command
+    assert parse_experiment(command, [word for word in rest if word != "--print_config"]) is not None
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "sh")], ids=lambda page: page.name)
+def test_shell_blocks_name_real_commands(
+    page: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(ROOT)  # where configs/ are
+    makefile = (ROOT / "Makefile").read_text()
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    for words in commands(page):
+        program, *rest = words
+        if program == "wheretolook":
+            check_wheretolook(rest, capsys)
+        elif program == "make":
+            assert [word for word in rest if "=" not in word and f"\n{word}: " not in makefile] == []
+        elif program == "pip" and rest[0] == "install":
+            extras = re.findall(r"\[(.*)\]", " ".join(rest))
+            assert {name for extra in extras for name in extra.split(",")} <= {*project["optional-dependencies"]}
+        elif program == "python":
+            assert (ROOT / rest[0]).is_file(), rest[0]
+        else:
+            pytest.fail(f"{page.name}: say why this is not run: {' '.join(words)}")
+
+
+# --- numbers: those of the release's tables
+
+
+def number_rows() -> dict[str, dict[str, str]]:
+    """By label of a method: cells of both tables, as the release's results have them."""
+    results = ROOT / "data" / "release" / "results"
+    columns = {"a": results / "scores.csv", "b": results / "generalization.csv"}
+    cells: dict[str, dict[str, str]] = {}
+    for column, path in columns.items():
+        table = pd.read_csv(path, keep_default_na=False, na_values=[""])
+        table = table[(table["scene"] == "all") & (table["top_n"] == 1) & (table["candidates"].astype(str) == "all")]
+        for row in table.to_dict("records"):
+            found = cells.setdefault(str(row["method"]), {})
+            share, low, high = (100 * row[f"normalized_{name}0.05m_0.4deg"] for name in ("", "low_", "high_"))
+            if row["occlusion"] == "mesh":
+                found[column] = f"{share:.1f} [{low:.1f}, {high:.1f}]"
+                found[f"{column} AUC"] = f"{row['roc_auc']:.3f}"
+            elif row["occlusion"] == "none":
+                found[f"{column} through"] = f"{share:.1f}"
+    return cells
+
+
+METHODS = {
+    "set of landmarks": "set",
+    "expected inliers": "expected-inliers",
+    "expected bins": "expected-bins",
+    "Fisher, trace, expected": "fisher-trace-expected",
+    "random": "random",
+    "a random direction": "random",
+    "forward, headings drawn": "forward",
+    "most visible landmarks": "visible",
+    "reprojections with bins": "bins",
+    "Fisher, min. eigenvalue, exact": "fisher-mineig-exact",
+    "Fisher, log det, exact": "fisher-logdet-exact",
+    "Fisher, trace, exact": "fisher-trace-exact",
+    "Fisher information, trace": "fisher-trace-exact",
+    "Fisher, trace, GP": "fisher-trace-gp",
+    "MLP, 2d + z": "mlp-2d+z",
+    "the paper's network": "mlp-2d+z",
+}
+
+
+def rows_of(page: Path, header: str) -> dict[str, list[str]]:
+    """A table's rows by their first cells, without emphasis and what stands in brackets there."""
+    lines = page.read_text().splitlines()
+    start = lines.index(header) + 2
+    rows = {}
+    for line in lines[start:]:
+        if not line.startswith("|"):
+            break
+        first, *cells = (cell.strip().replace("**", "") for cell in line.strip("|").split("|"))
+        rows[re.sub(r" \((ships|MLP).*\)$", "", first)] = cells
+    return rows
+
+
+@pytest.mark.parametrize(
+    ("page", "columns", "header"),
+    [
+        ("README.md", ["a", "a AUC", "b", "b AUC"], "| method | two test apartments | AUC | six other scenes | AUC |"),
+        (
+            "docs/results.md",
+            ["a", "a through", "a AUC", "b", "b through", "b AUC"],
+            "| method | two test apartments | through walls | AUC | six other scenes | through walls | AUC |",
+        ),
+    ],
+)
+def test_tables_hold_the_numbers_of_the_release(page: str, columns: list[str], header: str) -> None:
+    known, rows = number_rows(), rows_of(ROOT / page, header)
+    assert len(rows) == (6 if page == "README.md" else 16)
+    checked = {label: method for label, method in METHODS.items() if label in rows}
+    wanted = {label: [known[method][column] for column in columns] for label, method in checked.items()}
+    assert len(wanted) >= 6 and {label: rows[label] for label in wanted} == wanted

@@ -293,3 +293,27 @@ def test_tables_hold_the_numbers_of_the_release(page: str, columns: list[str], h
     checked = {label: method for label, method in METHODS.items() if label in rows}
     wanted = {label: [known[method][column] for column in columns] for label, method in checked.items()}
     assert len(wanted) >= 6 and {label: rows[label] for label in wanted} == wanted
+
+
+def test_tables_by_camera_hold_the_numbers_of_the_release() -> None:
+    page, methods = ROOT / "docs" / "results.md", ("set", "expected-inliers", "bins", "visible")
+    table = pd.read_csv(ROOT / "data" / "release" / "results" / "cameras.csv")
+    cells = {}
+    for row in table.to_dict("records"):
+        interval = f" [{row['regret_low']:.1f}, {row['regret_high']:.1f}]"
+        numbers = [f"{row['regret']:.1f}{between}; {row['auc']:.3f}" for between in ("", interval)]
+        cells[row["dataset"], row["group"], row["method"]] = numbers
+    header = "| regret in points [95 %]; AUC | set of landmarks | expected inliers | reprojections with bins |"
+    header += " most visible |"
+    groups = ["apartment", "building", "hall", "office", "court", "narrow", "wide"]
+    rows = [*rows_of(page, header).values()]
+    for group, row in zip([*(f"all {name}" for name in groups), "mean"], rows, strict=True):
+        for method, cell in zip(methods, row, strict=True):
+            assert cell in cells["cameras", group, method]
+    header = "| field of view | six other scenes: set | expected inliers | bins | most visible |"
+    header += " two apartments: set | expected inliers | bins | most visible |"
+    for angle, row in rows_of(page, header).items():
+        where = [
+            (f"test-{angle[:-1]}", f"all {kind}", method) for kind in ("others'", "apartment") for method in methods
+        ]
+        assert row == [cells[place][0] for place in where]

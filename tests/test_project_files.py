@@ -29,15 +29,8 @@ def test_the_top_level_holds_nothing_else() -> None:
         pytest.skip("no checkout")
     top = {name.partition("/")[0] for name in listed.stdout.splitlines() if not name.startswith(".")}
     folders = {"notebooks", "src", "data", "configs", "mlruns", "tests", "docs"}
-    assert top - PROJECT == {
-        *folders,
-        "environment.md",
-        "pyproject.toml",
-        "README.md",
-        "LICENSE",
-        "Makefile",
-        "mkdocs.yml",
-    }
+    files = {"environment.md", "pyproject.toml", "mkdocs.yml", "README.md", "LICENSE", "Makefile"}
+    assert top - PROJECT == folders | files
 
 
 def test_the_citation_has_what_its_schema_requires(citation: dict[str, Any]) -> None:

@@ -7,9 +7,10 @@ import os
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING
 
 from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.options import CommandParser
 
 if TYPE_CHECKING:
     from wheretolook.benchmark.report import Result
@@ -64,22 +65,15 @@ EXAMPLES
   wheretolook benchmark --errors estimate/pose_errors.txt --poses estimate/selected_gt_poses.txt"""
 
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        raise ConfigError(message, fix="`wheretolook benchmark --help` lists the options.")
-
-
 def parser() -> argparse.ArgumentParser:
     """The options of the command."""
     from wheretolook.benchmark.folder import LAYOUT
 
-    made = _Parser(
+    made = CommandParser(
         prog="wheretolook benchmark",
         usage=USAGE,
         description=ABOUT,
         epilog=_NOTES.format(layout=LAYOUT.replace("\n", "\n  ")),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
     )
     add = made.add_argument
     add("scenes", nargs="*", type=Path, metavar="SCENE_DIR", help="scene folders")

@@ -5,13 +5,13 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING
 
 from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.options import CommandParser
 from wheretolook.utils.shipped import WEIGHTS, or_shipped
 
 if TYPE_CHECKING:
-    from wheretolook.geometry.camera import Camera
     from wheretolook.geometry.poses import Float
     from wheretolook.space.free_space import FreeSpace
 
@@ -34,20 +34,9 @@ Example:
 """
 
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        raise ConfigError(message, fix="`wheretolook export --help` lists the options.")
-
-
 def run(arguments: Sequence[str]) -> int:
     """Run the command. Returns the exit code; raises a WhereToLookError on bad input."""
-    parser = _Parser(
-        "wheretolook export",
-        description=_TEXT,
-        epilog=_MORE,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
+    parser = CommandParser("wheretolook export", description=_TEXT, epilog=_MORE)
     parser.add_argument("--map", type=Path, required=True, metavar="SPARSE", help="COLMAP model, in metres, z up")
     parser.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="where to write")
     parser.add_argument(
@@ -72,6 +61,7 @@ def run(arguments: Sequence[str]) -> int:
 
 
 def _export(given: argparse.Namespace) -> None:
+    from wheretolook.geometry.camera_text import parse_camera
     from wheretolook.inputs.localization_map import LocalizationMap
     from wheretolook.robot.export import export_robot, pinhole_of
     from wheretolook.visibility.occlusion import MeshOcclusion, NoOcclusion, OcclusionModel
@@ -85,7 +75,7 @@ def _export(given: argparse.Namespace) -> None:
         space = FreeSpace(load_mesh(given.mesh))
         places = _places(space, given.spacing)
         occlusion = MeshOcclusion(space.raycaster, two_sided=space.two_sided)
-    named = None if given.camera is None else _camera(given.camera)
+    named = None if given.camera is None else parse_camera(given.camera)
     found = LocalizationMap.from_colmap(given.map, named, occlusion=occlusion, database=given.database)
     camera = pinhole_of(found.camera)
     if camera != found.camera:
@@ -96,18 +86,6 @@ def _export(given: argparse.Namespace) -> None:
         print("without --mesh the robot sees landmarks through walls")
     else:
         print(f"what is unoccluded is stored for {len(places):,} free places, {given.spacing:g} m apart")
-
-
-def _camera(text: str) -> Camera:
-    """The camera of COLMAP's text, with blanks or commas between. Raises ConfigError."""
-    from wheretolook.geometry.camera import camera_of
-
-    try:
-        model, width, height, *params = text.replace(",", " ").split()
-        return camera_of(model, int(width), int(height), [float(value) for value in params])
-    except ValueError as error:
-        fix = "Write it as 'PINHOLE,WIDTH,HEIGHT,FX,FY,CX,CY', in pixels."
-        raise ConfigError("this is no camera", value=text, fix=fix) from error
 
 
 def _places(space: FreeSpace, spacing_m: float) -> Float:

@@ -7,9 +7,10 @@ import re
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING
 
 from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.options import CommandParser
 
 if TYPE_CHECKING:
     from wheretolook.select.views import SelectedViews
@@ -52,21 +53,9 @@ In Python:
   views.save("views.csv")"""
 
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        raise ConfigError(message, fix="`wheretolook select --help` lists the options.")
-
-
 def parser() -> argparse.ArgumentParser:
     """The options of the command."""
-    made = _Parser(
-        prog="wheretolook select",
-        usage=USAGE,
-        description=ABOUT,
-        epilog=_NOTES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
+    made = CommandParser(prog="wheretolook select", usage=USAGE, description=ABOUT, epilog=_NOTES)
     add = made.add_argument
     add("--map", required=True, type=Path, metavar="SPARSE", help="folder of a COLMAP model")
     add("--at", nargs="+", metavar="FILE", help="waypoints: a file, or x,y,z in metres, several with blanks between")
@@ -160,7 +149,7 @@ def _check(options: argparse.Namespace) -> Waypoints | None:
 
 def _camera(options: argparse.Namespace):  # type: ignore[no-untyped-def]
     """The camera asked for: one, a camera_id of the map, or None for the map's own."""
-    from wheretolook.select.cameras import camera_of_view, parse_camera, parse_size
+    from wheretolook.geometry.camera_text import camera_of_view, parse_camera, parse_size
 
     ways = {"--camera": options.camera, "--fov": options.fov, "--camera-id": options.camera_id}
     named = [name for name, value in ways.items() if value is not None]

@@ -103,8 +103,8 @@ class WhereToLook:
             WeightsError: the weights cannot be used, or there are none.
             ConfigError: no such method, camera, occlusion, lattice or device.
         """
+        from wheretolook.geometry.camera_text import camera_of_view, parse_camera
         from wheretolook.methods.registry import load_scorer, make_scorer
-        from wheretolook.select.cameras import camera_of_view, parse_camera
 
         model, device = Path(path), usable_device(device)
         if camera is not None and fov_deg is not None:

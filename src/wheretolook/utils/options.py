@@ -6,6 +6,7 @@ and a mistyped name are answered at once.
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import difflib
 import inspect
@@ -14,7 +15,7 @@ import shutil
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import MISSING, dataclass
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 from wheretolook.utils.errors import ConfigError
 
@@ -26,6 +27,17 @@ WIDTH = 118  # columns of help, where the terminal has so many
 _NAME_WIDTH = 36
 
 T = TypeVar("T", bound="DataclassInstance")
+
+
+class CommandParser(argparse.ArgumentParser):
+    """Options of a command that is no stage: help as it is written, no abbreviations, errors that are ConfigErrors."""
+
+    def __init__(self, prog: str, **about: Any) -> None:
+        super().__init__(prog, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False, **about)
+
+    def error(self, message: str) -> NoReturn:
+        """Raise a ConfigError that names the command's help."""
+        raise ConfigError(message, fix=f"`{self.prog} --help` lists the options.")
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,11 @@ EXAMPLE = "PINHOLE,640,480,320,320,320,240"
 def parse_camera(text: str) -> Camera:
     """The camera of a text "MODEL,width,height,parameters", with COLMAP's models and order of parameters.
 
+    Blanks may stand for commas, as in COLMAP's cameras.txt.
+
     Raises a ConfigError if it is none, or a model that projects nothing.
     """
-    model, *numbers = (cell.strip() for cell in text.split(","))
+    model, *numbers = text.replace(",", " ").split() or [""]
     fix = f"Write MODEL,width,height,parameters as COLMAP orders them, such as {EXAMPLE}; sizes in pixels."
     try:
         width, height, *params = (float(number) for number in numbers)

@@ -3,7 +3,7 @@
 # make test-all   the same and the slow tests too, in a quarter of an hour
 # make ui     opens MLflow on the runs, those of the release included; make lab opens Jupyter on the notebooks
 # make html   runs all notebooks and writes them as pages, notebooks/html; make docs builds the documentation, site/
-# Options: TORCH=cuda for the CUDA build of PyTorch, PYTHON=python3.12 for a certain interpreter. See environment.md.
+# Options: TORCH=cuda for the CUDA build of PyTorch, PYTHON=python3.12, PORT=5001 for make ui. See environment.md.
 
 TORCH ?= cpu
 TORCH_VERSION := 2.13.0
@@ -34,9 +34,12 @@ test test-all: $(READY)
 	wait $$types || { cat $(VENV)/mypy.log; test $$tests -ne 0 || tests=1; }; \
 	exit $$tests
 
+PORT ?= 5000
 ui: $(READY)
+	@$(BIN)/python -c 'import socket; s = socket.socket(); s.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1); \
+	s.bind(("127.0.0.1", $(PORT)))' 2>/dev/null || { echo "port $(PORT) is in use: make ui PORT=$$(( $(PORT) + 1 ))" >&2; exit 1; }
 	@$(BIN)/wheretolook log-release
-	$(BIN)/mlflow ui --backend-store-uri sqlite:///mlruns/mlflow.db
+	$(BIN)/mlflow ui --host 127.0.0.1 --port $(PORT) --backend-store-uri sqlite:///mlruns/mlflow.db
 
 lab: $(READY)
 	@test -x $(BIN)/jupyter-lab || $(PIP) -c $(CONSTRAINTS) -e '.[notebooks]'

@@ -24,6 +24,7 @@ from wheretolook.geometry.lattices import Lattice
 from wheretolook.geometry.poses import Float, pose_error
 from wheretolook.labelling.config import LocalizerConfig
 from wheretolook.select.waypoints import Waypoints, read_waypoints
+from wheretolook.utils.confine import entry_of
 from wheretolook.utils.errors import SceneError, StorageError, TableError
 from wheretolook.utils.files import fingerprint, write_json
 from wheretolook.utils.version import VERSION
@@ -165,7 +166,7 @@ class SceneRound:
     # -- images
 
     def _draw(self, poses: PoseFile, folder: Path) -> None:
-        files = [folder / IMAGES / f"{name}{IMAGE_ENDING}" for name in poses.ids]
+        files = [entry_of(folder / IMAGES, f"{name}{IMAGE_ENDING}", "a view's id") for name in poses.ids]
         missing = np.flatnonzero([not path.is_file() for path in files])
         if len(missing) == 0:
             return

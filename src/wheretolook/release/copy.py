@@ -19,6 +19,7 @@ from wheretolook.mapping.colmap_model import CAMERAS_FILE, save_mapping_poses
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.methods.method import Method
 from wheretolook.methods.registry import learned, scorers
+from wheretolook.utils.confine import entry_of
 from wheretolook.utils.errors import ConfigError, StorageError, TableError, WeightsError
 from wheretolook.utils.files import sha256, write_json
 from wheretolook.utils.version import VERSION
@@ -52,7 +53,10 @@ def copy_dataset(dataset: Dataset, root: Path, settings: Mapping[str, Any]) -> D
     """
     before = _release_of(root, dataset.name)
     fingerprint = None if before is None else before.fingerprint()
-    copied = [(scene, SceneFolder(root / scene.name, scene.split, scene.camera)) for scene in dataset.scenes]
+    copied = [
+        (scene, SceneFolder(entry_of(root, scene.name, "a scene's name"), scene.split, scene.camera))
+        for scene in dataset.scenes
+    ]
     for scene, copy in copied:
         copy.map.mkdir(parents=True, exist_ok=True)
         write_table(scene.read_table(), copy.table, compact=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from collections.abc import Iterator, Sequence
@@ -27,6 +26,7 @@ from wheretolook.select.waypoints import Waypoints, read_waypoints
 from wheretolook.utils.confine import entry_of
 from wheretolook.utils.errors import SceneError, StorageError, TableError
 from wheretolook.utils.files import fingerprint, write_json
+from wheretolook.utils.reading import read_json_object
 from wheretolook.utils.version import VERSION
 
 if TYPE_CHECKING:
@@ -306,7 +306,7 @@ def _write_image(path: Path, rgb: NDArray[np.uint8]) -> None:
 
 def _keys(folder: Path) -> dict[str, str]:
     try:
-        return dict(json.loads((folder / KEYS).read_text()))
+        return read_json_object(folder / KEYS)
     except (OSError, ValueError):
         return {}
 

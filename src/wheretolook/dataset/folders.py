@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,6 +19,7 @@ from wheretolook.mapping.scale import read_scale
 from wheretolook.utils.confine import check_links, entry_of
 from wheretolook.utils.errors import ConfigError, SceneError, TableError
 from wheretolook.utils.files import fingerprint, write_json
+from wheretolook.utils.reading import read_json_object
 from wheretolook.viewpoints.config import Split
 from wheretolook.viewpoints.table import CAMERA_ID, read_table
 
@@ -109,7 +109,7 @@ class SceneFolder:
         if not self._about.is_file():
             return ()
         try:
-            rectangles = json.loads(self._about.read_text())["mapped_floor"]
+            rectangles = read_json_object(self._about)["mapped_floor"]
             return tuple((float(x0), float(y0), float(x1), float(y1)) for x0, y0, x1, y1 in rectangles)
         except (ValueError, KeyError, TypeError) as error:
             fix = "Remove it with the mesh beside it, and run the scenes stage again."
@@ -261,7 +261,7 @@ class Dataset:
         """
         path = root / "dataset.json"
         try:
-            content = json.loads(path.read_text())
+            content = read_json_object(path)
             scenes = []
             for entry in content["scenes"]:
                 camera = camera_of_record(entry["camera"] if "camera" in entry else content["camera"])
@@ -272,7 +272,7 @@ class Dataset:
                 scenes.append(SceneFolder(folder, entry["split"], camera, own))
         except FileNotFoundError as error:
             raise TableError("this folder is no dataset", path=path, fix="Run the scenes stage first.") from error
-        except (ConfigError, ValueError, KeyError, TypeError) as error:
+        except (OSError, ConfigError, ValueError, KeyError, TypeError, AttributeError) as error:
             problem, fix = f"damaged dataset description: {error}", "Run the scenes stage again."
             raise TableError(problem, path=path, fix=fix) from error
         check_links(root, depth=3)

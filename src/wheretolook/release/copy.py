@@ -6,7 +6,6 @@ labelled anew, but it is read, trained on and evaluated as any other.
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from collections.abc import Mapping
@@ -22,6 +21,7 @@ from wheretolook.methods.registry import learned, scorers
 from wheretolook.utils.confine import entry_of
 from wheretolook.utils.errors import ConfigError, StorageError, TableError, WeightsError
 from wheretolook.utils.files import sha256, write_json
+from wheretolook.utils.reading import read_json_object
 from wheretolook.utils.version import VERSION
 from wheretolook.viewpoints.table import write_table
 from wheretolook.visibility.occlusion import StoredOcclusion
@@ -181,7 +181,7 @@ def read_about(release: Dataset) -> dict[str, Any]:
     """
     path = release.root / RELEASE_FILE
     try:
-        about = dict(json.loads(path.read_text()))
+        about = read_json_object(path)
         return {name: about[name] for name in ("source", "source_fingerprint", "code_version", "settings")}
     except (OSError, ValueError, TypeError, KeyError) as error:
         fix = "Run `wheretolook release` on its source."
@@ -204,7 +204,7 @@ def _release_of(root: Path, source: str) -> Dataset | None:
 def _manifest(path: Path) -> dict[str, Any]:
     """What labels were made with, but for the shards, of which there are thousands, and the matches, which stay."""
     try:
-        content = json.loads(path.read_text())
+        content = read_json_object(path)
         return {name: value for name, value in content.items() if name not in ("shards", "store_matches")}
     except (ValueError, AttributeError) as error:
         fix = "Remove it, or label the scene again."

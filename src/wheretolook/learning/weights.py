@@ -109,4 +109,10 @@ def read_weights(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         problem = f"this version of wheretolook reads weights of format {FORMAT_VERSION}"
         fix = "Train again, or install the version that wrote them."
         raise WeightsError(problem, path=path, value=found, fix=fix)
+    if not isinstance(header.get("training", {}), dict):
+        problem = "damaged description in the header: what is known of the training is no JSON object"
+        raise WeightsError(problem, path=path, value=header["training"], fix="Train again.")
+    unknown = next((name for name, x in tensors.items() if x.is_floating_point() and bool(x.isnan().any())), None)
+    if unknown is not None:
+        raise WeightsError("these weights are not numbers (NaN)", path=path, value=unknown, fix="Train again.")
     return tensors, header

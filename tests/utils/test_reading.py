@@ -54,9 +54,9 @@ def npz_bomb(path: Path) -> None:
 
 
 def npz_that_lies(path: Path) -> None:
-    """An array of a header alone that tells of 8 TB."""
+    """An array of a header alone that tells of 4 GB."""
     with zipfile.ZipFile(path, "w") as file, file.open("a.npy", "w") as member:
-        header = {"descr": "<f8", "fortran_order": False, "shape": (1_000_000_000_000,)}
+        header = {"descr": "<f8", "fortran_order": False, "shape": (500_000_000,)}
         np.lib.format.write_array_header_1_0(member, header)
 
 
@@ -80,7 +80,7 @@ def long_alias_bomb(path: Path) -> None:
     ("function", "write", "said"),
     [
         ("npz_files.load_npz", npz_bomb, "would unfold"),
-        ("npz_files.load_npz", npz_that_lies, "an array of shape"),
+        ("npz_files.load_npz", npz_that_lies, "not a readable NPZ file"),
         ("npz_files.load_npz", lambda path: path.symlink_to("/dev/zero"), "a device"),
         ("npz_files.load_npz", os.mkfifo, "a device"),
         ("npz_files.load_npy", npy_that_lies, "an array of shape"),

@@ -32,19 +32,15 @@ def save_npz(path: Path, arrays: Mapping[str, NDArray[Any]], compress: bool = Fa
 def load_npz(path: Path) -> dict[str, NDArray[Any]]:
     """Read all arrays of an NPZ file by name. Raises ValueError if the file is missing or damaged.
 
-    Also if it unfolds to far more than it has bytes, or an array's header tells of more values than follow it: this is
-    found out before anything is unfolded.
+    Also if it unfolds to far more than it has bytes, which is found out before anything is unfolded. Of an array that
+    tells of more values than follow it, no more memory is touched than what follows.
     """
     try:
         n_bytes = check_file(path).st_size
         with np.load(path, allow_pickle=False) as stored:
-            members = stored.zip.infolist()
-            unfolded = sum(member.file_size for member in members)
+            unfolded = sum(member.file_size for member in stored.zip.infolist())
             if unfolded > max(FREE_BYTES, MAX_RATIO * n_bytes):
                 raise ValueError(f"its {n_bytes:,} bytes would unfold to {unfolded:,}")
-            for member in members:
-                with stored.zip.open(member) as file:
-                    _check_header(file, member.file_size)
             return {name: stored[name] for name in stored.files}
     except Exception as error:  # a damaged zip raises many kinds of errors
         raise ValueError(f"not a readable NPZ file: {error}") from error

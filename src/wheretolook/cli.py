@@ -320,18 +320,17 @@ def _with_shipped_weights(experiment: Experiment) -> Experiment:
 
 def _check_file(path: Path, options: Mapping[str, Option]) -> None:
     """Raise ConfigError, with the file's path, unless it can be read and every key in it is an option's."""
-    import yaml
-
     from wheretolook.config import MOVED
+    from wheretolook.utils.reading import read_yaml
 
     try:
-        content = yaml.safe_load(path.read_text()) or {}
+        content = read_yaml(path) or {}
     except FileNotFoundError as error:
         near, there = nearest(str(path), shipped_configs()), ", ".join(shipped_configs())
         fix = f"Did you mean {near}?" if near else f"Give the path of a YAML file, or one that ships: {there}."
         raise ConfigError("there is no such file", path=path, fix=fix) from error
-    except (UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ConfigError(f"this is no YAML: {' '.join(str(error).split())}", path=path) from error
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"this is no YAML: {error}", path=path) from error
     try:
         if not isinstance(content, dict):
             raise ConfigError("a file of settings is a mapping", fix="Write settings, such as `name: demo`.")

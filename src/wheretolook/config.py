@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, get_args
@@ -18,6 +17,7 @@ from wheretolook.methods.train_config import TrainConfig
 from wheretolook.planning.config import PathsConfig, PlanConfig, ViewpointMapConfig
 from wheretolook.scenes.config import ApartmentConfig, SceneKind
 from wheretolook.space.config import FreeSpaceConfig, MappedSpaceConfig
+from wheretolook.utils.confine import check_folder_name, entry_of
 from wheretolook.utils.devices import check_device_name, usable_device
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.tracking_config import TrackingConfig
@@ -25,14 +25,6 @@ from wheretolook.viewpoints.config import SampleConfig
 from wheretolook.visibility.config import OcclusionConfig
 
 NOT_SCENES = ("weights", "results", "all")  # folders of a dataset that are no scenes, and what all scenes are called
-
-
-def check_folder_name(whose: str, name: str, taken: tuple[str, ...] = ()) -> None:
-    """Raise ConfigError unless a name can be a folder's and is not one of those taken."""
-    if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9._-]*", name) or name in taken:
-        others = f", but not {', '.join(taken)}" if taken else ""
-        fix = f"Give it a name of letters, digits, '.', '_' and '-'{others}."
-        raise ConfigError(f"{whose} becomes a folder's", value=name, fix=fix)
 
 
 @dataclass(frozen=True)
@@ -147,7 +139,9 @@ class Experiment:
 
     def __post_init__(self) -> None:
         check_device_name(self.device)
+        entry_of(self.data, self.name, "a dataset's name")
         check_folder_name("a release's name", self.release_name)
+        entry_of(self.data, self.release_name, "a release's name")
         if not isinstance(self.camera, CameraConfig):  # from Python, a camera itself may be given
             object.__setattr__(self, "camera", CameraConfig.of(self.camera))
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.mapping.colmap_model import holds_model
-from wheretolook.utils.errors import MapError, SceneError, TableError, WhereToLookError
+from wheretolook.utils.confine import path_within
+from wheretolook.utils.errors import ConfigError, MapError, SceneError, TableError, WhereToLookError
 
 CAMERA = PinholeCamera(320, 320, 277.0, center_px=(159.5, 159.5))
 """The benchmark's camera, 60 degrees across: what its maps say, and what it localizes with (its camera.py)."""
@@ -73,7 +75,10 @@ class BenchmarkScene:
         "scene_reconstruction/images/0.png".
         """
         self.check_images()
-        places = (self.images / name, self.images.parent.parent / name, self.images / Path(name).name)
+        places = [self.images / Path(name).name]
+        with suppress(ConfigError):  # a path from elsewhere: there is only its last part to go by
+            above = self.images.parent.parent
+            places = [*(path_within(folder, name, "an image's name") for folder in (self.images, above)), *places]
         found = next((path for path in places if path.is_file()), None)
         if found is None:
             raise MapError("an image of the map is missing", path=places[-1], value=name, fix="Copy it there.")

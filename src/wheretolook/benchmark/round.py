@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from collections.abc import Iterator, Sequence
@@ -24,8 +23,10 @@ from wheretolook.geometry.lattices import Lattice
 from wheretolook.geometry.poses import Float, pose_error
 from wheretolook.labelling.config import LocalizerConfig
 from wheretolook.select.waypoints import Waypoints, read_waypoints
+from wheretolook.utils.confine import entry_of
 from wheretolook.utils.errors import SceneError, StorageError, TableError
 from wheretolook.utils.files import fingerprint, write_json
+from wheretolook.utils.reading import read_json_object
 from wheretolook.utils.version import VERSION
 
 if TYPE_CHECKING:
@@ -165,7 +166,7 @@ class SceneRound:
     # -- images
 
     def _draw(self, poses: PoseFile, folder: Path) -> None:
-        files = [folder / IMAGES / f"{name}{IMAGE_ENDING}" for name in poses.ids]
+        files = [entry_of(folder / IMAGES, f"{name}{IMAGE_ENDING}", "a view's id") for name in poses.ids]
         missing = np.flatnonzero([not path.is_file() for path in files])
         if len(missing) == 0:
             return
@@ -305,7 +306,7 @@ def _write_image(path: Path, rgb: NDArray[np.uint8]) -> None:
 
 def _keys(folder: Path) -> dict[str, str]:
     try:
-        return dict(json.loads((folder / KEYS).read_text()))
+        return read_json_object(folder / KEYS)
     except (OSError, ValueError):
         return {}
 

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 import pandas as pd
@@ -17,8 +16,10 @@ from wheretolook.geometry.camera import Camera, PinholeCamera, camera_of_record,
 from wheretolook.geometry.poses import Float
 from wheretolook.mapping.colmap_model import CAMERAS_FILE, colmap_poses, holds_model, load_mapping_poses
 from wheretolook.mapping.scale import read_scale
+from wheretolook.utils.confine import check_links, entry_of
 from wheretolook.utils.errors import ConfigError, SceneError, TableError
 from wheretolook.utils.files import fingerprint, write_json
+from wheretolook.utils.reading import read_json_object
 from wheretolook.viewpoints.config import Split
 from wheretolook.viewpoints.table import CAMERA_ID, read_table
 
@@ -108,7 +109,7 @@ class SceneFolder:
         if not self._about.is_file():
             return ()
         try:
-            rectangles = json.loads(self._about.read_text())["mapped_floor"]
+            rectangles = read_json_object(self._about)["mapped_floor"]
             return tuple((float(x0), float(y0), float(x1), float(y1)) for x0, y0, x1, y1 in rectangles)
         except (ValueError, KeyError, TypeError) as error:
             fix = "Remove it with the mesh beside it, and run the scenes stage again."
@@ -254,18 +255,25 @@ class Dataset:
 
     @classmethod
     def load(cls, root: Path) -> Dataset:
-        """Read a dataset folder. Raises TableError if there is no valid `dataset.json`."""
+        """Read a dataset folder.
+
+        Raises TableError if there is no valid `dataset.json`, ConfigError if a link in the folder leads out of it.
+        """
         path = root / "dataset.json"
         try:
-            content = json.loads(path.read_text())
+            content = read_json_object(path)
             scenes = []
             for entry in content["scenes"]:
                 camera = camera_of_record(entry["camera"] if "camera" in entry else content["camera"])
                 own = bool(entry.get("own_camera", False))
-                scenes.append(SceneFolder(root / entry["name"], entry["split"], camera, own))
-            return cls(root, tuple(scenes))
+                folder = entry_of(root, entry["name"], "a scene's name")
+                if entry["split"] not in get_args(Split):
+                    raise ValueError(f"a scene's split is {', '.join(get_args(Split))}, not {entry['split']!r}")
+                scenes.append(SceneFolder(folder, entry["split"], camera, own))
         except FileNotFoundError as error:
             raise TableError("this folder is no dataset", path=path, fix="Run the scenes stage first.") from error
-        except (ConfigError, ValueError, KeyError, TypeError) as error:
+        except (OSError, ConfigError, ValueError, KeyError, TypeError, AttributeError) as error:
             problem, fix = f"damaged dataset description: {error}", "Run the scenes stage again."
             raise TableError(problem, path=path, fix=fix) from error
+        check_links(root, depth=3)
+        return cls(root, tuple(scenes))

@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from wheretolook.dataset.folders import SceneFolder
+from wheretolook.utils.errors import TableError
 from wheretolook.utils.files import write_json
+from wheretolook.utils.reading import read_json_object
 
 STAGES = ("scenes", "map", "sample", "label")  # stages that work scene by scene, in order
 
@@ -20,7 +22,7 @@ def stage_key(stage: str, parts: list[Any]) -> str:
 
 
 def read_stamp(scene: SceneFolder, stage: str) -> str | None:
-    """The key a stage was finished with; None if it was not."""
+    """The key a stage was finished with; None if it was not. TableError if `stages.json` is damaged."""
     return _read(scene).get(stage)
 
 
@@ -50,7 +52,14 @@ def _path(scene: SceneFolder) -> Path:
 
 
 def _read(scene: SceneFolder) -> dict[str, str]:
+    path = _path(scene)
     try:
-        return dict(json.loads(_path(scene).read_text()))
-    except (OSError, ValueError):
+        stamps = read_json_object(path)
+        if not all(isinstance(stamp, str) for stamp in stamps.values()):
+            raise ValueError("a stage's key is a text")
+        return stamps
+    except FileNotFoundError:
         return {}
+    except (OSError, ValueError) as error:
+        fix = "Remove it, and run the scene's stages again."
+        raise TableError(f"damaged record of finished stages: {error}", path=path, fix=fix) from error

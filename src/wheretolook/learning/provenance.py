@@ -14,6 +14,7 @@ from wheretolook.learning.old_names import with_name
 from wheretolook.learning.scenes import with_also
 from wheretolook.utils.errors import ConfigError, TableError
 from wheretolook.utils.files import fingerprint, sha256
+from wheretolook.utils.reading import read_json_object
 from wheretolook.utils.version import VERSION
 
 
@@ -72,7 +73,7 @@ def _name(scene: SceneFolder, dataset: Dataset) -> str:
 def trained_before(path: Path, about: Mapping[str, Any]) -> TrainedModel | None:
     """The model at `path` if it was trained as `about` says and has not been changed since."""
     try:
-        record = json.loads(path.with_suffix(".json").read_text())
+        record = read_json_object(path.with_suffix(".json"))
         if with_name(record["about"]) == about and record["weights_sha256"] == sha256(path):
             return TrainedModel(about["method"], path, record["run_id"], record["metrics"], reused=True)
     except (OSError, ValueError, KeyError, TypeError):

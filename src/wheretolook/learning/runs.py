@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,7 +10,9 @@ import pandas as pd
 
 from wheretolook.dataset.folders import Dataset
 from wheretolook.learning.old_names import name_of_variant, with_name, with_names
+from wheretolook.utils.errors import WeightsError
 from wheretolook.utils.files import write_text
+from wheretolook.utils.reading import read_json_object
 from wheretolook.utils.tracking import artifact, client, finished_runs
 from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.utils.tracking_layout import AUC
@@ -98,9 +99,15 @@ def log_history(tracking: TrackingConfig, run_id: str, history: pd.DataFrame) ->
 
 
 def records(folder: Path) -> dict[Path, dict[str, Any]]:
-    """Records of training in a folder of weights and the folders in it, by their files."""
-    found = {path: json.loads(path.read_text()) for path in sorted(folder.rglob("*.json"))}
-    return {path: record | {"about": with_name(record["about"])} for path, record in found.items()}
+    """Records of training in a folder of weights and the folders in it, by their files. WeightsError if damaged."""
+    found = {}
+    for path in sorted(folder.rglob("*.json")):
+        try:
+            record = read_json_object(path)
+            found[path] = record | {"about": with_name(record["about"])}
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            raise WeightsError(f"not a record of training: {error}", path=path, fix="Train again.") from error
+    return found
 
 
 def read_histories(path: Path) -> pd.DataFrame:

@@ -89,7 +89,7 @@ class TrainedNetwork(Generic[NetworkT]):
             known = TrainingRange.of_record(header["range"]) if "range" in header else None
         except WeightsError as error:
             raise WeightsError(error.problem, path=path, value=error.value, fix=error.fix or fix) from error
-        except (KeyError, TypeError, ValueError, IndexError, ConfigError) as error:
+        except (KeyError, TypeError, ValueError, IndexError, AttributeError, RuntimeError, ConfigError) as error:
             raise WeightsError(f"damaged description in the header: {error}", path=path, fix=fix) from error
         try:
             network.stored.load_state_dict(tensors)

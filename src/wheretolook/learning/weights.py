@@ -14,6 +14,7 @@ from torch import Tensor
 
 from wheretolook.learning.old_names import name_of_header, with_name
 from wheretolook.utils.errors import WeightsError
+from wheretolook.utils.reading import parse_json_object, read_json_object
 
 FORMAT_VERSION = 1  # version of the layout of the metadata
 METADATA_KEY = "wheretolook"  # key of the JSON text in the header of the file
@@ -51,7 +52,7 @@ def read_record(path: str | Path) -> dict[str, Any]:
     """The record beside weights: "about", "weights_sha256", "run_id", "metrics". WeightsError if missing or damaged."""
     beside = Path(path).with_suffix(".json")
     try:
-        record = dict(json.loads(beside.read_text()))
+        record = read_json_object(beside)
         float(record["metrics"]["val_average_precision"])
         return record | {"about": with_name(record["about"])}
     except (OSError, ValueError, TypeError, KeyError) as error:
@@ -101,11 +102,17 @@ def read_weights(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         fix = "Give weights that the train stage wrote."
         raise WeightsError("these weights were not written by wheretolook", path=path, fix=fix)
     try:
-        header = dict(json.loads(metadata[METADATA_KEY]))
+        header = parse_json_object(metadata[METADATA_KEY])
     except ValueError as error:
         raise WeightsError(f"damaged description in the header: {error}", path=path, fix="Train again.") from error
     if (found := header.get("format_version")) != FORMAT_VERSION:
         problem = f"this version of wheretolook reads weights of format {FORMAT_VERSION}"
         fix = "Train again, or install the version that wrote them."
         raise WeightsError(problem, path=path, value=found, fix=fix)
+    if not isinstance(header.get("training", {}), dict):
+        problem = "damaged description in the header: what is known of the training is no JSON object"
+        raise WeightsError(problem, path=path, value=header["training"], fix="Train again.")
+    unknown = next((name for name, x in tensors.items() if x.is_floating_point() and bool(x.isnan().any())), None)
+    if unknown is not None:
+        raise WeightsError("these weights are not numbers (NaN)", path=path, value=unknown, fix="Train again.")
     return tensors, header

@@ -173,7 +173,8 @@ def load_mapping_poses(path: str | Path) -> Float:
         poses = load_npz(path)["cam_from_world"]
     except (ValueError, KeyError) as error:
         raise MapError(f"cannot read the mapping images' poses: {error}", path=path, fix=fix) from error
-    if poses.ndim != 3 or poses.shape[1:] != (3, 4) or not len(poses) or not np.isfinite(poses).all():
+    shape = poses.shape if poses.dtype.kind == "f" else ()
+    if len(shape) != 3 or shape[1:] != (3, 4) or not len(poses) or not np.isfinite(poses).all():
         raise MapError("these are no poses of mapping images", path=path, value=poses.shape, fix=fix)
     return np.asarray(poses, dtype=np.float32)
 

@@ -26,6 +26,7 @@ from wheretolook.utils.colmap import quiet_colmap
 from wheretolook.utils.errors import MapError
 from wheretolook.utils.npz_files import load_npz, save_npz
 from wheretolook.utils.processes import Processes
+from wheretolook.utils.reading import read_json_object
 
 _LEAST_IMAGES = 3  # of a model: two photographs alone do not determine a camera
 _VERSION = 1  # of the format in which finished steps are kept
@@ -214,7 +215,7 @@ def _key(parts: list[Any]) -> str:
 
 def _note(path: Path) -> dict[str, Any]:
     try:
-        return dict(json.loads(path.read_text()))
+        return read_json_object(path)
     except (OSError, ValueError):
         return {}
 

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 _BLOCK = 4096  # landmarks whose tracks are gathered at a time
 _SILENT_S = 2.0  # progress is shown of what takes longer
+_WHOLE = ("ids", "track_length", "descriptors")  # arrays of whole numbers; all others are of floats
 _TILE = 512  # descriptors along a side of a product that stays in the cache
 
 
@@ -90,11 +91,21 @@ class Landmarks:
             raise MapError(str(error), path=path, fix=fix) from error
         names = {f.name for f in fields(cls)}
         if set(values) and "mapping_distance_spread" not in values and "mapping_distance_m" in values:
-            values["mapping_distance_spread"] = np.full(len(values["mapping_distance_m"]), np.nan, dtype=np.float32)
+            values["mapping_distance_spread"] = np.full(values["mapping_distance_m"].shape[:1], np.nan, np.float32)
         if set(values) | {"descriptors", "mapping_focal_px"} != names:
             raise MapError("not a file of landmarks", path=path, value=sorted(values), fix=fix)
+        for name, value in values.items():
+            if value.ndim == 0 or value.dtype.kind not in ("iu" if name in _WHOLE else "f"):
+                problem = f"the array {name} is not one of {'whole ' if name in _WHOLE else ''}numbers, one a landmark"
+                raise MapError(problem, path=path, value=f"{value.dtype} {value.shape}", fix=fix)
         if len({len(v) for v in values.values()}) != 1 or values["points"].shape[1:] != (3,):
             raise MapError("the arrays disagree on the number of landmarks", path=path, fix=fix)
+        sides = {"points": (3,), "mapping_direction": (3,)}
+        for name, value in values.items():
+            if value.shape[1:] != sides.get(name, ()) and (name != "descriptors" or value.ndim != 2):
+                raise MapError(f"the array {name} has another shape", path=path, value=value.shape, fix=fix)
+        if not np.isfinite(values["points"]).all():
+            raise MapError("some landmarks are not at finite places", path=path, fix=fix)
         arrays: dict[str, Any] = {
             "descriptors": None,
             "mapping_focal_px": None,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +14,7 @@ from numpy.typing import ArrayLike
 from wheretolook.geometry.poses import Float
 from wheretolook.mapping.markers import Marker
 from wheretolook.utils.errors import ConfigError, MapError
+from wheretolook.utils.reading import read_json_object
 
 Source = Literal["markers", "distance", "positions", "model", "unknown"]
 REPORT_FILE = "report.json"
@@ -192,7 +192,7 @@ def read_positions(path: Path) -> dict[str, Float]:
     """
     if path.suffix.lower() == ".json":
         try:
-            rows = list(json.loads(path.read_text()).items())
+            rows = list(read_json_object(path).items())
         except (OSError, ValueError, AttributeError) as error:
             raise ConfigError(f"not a file of positions: {error}", path=path, fix="{image: [x, y, z]}") from error
     else:
@@ -214,7 +214,7 @@ def read_scale(map_dir: Path) -> MapScale | None:
     """The scale in a map's report; None for maps of known poses, which are metric. MapError if it is damaged."""
     path = map_dir / REPORT_FILE
     try:
-        scale = json.loads(path.read_text()).get("scale")
+        scale = read_json_object(path).get("scale")
         return None if scale is None else MapScale(**scale)
     except FileNotFoundError:
         return None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import glob
-import json
 import shutil
 import tempfile
 from collections.abc import Mapping
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.utils.errors import MapFormatError
 from wheretolook.utils.files import sha256, write_json, write_text
+from wheretolook.utils.reading import read_json
 
 FORMAT, VERSION = "wheretolook viewpoint map", 1
 
@@ -124,7 +124,7 @@ def _refuse_something_else(folder: Path) -> None:
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return
     try:
-        is_map = json.loads((folder / DESCRIPTION).read_text(encoding="utf-8"))["format"] == FORMAT
+        is_map = read_json(folder / DESCRIPTION)["format"] == FORMAT
     except (OSError, ValueError, LookupError, TypeError):
         is_map = False
     if not is_map:
@@ -165,7 +165,7 @@ def read_map(folder: str | Path, mmap: bool = False) -> tuple[VoxelGrid, dict[st
         fix = _left_behind(folder) or REBUILD
         raise MapFormatError("there is no viewpoint map in this folder", path=folder, fix=fix)
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path)
         found = content.get("format"), content.get("version")
     except (OSError, ValueError, AttributeError) as error:
         raise MapFormatError(f"damaged description: {error}", path=path, fix=REBUILD) from error

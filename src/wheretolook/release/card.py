@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -24,6 +23,7 @@ from wheretolook.release.copy import CARD, SHELF, read_about, size_text, sizes
 from wheretolook.utils.errors import TableError, WeightsError
 from wheretolook.utils.files import sha256, write_text
 from wheretolook.utils.markdown import markdown_table
+from wheretolook.utils.reading import read_json_object
 from wheretolook.viewpoints.thresholds import ALL, THRESHOLDS, threshold_key, threshold_label
 from wheretolook.visibility.occlusion import StoredOcclusion
 
@@ -341,6 +341,6 @@ def _pairs(values: Mapping[str, Any]) -> str:
 
 def _json(path: Path) -> dict[str, Any]:
     try:
-        return dict(json.loads(path.read_text()))
+        return read_json_object(path)
     except (OSError, ValueError, TypeError) as error:
         raise TableError(f"a description is missing or damaged: {error}", path=path, fix="Get it anew.") from error

@@ -6,7 +6,6 @@ labelled anew, but it is read, trained on and evaluated as any other.
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from collections.abc import Mapping
@@ -19,8 +18,10 @@ from wheretolook.mapping.colmap_model import CAMERAS_FILE, save_mapping_poses
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.methods.method import Method
 from wheretolook.methods.registry import learned, scorers
+from wheretolook.utils.confine import entry_of
 from wheretolook.utils.errors import ConfigError, StorageError, TableError, WeightsError
 from wheretolook.utils.files import sha256, write_json
+from wheretolook.utils.reading import read_json_object
 from wheretolook.utils.version import VERSION
 from wheretolook.viewpoints.table import write_table
 from wheretolook.visibility.occlusion import StoredOcclusion
@@ -52,7 +53,10 @@ def copy_dataset(dataset: Dataset, root: Path, settings: Mapping[str, Any]) -> D
     """
     before = _release_of(root, dataset.name)
     fingerprint = None if before is None else before.fingerprint()
-    copied = [(scene, SceneFolder(root / scene.name, scene.split, scene.camera)) for scene in dataset.scenes]
+    copied = [
+        (scene, SceneFolder(entry_of(root, scene.name, "a scene's name"), scene.split, scene.camera))
+        for scene in dataset.scenes
+    ]
     for scene, copy in copied:
         copy.map.mkdir(parents=True, exist_ok=True)
         write_table(scene.read_table(), copy.table, compact=True)
@@ -177,7 +181,7 @@ def read_about(release: Dataset) -> dict[str, Any]:
     """
     path = release.root / RELEASE_FILE
     try:
-        about = dict(json.loads(path.read_text()))
+        about = read_json_object(path)
         return {name: about[name] for name in ("source", "source_fingerprint", "code_version", "settings")}
     except (OSError, ValueError, TypeError, KeyError) as error:
         fix = "Run `wheretolook release` on its source."
@@ -200,7 +204,7 @@ def _release_of(root: Path, source: str) -> Dataset | None:
 def _manifest(path: Path) -> dict[str, Any]:
     """What labels were made with, but for the shards, of which there are thousands, and the matches, which stay."""
     try:
-        content = json.loads(path.read_text())
+        content = read_json_object(path)
         return {name: value for name, value in content.items() if name not in ("shards", "store_matches")}
     except (ValueError, AttributeError) as error:
         fix = "Remove it, or label the scene again."

@@ -6,7 +6,6 @@ the one that was labelled shows in its occlusion, which must be what the release
 
 from __future__ import annotations
 
-import json
 import re
 from functools import cached_property
 from typing import cast, get_args
@@ -20,6 +19,7 @@ from wheretolook.dataset.scene import Scene, SceneConfig
 from wheretolook.figures.house_image import Dollhouse, dollhouse
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float
+from wheretolook.release.copy import read_about
 from wheretolook.scenes.config import ApartmentConfig, SceneKind
 from wheretolook.scenes.procedural.generator import generate_scene
 from wheretolook.space.config import FreeSpaceConfig
@@ -132,14 +132,15 @@ def open_showcase(dataset: Dataset, name: str | None = None, device: str = "cpu"
     """A scene of a release of generated apartments, by default the first test scene.
 
     Raises:
-        ConfigError: it is no release, or has no such scene. SceneError: the scene was not generated from a seed, or
-            what this code makes of the seed is not the scene that was labelled.
+        ConfigError: it is no release, its description is damaged, or it has no such scene.
+        SceneError: the scene was not generated from a seed, or what this code makes of the seed is not the scene that
+            was labelled.
     """
     about = dataset.root / RELEASE_FILE
     if not about.is_file():
         fix = "Open one that `wheretolook release` made."
         raise ConfigError("this dataset is no release", path=dataset.root, fix=fix)
-    settings = json.loads(about.read_text())["settings"]
+    settings = read_about(dataset)["settings"]
     scene = dataset.scene(name) if name else (*dataset.split("test"), *dataset.scenes)[0]
     seeded = _SEEDED.fullmatch(scene.name)
     if seeded is None:

@@ -13,6 +13,7 @@ from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.select.waypoints import Waypoints
 from wheretolook.utils.errors import ConfigError, SceneError, TableError
+from wheretolook.utils.npz_files import load_npy
 from wheretolook.visibility.config import OCCLUSION_NAMES, OcclusionConfig
 
 if TYPE_CHECKING:
@@ -104,8 +105,8 @@ def read_depth_images(model: Path, folder: Path, scale: float = 1000.0) -> list[
 def _read_depth(path: Path, scale: float) -> NDArray[np.float32]:
     if path.suffix.lower() == ".npy":
         try:
-            values = np.load(path, allow_pickle=False)
-        except (OSError, ValueError) as error:
+            values = load_npy(path)
+        except ValueError as error:
             raise SceneError(f"cannot read the depth image: {error}", path=path, fix="Export it again.") from error
     else:
         import cv2

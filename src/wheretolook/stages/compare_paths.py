@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
@@ -19,6 +18,7 @@ from wheretolook.planning.config import FORWARD, PathsConfig
 from wheretolook.stages.inputs import Say, Tick, dataset_after, extractor_of, open_scene
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.utils.files import fingerprint, write_json, write_text
+from wheretolook.utils.reading import read_json, read_json_object
 from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.table import SCHEMA, UNLABELLED
 
@@ -79,7 +79,7 @@ def _plan(scene: Scene, dataset: Dataset, config: PathsConfig, say: Say) -> Comp
     key = stage_key("paths 2", [settings, *looked_at, *made_from, used])
     tables = {name: folder / f"{name}.parquet" for name in ("paths", "views")}
     made = folder / "made.json"
-    if made.is_file() and all(path.is_file() for path in tables.values()) and json.loads(made.read_text()) == key:
+    if all(path.is_file() for path in tables.values()) and _holds(made, key):
         say(f"{scene.name}: reusing {folder}")
         return ComparedPaths(**{name: pd.read_parquet(path) for name, path in tables.items()})
     mapped = [name for name in config.methods if name != FORWARD]
@@ -120,11 +120,18 @@ def _localize(
             outcome = result.table[["status", "error_m", "error_deg", "n_inliers"]].reset_index(drop=True)
             labelled[name] = pd.concat([planned[name].views, outcome], axis=1)
     for task in tasks:  # views of paths that were planned with other settings
-        current = json.loads((task.shards / MANIFEST).read_text())["shards"]
+        current = read_json_object(task.shards / MANIFEST)["shards"]
         for path in task.shards.glob("*.parquet"):
             if path.name not in current:
                 path.unlink()
     return labelled
+
+
+def _holds(path: Path, key: str) -> bool:
+    try:
+        return bool(read_json(path) == key)
+    except (OSError, ValueError):
+        return False
 
 
 def _report(

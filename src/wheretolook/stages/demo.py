@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import textwrap
 import time
 from collections.abc import Callable
@@ -26,6 +25,7 @@ from wheretolook.methods.registry import best_weights, load_scorer, methods_name
 from wheretolook.stages.inputs import Say, Tick, dataset_after, open_scene
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import fingerprint, write_json
+from wheretolook.utils.reading import read_json
 from wheretolook.utils.shipped import WEIGHTS, shipped
 from wheretolook.utils.tracking import ui_command
 from wheretolook.utils.version import VERSION
@@ -86,7 +86,7 @@ def compare(experiment: Experiment, say: Say, tick: Tick) -> None:
         return {"key": stage_key("evaluate", [*made_from, *content]), "runs": str(tracking.root)}
 
     try:
-        known = json.loads(stamp.read_text()) == made() and (tracking.root / "mlflow.db").is_file()
+        known = read_json(stamp) == made() and (tracking.root / "mlflow.db").is_file()
     except (OSError, ValueError):
         known = False
     if not known:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,6 +15,7 @@ from wheretolook.geometry.camera import CameraConfig
 from wheretolook.utils.errors import ConfigError, MapError, SceneError, TableError
 from wheretolook.utils.files import fingerprint
 from wheretolook.utils.options import recorded
+from wheretolook.utils.reading import read_json_object
 
 if TYPE_CHECKING:
     from wheretolook.features.keypoints import ExtractorConfig
@@ -83,9 +83,9 @@ def extractor_of(scene: SceneFolder) -> ExtractorConfig:
 
     path = scene.map / "report.json"
     try:
-        report = json.loads(path.read_text())
+        report = read_json_object(path)
         extractor = recorded(ExtractorConfig, report["config"]["extractor"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise MapError("the map's report is missing or damaged", path=path, fix="Run the map stage again.") from error
     if not report.get("has_descriptors", True):
         fix = "Run the map stage again with --database, or with --images to triangulate anew."

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from wheretolook.config import NOT_SCENES, Experiment, check_folder_name
+from wheretolook.config import NOT_SCENES, Experiment
 from wheretolook.dataset.folders import Dataset, SceneFolder
 from wheretolook.dataset.stamps import forget_stamp, is_done, read_stamp, stage_key, write_stamp
 from wheretolook.geometry.camera import Camera, CameraConfig, PinholeCamera, describe_camera, draw_camera
@@ -24,6 +24,7 @@ from wheretolook.stages.inputs import (
     open_scene,
     refuse_release,
 )
+from wheretolook.utils.confine import check_folder_name, entry_of, path_within
 from wheretolook.utils.errors import ConfigError, MapError, SceneError
 from wheretolook.utils.files import fingerprint
 
@@ -103,7 +104,7 @@ def _map_photographs(experiment: Experiment, say: Say, tick: Tick) -> Dataset:
     assert settings.images is not None
     name = settings.name or settings.images.resolve().name
     check_folder_name("a scene's name, map.photographs.name,", name, NOT_SCENES)
-    scene = SceneFolder(root / name, "test", experiment.camera.camera)
+    scene = SceneFolder(entry_of(root, name, "a scene's name"), "test", experiment.camera.camera)
     dataset = _with_photographs(scene, experiment)
     files = [settings.images / name for name in list_photographs(settings.images)]
     tables = [path for path in (settings.scale.marker_table, settings.scale.positions) if path is not None]
@@ -150,12 +151,14 @@ def _map_existing(experiment: Experiment, say: Say, tick: Tick) -> Dataset:
         fix = "Give a model and a mesh that are both in metres with z up."
         raise ConfigError("a model that is turned or scaled leaves its mesh", value=str(settings.mesh), fix=fix)
     model = read_model(settings.model)
-    scene = _with_own_camera(SceneFolder(root / name, "test", experiment.camera.camera), model, experiment)
+    scene = SceneFolder(entry_of(root, name, "a scene's name"), "test", experiment.camera.camera)
+    scene = _with_own_camera(scene, model, experiment)
     dataset = _with_photographs(scene, experiment)
     tables = [photographs.scale.marker_table, photographs.scale.positions, settings.database]
     files = [*sorted(settings.model.iterdir()), *(path for path in tables if path is not None)]
     if photographs.images is not None:
-        files += [photographs.images / image.name for _, image in sorted(model.images.items())]
+        names = [image.name for _, image in sorted(model.images.items())]
+        files += [path_within(photographs.images, name, "the name of a model's image") for name in names]
     stats = [(path, path.stat()) for path in files if path.is_file()]
     made_from = [(str(path), stat.st_size, stat.st_mtime_ns) for path, stat in stats]
     mesh = [] if settings.mesh is None else [mesh_fingerprint(settings.mesh)]

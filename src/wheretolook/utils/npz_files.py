@@ -1,14 +1,23 @@
-"""NPZ files, written atomically and read with one kind of error."""
+"""NPZ and NPY files, written atomically and read with limits and one kind of error."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
+from numpy.lib import format as npy
 from numpy.typing import NDArray
+
+from wheretolook.utils.reading import check_file
+
+MAX_RATIO = 100
+"""Bytes that one byte of a file may unfold to. Packed occlusion of the maps that ship has 8; a bomb has up to 1032."""
+
+FREE_BYTES = 128_000_000
+"""A file may always unfold to so many."""
 
 
 def save_npz(path: Path, arrays: Mapping[str, NDArray[Any]], compress: bool = False) -> None:
@@ -21,9 +30,42 @@ def save_npz(path: Path, arrays: Mapping[str, NDArray[Any]], compress: bool = Fa
 
 
 def load_npz(path: Path) -> dict[str, NDArray[Any]]:
-    """Read all arrays of an NPZ file by name. Raises ValueError if the file is missing or damaged."""
+    """Read all arrays of an NPZ file by name. Raises ValueError if the file is missing or damaged.
+
+    Also if it unfolds to far more than it has bytes, which is found out before anything is unfolded. Of an array that
+    tells of more values than follow it, no more memory is touched than what follows.
+    """
     try:
-        with np.load(path) as stored:
+        n_bytes = check_file(path).st_size
+        with np.load(path, allow_pickle=False) as stored:
+            unfolded = sum(member.file_size for member in stored.zip.infolist())
+            if unfolded > max(FREE_BYTES, MAX_RATIO * n_bytes):
+                raise ValueError(f"its {n_bytes:,} bytes would unfold to {unfolded:,}")
             return {name: stored[name] for name in stored.files}
     except Exception as error:  # a damaged zip raises many kinds of errors
         raise ValueError(f"not a readable NPZ file: {error}") from error
+
+
+def load_npy(path: Path) -> NDArray[Any]:
+    """Read the array of an NPY file. Raises ValueError if the file is missing, damaged, or shorter than it tells."""
+    try:
+        n_bytes = check_file(path).st_size
+        with path.open("rb") as file:
+            _check_header(file, n_bytes)
+        return np.asarray(np.load(path, allow_pickle=False))
+    except Exception as error:  # a damaged header raises many kinds of errors
+        raise ValueError(f"not a readable array: {error}") from error
+
+
+def _check_header(file: IO[bytes], n_bytes: int) -> None:
+    """Raise ValueError if what is no array of `n_bytes` with its header starts here."""
+    version = npy.read_magic(file)
+    if version not in ((1, 0), (2, 0), (3, 0)):
+        raise ValueError(f"an array of version {version}")
+    read: Any = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+    shape, _, dtype = read(file)
+    told = dtype.itemsize
+    for side in shape:
+        told *= side  # of Python's integers, which do not overflow
+    if min(shape, default=0) < 0 or told > n_bytes:
+        raise ValueError(f"an array of shape {shape} and type {dtype} in {n_bytes:,} bytes")

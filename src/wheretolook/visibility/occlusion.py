@@ -224,7 +224,14 @@ class StoredOcclusion(OcclusionModel):
         """Read what `save` wrote. Raises TableError if the file is missing or damaged."""
         try:
             data = load_npz(path)
-            return cls(data["locations"], data["mask"], int(data["n_landmarks"]), str(data.get("model", "mesh")))
+            locations, mask, n_landmarks = data["locations"], data["mask"], data["n_landmarks"]
+            if locations.dtype.kind != "f" or locations.shape[1:] != (3,) or not np.isfinite(locations).all():
+                raise ValueError(
+                    f"locations of type {locations.dtype} and shape {locations.shape} are no places (L, 3)"
+                )
+            if mask.dtype != np.uint8 or n_landmarks.dtype.kind not in "iu" or n_landmarks.shape or n_landmarks < 0:
+                raise ValueError(f"a mask of type {mask.dtype} of {n_landmarks!s:.40} landmarks is none of packed bits")
+            return cls(locations, mask, int(n_landmarks), str(data.get("model", "mesh")))
         except (ValueError, KeyError, TypeError) as error:
             fix = "Run the sample stage again."
             raise TableError(f"cannot read stored occlusion: {error}", path=path, fix=fix) from error

@@ -123,7 +123,7 @@ class BoostedTrees:
             camera = None if header["camera"] is None else camera_of_record(header["camera"])
             known = TrainingRange.of_record(header["range"]) if "range" in header else None
             arrays = {name: tensors[name] for name in _ARRAYS}
-        except (KeyError, TypeError, ValueError, IndexError, ConfigError) as error:
+        except (KeyError, TypeError, ValueError, IndexError, AttributeError, ConfigError) as error:
             raise WeightsError(f"damaged description of trees: {error}", path=path, fix=fix) from error
         arrays |= {name: arrays[name].long() for name in ("roots", "feature", "left", "right")}
         arrays["missing_left"] = arrays["missing_left"].bool()

@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from wheretolook.geometry.camera import ColmapCamera, PinholeCamera, cameras_of_map, only_camera
+from wheretolook.geometry.camera import ColmapCamera, PinholeCamera, cameras_by_id, only_camera
+from wheretolook.mapping.colmap_model import read_model
 from wheretolook.utils.errors import ConfigError, MapError
 
 
@@ -68,14 +69,14 @@ def test_the_camera_of_a_map(tmp_path: Path) -> None:
     )
     model.write(tmp_path)
     camera = ColmapCamera("RADIAL", 640, 480, (500.0, 320.0, 240.0, 0.1, 0.01))
-    assert only_camera(cameras_of_map(tmp_path), tmp_path) == camera
+    assert only_camera(cameras_by_id(read_model(tmp_path).cameras, tmp_path), tmp_path) == camera
     model.add_camera(pycolmap.Camera(model="SIMPLE_PINHOLE", width=64, height=48, params=[50, 32, 24], camera_id=2))
     model.write(tmp_path)
-    assert cameras_of_map(tmp_path) == {1: camera, 2: PinholeCamera(64, 48, 50.0)}
+    assert cameras_by_id(read_model(tmp_path).cameras, tmp_path) == {1: camera, 2: PinholeCamera(64, 48, 50.0)}
     with pytest.raises(MapError, match=r"2: 64 x 48 px, 65\.2 x 51\.3 degrees"):
-        only_camera(cameras_of_map(tmp_path), tmp_path)
+        only_camera(cameras_by_id(read_model(tmp_path).cameras, tmp_path), tmp_path)
     with pytest.raises(MapError, match="nowhere"):
-        cameras_of_map(tmp_path / "nowhere")
+        read_model(tmp_path / "nowhere")
 
 
 def test_unknown_models_and_wrong_parameters_are_named() -> None:

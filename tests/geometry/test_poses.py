@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from wheretolook.geometry import poses as geo
 from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.errors import ConfigError, PoseError, WhereToLookError
 
 
 def random_poses(n: int, seed: int = 0) -> np.ndarray:
@@ -100,3 +100,22 @@ def test_pose_error_is_between_centres_not_translations() -> None:
 def test_bad_camera() -> None:
     with pytest.raises(ConfigError, match="positive"):
         PinholeCamera(640, 0, 320)
+
+
+@pytest.mark.parametrize("direction", [(0, 0, 0), (np.nan, 0, 1), (np.inf, 0, 1), (1e300, 1e300, 0)])
+def test_directions_that_say_nothing_are_refused(direction) -> None:
+    for directions in (direction, [(1, 0, 0), direction], [[(1, 0, 0)], [direction]]):
+        for ask in (geo.rotation_looking_along, lambda along: geo.poses_looking_along((0, 0, 1), along)):
+            with pytest.raises(PoseError, match=r"cannot look along this direction.*got"):
+                ask(directions)
+
+
+def test_locations_and_poses_that_are_not_finite_are_refused() -> None:
+    with pytest.raises(PoseError, match=r"location is NaN or infinite.*\[0\.0, nan, 1\.0\]"):
+        geo.poses_looking_along([(0, 0, 1), (0, np.nan, 1)], (1, 0, 0))
+    with pytest.raises(PoseError, match="first in pose 1"):
+        geo.check_poses(np.stack([np.eye(3, 4), np.full((3, 4), np.nan)]))
+    with pytest.raises(PoseError, match="shape"):
+        geo.check_poses(np.eye(4))
+    assert issubclass(PoseError, ValueError) and issubclass(PoseError, WhereToLookError)
+    assert geo.poses_looking_along(np.empty((0, 3)), np.empty((0, 3))).shape == (0, 3, 4)

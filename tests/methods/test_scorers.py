@@ -29,7 +29,7 @@ from wheretolook.methods.sphere.network import SphereNetwork
 from wheretolook.methods.trees.config import TreesConfig
 from wheretolook.methods.trees.learn import BoostedTrees, PooledViews, fit_trees
 from wheretolook.methods.visible import VisibleScorer
-from wheretolook.utils.errors import ConfigError, WeightsError
+from wheretolook.utils.errors import ConfigError, PoseError, WeightsError
 
 
 @pytest.fixture
@@ -116,6 +116,16 @@ def test_scorers_keep_their_contract(
     monkeypatch.setattr("wheretolook.methods.base.BLOCK", 7)
     np.testing.assert_allclose(scorer.score(views), scores, rtol=rtol)
     assert scorer.score(views[:0]).shape == (0,)
+    for value in (np.nan, np.inf):
+        spoilt = views.copy()
+        spoilt[3, 1, 2] = value
+        for asked in (scorer.score, scorer.in_range, scorer.report):
+            with pytest.raises(PoseError, match=r"NaN or infinite entries, first in pose 3"):
+                asked(spoilt)
+        with pytest.raises(PoseError, match="location is NaN or infinite"):
+            scorer.score_around(np.array([[0.0, 0, 1], [0, value, 1]]), np.eye(3))
+        with pytest.raises(PoseError, match="cannot look along this direction"):
+            scorer.score_around(np.zeros((1, 3)), np.array([[1.0, 0, 0], [0, value, 1]]))
 
 
 def _binned(counts: list[list[int]]) -> BinnedViews:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wheretolook.dataset.folders import SceneFolder
-from wheretolook.geometry.camera import Camera, cameras_of_map, only_camera
+from wheretolook.geometry.camera import Camera, cameras_by_id, only_camera
 from wheretolook.geometry.lattices import ViewLattice, VoxelGrid
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.mapping.scale import read_scale
@@ -210,12 +210,13 @@ class Scene:
     @cached_property
     def _fused(self) -> tuple[TsdfVolume, RenderedDepth]:
         """The volume that depth images fuse to, and these, rendered where the map's images were taken."""
-        from wheretolook.mapping.colmap_model import colmap_poses
+        from wheretolook.mapping.colmap_model import colmap_poses, read_model
         from wheretolook.visibility.tsdf import TsdfConfig, TsdfVolume
 
         config = self.config.occlusion
-        mapped = only_camera(cameras_of_map(self.files.map), self.files.map)
-        images = RenderedDepth(self.renderer, mapped, colmap_poses(self.files.map))
+        model = read_model(self.files.map)
+        mapped = only_camera(cameras_by_id(model.cameras, self.files.map), self.files.map)
+        images = RenderedDepth(self.renderer, mapped, colmap_poses(self.files.map, model))
         tsdf = TsdfConfig(voxel_size_m=config.voxel_m, max_depth_m=config.max_depth_m)
         return TsdfVolume.from_images(images, tsdf, self.progress), images
 

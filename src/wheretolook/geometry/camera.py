@@ -315,20 +315,10 @@ def write_cameras(cameras: Mapping[int, Camera], path: Path) -> None:
     write_text(path, "\n".join(lines) + "\n")
 
 
-def cameras_of_map(model: str | Path) -> dict[int, Camera]:
-    """The cameras of the COLMAP model in a folder, by their camera_id; MapError if it cannot be read."""
-    import pycolmap
-
-    path = Path(model)
-    try:
-        cameras = pycolmap.Reconstruction(path).cameras
-    except Exception as error:
-        raise MapError(f"cannot read the cameras: {error}", path=path, fix="Give a COLMAP model folder.") from error
-    return cameras_by_id(cameras, path)
-
-
 def cameras_by_id(cameras: Any, path: Path) -> dict[int, Camera]:
-    """Cameras of a pycolmap model by their camera_id; MapError, naming the model, if one is no camera."""
+    """Cameras of the pycolmap model in a folder by their camera_id; MapError, naming the file, if one is no camera."""
+    files = [path / f"cameras{suffix}" for suffix in (".bin", ".txt")]
+    path = next((file for file in files if file.is_file()), path)
     found: dict[int, Camera] = {}
     for number, camera in sorted(cameras.items()):
         try:

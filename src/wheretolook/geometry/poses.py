@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from wheretolook.utils.errors import PoseError
+
 Float = NDArray[np.floating[Any]]
 
 
@@ -42,10 +44,18 @@ def rotation_looking_along(directions: ArrayLike) -> Float:
     """cam_from_world rotations (..., 3, 3) of cameras that look along world directions (..., 3) and do not roll.
 
     The image's x axis is horizontal and its y axis points down as far as it can (world z is up). Of a camera that looks
-    straight up or down, the image's x axis is the world's. Directions need not be of unit length.
+    straight up or down, the image's x axis is the world's. Directions need not be of unit length. Raises PoseError if
+    one has no length, or entries that are not finite.
     """
     forward = np.asarray(directions, dtype=np.float64)
-    forward = forward / np.linalg.norm(forward, axis=-1, keepdims=True)
+    length = np.linalg.norm(forward, axis=-1, keepdims=True)
+    usable = (length > 0) & np.isfinite(length)
+    if not usable.all():
+        value = forward[~usable[..., 0]].reshape(-1, 3)[0].tolist()
+        raise PoseError(
+            "a camera cannot look along this direction", value=value, fix="Give three numbers, not all zero."
+        )
+    forward = forward / length
     right = np.stack([forward[..., 1], -forward[..., 0], np.zeros_like(forward[..., 0])], axis=-1)
     length = np.linalg.norm(right, axis=-1, keepdims=True)
     vertical = length < 1e-9
@@ -54,9 +64,12 @@ def rotation_looking_along(directions: ArrayLike) -> Float:
 
 
 def poses_looking_along(locations: ArrayLike, directions: ArrayLike) -> Float:
-    """cam_from_world poses (..., 3, 4) of cameras at `locations` (..., 3) m looking along `directions` (..., 3)."""
+    """cam_from_world poses (..., 3, 4) of cameras at `locations` (..., 3) m looking along `directions` (..., 3).
+
+    Raises PoseError if a location is not finite, or a direction is not or has no length.
+    """
     rotation = rotation_looking_along(directions)
-    center = np.asarray(locations, dtype=np.float64)
+    center = check_locations(locations)
     return np.concatenate([rotation, -rotation @ center[..., None]], axis=-1)
 
 
@@ -98,10 +111,25 @@ def pose_error(cam_from_world_a: ArrayLike, cam_from_world_b: ArrayLike) -> tupl
 
 
 def check_poses(cam_from_world: ArrayLike) -> NDArray[np.float64]:
-    """The poses as float64 (B, 3, 4). Raises ValueError on another shape or on values that are not finite."""
+    """The poses as float64 (B, 3, 4). Raises PoseError, a ValueError, on another shape or entries not finite."""
     poses = np.asarray(cam_from_world, dtype=np.float64)
     if poses.ndim != 3 or poses.shape[1:] != (3, 4):
-        raise ValueError(f"cam_from_world must have shape (B, 3, 4), got {poses.shape}")
-    if not np.isfinite(poses).all():
-        raise ValueError("cam_from_world has NaN or infinite entries")
+        raise PoseError(f"cam_from_world must have shape (B, 3, 4), got {poses.shape}")
+    finite = np.isfinite(poses)
+    if not finite.all():
+        row = int(np.flatnonzero(~finite.all(axis=(1, 2)))[0])
+        fix = "Leave such poses out."
+        raise PoseError(
+            f"cam_from_world has NaN or infinite entries, first in pose {row}", value=poses[row].tolist(), fix=fix
+        )
     return poses
+
+
+def check_locations(locations: ArrayLike) -> NDArray[np.float64]:
+    """The locations as float64 (..., 3). Raises PoseError, a ValueError, on entries that are not finite."""
+    at = np.asarray(locations, dtype=np.float64)
+    finite = np.isfinite(at)
+    if not finite.all():
+        value = at[~finite.all(axis=-1)].reshape(-1, 3)[0].tolist()
+        raise PoseError("a camera's location is NaN or infinite", value=value, fix="Leave such locations out.")
+    return at

@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
-import itertools
-import re
-import struct
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from wheretolook.geometry.camera import Camera, cameras_by_id, mean_focal_px, only_camera
 from wheretolook.geometry.poses import Float
+from wheretolook.mapping.colmap_files import (
+    REBUILD,
+    blame_binary,
+    blame_text,
+    check_binary,
+    check_text,
+    check_text_count,
+    contradicting,
+    point_heads,
+    point_starts,
+    track_elements,
+)
 from wheretolook.utils.colmap import quiet_colmap
 from wheretolook.utils.errors import MapError
 from wheretolook.utils.npz_files import load_npz, save_npz
@@ -24,12 +32,6 @@ from wheretolook.utils.npz_files import load_npz, save_npz
 CAMERAS_FILE = "cameras.npz"  # lies beside the landmarks, small enough to travel without the COLMAP model
 MODEL_FILES = ("cameras", "images", "points3D")
 _LARGE_BYTES = 500e6  # of a model that takes so long to read that a bar shows how far it is
-_REBUILD = "Copy or build the model again."
-# The least bytes of an entry: an image with an empty name and no 2D points, a rig of one sensor, a frame of one image.
-_LEAST_BYTES = {"images.bin": 73, "rigs.bin": 8, "frames.bin": 68}
-# A point, which the track's elements follow: image id and index of the keypoint, uint32 each.
-_POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("n", "<u8")])
-_POINT_BYTES, _TRACK_LENGTH = _POINT.itemsize, struct.Struct("<Q")
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +53,8 @@ class ModelArrays:
 def read_model(model_dir: str | Path) -> Any:
     """Read a COLMAP model as a `pycolmap.Reconstruction`, binary or text, with or without rigs and frames (3.12).
 
-    Raises MapError if the folder or a file is missing, or a file is truncated or corrupt.
+    Raises MapError if the folder or a file is missing, truncated or corrupt, or holds a camera, pose or point that is
+    not finite or that no model can have; it names the file.
     """
     import pycolmap
 
@@ -66,30 +69,28 @@ def read_model(model_dir: str | Path) -> Any:
         raise MapError("no COLMAP model here", path=folder, fix=fix)
     for name in MODEL_FILES:
         if not (folder / (name + suffix)).is_file():
-            raise MapError("a file of the COLMAP model is missing", path=folder / (name + suffix), fix=_REBUILD)
+            raise MapError("a file of the COLMAP model is missing", path=folder / (name + suffix), fix=REBUILD)
     n_bytes = sum((folder / (name + suffix)).stat().st_size for name in MODEL_FILES)
     bar = tqdm(total=2, desc=f"model of {n_bytes / 1e9:.1f} GB: read", unit="step", disable=n_bytes < _LARGE_BYTES)
     reconstruction = pycolmap.Reconstruction()
-    try:
-        with bar, quiet_colmap():
-            if suffix == ".bin":
-                # From a damaged file pycolmap may read a count so large that it does not come back.
-                for name, least in _LEAST_BYTES.items():
-                    _check_count(folder / name, least)
-                _check_points(folder / "points3D.bin")
-            bar.update()
+    with bar, quiet_colmap():
+        (check_text(folder) if suffix == ".txt" else check_binary(folder, folder))
+        bar.update()
+        try:
             (reconstruction.read_binary if suffix == ".bin" else reconstruction.read_text)(str(folder))
-            bar.update()
-    except (ValueError, IndexError, RuntimeError, MemoryError, KeyError) as error:
-        raise MapError(f"pycolmap cannot read the model: {error}", path=folder, fix=_REBUILD) from error
+        except (ValueError, IndexError, RuntimeError, MemoryError, KeyError) as error:
+            (blame_text if suffix == ".txt" else blame_binary)(folder)
+            name = contradicting(error)
+            path = folder / f"{name}{suffix}" if name else folder
+            raise MapError(f"pycolmap cannot read the model: {error}", path=path, fix=REBUILD) from error
+        bar.update()
     if suffix == ".txt":
         found = (reconstruction.num_cameras(), reconstruction.num_images(), reconstruction.num_points3D())
         for name, number in zip(MODEL_FILES, found, strict=True):
-            _check_text_count(folder / f"{name}.txt", number)
-    else:
-        images, cameras = reconstruction.images.values(), reconstruction.cameras.values()
-        _check_size(folder / "cameras.bin", 8 + sum(24 + 8 * len(c.params) for c in cameras))
-        _check_size(folder / "images.bin", 8 + sum(73 + len(i.name.encode()) + 24 * i.num_points2D() for i in images))
+            check_text_count(folder / f"{name}.txt", number)
+        with TemporaryDirectory() as copy:
+            reconstruction.write_binary(copy)
+            check_binary(Path(copy), folder, suffix)
     return reconstruction
 
 
@@ -105,7 +106,7 @@ def model_arrays(reconstruction: Any) -> ModelArrays:
     image_ids = np.array(sorted(i for i, image in reconstruction.images.items() if image.has_pose), dtype=np.int64)
     images = [reconstruction.images[i] for i in image_ids]
     if not np.isin(stored.elements[:, 0], image_ids).all():
-        raise MapError("points were observed by images without a pose", fix=_REBUILD)
+        raise MapError("points were observed by images without a pose", fix=REBUILD)
     return ModelArrays(
         point_ids=stored.ids,
         points=stored.points,
@@ -199,62 +200,11 @@ def _stored_points(reconstruction: Any) -> _StoredPoints:
     with TemporaryDirectory() as folder:
         reconstruction.write_binary(folder)
         data = np.fromfile(Path(folder) / "points3D.bin", dtype=np.uint8)
-    starts = _point_starts(data.tobytes())
-    heads = np.zeros(0, dtype=_POINT)
-    if len(starts) > 1:
-        heads = sliding_window_view(data, _POINT_BYTES)[starts[:-1]].view(_POINT).reshape(-1)
-    step = np.zeros(len(data) + 1, dtype=np.int8)  # up where a point begins, down where its track does
-    step[starts[:-1]] += 1
-    step[starts[:-1] + _POINT_BYTES] -= 1
-    in_track = np.cumsum(step[:-1], dtype=np.int8) == 0
-    in_track[:8] = False
-    elements = data[in_track].view("<u4").reshape(-1, 2).astype(np.int64)
+    starts = point_starts(data.tobytes())
+    heads, elements = point_heads(data, starts), track_elements(data, starts).astype(np.int64)
     lengths, order = heads["n"].astype(np.int64), np.argsort(heads["id"])
     ends = np.cumsum(lengths)
     rows = np.repeat((ends - lengths)[order] - np.cumsum(lengths[order]) + lengths[order], lengths[order])
     elements = elements[rows + np.arange(len(rows))]
     heads = heads[order]
     return _StoredPoints(heads["id"].astype(np.int64), heads["xyz"], heads["error"], lengths[order], elements)
-
-
-def _point_starts(data: bytes) -> NDArray[np.int64]:
-    """Offsets of the points in the content of a points3D.bin, and where the last one ends; -1 if its end is missing."""
-    count, end = struct.unpack_from("<Q", data)[0], 8
-    starts = []
-    for _ in range(count):
-        starts.append(end)
-        if end + _POINT_BYTES > len(data):
-            end = -1
-            break
-        end += _POINT_BYTES + 8 * _TRACK_LENGTH.unpack_from(data, end + _POINT_BYTES - 8)[0]
-    return np.array([*starts, end], dtype=np.int64)
-
-
-def _check_count(path: Path, least_bytes: int) -> None:
-    if not path.is_file():
-        return  # models from before COLMAP 3.12 have no rigs and frames
-    size = path.stat().st_size
-    with path.open("rb") as file:
-        head = file.read(8)
-    if len(head) < 8 or struct.unpack("<Q", head)[0] * least_bytes > size - 8:
-        raise MapError("the file is truncated or corrupt", path=path, value=f"{size} bytes", fix=_REBUILD)
-
-
-def _check_text_count(path: Path, found: int) -> None:
-    """Compare with the number that COLMAP writes at the top of a text file, if it is there."""
-    with path.open(errors="replace") as file:
-        head = "".join(line for line in itertools.islice(file, 6) if line.startswith("#"))
-    told = re.search(r"# Number of \w+: (\d+)", head)
-    if told and found < int(told[1]):
-        raise MapError(f"the file is truncated: it tells of {told[1]}", path=path, value=found, fix=_REBUILD)
-
-
-def _check_points(path: Path) -> None:
-    _check_count(path, _POINT_BYTES)
-    _check_size(path, int(_point_starts(path.read_bytes())[-1]))
-
-
-def _check_size(path: Path, expected: int) -> None:
-    size = path.stat().st_size
-    if size != expected:
-        raise MapError("the file is truncated or corrupt", path=path, value=f"{size} bytes", fix=_REBUILD)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wheretolook.geometry.camera import Camera, ColmapCamera, describe_camera
-from wheretolook.geometry.poses import Float, poses_looking_along
+from wheretolook.geometry.poses import Float, check_poses, poses_looking_along
 from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS
 from wheretolook.utils.errors import CameraError
 
@@ -54,14 +54,14 @@ class Scorer(ABC):
 
     @abstractmethod
     def score(self, cam_from_world: Float) -> Float:
-        """Score poses (B, 3, 4). Returns (B,) float64, finite."""
+        """Score poses (B, 3, 4). Returns (B,) float64, finite. Raises PoseError if a pose is not finite."""
 
     def in_range(self, cam_from_world: Float) -> NDArray[np.bool_]:
         """Which poses (B, 3, 4) see what is like the views that the scorer has learnt from, (B,) bool.
 
         All do where nothing was learnt, or nothing is known of the views it was learnt from.
         """
-        return np.ones(len(cam_from_world), dtype=bool)
+        return np.ones(len(check_poses(cam_from_world)), dtype=bool)
 
     def score_around(self, locations: Float, directions: Float) -> Float:
         """Scores (L, D) of cameras without roll at locations (L, 3) m that look along each of directions (D, 3).

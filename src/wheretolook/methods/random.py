@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.geometry.poses import Float
+from wheretolook.geometry.poses import Float, check_poses
 from wheretolook.methods.base import Scorer
 from wheretolook.methods.method import MethodStyle, ScorerOptions, rule
 
@@ -29,7 +29,7 @@ class RandomScorer(Scorer):
 
     def score(self, cam_from_world: Float) -> Float:
         """(B,) in [0, 1)."""
-        return uniform(np.asarray(cam_from_world, dtype=np.float64).reshape(len(cam_from_world), 12), self.seed)
+        return uniform(check_poses(cam_from_world).reshape(-1, 12), self.seed)
 
 
 def uniform(values: Float, seed: int) -> Float:

@@ -152,14 +152,17 @@ class RobotScorer:
         """The view with the highest score at a position (3,) m.
 
         `directions` to look along are (D, 3), or so many spread evenly over the sphere; only those whose pitch, up from
-        level, is within `pitch_deg` count. For `unoccluded` see `views`. Raises ValueError if no direction is left, or
-        the position is not finite.
+        level, is within `pitch_deg` count. For `unoccluded` see `views`. Raises ValueError if no direction is left, one
+        has no length, or one or the position is not finite.
         """
         at = np.asarray(position, dtype=np.float64)
         if at.shape != (3,) or not np.isfinite(at).all():
             raise ValueError(f"a position is three finite numbers in metres, not {position!r}")
         along = fibonacci_sphere(directions) if isinstance(directions, int) else np.asarray(directions, np.float64)
-        along = along / np.linalg.norm(along, axis=1, keepdims=True)
+        lengths = np.linalg.norm(along, axis=1, keepdims=True)
+        if not ((lengths > 0) & np.isfinite(lengths)).all():
+            raise ValueError("directions are three finite numbers each, not all zero")
+        along = along / lengths
         pitch = np.degrees(np.arcsin(np.clip(along[:, 2], -1, 1)))
         along = along[(pitch >= pitch_deg[0]) & (pitch <= pitch_deg[1])]
         if len(along) == 0:

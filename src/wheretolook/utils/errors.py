@@ -72,5 +72,9 @@ class MapWarning(UserWarning):
     """A map is used, but in part, or may not be what it is taken for: not in metres, or not with z up."""
 
 
+class PoseError(WhereToLookError, ValueError):
+    """Poses, locations or directions have the wrong shape, are not finite, or say nothing, as a direction of zero."""
+
+
 class PlanningError(WhereToLookError):
     """There is no path, or no sequence of views along one that keeps the camera's limits."""

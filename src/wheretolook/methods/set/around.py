@@ -19,7 +19,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from wheretolook.geometry.poses import Float, rotation_looking_along
+from wheretolook.geometry.poses import Float, check_locations, rotation_looking_along
 from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 from wheretolook.methods.matchability.network import N_EXPECTED, bearing_precision
 from wheretolook.methods.set.network import expected_cells
@@ -113,7 +113,8 @@ class ScoresAround:
         return torch.stack([weight[:, names.index(name)] if name in names else zero for name in wanted])
 
     def score(self, locations: Float) -> Float:
-        """Scores (L, D) at locations (L, 3) m."""
+        """Scores (L, D) at locations (L, 3) m. Raises PoseError if one is not finite."""
+        locations = check_locations(locations)
         scores = np.empty((len(locations), len(self.rotations)))
         step = max(1, AROUND[self.device.type] // max(1, len(self.points)))
         blocks = [slice(begin, begin + step) for begin in range(0, len(locations), step)]

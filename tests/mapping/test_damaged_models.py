@@ -1,0 +1,112 @@
+"""COLMAP models that are damaged or lie: a typed error that names the file, at once."""
+
+from __future__ import annotations
+
+import os
+import struct
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import wheretolook
+from mapping.test_own_models import rig_model, written
+from wheretolook.mapping.colmap_model import read_model
+from wheretolook.utils.errors import MapError
+
+NAN = float("nan")
+# File, offset in the binary model of `rig_model`, layout and value of what is changed there.
+LIES = [
+    ("rigs", 12, "<I", 4_000_000_000, "truncated or corrupt"),  # sensors of a rig
+    ("frames", 72, "<I", 4_000_000_000, "truncated or corrupt|not in its rig"),  # images of a frame
+    ("images", 0, "<Q", 2**62, "truncated or corrupt"),
+    ("points3D", 8 + 43, "<Q", 2**63, "truncated or corrupt"),  # length of a track
+    ("images", 12, "<d", NAN, "no rotation and translation"),
+    ("images", 12, "<d", 5.0, "no rotation and translation"),
+    ("images", 8 + 36, "<d", 1e300, "no rotation and translation"),
+    ("frames", 16, "<d", NAN, "no rotation and translation"),
+    ("points3D", 16, "<d", 1e300, "too far away"),
+    ("points3D", 16, "<d", NAN, "NaN"),
+    ("cameras", 16, "<Q", 0, "no image has this size"),
+    ("cameras", 16, "<Q", 2**40, "no image has this size"),
+    ("cameras", 12, "<i", 99, "no known model"),
+    *[("cameras", 32, "<d", focal, "positive focal length") for focal in (NAN, 0.0, -320.0)],
+    ("points3D", 8 + 51, "<I", 99, "image 99"),  # a track's image
+]
+
+
+@pytest.mark.parametrize(("name", "offset", "layout", "value", "says"), LIES)
+def test_what_no_model_holds_is_refused_by_the_files_name(tmp_path, name, offset, layout, value, says):
+    path = written(rig_model(), tmp_path / "model") / f"{name}.bin"
+    content = bytearray(path.read_bytes())
+    struct.pack_into(layout, content, offset, value)
+    path.write_bytes(content)
+    with pytest.raises(MapError, match=says) as caught:
+        read_model(path.parent)
+    assert caught.value.path == path and caught.value.fix
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new"),
+    [
+        ("rigs", "1 2 CAMERA", "1 4000000000 CAMERA"),
+        ("frames", " 2 CAMERA 1 11", " 4000000000 CAMERA 1 11"),
+        ("frames", "1 1 0.707", "1 1 nan 0.707"),
+        ("cameras", "640 480 320 ", "640 480 nan "),
+        ("cameras", "640 480 320 ", "640 480 -320 "),
+        ("cameras", "640 480 320 ", "640 0 320 "),
+        ("points3D", "1 -1 2 0.5", "1 1e300 2 0.5"),
+        ("points3D", "1 -1 2 0.5", "1 nan 2 0.5"),
+        ("images", "11 0.7071", "11 nan 0.7071"),
+    ],
+)
+def test_text_models_too(tmp_path, name, old, new):
+    path = written(rig_model(), tmp_path / "model", text=True) / f"{name}.txt"
+    content = path.read_text()
+    assert old in content
+    path.write_text(content.replace(old, new, 1))
+    with pytest.raises(MapError) as caught:
+        read_model(path.parent)
+    assert caught.value.path == path
+
+
+FLIPS = """
+import random, resource, sys
+from pathlib import Path
+from wheretolook.mapping.colmap_model import colmap_poses, model_arrays, read_model
+from wheretolook.utils.errors import MapError
+import numpy as np, pycolmap
+resource.setrlimit(resource.RLIMIT_AS, (4 << 30,) * 2)
+resource.setrlimit(resource.RLIMIT_CPU, (60, 60))
+draw = random.Random(21)
+for folder in map(Path, sys.argv[1:]):
+    files, said = sorted(folder.iterdir()), [0, 0]
+    for _ in range(100):
+        path = draw.choice(files)
+        whole = path.read_bytes()
+        bit = draw.randrange(8 * len(whole))
+        flipped = bytearray(whole)
+        flipped[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(flipped)
+        try:
+            model = read_model(folder)
+            assert np.isfinite(model_arrays(model).points).all() and np.isfinite(colmap_poses(folder, model)).all()
+            said[0] += 1
+        except MapError as error:
+            assert Path(error.path).parent in (folder, folder.parent), (path, bit, error)
+            said[1] += 1
+        path.write_bytes(whole)
+    print(*said)
+"""
+
+
+def test_flipped_bits_are_typed_errors_or_numbers(tmp_path):
+    """In a process with limits on memory and time: a library in C++ that gives up would take this one along."""
+    folders = [str(written(rig_model(), tmp_path / kind, text=kind == "text")) for kind in ("binary", "text")]
+    env = {**os.environ, "PYTHONPATH": str(Path(wheretolook.__file__).parents[1])}
+    done = subprocess.run([sys.executable, "-c", FLIPS, *folders], capture_output=True, text=True, timeout=120, env=env)
+    assert done.returncode == 0, done.stderr[-3000:]
+    counts = np.array([line.split() for line in done.stdout.splitlines() if line[:1].isdigit()], dtype=int)
+    assert counts.shape == (2, 2) and (counts > 15).all()

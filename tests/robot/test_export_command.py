@@ -74,11 +74,26 @@ def test_a_mesh_and_a_camera_of_the_robot(model: Path, tmp_path: Path, capsys: p
     np.testing.assert_allclose(robot.score(views), expected, atol=1e-5, rtol=0)
 
 
+def test_one_of_several_cameras(model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    found = pycolmap.Reconstruction(str(model))
+    found.add_camera_with_trivial_rig(
+        pycolmap.Camera(camera_id=2, model="PINHOLE", width=640, height=480, params=[400.0, 410.0, 320.0, 240.0])
+    )
+    found.write_binary(str(model))
+    given = ["export", "--map", str(model), "--out", str(tmp_path / "robot"), "--weights", str(WEIGHTS)]
+    assert main(given) == 2
+    assert "2 cameras" in (said := capsys.readouterr().err) and "--camera-id 1" in said
+    assert main([*given, "--camera-id", "2"]) == 0
+    assert RobotScorer(tmp_path / "robot").camera["fy"] == 410
+
+
 @pytest.mark.parametrize(
     ("options", "says"),
     [
         (["--map", "nowhere"], "nowhere"),
-        (["--camera", "PINHOLE 640"], "PINHOLE WIDTH HEIGHT"),
+        (["--camera", "PINHOLE 640"], "Write MODEL,width,height,parameters"),
+        (["--camera-id", "7"], "no such camera"),
+        (["--camera-id", "1", "--camera", "PINHOLE,640,480,400,410,320,240"], "in two ways"),
         (["--camera", "OPENCV_FISHEYE,320,240,160,160,160,120,0,0,0,0"], "no pinhole of its own"),
         (["--weights", "none.safetensors"], "none.safetensors"),
         (["--mesh", "none.glb"], "none.glb"),

@@ -57,6 +57,17 @@ def test_json(views: SelectedViews, tmp_path: Path) -> None:
     assert told["method"] == "set" and "camera-to-world" in told["frames"]
     np.testing.assert_array_equal([view["cam_from_world"] for view in told["views"]], views.cam_from_world)
     assert [view["waypoint"] for view in told["views"]] == ["3", "1", "20", "7"]
+    np.testing.assert_array_equal([view["quaternion_xyzw"] for view in told["views"]], views.quaternions_xyzw)
+
+
+def test_names_with_blanks_commas_and_quotes(look: WhereToLook, tmp_path: Path) -> None:
+    names = ("hall, north", 'the "attic"', "a b", "c")
+    views = look.best(POINTS, ids=names)
+    views.save(tmp_path / "views.csv")
+    assert read_waypoints(tmp_path / "views.csv").ids == names
+    views.save(tmp_path / "poses.txt", "benchmark")
+    rows = [line.split() for line in (tmp_path / "poses.txt").read_text().splitlines()[1:]]
+    assert [len(row) for row in rows] == [8] * 4 and rows[2][0] == "a_b"
 
 
 def test_tum(views: SelectedViews, tmp_path: Path) -> None:

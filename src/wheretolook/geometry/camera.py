@@ -334,7 +334,8 @@ def only_camera(cameras: Mapping[int, Camera], path: Path) -> Camera:
     if len(different) == 1:
         return different[0]
     listed = "; ".join(f"{number}: {describe_camera(camera)}" for number, camera in list(cameras.items())[:10])
-    fix = "Say which camera will look: camera=, a camera_id of the model or a camera of its own."
+    one = min(cameras)
+    fix = f"Say which will look: --camera-id {one}, in Python camera={one}; or describe another: --camera."
     raise MapError(f"the map has {len(different)} cameras, not one ({listed})", path=path, fix=fix)
 
 

@@ -48,6 +48,7 @@ def run(arguments: Sequence[str]) -> int:
         help="the robot's, as COLMAP writes a pinhole, 'PINHOLE,WIDTH,HEIGHT,FX,FY,CX,CY'; by default the map's own, "
         "if it has but one, as the pinhole of its rectified images",
     )
+    parser.add_argument("--camera-id", type=int, metavar="ID", help="or the camera_id of one of the map's cameras")
     parser.add_argument(
         "--database", type=Path, metavar="FILE", help="the map's: its descriptors tell which landmarks look alike"
     )
@@ -56,6 +57,8 @@ def run(arguments: Sequence[str]) -> int:
     given = parser.parse_args(arguments)
     if not 0 < given.spacing < float("inf"):
         raise ConfigError("the spacing must be positive", value=given.spacing, fix="Give it in metres.")
+    if given.camera is not None and given.camera_id is not None:
+        raise ConfigError("a camera is described in two ways", value=given.camera, fix="Give --camera or --camera-id.")
     _export(given)
     return 0
 
@@ -75,7 +78,7 @@ def _export(given: argparse.Namespace) -> None:
         space = FreeSpace(load_mesh(given.mesh))
         places = _places(space, given.spacing)
         occlusion = MeshOcclusion(space.raycaster, two_sided=space.two_sided)
-    named = None if given.camera is None else parse_camera(given.camera)
+    named = given.camera_id if given.camera is None else parse_camera(given.camera)
     found = LocalizationMap.from_colmap(given.map, named, occlusion=occlusion, database=given.database)
     camera = pinhole_of(found.camera)
     if camera != found.camera:

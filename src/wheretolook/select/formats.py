@@ -135,15 +135,15 @@ def _cell(name: str, value: Any) -> str:
         return ""
     if isinstance(value, bool) or not isinstance(value, float):
         text = str(value)
-        return f'"{text}"' if "," in text else text
+        return '"' + text.replace('"', '""') + '"' if "," in text or '"' in text else text
     return format(value, _DIGITS.get(name, ".9f"))
 
 
 def _json(views: SelectedViews) -> dict[str, Any]:
     frames = "x, y, z: camera centre in the world, m; qw, qx, qy, qz: camera-to-world; world z up, camera z forward"
     about = {"frames": frames, "method": views.method, "camera": views.camera.colmap.record()}
-    poses = [pose.tolist() for pose in views.cam_from_world]
-    rows = [row | {"cam_from_world": pose} for row, pose in zip(_rows(views), poses, strict=True)]
+    poses = zip(_rows(views), views.quaternions_xyzw.tolist(), views.cam_from_world.tolist(), strict=True)
+    rows = [row | {"quaternion_xyzw": xyzw, "cam_from_world": pose} for row, xyzw, pose in poses]
     return about | {"views": rows}
 
 
@@ -164,7 +164,7 @@ def _tum(views: SelectedViews) -> str:
 def _benchmark(views: SelectedViews) -> str:
     lines = ["# id qw qx qy qz tx ty tz"]
     for name, pose in zip(views.waypoint_id, _cam_from_world(views), strict=True):
-        lines.append(" ".join([name, *pose]))
+        lines.append(" ".join([name.replace(" ", "_"), *pose]))
     return "\n".join(lines) + "\n"
 
 

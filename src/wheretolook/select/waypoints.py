@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -86,7 +87,7 @@ def read_waypoints(path: str | Path) -> Waypoints:
     if not rows:
         raise TableError("there are no waypoints in the file", path=path, fix=f"Give {FORMATS}.")
     separator = next((mark for mark in ",;" if mark in rows[0][1]), None)
-    cells = [(number, [cell.strip() for cell in line.split(separator)]) for number, line in rows]
+    cells = [(number, _cells(line, separator)) for number, line in rows]
     header = cells[0][1] if not any(map(_is_number, cells[0][1])) and len(cells[0][1]) > 1 else None
     if header is not None:
         columns, name = _named(header, path)
@@ -119,6 +120,16 @@ def parse_points(texts: Sequence[str]) -> Waypoints:
             raise TableError("a waypoint is three numbers", value=text.strip(), fix=fix)
         points.append([float(cell) for cell in cells])
     return Waypoints.of(points)
+
+
+def _cells(line: str, separator: str | None) -> list[str]:
+    """Cells of a line; between commas or semicolons they may stand in quotes."""
+    if separator is None:
+        return line.split()
+    try:
+        return [cell.strip() for cell in next(csv.reader([line], delimiter=separator, skipinitialspace=True))]
+    except csv.Error:  # longer than any table's cell
+        return line.split(separator)
 
 
 def _is_number(text: str) -> bool:

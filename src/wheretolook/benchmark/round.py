@@ -144,7 +144,7 @@ class SceneRound:
         return views.waypoint_id, views.cam_from_world
 
     def _weights(self, method: str) -> Path | None:
-        from wheretolook.select.shipped import weights_of
+        from wheretolook.select.weights import weights_of
 
         return weights_of("" if method == BEST else method, self.config.weights)
 

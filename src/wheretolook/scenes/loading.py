@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from wheretolook.geometry.mesh import TexturedMesh
+from wheretolook.scenes.glb_checks import check_glb, check_image
 from wheretolook.utils.errors import ConfigError, SceneError
 
 # Rotations that turn the named axis of a file into the world's z axis.
@@ -144,6 +145,9 @@ def _part(geometry: Any, matrix: NDArray[np.float64]) -> _Part:
     if np.linalg.det(matrix[:3, :3]) < 0:  # a mirroring transform turns triangles inside out
         triangles = triangles[:, ::-1]
 
+    if triangles.min() < 0 or triangles.max() >= len(vertices):
+        raise ValueError(f"a triangle has vertex {triangles.max()} of {len(vertices)}")
+
     visual = geometry.visual
     uvs, colors, texture, colored = None, None, _WHITE, False
     if visual.kind == "texture":
@@ -151,6 +155,8 @@ def _part(geometry: Any, matrix: NDArray[np.float64]) -> _Part:
         image, factor = _material(visual.material)
         if image is not None and visual.uv is not None:
             uvs = np.asarray(visual.uv, dtype=np.float64) * (1, -1) + (0, 1)
+            if uvs.shape != (len(vertices), 2):
+                raise ValueError(f"texture coordinates of shape {uvs.shape} for {len(vertices)} vertices")
             texture = np.array(image.convert("RGB"), dtype=np.uint8)
         if factor is not None:
             texture = np.rint(texture * factor).astype(np.uint8)
@@ -159,6 +165,8 @@ def _part(geometry: Any, matrix: NDArray[np.float64]) -> _Part:
         colors, colored = visual.vertex_colors, True
     if colors is not None:
         colors = _as_uint8(np.asarray(colors)[:, :3])
+        if colors.shape != (len(vertices), 3):
+            raise ValueError(f"colours of shape {colors.shape} for {len(vertices)} vertices")
     return _Part(vertices, triangles, uvs, texture, colors, colored)
 
 
@@ -291,11 +299,19 @@ def _check_texture_references(path: Path) -> None:
     """
     suffix = path.suffix.lower()
     if suffix == ".glb":
-        for image in _glb_json(path).get("images", []):
+        tree, begin = _glb_json(path)
+        check_glb(tree, path, path.stat().st_size)
+        for index, image in enumerate(tree.get("images", [])):
             mime_type = image.get("mimeType", "")
             if "bufferView" in image and mime_type not in _READABLE:
                 fix = "Use the GLB with JPEG or PNG textures; a .basis.glb holds compressed ones"
                 raise SceneError("a texture is in a format that is not supported", path=path, value=mime_type, fix=fix)
+            if "bufferView" in image:
+                view = _item(tree["bufferViews"], image["bufferView"], path)
+                if "uri" not in tree["buffers"][view["buffer"]]:
+                    with path.open("rb") as file:
+                        file.seek(begin + view.get("byteOffset", 0))
+                        check_image(file.read(view["byteLength"]), index, path)
         return
     for texture in _ply_textures(path) if suffix == ".ply" else _obj_textures(path):
         if not texture.is_file():
@@ -303,8 +319,14 @@ def _check_texture_references(path: Path) -> None:
             raise SceneError("a texture is missing", path=path, value=str(texture), fix=fix)
 
 
-def _glb_json(path: Path) -> dict[str, Any]:
-    """The JSON chunk of a binary glTF 2.0 file (glTF 2.0 specification, section 4.4)."""
+def _item(items: list[Any], index: Any, path: Path) -> Any:
+    if not isinstance(index, int) or not 0 <= index < len(items):
+        raise SceneError("the glTF file is corrupt: an image has no such view", path=path, value=index)
+    return items[index]
+
+
+def _glb_json(path: Path) -> tuple[Any, int]:
+    """The JSON chunk of a binary glTF 2.0 file, and where its data begin (glTF 2.0 specification, section 4.4)."""
     fix = "Check that the file was copied whole"
     with path.open("rb") as file:
         header = file.read(20)
@@ -315,10 +337,10 @@ def _glb_json(path: Path) -> dict[str, Any]:
             value = f"{path.stat().st_size} of {length} bytes, version {version}"
             raise SceneError("a truncated glTF file or not of version 2", path=path, value=value, fix=fix)
         try:
-            content: dict[str, Any] = json.loads(file.read(json_length))
-        except ValueError as error:
+            content = json.loads(file.read(json_length))
+        except (ValueError, RecursionError) as error:
             raise SceneError("the glTF file is corrupt", path=path, value=str(error)) from error
-        return content
+        return content, 20 + json_length + 8
 
 
 def _ply_textures(path: Path) -> list[Path]:

@@ -166,8 +166,12 @@ def test_routes_are_improved_and_stay_free() -> None:
 def test_what_cannot_be_planned_is_named() -> None:
     views = looking_north()
     for start, goal, name in (((3.0, 1.0, 1.1), GOAL, "start"), (START, (5.0, 1.0, 9.0), "goal")):
-        with pytest.raises(PlanningError, match=f"the {name} is not in free space"):
+        with pytest.raises(PlanningError, match=f"the {name} is not in free space") as told:
             plan_path(start, goal, Room(), BOUNDS, views, QUICK, progress=False)
+        near = np.array(
+            [float(x) for x in str(told.value).partition("one near by is [")[2].partition("]")[0].split(",")]
+        )
+        assert Room().is_free(near[None])[0]
     with pytest.raises(PlanningError, match="the start is the goal"):
         plan_path(START, START, Room(), BOUNDS, views, QUICK, progress=False)
     with pytest.raises(PlanningError, match="cannot be pitched"):

@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from selection.room import POINTS
+from wheretolook.select.formats import check_format
 from wheretolook.select.views import SelectedViews
 from wheretolook.select.waypoints import read_waypoints
 from wheretolook.select.where_to_look import WhereToLook
@@ -132,3 +133,9 @@ def test_files_that_cannot_be(views: SelectedViews, look: WhereToLook, sparse: P
     (tmp_path / "file").write_text("")
     with pytest.raises(StorageError, match="cannot write"):
         views.save(tmp_path / "file" / "views.csv")
+
+
+def test_a_place_that_cannot_be_written_to_is_known_before_scoring(tmp_path: Path) -> None:
+    (tmp_path / "taken").write_text("a file")
+    with pytest.raises(StorageError, match="cannot write views there"):
+        check_format(tmp_path / "taken" / "views.csv", None, 1)

@@ -121,6 +121,7 @@ def test_limits_on_pitch(look: WhereToLook) -> None:
     ("options", "says"),
     [
         ({"n": 0}, "at least 1"),
+        ({"n": 10_000}, "directions to choose from"),
         ({"n": 2, "max_turn_deg": 30}, "one view of each waypoint"),
         ({"max_turn_deg": -1}, "at least 0 degrees"),
         ({"max_turn_deg": np.nan}, "at least 0 degrees"),
@@ -232,6 +233,7 @@ def test_cameras(sparse: Path) -> None:
         ({"occlusion": "fog"}, ConfigError),
         ({"lattice": "square"}, ConfigError),
         ({"directions": 0}, ConfigError),
+        ({"max_reprojection_error_px": -1}, ConfigError),
         ({"device": "tpu"}, ConfigError),
     ],
 )

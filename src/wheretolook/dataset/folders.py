@@ -271,7 +271,8 @@ class Dataset:
                     raise ValueError(f"a scene's split is {', '.join(get_args(Split))}, not {entry['split']!r}")
                 scenes.append(SceneFolder(folder, entry["split"], camera, own))
         except FileNotFoundError as error:
-            raise TableError("this folder is no dataset", path=path, fix="Run the scenes stage first.") from error
+            fix = "Run the scenes stage first, or for a map of your own `wheretolook map --model SPARSE`."
+            raise TableError("this folder is no dataset", path=path, fix=fix) from error
         except (OSError, ConfigError, ValueError, KeyError, TypeError, AttributeError) as error:
             problem, fix = f"damaged dataset description: {error}", "Run the scenes stage again."
             raise TableError(problem, path=path, fix=fix) from error

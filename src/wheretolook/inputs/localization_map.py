@@ -16,6 +16,7 @@ from wheretolook.inputs.bins import BinnedViews, bin_views, count_bins
 from wheretolook.mapping.colmap_model import camera_of_model, colmap_poses, read_model
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
 from wheretolook.mapping.plausibility import warn_of_frame
+from wheretolook.utils.errors import ConfigError
 from wheretolook.visibility import frustum
 from wheretolook.visibility.frustum import LandmarkSets, PosedViews, landmarks_in_view
 from wheretolook.visibility.listing import in_view_by_table
@@ -73,9 +74,15 @@ class LocalizationMap:
             MapError: no usable model in the folder, no such camera in it, or several and none is named; or the database
                 is unreadable or another's.
             SceneError: the mesh cannot be used.
+            ConfigError: the largest reprojection error is not positive.
         """
+        worst_px = max_reprojection_error_px
+        if worst_px is not None and not worst_px > 0:
+            raise ConfigError(
+                "the largest reprojection error is positive", value=worst_px, fix="Give pixels, such as 2."
+            )
         found = read_model(model)
-        landmarks = load_colmap_landmarks(Path(model), database, max_reprojection_error_px, device, found)
+        landmarks = load_colmap_landmarks(Path(model), database, worst_px, device, found)
         poses = colmap_poses(model, found)
         warn_of_frame(model, landmarks.mapping_distance_m, poses)
         if camera is None or isinstance(camera, int):

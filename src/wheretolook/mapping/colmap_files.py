@@ -107,7 +107,7 @@ def check_text_count(path: Path, found: int) -> None:
 def point_starts(data: bytes) -> NDArray[np.int64]:
     """Offsets of the points in the content of a points3D.bin, and where the last one ends; -1 if its end is missing."""
     count, end = _TRACK_LENGTH.unpack_from(data)[0], 8
-    starts = []
+    starts: list[int] = []
     for _ in range(count):
         if end + POINT.itemsize > len(data):
             return np.array([*starts, -1], dtype=np.int64)

@@ -140,7 +140,12 @@ def check_ends(ends: Float, space: Space, bounds: Float) -> None:
     low, high = bounds
     for name, point in zip(("start", "goal"), ends, strict=True):
         if not ((point >= low) & (point <= high)).all() or not space.is_free(point[None])[0]:
-            fix = "Give a point where the camera can be, off walls and furniture."
+            fix = "Give a point where the camera can be, off walls and furniture"
+            there = low + (high - low) * np.random.default_rng(0).random((4096, 3))
+            if (free := space.is_free(there)).any():
+                near = there[free][np.linalg.norm(there[free] - point, axis=1).argmin()]
+                fix += f"; one near by is [{', '.join(f'{x:.2f}' for x in near)}]"
+            fix += "."
             raise PlanningError(f"the {name} is not in free space", value=tuple(point.tolist()), fix=fix)
     if np.linalg.norm(ends[1] - ends[0]) < SAME_M:
         fix = "Ask the map for the best view there."

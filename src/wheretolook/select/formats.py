@@ -5,6 +5,7 @@ The world is that of the map, in metres, z up; cameras look along their z, x rig
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +44,8 @@ def format_of(path: Path, format: str | None = None) -> str:
 
 
 def check_format(path: Path, format: str | None, n: int) -> str:
-    """As `format_of`, and whether it can hold n views of a waypoint; a ConfigError if not, or the path is taken."""
+    """As `format_of`, and whether it can hold n views of a waypoint; a ConfigError if not, or the path is taken; a
+    StorageError if nothing can be written there."""
     found = format_of(path, format)
     if found in ("tum", "benchmark") and n > 1:
         fix = "Ask for one view, or write csv, json or colmap."
@@ -52,6 +54,9 @@ def check_format(path: Path, format: str | None, n: int) -> str:
         raise ConfigError("this is a folder", path=path, fix="Name a file.")
     if found == "colmap" and not path.suffix and holds_model(path) and not _is_ours(path):
         raise ConfigError("a COLMAP model lies here already", path=path, fix="Name another folder.")
+    folder = next(parent for parent in path.absolute().parents if parent.exists())
+    if not folder.is_dir() or not os.access(folder, os.W_OK):
+        raise StorageError("cannot write views there", path=folder, fix="Name a file in another folder.")
     return found
 
 

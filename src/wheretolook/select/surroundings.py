@@ -105,7 +105,7 @@ def read_depth_images(model: Path, folder: Path, scale: float = 1000.0) -> list[
 def _read_depth(path: Path, scale: float) -> NDArray[np.float32]:
     if path.suffix.lower() == ".npy":
         try:
-            values = load_npy(path)
+            values: NDArray[Any] | None = load_npy(path)
         except ValueError as error:
             raise SceneError(f"cannot read the depth image: {error}", path=path, fix="Export it again.") from error
     else:

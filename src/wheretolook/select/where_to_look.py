@@ -236,7 +236,7 @@ class WhereToLook:
         if max_turn_deg is not None and not max_turn_deg >= 0:
             raise ConfigError("a limit on turns is at least 0 degrees", value=max_turn_deg)
         if pitch_deg is None:
-            return self.directions
+            return self._enough(self.directions, n)
         low, high = pitch_deg
         if not -90 <= low <= high <= 90:
             fix = "Give the lowest and the highest pitch in degrees, such as -30 and 30."
@@ -246,6 +246,13 @@ class WhereToLook:
         if len(axes) == 0:
             fix = "Widen it, or look along more directions."
             raise ConfigError("no direction lies within the limit on pitch", value=(low, high), fix=fix)
+        return self._enough(axes, n)
+
+    @staticmethod
+    def _enough(axes: Float, n: int) -> Float:
+        if len(axes) < n:
+            fix = "Ask for fewer views, look along more directions, or widen the limit on pitch."
+            raise ConfigError(f"there are only {len(axes)} directions to choose from", value=n, fix=fix)
         return axes
 
     def save(self, path: str | Path, format: str | None = None) -> None:

@@ -74,7 +74,8 @@ display(training_figure(curves) if curves else Markdown(f"No run has a history y
 #
 # Of all test viewpoints with about the same predicted probability, how many localize? On the dashed line as many as
 # predicted. The paper's network promises too much, and dividing its logits by a temperature T, fitted on the validation
-# scene, does not mend it; the set of landmarks keeps nearer to the line, and promises too little. Below, how many viewpoints there are.
+# scene, does not mend it; the set of landmarks keeps nearer to the line, and promises too little. Below, how many
+# viewpoints there are.
 
 # %%
 from wheretolook.evaluation.calibration import read_calibration

@@ -91,7 +91,8 @@ def release(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
         "occlusion": asdict(OcclusionConfig()),
         "sample": asdict(SAMPLING),
     }
-    (root / "release.json").write_text(json.dumps({"settings": settings}))
+    about = {"source": "source", "source_fingerprint": "0", "code_version": "0", "settings": settings}
+    (root / "release.json").write_text(json.dumps(about))
     return dataset
 
 

@@ -188,6 +188,24 @@ def test_what_is_missing_is_named(
     assert str(caught.value.path).endswith(named)
 
 
+def test_a_map_of_several_cameras_is_left_to_the_benchmarks_localizer(scene_folder: Path, tmp_path: Path) -> None:
+    import pycolmap
+
+    from wheretolook.benchmark.command import run
+
+    scene = remade(scene_folder, tmp_path)
+    model = pycolmap.Reconstruction(str(scene / "scene_reconstruction"))
+    other = pycolmap.Camera(model.cameras[min(model.cameras)].todict())
+    other.camera_id, other.params = 7, other.params * 1.5
+    model.add_camera_with_trivial_rig(other)
+    model.write(str(scene / "scene_reconstruction"))
+    given = [str(scene), "--out", str(tmp_path / "out"), "--workers", "1", "--methods", "max-visibility-shipped"]
+    with pytest.raises(MapError, match="have one camera") as caught:
+        run(given)
+    assert "--localizer none" in str(caught.value)
+    assert run([*given, "--localizer", "none"]) == 0
+
+
 def test_a_mesh_in_another_frame_is_refused(
     scene_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

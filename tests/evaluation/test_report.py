@@ -234,6 +234,13 @@ def test_the_paired_interval_decides_where_there_is_one(reference: str) -> None:
     )
 
 
+def test_two_that_chose_alike_need_no_interval() -> None:
+    table = make_scores(("random", "bins", "visible"), "bins", (1,), ("a",))
+    rows = table["method"] == "visible"
+    table.loc[rows, [name for name in table.columns if name.startswith("difference_")]] = 0.0
+    assert best_in_words(table).endswith("knows, at 45. The first two chose equally well everywhere.")
+
+
 def test_views_of_several_at_a_location_are_counted() -> None:
     assert "0.4° 180 of 250 times (5 views at each of 50 locations); forward 175, random " in told(
         n=5, bins=36, forward=35

@@ -54,6 +54,10 @@ def test_a_sequence_and_a_grid(sparse: Path, at: Path) -> None:
     [
         (["--at", "at.csv", "--out", "v.csv"], "--map"),
         (["--map", "nowhere", "--at", "at.csv", "--out", "v.csv"], "nowhere: there is no such folder"),
+        # told before the map is read
+        (["--map", "nowhere", "--at", "at.csv", "--out", "v.csv", "--n", "0"], "at least 1"),
+        (["--map", "nowhere", "--at", "at.csv", "--out", "v.csv", "--pitch", "30", "-30"], "limits on pitch"),
+        (["--map", "nowhere", "--at", "at.csv", "--out", "v.csv", "--max-turn", "-1"], "at least 0 degrees"),
         (["--map", "SPARSE", "--out", "v.csv"], "--at or by --grid"),
         (["--map", "SPARSE", "--at", "at.csv", "--grid", "1", "--out", "v.csv"], "--at or by --grid"),
         (["--map", "SPARSE", "--at", "gone.csv", "--out", "v.csv"], "gone.csv: there is no such file"),

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from wheretolook.benchmark.folder import DRAWN_CAMERA, BenchmarkScene
 from wheretolook.features.extraction import KeypointExtractor
-from wheretolook.geometry.camera import PinholeCamera, cameras_by_id, only_camera
+from wheretolook.geometry.camera import PinholeCamera, cameras_by_id
 from wheretolook.mapping.building import LANDMARKS_FILE, Clock, extract_with_colors, remove_inaccurate, save_landmarks
 from wheretolook.mapping.colmap_model import colmap_poses, read_model
 from wheretolook.mapping.config import MapConfig
@@ -38,7 +38,10 @@ def build_query_map(
     one with distortion, or nothing can be triangulated.
     """
     config, model = MapConfig(), read_model(scene.model)
-    camera = only_camera(cameras_by_id(model.cameras, scene.model), scene.model)
+    cameras = {*cameras_by_id(model.cameras, scene.model).values()}
+    if len(cameras) > 1:
+        raise MapError("the benchmark's maps have one camera", path=scene.model, value=len(cameras), fix=_FIX)
+    camera = cameras.pop()
     if not isinstance(camera, PinholeCamera):
         raise MapError("the camera of the map is no pinhole", path=scene.model, value=camera.model, fix=_FIX)
     poses = colmap_poses(scene.model, model)

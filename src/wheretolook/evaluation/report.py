@@ -100,6 +100,8 @@ def _told_apart(first: Row, second: Row, key: str) -> str:
         low, high = sorted(sign * row[f"difference_{end}_{key}"] for end in ("low", "high"))
         why = f"the 95 % interval of their difference is {_signed(low)} to {_signed(high)} points"
         apart = low > 0
+        if low == high == 0:
+            return "The first two chose equally well everywhere."
     else:
         low, high = first[f"raw_low_{key}"], second[f"raw_high_{key}"]
         apart = low > high

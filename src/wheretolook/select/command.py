@@ -133,9 +133,11 @@ def run(arguments: Sequence[str]) -> int:
 def _check(options: argparse.Namespace) -> Waypoints | None:
     """The waypoints, None for a grid; whatever can be refused before the map is read is refused here."""
     from wheretolook.select.formats import check_format
+    from wheretolook.select.limits import check_limits
     from wheretolook.select.waypoints import parse_points, read_waypoints
 
     check_format(options.out, options.format, options.n)
+    check_limits(options.n, options.pitch, options.max_turn)
     if (options.at is None) == (options.grid is None):
         raise ConfigError("waypoints are given by --at or by --grid", fix="Give one of them.")
     _camera(options)

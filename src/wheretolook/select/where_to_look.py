@@ -16,6 +16,7 @@ from wheretolook.geometry.poses import Float, check_poses, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.planning.sequences import TurnLimit, best_sequence
 from wheretolook.planning.turns import pan_tilt_angles
+from wheretolook.select.limits import check_limits
 from wheretolook.select.surroundings import grid_waypoints, map_space, surroundings, usable_waypoints
 from wheretolook.select.views import SelectedViews, joined
 from wheretolook.select.waypoints import Waypoints
@@ -228,19 +229,10 @@ class WhereToLook:
 
     def _allowed(self, n: int, pitch_deg: tuple[float, float] | None, max_turn_deg: float | None) -> Float:
         """The directions within the limit on pitch, (D, 3); a ConfigError if there is none, or a number is no limit."""
-        if not isinstance(n, int | np.integer) or n < 1:
-            raise ConfigError("views of a waypoint are a whole number of at least 1", value=n)
-        if max_turn_deg is not None and n > 1:
-            fix = "Ask for one view, or leave the limit out."
-            raise ConfigError("a limit on turns is for one view of each waypoint", value=n, fix=fix)
-        if max_turn_deg is not None and not max_turn_deg >= 0:
-            raise ConfigError("a limit on turns is at least 0 degrees", value=max_turn_deg)
+        check_limits(n, pitch_deg, max_turn_deg)
         if pitch_deg is None:
             return self._enough(self.directions, n)
         low, high = pitch_deg
-        if not -90 <= low <= high <= 90:
-            fix = "Give the lowest and the highest pitch in degrees, such as -30 and 30."
-            raise ConfigError("the limits on pitch do not lie within -90 and 90", value=(low, high), fix=fix)
         pitch = np.degrees(pan_tilt_angles(self.directions)[1])
         axes = self.directions[(pitch >= low - 1e-9) & (pitch <= high + 1e-9)]
         if len(axes) == 0:

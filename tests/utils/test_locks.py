@@ -56,7 +56,8 @@ def test_readers_share_and_shut_writers_out(tmp_path: Path) -> None:
     killed.wait()
     with hold(lock, "train", shared=True), pytest.raises(InUseError) as caught, hold(lock, "label"):
         pass
-    assert "evaluate" in str(caught.value) and "train" in str(caught.value) and "plan" not in str(caught.value)
+    said = str(caught.value)
+    assert f"process {other.pid} " in said and f"process {os.getpid()} " in said and f" {killed.pid} " not in said
     assert lock.exists()
     other.communicate("")
     assert not lock.exists()

@@ -44,6 +44,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         workshop, rng = cases.Workshop(root, _say), random.Random(options.seed)
         workshop.make(chosen if not options.damages else dict.fromkeys([*cases.LINE, *chosen]))
+        chosen = [case for case in chosen if case.name in workshop.events]
         disturb = [("kill", pair) for pair in kills.planned(chosen, options.kills, rng)]
         disturb += [("damage", one) for one in damage.planned(workshop, options.damages, rng)]
         fresh = [case for case in chosen if not case.again and "train" not in case.name]
@@ -65,7 +66,8 @@ def main(arguments: list[str] | None = None) -> int:
     if options.report:
         options.report.write_text("".join(f"{line}\n" for line in lines))
     _say(summary(outcomes, time.monotonic() - start))
-    return 0 if len(outcomes) == len(disturb) and not any(codes) and not any(one.problems for one in outcomes) else 1
+    harm = [*workshop.broken, *(one for one in outcomes if one.problems)]
+    return 0 if len(outcomes) == len(disturb) and not any(codes) and not harm else 1
 
 
 def _work(workshop, tasks, rng, root, job, options) -> None:  # type: ignore[no-untyped-def]

@@ -75,7 +75,7 @@ def test_what_a_killed_run_held_is_free(dataset: Dataset, capsys: pytest.Capture
 
 
 def test_training_holds_the_labels_that_it_learns_from(dataset: Dataset) -> None:
-    config = train_config("mlp-2d", epochs=500, hidden=(32,), accelerator="cpu")
+    config = train_config("mlp-2d", epochs=40, hidden=(32,), accelerator="cpu")
     tracking = TrackingConfig(str(dataset.root.parent / "mlruns"))
     failed: list[BaseException] = []
 

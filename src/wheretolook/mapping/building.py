@@ -7,7 +7,7 @@ import os
 import shutil
 import time
 from collections import deque
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -73,6 +73,7 @@ def build_map(
     workers: int = 2,
     device: str = "cpu",
     progress: bool = True,
+    replacing: Callable[[], None] = lambda: None,
 ) -> MapReport:
     """Map a scene in metres, z up: walk, render, extract, match, triangulate with known poses, filter.
 
@@ -83,12 +84,13 @@ def build_map(
 
     `raycaster` measures the distance from landmarks to the mesh. Keypoints are extracted on `device`, "cpu" or a CUDA
     device, and matched, by `workers` processes; above 1 the caller's script must be guarded by
-    `if __name__ == "__main__":`, as for any of Python's process pools. Raises MapError if the images give no landmark
+    `if __name__ == "__main__":`, as for any of Python's process pools. `replacing` is called when all is done, right
+    before the folder changes. Raises MapError if the images give no landmark
     or `out_dir` holds something that is not a map, SceneError if there is no floor to walk on.
     """
     config, out_dir, clock = config or MapConfig(), Path(out_dir), Clock()
     refuse_foreign_folder(out_dir)
-    with partial_folder(out_dir) as partial, Processes(workers) as processes:
+    with partial_folder(out_dir, replacing) as partial, Processes(workers) as processes:
         with clock("walk"):
             walk = plan_walk(free_space, mesh.bounds, config.n_images, config.walk, seed)
             poses = poses_looking_along(walk.positions, walk.directions)
@@ -181,14 +183,18 @@ class Clock:
 
 
 @contextmanager
-def partial_folder(out_dir: Path) -> Iterator[Path]:
-    """An empty folder beside `out_dir` that takes its place if the block succeeds and is removed if it does not."""
+def partial_folder(out_dir: Path, replacing: Callable[[], None] = lambda: None) -> Iterator[Path]:
+    """An empty folder beside `out_dir` that takes its place if the block succeeds and is removed if it does not.
+
+    `replacing` is called right before it takes it.
+    """
     partial, old = (out_dir.with_name(f".{out_dir.name}.{suffix}") for suffix in ("partial", "replaced"))
     for leftover in (partial, old):
         shutil.rmtree(leftover, ignore_errors=True)
     partial.mkdir(parents=True)
     try:
         yield partial
+        replacing()
         if out_dir.exists():
             os.replace(out_dir, old)
         os.replace(partial, out_dir)

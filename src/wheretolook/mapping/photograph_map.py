@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -54,6 +55,7 @@ def map_photographs(
     workers: int = 1,
     device: str = "cpu",
     progress: bool = True,
+    replacing: Callable[[], None] = lambda: None,
 ) -> PhotographMapReport:
     """Map the photographs in `config.photographs.images`.
 
@@ -65,6 +67,7 @@ def map_photographs(
 
     Of `config`, only `photographs`, `extractor` and `keep_database` count. As many threads as `workers` adjust bundles:
     with one worker the same seed gives the same map; with more, COLMAP sums large problems in another order each time.
+    `replacing` is called when all is done, right before the folder changes.
 
     Raises MapError if the photographs are missing, unreadable or do not overlap, if they do not give the scale asked
     for, or if `out_dir` holds something that is not a map; ConfigError if a table of markers or positions is damaged,
@@ -76,7 +79,7 @@ def map_photographs(
     building.refuse_foreign_folder(out_dir)
     known = KnownScale.read(settings.scale)  # a damaged table is reported before the work
     work.mkdir(parents=True, exist_ok=True)
-    with building.partial_folder(out_dir) as partial, Processes(workers) as processes:
+    with building.partial_folder(out_dir, replacing) as partial, Processes(workers) as processes:
         with clock("extract"):
             side_px, extractor = settings.max_side_px, config.extractor
             features = photograph_features(settings.images, work, side_px, extractor, processes, device, progress)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.utils.errors import MapFormatError
 from wheretolook.utils.files import sha256, write_json, write_text
+from wheretolook.utils.locks import hold
 from wheretolook.utils.reading import read_json
 
 FORMAT, VERSION = "wheretolook viewpoint map", 1
@@ -33,6 +34,8 @@ ARRAYS = {
 """Type, little-endian, shape and meaning of each array; each is a file `<name>.npy`."""
 
 _OLD = "old"  # name of a map that is being replaced, in the hidden folder where the new one is written
+_NEW = "new"  # name of the new one there
+_WAIT_S = 120.0  # for another process to write its map into the same folder
 
 REBUILD = "Build it anew with `wheretolook viewpoint-map`, or get the folder again."
 
@@ -97,26 +100,30 @@ def write_map(
 
     The same map gives the same bytes; the folder's own `LAYOUT.txt` describes them. The new map is written in a hidden
     folder beside it, `.<name>.<some letters>`, into which the old one is moved until the new one is in place. A process
-    killed in between leaves both there, and `read_map` says where.
+    killed in between leaves both there, and `read_map` says where; one killed earlier leaves part of the new one, which
+    the next one that writes here removes. They wait for one another.
 
     `origin` has the fields of `MapOrigin` but `derived`, `arrays` those of `ARRAYS` by name. Raises MapFormatError if
     the folder holds anything that is not part of a viewpoint map.
     """
     folder = Path(folder).resolve()  # so that "." has a name too
     _refuse_something_else(folder)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    work = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-    new, old = work / "new", work / _OLD
-    try:
-        new.mkdir()
-        _write(new, grid, origin, arrays)
-        if folder.exists():
-            folder.rename(old)
-        new.rename(folder)
-    finally:
-        if old.exists() and not folder.exists():
-            old.rename(folder)
-        shutil.rmtree(work, ignore_errors=True)  # processes that have mapped the old files still read them
+    with hold(folder.with_name(f".{folder.name}.lock"), "viewpoint map", wait_s=_WAIT_S):
+        for left in folder.parent.glob(f".{glob.escape(folder.name)}.????????"):
+            if [path.name for path in left.glob("*")] in ([], [_NEW]):  # of a process that was killed while it wrote
+                shutil.rmtree(left, ignore_errors=True)
+        work = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+        new, old = work / _NEW, work / _OLD
+        try:
+            new.mkdir()
+            _write(new, grid, origin, arrays)
+            if folder.exists():
+                folder.rename(old)
+            new.rename(folder)
+        finally:
+            if old.exists() and not folder.exists():
+                old.rename(folder)
+            shutil.rmtree(work, ignore_errors=True)  # processes that have mapped the old files still read them
 
 
 def _refuse_something_else(folder: Path) -> None:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from wheretolook.dataset.folders import RELEASE_FILE, Dataset, SceneFolder
+from wheretolook.dataset.stamps import forget_stamp
 from wheretolook.mapping.colmap_model import CAMERAS_FILE, save_mapping_poses
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.methods.method import Method
@@ -53,6 +54,8 @@ def copy_dataset(dataset: Dataset, root: Path, settings: Mapping[str, Any]) -> D
     """
     before = _release_of(root, dataset.name)
     fingerprint = None if before is None else before.fingerprint()
+    for scene in before.scenes if before is not None else ():
+        forget_stamp(scene, "label")  # until all is copied, nothing may learn from what is there
     copied = [
         (scene, SceneFolder(entry_of(root, scene.name, "a scene's name"), scene.split, scene.camera))
         for scene in dataset.scenes
@@ -159,7 +162,7 @@ def sizes(root: Path, weights: bool = True) -> dict[str, int]:
     parts = dict.fromkeys((*kinds.values(), "weights", "text"), 0)
     for path in root.rglob("*"):
         shelved = path.suffix == ".safetensors" and (path.parent.name == SHELF or not weights)
-        drawn = path.suffix in (".png", ".partial") or path.parent == root / "results" / "figures"
+        drawn = path.suffix in (".png", ".partial", ".lock") or path.parent == root / "results" / "figures"
         if path.is_file() and not shelved and not drawn:
             parts["weights" if path.suffix == ".safetensors" else kinds.get(path.name, "text")] += path.stat().st_size
     if sum(parts.values()) >= MAX_BYTES:

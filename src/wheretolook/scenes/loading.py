@@ -98,12 +98,12 @@ def save_glb(mesh: TexturedMesh, path: str | PathLike[str], jpeg_quality: int = 
         if len(faces):
             scene.add_geometry(_geometry(mesh, faces, _EncodedJpeg(texture, jpeg_quality)), node_name=f"part_{index}")
     target = Path(path)
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
+    partial = target.with_name(f"{target.name}.partial")
     try:
-        temporary.write_bytes(trimesh.exchange.gltf.export_glb(scene, tree_postprocessor=_mark_unlit))
-        os.replace(temporary, target)
+        partial.write_bytes(trimesh.exchange.gltf.export_glb(scene, tree_postprocessor=_mark_unlit))
+        os.replace(partial, target)
     finally:
-        temporary.unlink(missing_ok=True)
+        partial.unlink(missing_ok=True)
 
 
 def _mesh_file(path: Path) -> Path:

@@ -16,6 +16,7 @@ from wheretolook.dataset.scene import Scene
 from wheretolook.dataset.stamps import stage_key
 from wheretolook.planning.config import FORWARD, PathsConfig
 from wheretolook.stages.inputs import Say, Tick, dataset_after, extractor_of, open_scene
+from wheretolook.stages.one_at_a_time import reading
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.utils.files import fingerprint, write_json, write_text
 from wheretolook.utils.reading import read_json, read_json_object
@@ -41,14 +42,15 @@ def compare_paths(experiment: Experiment, say: Say = print, tick: Tick = lambda 
     """
     from wheretolook.planning.scene_map import check_methods
 
-    dataset, config = dataset_after(experiment, "map"), experiment.paths
-    check_methods(config.methods)
-    scenes = [open_scene(experiment, dataset, files) for files in _chosen(dataset, config)]
-    planned = {scene.name: _plan(scene, dataset, config, say) for scene in scenes}
-    labelled = _localize(scenes, planned, dataset, experiment)
-    paths = pd.concat([found.paths.assign(scene=name) for name, found in planned.items()], ignore_index=True)
-    views = pd.concat([table.assign(scene=name) for name, table in labelled.items()], ignore_index=True)
-    summary = _report(paths, views, dataset, config, experiment.tracking, say)
+    with reading(experiment.root, "compare-paths", FOLDER):
+        dataset, config = dataset_after(experiment, "map"), experiment.paths
+        check_methods(config.methods)
+        scenes = [open_scene(experiment, dataset, files) for files in _chosen(dataset, config)]
+        planned = {scene.name: _plan(scene, dataset, config, say) for scene in scenes}
+        labelled = _localize(scenes, planned, dataset, experiment)
+        paths = pd.concat([found.paths.assign(scene=name) for name, found in planned.items()], ignore_index=True)
+        views = pd.concat([table.assign(scene=name) for name, table in labelled.items()], ignore_index=True)
+        summary = _report(paths, views, dataset, config, experiment.tracking, say)
     tick(1)
     return summary
 

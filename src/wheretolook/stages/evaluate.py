@@ -12,6 +12,7 @@ from wheretolook.config import Experiment
 from wheretolook.dataset.folders import Dataset
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.stages.inputs import Say, Tick, dataset_after
+from wheretolook.stages.one_at_a_time import reading, reads_dataset
 from wheretolook.utils.files import write_text
 from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.visibility.config import OcclusionConfig
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from wheretolook.learning.provenance import TrainedModel
 
 
+@reads_dataset("evaluate")
 def evaluate(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> pd.DataFrame:
     """Stage 6: the score table of all methods on the test scenes, `<dataset>/results/`, and nested MLflow runs."""
     dataset = dataset_after(experiment, "label")
@@ -60,16 +62,18 @@ def evaluate_methods(
         WeightsError: weights are missing, or were trained for another field of view.
         MapError: a scene has no landmarks.
         ConfigError: the reference is none of the methods.
+        InUseError: the dataset is being changed, or evaluated on the same split.
     """
     from wheretolook.evaluation.report import score_markdown
     from wheretolook.evaluation.results import log_evaluation, results_folder
     from wheretolook.evaluation.run import compare_methods
 
-    found = compare_methods(dataset, config, models, progress, device, occlusion)
     title = f"Localization score on {dataset.name}" + (f", {config.split} scenes" if config.split != "test" else "")
     folder = results_folder(dataset, config)
-    write_results(folder, found.table, found.calibration, title)
-    log_evaluation(dataset, found, config, tracking, occlusion, folder)
+    with reading(dataset.root, "evaluate", folder.name):
+        found = compare_methods(dataset, config, models, progress, device, occlusion)
+        write_results(folder, found.table, found.calibration, title)
+        log_evaluation(dataset, found, config, tracking, occlusion, folder)
     if progress and show:
         print(score_markdown(found.table, title))
     return found.table

@@ -6,9 +6,11 @@ from wheretolook.config import Experiment
 from wheretolook.dataset.folders import Dataset
 from wheretolook.stages.inputs import Say
 from wheretolook.stages.log_release import log_release
+from wheretolook.stages.one_at_a_time import reads_dataset
 from wheretolook.utils.errors import MissingRunError
 
 
+@reads_dataset("figures")
 def figures(experiment: Experiment, say: Say = print) -> Dataset:
     """Draw every figure and table from logged runs; those of a release are logged first.
 

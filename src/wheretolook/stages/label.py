@@ -16,6 +16,7 @@ from wheretolook.dataset.folders import Dataset, SceneFolder
 from wheretolook.dataset.stamps import forget_stamp, is_done, read_stamp, stage_key, write_stamp
 from wheretolook.labelling.report import LABELS_CSV, LABELS_MD, LABELS_PNG, LabelSummary, label_markdown, label_summary
 from wheretolook.stages.inputs import Say, Tick, dataset_after, existing, extractor_of, open_scene
+from wheretolook.stages.one_at_a_time import changes_dataset
 from wheretolook.utils.errors import MapError, SceneError, TableError
 from wheretolook.utils.files import write_json, write_text
 from wheretolook.utils.tracking import log, start_run
@@ -24,6 +25,7 @@ from wheretolook.viewpoints.table import is_good, write_table
 from wheretolook.viewpoints.thresholds import ALL
 
 
+@changes_dataset("label")
 def label(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> Dataset:
     """Stage 4: every viewpoint rendered and localized; status and errors into `<scene>/viewpoints.parquet`.
 

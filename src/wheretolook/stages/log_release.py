@@ -9,6 +9,7 @@ from wheretolook.config import Experiment
 from wheretolook.dataset.folders import Dataset
 from wheretolook.figures.config import FiguresConfig
 from wheretolook.stages.inputs import Say
+from wheretolook.stages.one_at_a_time import reads_dataset
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.tracking import ui_command
 
@@ -17,6 +18,7 @@ QUICK = ("top_n", *_TABLES, "training", "calibration", "scores", "regret", "path
 """Figures and tables that need no scene, and so only seconds."""
 
 
+@reads_dataset("log-release")
 def log_release(experiment: Experiment, say: Say = print, attach: bool = True) -> Dataset:
     """Log what a release holds as MLflow runs, as far as the store lacks them, on request with figures and tables.
 

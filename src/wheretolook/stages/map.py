@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import zlib
 from dataclasses import asdict, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -24,11 +25,13 @@ from wheretolook.stages.inputs import (
     open_scene,
     refuse_release,
 )
+from wheretolook.stages.one_at_a_time import changes_dataset
 from wheretolook.utils.confine import check_folder_name, entry_of, path_within
 from wheretolook.utils.errors import ConfigError, MapError, SceneError
 from wheretolook.utils.files import fingerprint
 
 
+@changes_dataset("map")
 def make_maps(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> Dataset:
     """Stage 2: a COLMAP model of every scene with its landmarks' attributes, `<scene>/map/`.
 
@@ -63,7 +66,9 @@ def make_maps(experiment: Experiment, say: Say = print, tick: Tick = lambda work
                 space = PartOfFloor(scene.mesh_space, floor) if floor else scene.mesh_space
                 shown = (scene.mesh, scene.renderer, space, camera)
                 workers, device = experiment.n_workers, scene.device
-                report = build_map(*shown, experiment.map, seed, files.map, scene.raycaster, workers, device)
+                how = (scene.raycaster, workers, device)
+                forget = partial(forget_stamp, files, "map")
+                report = build_map(*shown, experiment.map, seed, files.map, *how, replacing=forget)
             write_stamp(files, "map", key)
             found = f"{report.n_landmarks:,} landmarks from {report.n_registered} images"
             off = f"median {report.median_distance_to_mesh_cm:.2f} cm from the mesh"
@@ -119,7 +124,8 @@ def _map_photographs(experiment: Experiment, say: Say, tick: Tick) -> Dataset:
         from wheretolook.mapping.photograph_map import map_photographs
 
         how = (scene.folder / "photographs", _seed(scene), experiment.n_workers, experiment.warp_device)
-        report = map_photographs(experiment.map, scene.map, *how)
+        forget = partial(forget_stamp, scene, "map")
+        report = map_photographs(experiment.map, scene.map, *how, replacing=forget)
         write_stamp(scene, "map", key)
         used_images = f"{report.n_registered} of {report.n_images} photographs"
         say(f"{scene.name}: {report.n_landmarks:,} landmarks from {used_images} -> {scene.map}")

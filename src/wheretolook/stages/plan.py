@@ -13,7 +13,10 @@ from wheretolook.dataset.folders import Dataset
 from wheretolook.geometry.camera import Camera, PinholeCamera
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.stages.inputs import Say, Tick, dataset_after, open_scene
+from wheretolook.stages.one_at_a_time import reads_dataset
 from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.files import write_text
+from wheretolook.utils.locks import hold
 from wheretolook.utils.tracking import log, start_run
 from wheretolook.utils.tracking_layout import joined
 from wheretolook.viewpoints.table import pose_columns
@@ -22,6 +25,7 @@ if TYPE_CHECKING:
     from wheretolook.planning.route_views import PathView, PlannedPath
 
 
+@reads_dataset("plan")
 def plan(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> PlannedPath:
     """A path through a scene on which the camera localizes, `<scene>/path/path.{csv,png,gif}`; needs the map stage.
 
@@ -49,19 +53,22 @@ def plan(experiment: Experiment, say: Say = print, tick: Tick = lambda work: Non
     renderer = None if scene.is_photographed else scene.renderer
     views[method] = path_views(path, scene.localization_map, renderer)
     folder = config.out or files.folder / "path"
-    written = _draw(views, scene.landmarks.points, f"{scene.name}, {method}", folder, config.film)
-    _table(path).to_csv(folder / "path.csv", index=False, lineterminator="\n")
-    if rerun is not None:
-        _record(rerun, views[method], scene.landmarks.points, scene.camera, folder / "path.rrd")
-        written.append("path.rrd")
-    written.insert(0, "path.csv")
-    _log(experiment, dataset, scene.name, list(paths), path, [folder / name for name in written])
+    with hold(folder.with_name(f".{folder.name}.lock"), "plan", wait_s=WAIT_S):
+        written = _draw(views, scene.landmarks.points, f"{scene.name}, {method}", folder, config.film)
+        write_text(folder / "path.csv", _table(path).to_csv(index=False, lineterminator="\n"))
+        if rerun is not None:
+            _record(rerun, views[method], scene.landmarks.points, scene.camera, folder / "path.rrd")
+            written.append("path.rrd")
+        written.insert(0, "path.csv")
+        _log(experiment, dataset, scene.name, list(paths), path, [folder / name for name in written])
     score = "" if np.isnan(path.scores).any() else f", mean score {score_text(float(np.mean(path.scores)))}"
     found = f"{path.length_m:.2f} m, {path.turn_deg:.0f} degrees of turning, {len(path.positions)} views{score}"
     say(f"{scene.name}: {found} -> {folder}: {', '.join(written)}")
     tick(1)
     return path
 
+
+WAIT_S = 120.0  # for another plan to write its path into the same folder
 
 Film = Literal["gif", "mp4", "none"]
 

@@ -12,8 +12,10 @@ from wheretolook.dataset.folders import Dataset
 from wheretolook.dataset.stamps import read_stamp, write_stamp
 from wheretolook.stages.evaluate import evaluate
 from wheretolook.stages.inputs import Say, Tick, dataset_after
+from wheretolook.stages.one_at_a_time import changing, reading, reads_dataset
 
 
+@reads_dataset("release")
 def release(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> Dataset:
     """Publish a labelled dataset: a compact copy of it, `<data>/<release_name>/`, and in the end its card.
 
@@ -24,22 +26,33 @@ def release(experiment: Experiment, say: Say = print, tick: Tick = lambda work: 
         WeightsError: there are no weights, or they do not fit the release.
         StorageError: it is not smaller than 16 MB.
         ConfigError: another dataset lies where the copy belongs.
+        InUseError: another stage changes the dataset, or is at work on the copy.
     """
+    from wheretolook.release import copy as releases
+
+    dataset = dataset_after(experiment, "label")
+    if not releases.is_release(dataset):
+        root = experiment.data / experiment.release_name
+        with changing(root, "release"):
+            copy = releases.copy_dataset(dataset, root, release_settings(experiment))
+            for scene, source in zip(copy.scenes, dataset.scenes, strict=True):
+                stamp = read_stamp(source, "label")
+                assert stamp is not None  # `dataset_after` has checked it
+                write_stamp(scene, "label", stamp)
+        say(f"{len(copy.scenes)} scenes -> {copy.root}: {releases.size_text(releases.sizes(copy.root, weights=False))}")
+        say("next: train on it, then `wheretolook release` with its own configuration")
+        return copy
+    with reading(dataset.root, "release", "card"):
+        return _finish(experiment, dataset, say, tick)
+
+
+def _finish(experiment: Experiment, dataset: Dataset, say: Say, tick: Tick) -> Dataset:
+    """Choose the weights that ship with a release, evaluate them, and write its card."""
     from wheretolook.evaluation.results import SCORES_CSV, VARIANTS_CSV
     from wheretolook.learning.runs import keep_histories
     from wheretolook.release import copy as releases
     from wheretolook.release.card import write_card
 
-    dataset = dataset_after(experiment, "label")
-    if not releases.is_release(dataset):
-        copy = releases.copy_dataset(dataset, experiment.data / experiment.release_name, release_settings(experiment))
-        for scene, source in zip(copy.scenes, dataset.scenes, strict=True):
-            stamp = read_stamp(source, "label")
-            assert stamp is not None  # `dataset_after` has checked it
-            write_stamp(scene, "label", stamp)
-        say(f"{len(copy.scenes)} scenes -> {copy.root}: {releases.size_text(releases.sizes(copy.root, weights=False))}")
-        say("next: train on it, then `wheretolook release` with its own configuration")
-        return copy
     # on the CPU, so that machines without a GPU get the same scores
     on_cpu = replace(experiment, device="cpu", evaluate=replace(experiment.evaluate, weights=()))
     results = dataset.root / "results"

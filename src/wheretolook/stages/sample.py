@@ -10,13 +10,15 @@ import numpy as np
 from wheretolook.config import Experiment
 from wheretolook.dataset.folders import Dataset
 from wheretolook.dataset.scene import Scene
-from wheretolook.dataset.stamps import is_done, stage_key, write_stamp
+from wheretolook.dataset.stamps import forget_stamp, is_done, stage_key, write_stamp
 from wheretolook.geometry.camera import Camera, draw_camera, write_cameras
 from wheretolook.stages.inputs import Say, Tick, dataset_after, existing, naming_scene, open_scene
+from wheretolook.stages.one_at_a_time import changes_dataset
 from wheretolook.utils.errors import MapError, SceneError
 from wheretolook.viewpoints.config import SampleConfig
 
 
+@changes_dataset("sample")
 def sample(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> Dataset:
     """Stage 3: viewpoints and which landmarks their locations see, `<scene>/viewpoints.parquet` and `occlusion.npz`.
 
@@ -70,6 +72,7 @@ def _sample(scene: Scene, config: SampleConfig, say: Say) -> None:
         seen = (scene.landmarks, cameras, scene.occlusion)
         title = f"sample {scene.name}"
         table, occlusion = sample_viewpoints(grid, free, *seen, config, scene.device, title, files.split)
+    forget_stamp(files, "sample")
     files.cameras_file.unlink(missing_ok=True)
     if isinstance(cameras, dict):
         write_cameras(cameras, files.cameras_file)

@@ -11,6 +11,7 @@ from wheretolook.dataset.folders import Dataset, MappedFloor, SceneFolder
 from wheretolook.dataset.stamps import forget_stamp, is_done, stage_key, write_stamp
 from wheretolook.scenes.config import SceneKind
 from wheretolook.stages.inputs import Say, Tick, mesh_fingerprint, refuse_release
+from wheretolook.stages.one_at_a_time import changes_dataset
 from wheretolook.utils.confine import entry_of
 from wheretolook.utils.errors import SceneError
 from wheretolook.viewpoints.config import Split
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from wheretolook.geometry.mesh import TexturedMesh
 
 
+@changes_dataset("scenes")
 def make_scenes(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> Dataset:
     """Stage 1: a textured mesh for every scene, `<scene>/mesh.glb`, and the dataset's description.
 
@@ -52,6 +54,7 @@ def make_scenes(experiment: Experiment, say: Say = print, tick: Tick = lambda wo
 
             mesh, mapped = make()
             scene.folder.mkdir(parents=True, exist_ok=True)
+            forget_stamp(scene, "scenes")  # so that no stamp is of what it no longer stands for, whenever it is killed
             save_glb(mesh, scene.mesh)
             scene.save_mapped_floor(mapped)
             write_stamp(scene, "scenes", key)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -13,6 +14,8 @@ from wheretolook.dataset.folders import Dataset
 from wheretolook.methods.method import Method
 from wheretolook.methods.train_config import TrainConfig
 from wheretolook.stages.inputs import Say, Tick, dataset_after
+from wheretolook.stages.one_at_a_time import reading, reads_dataset
+from wheretolook.utils.confine import entry_of
 from wheretolook.utils.files import sha256, write_json
 from wheretolook.utils.tracking import log, start_run
 from wheretolook.utils.tracking_config import TrackingConfig
@@ -26,6 +29,7 @@ if TYPE_CHECKING:
 Values = dict[str, Any]
 
 
+@reads_dataset("train")
 def train(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> Sequence[TrainedModel]:
     """Stage 5: the weights of each method that is to learn, `<dataset>/weights/`, and an MLflow run for each."""
     config = experiment.train
@@ -54,18 +58,22 @@ def train_methods(
         TableError: no train scene, no labels, or labels of one class only; or a dataset of `config.also` is missing.
         MapError: a scene has no landmarks.
         ConfigError: there are fewer GPUs than asked for, cameras of datasets differ, or the views do not fit into
-            memory shared by processes.
+            memory shared by processes. InUseError: a dataset is being changed, or the same is being trained.
     """
     from wheretolook.learning.provenance import about_training, trained_before, weights_path
     from wheretolook.learning.scenes import with_also
 
-    dataset = with_also(dataset, config.also)
     shared: dict[str, Any] = {"progress": progress, "kept": {}}
     models = []
-    for method in config.chosen():
-        about = about_training(dataset, method.name, config, config.options_of(method))
-        known = None if force else trained_before(weights_path(dataset, method.name), about)
-        models.append(known or _train(method, dataset, config, about, tracking, shared))
+    with ExitStack() as stack:
+        for root in (dataset.root, *(entry_of(dataset.root.parent, name, "a dataset's name") for name in config.also)):
+            stack.enter_context(reading(root, "train"))
+        dataset = with_also(dataset, config.also)
+        for method in config.chosen():
+            with reading(dataset.root, "train", f"{method.name}-weights"):
+                about = about_training(dataset, method.name, config, config.options_of(method))
+                known = None if force else trained_before(weights_path(dataset, method.name), about)
+                models.append(known or _train(method, dataset, config, about, tracking, shared))
     return models
 
 

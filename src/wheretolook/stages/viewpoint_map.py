@@ -7,11 +7,13 @@ from typing import TYPE_CHECKING
 
 from wheretolook.config import Experiment
 from wheretolook.stages.inputs import Say, Tick, dataset_after, naming_scene, open_scene
+from wheretolook.stages.one_at_a_time import reads_dataset
 
 if TYPE_CHECKING:
     from wheretolook.planning.viewpoint_map import ViewpointMap
 
 
+@reads_dataset("viewpoint-map")
 def viewpoint_map(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> dict[str, ViewpointMap]:
     """For planners: every direction scored at every free voxel of a scene, `<scene>/viewpoint-map/`.
 

@@ -48,6 +48,10 @@ class StorageError(WhereToLookError):
     """A result cannot be written, or vanished after it was."""
 
 
+class InUseError(WhereToLookError):
+    """Another run holds the lock on a dataset or a store."""
+
+
 class WeightsError(WhereToLookError):
     """Trained weights are missing or do not fit the network or the inputs asked for."""
 
@@ -70,6 +74,10 @@ class OutOfRangeWarning(UserWarning):
 
 class MapWarning(UserWarning):
     """A map is used, but in part, or may not be what it is taken for: not in metres, or not with z up."""
+
+
+class LockWarning(UserWarning):
+    """A file system has no locks, so that nothing keeps two runs apart."""
 
 
 class PoseError(WhereToLookError, ValueError):

@@ -1,0 +1,63 @@
+"""Which stages may run on a dataset beside which: one that changes it runs alone, those that only read it together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
+from functools import wraps
+from pathlib import Path
+from typing import Any, ParamSpec, TypeVar
+
+from wheretolook.utils.locks import hold
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def changes_dataset(stage: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Of a function of an experiment: while it runs, no other stage runs on the dataset. InUseError if one does."""
+    return _holding(stage, shared=False)
+
+
+def reads_dataset(stage: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Of a function of an experiment: while it runs, no stage changes the dataset. InUseError if one does."""
+    return _holding(stage, shared=True)
+
+
+def changing(root: Path, stage: str) -> AbstractContextManager[None]:
+    """Within this block no other stage runs on the dataset in this folder. Raises InUseError if one does."""
+    return hold(root / _LOCK, stage)
+
+
+@contextmanager
+def reading(root: Path, stage: str, makes: str = "") -> Iterator[None]:
+    """Nothing changes the dataset in this folder while a stage reads it; what it makes of it, it alone makes.
+
+    Raises InUseError if another stage changes the dataset, or makes the same: "weights", "results" or "paths".
+    """
+    with hold(root / _LOCK, stage, shared=True):
+        if not makes:
+            yield
+            return
+        with hold(root / f".{makes}{_LOCK}", stage):
+            yield
+
+
+_LOCK = ".lock"
+
+
+def _holding(stage: str, shared: bool) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    def of(function: Callable[P, R]) -> Callable[P, R]:
+        @wraps(function)
+        def alone(*args: P.args, **kwargs: P.kwargs) -> R:
+            experiment: Any = args[0] if args else kwargs["experiment"]
+            try:
+                with hold(experiment.root / _LOCK, stage, shared=shared):
+                    return function(*args, **kwargs)
+            finally:
+                with suppress(OSError):  # made for the lock of a stage that then found nothing to work on
+                    experiment.root.rmdir()
+
+        return alone
+
+    return of

@@ -1,0 +1,109 @@
+"""Two runs on one dataset: what changes it runs alone, what reads it runs beside others, and who holds it is said."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from learning_options import train_config
+from synthetic_dataset import make_dataset
+from wheretolook.cli import main
+from wheretolook.dataset.folders import Dataset
+from wheretolook.dataset.stamps import write_stamp
+from wheretolook.stages.one_at_a_time import changing, reading
+from wheretolook.stages.train import train_methods
+from wheretolook.utils.errors import InUseError
+from wheretolook.utils.tracking_config import TrackingConfig
+
+HOLDER = """
+import sys
+from pathlib import Path
+from wheretolook.stages.one_at_a_time import changing
+with changing(Path(sys.argv[1]), "label"):
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.fixture
+def dataset(tmp_path: Path) -> Dataset:
+    dataset = make_dataset(tmp_path / "data" / "tiny")
+    for scene in dataset.scenes:
+        write_stamp(scene, "label", "key")
+    return dataset
+
+
+def run(dataset: Dataset, stage: str, *options: str) -> int:
+    root = dataset.root
+    camera = ["--camera.width", "160", "--camera.height", "120", "--camera.focal_px", "80", "--camera.fov_deg", "null"]
+    where = ["--name", root.name, "--data", str(root.parent), "--tracking.folder", str(root.parent / "mlruns")]
+    return main([stage, *where, "--device", "cpu", *camera, *options])
+
+
+@pytest.mark.parametrize(
+    "stage",
+    ["scenes", "map", "sample", "label", "train", "evaluate", "viewpoint-map", "plan", "compare-paths", "release",
+     "figures", "log-release", "demo"],
+)  # fmt: skip
+def test_a_stage_stops_at_once_beside_one_that_changes_the_dataset(
+    dataset: Dataset, stage: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with changing(dataset.root, "label"):
+        assert run(dataset, stage) == 2
+    said = capsys.readouterr().err
+    assert "another run is at work here" in said and f"label, process {os.getpid()} on " in said
+
+
+def test_what_a_killed_run_held_is_free(dataset: Dataset, capsys: pytest.CaptureFixture[str]) -> None:
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    arguments = [sys.executable, "-c", HOLDER, str(dataset.root)]
+    other = subprocess.Popen(arguments, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert other.stdout is not None and other.stdout.readline() == "held\n"
+    assert run(dataset, "sample") == 2
+    assert f"label, process {other.pid} on " in capsys.readouterr().err
+    other.send_signal(signal.SIGKILL)
+    other.wait()
+    assert run(dataset, "sample") == 2
+    assert "the map stage has not been run" in capsys.readouterr().err  # it looks at the dataset now
+
+
+def test_training_holds_the_labels_that_it_learns_from(dataset: Dataset) -> None:
+    config = train_config("mlp-2d", epochs=40, hidden=(32,), accelerator="cpu")
+    tracking = TrackingConfig(str(dataset.root.parent / "mlruns"))
+    failed: list[BaseException] = []
+
+    def train() -> None:
+        try:
+            train_methods(dataset, config, tracking, progress=False)
+        except BaseException as error:
+            failed.append(error)
+
+    thread = threading.Thread(target=train)
+    thread.start()
+    while not (dataset.root / ".mlp-2d-weights.lock").is_file():
+        assert thread.is_alive(), failed
+        time.sleep(0.001)
+    with pytest.raises(InUseError, match="train, process"), changing(dataset.root, "label"):
+        pass
+    with pytest.raises(InUseError, match="train, process"):
+        train_methods(dataset, config, tracking, progress=False)
+    with reading(dataset.root, "evaluate", "results"), reading(dataset.root, "train", "set-weights"):
+        pass
+    thread.join()
+    assert not failed
+    with changing(dataset.root, "label"):
+        assert {path.name for path in dataset.root.glob(".*")} == {".lock"}
+    assert not list(dataset.root.glob(".*"))
+
+
+def test_a_name_that_is_no_dataset_leaves_no_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["sample", "--name", "typo", "--data", str(tmp_path / "data"), "--device", "cpu"]) == 2
+    assert "this folder is no dataset" in capsys.readouterr().err
+    assert not (tmp_path / "data" / "typo").exists()

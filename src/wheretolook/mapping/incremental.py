@@ -19,11 +19,12 @@ from wheretolook.features.extraction import KeypointExtractor
 from wheretolook.features.keypoints import ExtractorConfig
 from wheretolook.mapping import photographs
 from wheretolook.mapping.building import extract_with_colors
-from wheretolook.mapping.colmap_model import read_model
+from wheretolook.mapping.colmap_model import read_model, write_model
 from wheretolook.mapping.photographs import PhotographCameras, list_photographs, photograph_pairs
 from wheretolook.mapping.triangulation import Stored, fill_database, match_pairs, stored_keypoints
 from wheretolook.utils.colmap import quiet_colmap
 from wheretolook.utils.errors import MapError
+from wheretolook.utils.files import write_json
 from wheretolook.utils.npz_files import load_npz, save_npz
 from wheretolook.utils.processes import Processes
 from wheretolook.utils.reading import read_json_object
@@ -116,7 +117,7 @@ def map_incrementally(
         matches = np.split(kept["matches"], np.cumsum(kept["counts"])[:-1])
         _fill(database, features, cameras, pairs, matches)
         model_sizes = _reconstruct(database, folder, len(features.names), cameras.given, seed, processes, progress)
-        note.write_text(json.dumps({"key": key, "model_sizes": model_sizes}))
+        write_json(note, {"key": key, "model_sizes": model_sizes})
     return MappedPhotographs(read_model(folder), database, _note(note)["model_sizes"])
 
 
@@ -202,8 +203,7 @@ def _reconstruct(
         fix = f"Give {enough}, from different places; a focal length (map.photographs.camera_params) helps."
         value = f"{n_images} photographs, none placed"
         raise MapError("the photographs do not overlap enough for a map", value=value, fix=fix)
-    models.mkdir()
-    ordered[0].write_binary(str(models))
+    write_model(ordered[0], models)
     os.replace(models, folder)
     return [model.num_reg_images() for model in ordered]
 

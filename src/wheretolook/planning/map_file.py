@@ -16,6 +16,7 @@ from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.utils.errors import MapFormatError
 from wheretolook.utils.files import sha256, write_json, write_text
 from wheretolook.utils.locks import hold
+from wheretolook.utils.npz_files import save_npy
 from wheretolook.utils.reading import read_json
 
 FORMAT, VERSION = "wheretolook viewpoint map", 1
@@ -145,7 +146,7 @@ def _refuse_something_else(folder: Path) -> None:
 def _write(folder: Path, grid: VoxelGrid, origin: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> None:
     checksums = {}
     for name, (kind, _, _) in ARRAYS.items():
-        np.save(folder / f"{name}.npy", np.ascontiguousarray(arrays[name], dtype=kind))
+        save_npy(folder / f"{name}.npy", np.ascontiguousarray(arrays[name], dtype=kind))
         checksums[f"{name}.npy"] = sha256(folder / f"{name}.npy")
     n_rows, n_directions = arrays["scores"].shape
     files = "\n".join(

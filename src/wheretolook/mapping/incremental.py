@@ -22,7 +22,7 @@ from wheretolook.mapping.building import extract_with_colors
 from wheretolook.mapping.colmap_model import read_model, write_model
 from wheretolook.mapping.photographs import PhotographCameras, list_photographs, photograph_pairs
 from wheretolook.mapping.triangulation import Stored, fill_database, match_pairs, stored_keypoints
-from wheretolook.utils.colmap import quiet_colmap
+from wheretolook.utils.colmap import quiet_colmap, storing_in_database
 from wheretolook.utils.errors import MapError
 from wheretolook.utils.files import write_json
 from wheretolook.utils.npz_files import load_npz, save_npz
@@ -101,15 +101,16 @@ def map_incrementally(
     """
     seed %= 2**31  # COLMAP keeps it in an int
     pairs = photograph_pairs(len(features.names), exhaustive_up_to, overlap)
-    key = _key([features.key, pairs.tolist()])
+    key, database = _key([features.key, pairs.tolist()]), work / "database.db"
     kept = _load(work / "matches.npz", key)
     if kept is None:
-        matches = list(match_pairs(features.stored, pairs, work, processes, progress))
+        with storing_in_database(database):
+            matches = list(match_pairs(features.stored, pairs, work, processes, progress))
         kept = {"matches": np.concatenate(matches), "counts": np.array([len(found) for found in matches])}
         save_npz(work / "matches.npz", {"key": np.array(key), **kept})
     intrinsics = [camera.todict() for camera in cameras.cameras]
     key = _key([key, intrinsics, cameras.camera_of.tolist(), cameras.given, seed])
-    database, folder, note = work / "database.db", work / "sparse", work / "sparse.json"
+    folder, note = work / "sparse", work / "sparse.json"
     if not (database.is_file() and folder.is_dir() and _note(note).get("key") == key):
         for leftover in (database, note):
             leftover.unlink(missing_ok=True)
@@ -165,10 +166,11 @@ def _fill(
     for index, (name, row) in enumerate(zip(features.names, cameras.camera_of.tolist(), strict=True)):
         image = pycolmap.Image(name=name, camera_id=cameras.cameras[row].camera_id, image_id=index + 1)
         model.add_image_with_trivial_frame(image)
-    fill_database(database, model, features.stored)
-    with pycolmap.Database.open(str(database)) as db:
-        for (i, j), found in zip(pairs.tolist(), matches, strict=True):
-            db.write_matches(i + 1, j + 1, found)
+    with storing_in_database(database):
+        fill_database(database, model, features.stored)
+        with pycolmap.Database.open(str(database)) as db:
+            for (i, j), found in zip(pairs.tolist(), matches, strict=True):
+                db.write_matches(i + 1, j + 1, found)
 
 
 def _reconstruct(
@@ -192,7 +194,7 @@ def _reconstruct(
     models.mkdir()
     bar = tqdm(total=n_images, desc="map: register", disable=not progress, unit="image")
     steps: Any = {"initial_image_pair_callback": lambda: bar.update(2), "next_image_callback": lambda: bar.update(1)}
-    with quiet_colmap("ERROR"), bar:
+    with storing_in_database(database), quiet_colmap("ERROR"), bar:
         verifier = pycolmap.GeometricVerifierOptions(num_threads=threads)
         pycolmap.geometric_verification(str(database), verifier, two_view_geometry_options=verification)
         found = pycolmap.incremental_mapping(str(database), str(models), str(models), options, **steps)

@@ -148,6 +148,10 @@ def _check_database(database: Path) -> None:
             if error.sqlite_errorcode in (sqlite3.SQLITE_INTERRUPT, sqlite3.SQLITE_BUSY):
                 return
             raise
+    with database.open("rb") as file:
+        page = int.from_bytes(file.read(18)[16:], "big")
+    if (found == "ok" and database.stat().st_size % (65536 if page == 1 else page or 1) != 0) or not page:
+        found = "the file is truncated"  # SQLite takes one of a few bytes for empty, and rounds
     if found != "ok":
         raise TrackingError(f"the database is damaged: {' '.join(found.split())}", path=database, fix=_FIX)
 
@@ -168,7 +172,7 @@ def _told(root: Path) -> Iterator[None]:
     except Exception as error:
         if type(error).__module__.partition(".")[0] not in ("mlflow", "sqlalchemy", "sqlite3", "alembic"):
             raise
-        first = re.sub(r"^\(\w+\.\w+\) ", "", (str(error).splitlines() or [""])[0])
+        first = re.sub(r"^\(\w+\.\w+\) ", "", (str(error).splitlines() or [""])[0]).partition(" NOTE:")[0].rstrip(".")
         problem = f"the store cannot be used: {first or type(error).__name__}"
         raise TrackingError(problem, path=root / "mlflow.db", fix=_FIX) from error
 

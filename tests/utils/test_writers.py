@@ -18,6 +18,7 @@ from tests.synthetic_dataset import CAMERA, make_landmarks, make_mapping_poses
 from wheretolook.figures.path_film import save_film
 from wheretolook.figures.style import save_figure
 from wheretolook.learning.weights import write_weights
+from wheretolook.mapping.building import partial_folder
 from wheretolook.mapping.colmap_model import colmap_poses, save_mapping_poses, write_model
 from wheretolook.mapping.triangulation import fill_database
 from wheretolook.scenes.loading import save_glb
@@ -166,3 +167,10 @@ def test_a_database_that_colmap_cannot_write_is_named(limit: int, tmp_path: Path
     with file_limit(limit), failing as raised, storing_in_database(database):
         fill_database(database, _model(4), stored)
     assert raised.value.path == database
+
+
+def test_a_folder_that_is_moved_later_is_named_as_it_was_to_be(tmp_path: Path) -> None:
+    place, limited = tmp_path / "map", file_limit(LIMIT)
+    with pytest.raises(StorageError) as raised, limited, partial_folder(place) as partial:
+        write_bytes(partial / "deep" / "a.bin", NOISE.tobytes())
+    assert raised.value.path == place / "deep" / "a.bin" and not list(tmp_path.iterdir())

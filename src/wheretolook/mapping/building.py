@@ -27,8 +27,8 @@ from wheretolook.mapping.config import MapConfig
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
 from wheretolook.mapping.triangulation import image_name, triangulate_known_poses
 from wheretolook.mapping.walk import FreeSpaceQueries, plan_walk
-from wheretolook.utils.errors import MapError, StorageError
-from wheretolook.utils.files import storing, write_bytes, write_json
+from wheretolook.utils.errors import MapError
+from wheretolook.utils.files import moved_later, storing, write_bytes, write_json
 from wheretolook.utils.processes import Processes
 
 if TYPE_CHECKING:
@@ -194,18 +194,16 @@ def partial_folder(out_dir: Path, replacing: Callable[[], None] = lambda: None) 
     with storing(partial):
         partial.mkdir(parents=True)
     try:
-        yield partial
+        with moved_later(partial, out_dir):
+            yield partial
         replacing()
         with storing(out_dir):
             if out_dir.exists():
                 os.replace(out_dir, old)
             os.replace(partial, out_dir)
         shutil.rmtree(old, ignore_errors=True)
-    except BaseException as error:
+    except BaseException:
         shutil.rmtree(partial, ignore_errors=True)
-        if isinstance(error, StorageError) and error.path and Path(error.path).is_relative_to(partial):
-            path = out_dir / Path(error.path).relative_to(partial)  # the file that was to be, not its place meanwhile
-            raise StorageError(error.problem, path=path, fix=error.fix) from error
         raise
 
 

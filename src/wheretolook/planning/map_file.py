@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.utils.errors import MapFormatError
-from wheretolook.utils.files import sha256, write_json, write_text
+from wheretolook.utils.files import moved_later, sha256, storing, write_json, write_text
 from wheretolook.utils.locks import hold
 from wheretolook.utils.npz_files import save_npy
 from wheretolook.utils.reading import read_json
@@ -113,11 +113,13 @@ def write_map(
         for left in folder.parent.glob(f".{glob.escape(folder.name)}.????????"):
             if [path.name for path in left.glob("*")] in ([], [_NEW]):  # of a process that was killed while it wrote
                 shutil.rmtree(left, ignore_errors=True)
-        work = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+        with storing(folder):
+            work = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
         new, old = work / _NEW, work / _OLD
         try:
-            new.mkdir()
-            _write(new, grid, origin, arrays)
+            with moved_later(new, folder), storing(folder):
+                new.mkdir()
+                _write(new, grid, origin, arrays)
             if folder.exists():
                 folder.rename(old)
             new.rename(folder)

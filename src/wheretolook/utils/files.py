@@ -71,6 +71,18 @@ def storing(path: Path, partial: Path | None = None) -> Iterator[None]:
         raise StorageError(f"cannot be written: {reason}", path=concerned, fix=MAKE_ROOM) from error
 
 
+@contextmanager
+def moved_later(folder: Path, place: Path) -> Iterator[None]:
+    """Let StorageErrors about files in a folder name them as they were to lie, once the folder is moved to `place`."""
+    try:
+        yield
+    except StorageError as error:
+        if error.path is None or not Path(error.path).is_relative_to(folder):
+            raise
+        path = place / Path(error.path).relative_to(folder)
+        raise StorageError(error.problem, path=path, value=error.value, fix=error.fix) from error
+
+
 def sha256(path: Path) -> str:
     """SHA-256 of a file, in hexadecimal digits."""
     with path.open("rb") as file:

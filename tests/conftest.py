@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -61,8 +61,8 @@ def migrated_stores(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 def _without_pictures() -> Iterator[None]:
     """Figures are built, but their files stay empty: drawing is a third of a small training or evaluation."""
 
-    def savefig(figure: Figure, path: str | Path, **options: object) -> None:
-        Path(path).write_bytes(b"")
+    def savefig(figure: Figure, file: io.BytesIO, **options: object) -> None:
+        file.write(b"")
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Figure, "savefig", savefig)

@@ -14,7 +14,14 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from wheretolook.utils.errors import ConfigError, LockWarning, MapWarning, OutOfRangeWarning, WhereToLookError
+from wheretolook.utils.errors import (
+    ConfigError,
+    LockWarning,
+    MapWarning,
+    OutOfRangeWarning,
+    TrackingWarning,
+    WhereToLookError,
+)
 from wheretolook.utils.options import Option, all_options, check_names, grouped, names_in, nearest, short_lines
 from wheretolook.utils.shipped import or_shipped, shipped, shipped_configs
 from wheretolook.utils.version import VERSION
@@ -394,7 +401,7 @@ def _quieten() -> None:
     os.environ.setdefault("GLOG_minloglevel", "2")
     os.environ.setdefault("PYTHONWARNINGS", "ignore")  # for worker processes
     warnings.simplefilter("ignore")
-    for kind in (OutOfRangeWarning, MapWarning, LockWarning):  # the user's own views, map and disk, not chatter
+    for kind in (OutOfRangeWarning, MapWarning, LockWarning, TrackingWarning):  # the user's own things, not chatter
         warnings.simplefilter("default", kind)
     warnings.formatwarning = lambda message, *_, **__: f"wheretolook: warning: {message}\n"
     for name in ("lightning", "lightning.pytorch", "lightning.fabric", "mlflow", "alembic"):

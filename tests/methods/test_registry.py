@@ -126,7 +126,7 @@ from wheretolook.utils.files import write_json
 from wheretolook.utils.tracking import newest_run
 from wheretolook.utils.tracking_config import TrackingConfig
 
-Figure.savefig = lambda figure, path, **options: Path(path).write_bytes(b"")  # figures are built, which is enough here
+Figure.savefig = lambda figure, file, **options: file.write(b"")  # figures are built, which is enough here
 folder = Path(sys.argv[1])
 dataset = make_dataset(folder / "tiny", ("train", "test"), n_locations=8, n_directions=12)
 room = box_quads((-3.1, -3.1, -0.1), (3.1, 3.1, 2.6), inward=True)

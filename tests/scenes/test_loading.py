@@ -14,7 +14,7 @@ from trimesh.visual.material import PBRMaterial
 
 from box_scenes import box_quads, furnished_room, quads_mesh, random_texture
 from wheretolook.scenes.loading import load_mesh, save_glb
-from wheretolook.utils.errors import ConfigError, SceneError
+from wheretolook.utils.errors import ConfigError, SceneError, StorageError
 
 VERTICES = np.array([[0, 0, 0], [2, 0, 0], [2, 3, 0], [0, 3, 1]], dtype=np.float64)
 FACES = np.array([[0, 1, 2], [0, 2, 3]])
@@ -312,7 +312,7 @@ def test_saved_glb_keeps_the_old_file_when_writing_fails(tmp_path, monkeypatch):
         raise OSError("no space left on device")
 
     monkeypatch.setattr("pathlib.Path.write_bytes", no_space)
-    with pytest.raises(OSError, match="no space"):
+    with pytest.raises(StorageError, match=r"a\.glb: .*no space"):
         save_glb(mesh, tmp_path / "a.glb")
     monkeypatch.undo()
     assert (tmp_path / "a.glb").read_bytes() == before

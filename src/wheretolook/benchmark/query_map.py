@@ -13,7 +13,7 @@ from wheretolook.benchmark.folder import DRAWN_CAMERA, BenchmarkScene
 from wheretolook.features.extraction import KeypointExtractor
 from wheretolook.geometry.camera import PinholeCamera, cameras_by_id
 from wheretolook.mapping.building import LANDMARKS_FILE, Clock, extract_with_colors, remove_inaccurate, save_landmarks
-from wheretolook.mapping.colmap_model import colmap_poses, read_model
+from wheretolook.mapping.colmap_model import colmap_poses, read_model, write_model
 from wheretolook.mapping.config import MapConfig
 from wheretolook.mapping.triangulation import choose_pairs, shrink_depth, surface_overlap, triangulate_known_poses
 from wheretolook.utils.errors import MapError
@@ -61,7 +61,7 @@ def build_query_map(
         views = camera, poses, keypoints, colors, pairs
         built = triangulate_known_poses(database, *views, config, Clock(), 0, processes, progress)
     remove_inaccurate(built, config.max_reprojection_error_px, scene.images, _FIX)
-    built.write_binary(str(folder))
+    write_model(built, folder)
     save_landmarks(folder, database, config.max_reprojection_error_px)
     database.unlink()
     return folder / LANDMARKS_FILE

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -25,7 +24,7 @@ from wheretolook.labelling.config import LocalizerConfig
 from wheretolook.select.waypoints import Waypoints, read_waypoints
 from wheretolook.utils.confine import entry_of
 from wheretolook.utils.errors import SceneError, StorageError, TableError
-from wheretolook.utils.files import fingerprint, write_json
+from wheretolook.utils.files import fingerprint, write_bytes, write_json
 from wheretolook.utils.reading import read_json_object
 from wheretolook.utils.version import VERSION
 
@@ -299,9 +298,7 @@ def _files_key(path: Path | None) -> list[str]:
 def _write_image(path: Path, rgb: NDArray[np.uint8]) -> None:
     import cv2
 
-    partial = path.with_name(path.name + ".partial")
-    partial.write_bytes(cv2.imencode(IMAGE_ENDING, rgb[:, :, ::-1])[1].tobytes())
-    os.replace(partial, path)
+    write_bytes(path, cv2.imencode(IMAGE_ENDING, rgb[:, :, ::-1])[1].tobytes())
 
 
 def _keys(folder: Path) -> dict[str, str]:

@@ -21,7 +21,7 @@ from wheretolook.evaluation.views import CandidateSet
 from wheretolook.geometry.poses import Float
 from wheretolook.methods.registry import methods_named, scorers
 from wheretolook.methods.styles import ORACLE
-from wheretolook.utils.files import fingerprint
+from wheretolook.utils.files import fingerprint, replacing
 from wheretolook.utils.tracking import (
     FINGERPRINT_TAG,
     NestedRun,
@@ -158,7 +158,8 @@ def _runs_with_locations(
     for one in scored:
         for nested in runs_of_rows(one.table, params):
             chosen = [location_table(one, nested.params["method"], n, scenes, config) for n in config.top_n]
-            pd.concat(chosen).to_parquet(file, index=False)
+            with replacing(file) as partial:
+                pd.concat(chosen).to_parquet(partial, index=False)
             yield replace(nested, files=(file,))
 
 
@@ -214,7 +215,7 @@ def log_evaluation(
     with TemporaryDirectory() as folder, opened as (client, run):
         log(client, run, metrics=metrics)
         for file in results.iterdir():
-            if file.is_file():
+            if file.is_file() and file.suffix != ".partial":  # a killed process may have left one
                 client.log_artifact(run, str(file))
         file = Path(folder) / LOCATIONS_PARQUET
         log_nested(tracking, run, "evaluate", _runs_with_locations(evaluation.scored, params, scenes, config, file))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -19,7 +18,8 @@ from wheretolook.geometry.poses import Float
 from wheretolook.methods.styles import method_style
 from wheretolook.planning.route_views import PathView
 from wheretolook.planning.sequences import lengths_along
-from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.errors import ConfigError, StorageError
+from wheretolook.utils.files import MAKE_ROOM, replacing
 
 Pixels = NDArray[np.uint8]
 
@@ -83,30 +83,40 @@ def save_film(frames: Iterator[Pixels], path: Path) -> None:
 
     Raises ConfigError for another ending, or if MP4 cannot be written here.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".partial-{path.name}")
-    if path.suffix == ".gif":
-        from PIL import Image
-
-        first, *rest = (Image.fromarray(frame).quantize(128) for frame in frames)
-        first.save(partial, save_all=True, append_images=rest, duration=round(1000 / FRAMES_PER_SECOND), loop=0)
-    elif path.suffix == ".mp4":
-        import cv2
-
-        writer = None
-        for frame in frames:
-            even = frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2]  # the codec needs even sides
-            if writer is None:
-                codec = cv2.VideoWriter.fourcc(*"mp4v")
-                writer = cv2.VideoWriter(str(partial), codec, FRAMES_PER_SECOND, even.shape[1::-1])
-                if not writer.isOpened():
-                    raise ConfigError("this OpenCV cannot write MP4", path=path, fix="Ask for a .gif.")
-            writer.write(np.ascontiguousarray(even[..., ::-1]))
-        if writer is not None:
-            writer.release()
-    else:
+    if path.suffix not in (".gif", ".mp4"):
         raise ConfigError("a film is a .gif or an .mp4", path=path, value=path.suffix, fix="Name it so.")
-    os.replace(partial, path)
+    with replacing(path, path.with_name(f".partial-{path.name}")) as partial:
+        if path.suffix == ".gif":
+            from PIL import Image
+
+            first, *rest = (Image.fromarray(frame).quantize(128) for frame in frames)
+            first.save(partial, save_all=True, append_images=rest, duration=round(1000 / FRAMES_PER_SECOND), loop=0)
+        else:
+            _save_mp4(frames, partial, path)
+
+
+def _save_mp4(frames: Iterator[Pixels], partial: Path, path: Path) -> None:
+    """Write the file `partial` of the film that is to be `path`. Raises as `save_film`."""
+    import cv2
+
+    partial.write_bytes(b"")  # OpenCV does not tell why it cannot open a file
+    writer, n_frames = None, 0
+    for frame in frames:
+        even = frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2]  # the codec needs even sides
+        if writer is None:
+            codec = cv2.VideoWriter.fourcc(*"mp4v")
+            writer = cv2.VideoWriter(str(partial), codec, FRAMES_PER_SECOND, even.shape[1::-1])
+            if not writer.isOpened():
+                raise ConfigError("this OpenCV cannot write MP4", path=path, fix="Ask for a .gif.")
+        writer.write(np.ascontiguousarray(even[..., ::-1]))
+        n_frames += 1
+    if writer is not None:
+        writer.release()
+        written = cv2.VideoCapture(str(partial))  # OpenCV does not notice a full disk
+        whole = written.get(cv2.CAP_PROP_FRAME_COUNT) == n_frames
+        written.release()
+        if not whole:
+            raise StorageError("cannot be written whole: is the disk full?", path=path, fix=MAKE_ROOM)
 
 
 def score_text(score: float) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import html
-import os
+import io
 import re
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from matplotlib.style import context
 
 from wheretolook.figures.config import KINDS
 from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.files import write_bytes
 
 ONE_COLUMN_IN, TWO_COLUMNS_IN = 3.5, 7.2
 """Widths of figures for one and for two columns of a paper, inches. Their letters are as large as they will be in
@@ -56,15 +57,14 @@ def save_figure(figure: Figure, path: Path, note: str = "") -> None:
     kind = path.suffix[1:].lower()
     if kind not in KINDS:
         raise ConfigError("figures are not written as such files", path=path, fix=f"Use {', '.join(KINDS)}.")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
     # without dates and versions
     metadata: dict[str, Any] = {"pdf": {"CreationDate": None, "Creator": None}, "svg": {"Date": None}}.get(kind, {})
     if note:
         metadata[_NOTE[kind]] = note
+    drawn = io.BytesIO()  # not into the file: of a full disk, PDFs tell no cause
     with context(RC):
-        figure.savefig(partial, format=kind, metadata={**metadata, **({"Software": None} if kind == "png" else {})})
-    os.replace(partial, path)
+        figure.savefig(drawn, format=kind, metadata={**metadata, **({"Software": None} if kind == "png" else {})})
+    write_bytes(path, drawn.getvalue())
 
 
 def note_of(path: Path) -> str:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Generator, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -85,8 +85,7 @@ def label_scenes(
             if not scene.missing:
                 yield scene.result()
         for shard, labelled in results:
-            with storing(shard.path):
-                write_table(labelled.rows, shard.path)
+            write_table(labelled.rows, shard.path)
             scene = scene_of_shard[shard]
             scene.missing.remove(shard)
             for step, seconds in labelled.seconds.items():
@@ -147,8 +146,7 @@ class _SceneInProgress:
             digest = hashlib.sha256(text + content.tobytes()).hexdigest()[:16]
             shards.append(Shard(job, task.shards / f"{begin:08d}-{digest}.parquet", rows))
         scene = cls(task, settings, shards, [shard for shard in shards if _finished(shard) is None])
-        with storing(task.shards / MANIFEST):
-            write_json(task.shards / MANIFEST, scene.manifest())
+        write_json(task.shards / MANIFEST, scene.manifest())
         return scene
 
     def manifest(self) -> dict[str, Any]:
@@ -187,17 +185,6 @@ def _run(
         from wheretolook.labelling.local_engine import run_local
 
         yield from run_local(shards, config.workers or len(os.sched_getaffinity(0)), tick)
-
-
-@contextmanager
-def storing(path: Path) -> Iterator[None]:
-    """Turn an OSError into a StorageError that names the file of a labelling run that could not be written."""
-    try:
-        yield
-    except OSError as error:
-        problem = f"this file cannot be written: {error.strerror or error}"
-        fix = "Make room (or mend the disk) and run again: finished shards are kept."
-        raise StorageError(problem, path=path, fix=fix) from error
 
 
 def _finished(shard: Shard) -> pd.DataFrame | None:

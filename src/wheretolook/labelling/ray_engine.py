@@ -22,6 +22,7 @@ import pandas as pd
 
 from wheretolook.labelling.shard import LabelledShard, SceneJob, Shard, ShardWorker
 from wheretolook.utils.errors import ConfigError, WhereToLookError, WorkerError
+from wheretolook.utils.files import replacing
 
 MAX_RETRIES = 5
 """How often Ray restarts a shard whose process or machine was lost."""
@@ -150,11 +151,8 @@ def _cached_file(folder: Path, content: bytes, suffix: str) -> Path:
         os.utime(path)
     except FileNotFoundError:
         partial = path.with_name(f"{path.name}.{os.getpid()}.partial")  # other workers may write the same file
-        try:
+        with replacing(path, partial):
             partial.write_bytes(content)
-            os.replace(partial, path)
-        finally:
-            partial.unlink(missing_ok=True)
         for file in folder.iterdir():
             with suppress(FileNotFoundError):  # another worker may have removed it
                 if file.stat().st_mtime < time.time() - KEEP_S:

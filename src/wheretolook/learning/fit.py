@@ -24,7 +24,7 @@ from tqdm.auto import tqdm
 
 from wheretolook.learning.classifier import ViewpointClassifier
 from wheretolook.learning.config import FittingConfig, SharedConfig
-from wheretolook.utils.errors import ConfigError, WorkerError
+from wheretolook.utils.errors import ConfigError, TrackingError, WorkerError
 from wheretolook.utils.tracking import client
 from wheretolook.utils.tracking_config import TrackingConfig
 
@@ -81,10 +81,14 @@ def fit(classifier: ViewpointClassifier, data: LightningDataModule, record: Epoc
 
 
 class RunLog:
-    """Logs the metrics of epochs to an open MLflow run, several epochs at a time."""
+    """Logs the metrics of epochs to an open MLflow run, several epochs at a time.
+
+    A store that fails does not end the training: nothing more is logged, and `failed` holds the error.
+    """
 
     def __init__(self, tracking: TrackingConfig, run_id: str) -> None:
         self.tracking, self.run_id = tracking, run_id
+        self.failed: TrackingError | None = None
         self._waiting: list[Metric] = []
         self._flushed = time.monotonic()
 
@@ -99,8 +103,11 @@ class RunLog:
 
     def flush(self) -> None:
         """Log what waits."""
-        if self._waiting:
-            client(self.tracking).log_batch(self.run_id, metrics=self._waiting)
+        if self._waiting and self.failed is None:
+            try:
+                client(self.tracking).log_batch(self.run_id, metrics=self._waiting)
+            except TrackingError as error:
+                self.failed = error
         self._waiting, self._flushed = [], time.monotonic()
 
 

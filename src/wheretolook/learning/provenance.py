@@ -24,7 +24,7 @@ class TrainedModel:
 
     method: str  # its name
     path: Path  # its weights
-    run_id: str  # its MLflow run, at the time of training
+    run_id: str  # its MLflow run, at the time of training; "" if it is not logged yet
     # metrics of the epoch whose weights were kept, and that epoch's number (from 0) as "epoch"
     metrics: dict[str, float]
     reused: bool = False  # whether it was trained before and only found again

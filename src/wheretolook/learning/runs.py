@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +25,9 @@ HISTORY_CSV = "history.csv"  # artifact of a train run: a row an epoch
 
 TRAINING_CSV = "training.csv"
 """In a release's `results/`: the histories of all that was trained, one below the other, with a column `method`."""
+
+NOT_LOGGED = "not_logged"
+"""In the record of weights whose training is not logged yet: "params" and "history", the text of `HISTORY_CSV`."""
 
 LOG_AT_MOST = 1000  # metrics MLflow takes at a time
 
@@ -83,6 +87,13 @@ def trained(tracking: TrackingConfig, dataset: str) -> pd.DataFrame:
 _MEASURES = ("average_precision", "roc_auc", "calibration_error")
 
 
+def history_not_logged(record: Mapping[str, Any]) -> pd.DataFrame | None:
+    """The history in the record of a training that is not logged yet; None if there is none."""
+    kept = record.get(NOT_LOGGED)
+    text = kept.get("history") if isinstance(kept, dict) else None
+    return pd.read_csv(StringIO(text), float_precision="round_trip") if isinstance(text, str) and text else None
+
+
 def log_history(tracking: TrackingConfig, run_id: str, history: pd.DataFrame) -> None:
     """Log a history, one row for each `epoch`, as training itself does. What is not finite is left out."""
     from mlflow.entities import Metric
@@ -132,6 +143,8 @@ def keep_histories(release: Dataset, tracking: TrackingConfig) -> pd.DataFrame:
         own = [run for run in alike if run.info.run_id == record["run_id"]]
         for run in (own or alike)[:1]:
             history = pd.read_csv(artifact(tracking, run.info.run_id, HISTORY_CSV))
+        if history is None:
+            history = history_not_logged(record)
         rows = known[known["method"] == method] if history is None else history.assign(method=method)
         kept.append(rows[["method", *rows.columns.drop("method")]])
     table = pd.concat([rows for rows in kept if len(rows)], ignore_index=True) if any(map(len, kept)) else known

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from torch import Tensor
 
 from wheretolook.learning.old_names import name_of_header, with_name
 from wheretolook.utils.errors import WeightsError
+from wheretolook.utils.files import write_bytes
 from wheretolook.utils.reading import parse_json_object, read_json_object
 
 FORMAT_VERSION = 1  # version of the layout of the metadata
@@ -25,14 +25,10 @@ def write_weights(path: str | Path, method: str, tensors: Mapping[str, Tensor], 
 
     Of the description "camera" is that of the training views, "training" what is known of the training.
     """
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     text = json.dumps({"format_version": FORMAT_VERSION, **header, "method": method})
-    partial = path.with_name(path.name + ".partial")
     # not by `save_file`, which makes a file that other users cannot read
     content = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    partial.write_bytes(save(content, metadata={METADATA_KEY: text}))
-    os.replace(partial, path)
+    write_bytes(Path(path), save(content, metadata={METADATA_KEY: text}))
 
 
 def check_serves(path: str | Path, header: Mapping[str, Any], *methods: str) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import time
@@ -23,12 +22,13 @@ from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float, poses_looking_along
 from wheretolook.mapping import triangulation
-from wheretolook.mapping.colmap_model import CAMERAS_FILE, colmap_poses, save_mapping_poses
+from wheretolook.mapping.colmap_model import CAMERAS_FILE, colmap_poses, save_mapping_poses, write_model
 from wheretolook.mapping.config import MapConfig
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
 from wheretolook.mapping.triangulation import image_name, triangulate_known_poses
 from wheretolook.mapping.walk import FreeSpaceQueries, plan_walk
 from wheretolook.utils.errors import MapError
+from wheretolook.utils.files import moved_later, storing, write_bytes, write_json
 from wheretolook.utils.processes import Processes
 
 if TYPE_CHECKING:
@@ -109,7 +109,7 @@ def build_map(
         with clock("filter_and_write"):
             fix = "Map with more images (n_images), or check that the scene has texture."
             n_removed = remove_inaccurate(model, config.max_reprojection_error_px, out_dir, fix)
-            model.write_binary(str(partial))
+            write_model(model, partial)
         with clock("landmarks"):
             landmarks = save_landmarks(partial, database, config.max_reprojection_error_px)
         with clock("accuracy"):
@@ -138,7 +138,7 @@ def build_map(
             config=asdict(config),
             seconds={**clock.seconds, "total": sum(clock.seconds.values())},
         )
-        (partial / REPORT_FILE).write_text(json.dumps(asdict(report), indent=2) + "\n")
+        write_json(partial / REPORT_FILE, asdict(report))
     return report
 
 
@@ -191,13 +191,16 @@ def partial_folder(out_dir: Path, replacing: Callable[[], None] = lambda: None) 
     partial, old = (out_dir.with_name(f".{out_dir.name}.{suffix}") for suffix in ("partial", "replaced"))
     for leftover in (partial, old):
         shutil.rmtree(leftover, ignore_errors=True)
-    partial.mkdir(parents=True)
+    with storing(partial):
+        partial.mkdir(parents=True)
     try:
-        yield partial
+        with moved_later(partial, out_dir):
+            yield partial
         replacing()
-        if out_dir.exists():
-            os.replace(out_dir, old)
-        os.replace(partial, out_dir)
+        with storing(out_dir):
+            if out_dir.exists():
+                os.replace(out_dir, old)
+            os.replace(partial, out_dir)
         shutil.rmtree(old, ignore_errors=True)
     except BaseException:
         shutil.rmtree(partial, ignore_errors=True)
@@ -246,6 +249,6 @@ def _rendered(
         depth.extend(triangulation.shrink_depth(rendering.depth_m))
         for offset, rgb in enumerate(rendering.rgb):
             if keep_in is not None:
-                keep_in.mkdir(exist_ok=True)
-                cv2.imwrite(str(keep_in / image_name(start + offset)), cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
+                path = keep_in / image_name(start + offset)
+                write_bytes(path, cv2.imencode(path.suffix, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))[1].tobytes())
             yield rgb

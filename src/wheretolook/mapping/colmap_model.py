@@ -26,7 +26,8 @@ from wheretolook.mapping.colmap_files import (
     track_elements,
 )
 from wheretolook.utils.colmap import quiet_colmap
-from wheretolook.utils.errors import MapError
+from wheretolook.utils.errors import MapError, StorageError
+from wheretolook.utils.files import MAKE_ROOM, storing
 from wheretolook.utils.npz_files import load_npz, save_npz
 
 CAMERAS_FILE = "cameras.npz"  # lies beside the landmarks, small enough to travel without the COLMAP model
@@ -92,6 +93,23 @@ def read_model(model_dir: str | Path) -> Any:
             reconstruction.write_binary(copy)
             check_binary(Path(copy), folder, suffix)
     return reconstruction
+
+
+def write_model(reconstruction: Any, folder: Path) -> None:
+    """Write a `pycolmap.Reconstruction` as binary files into a folder, made if missing.
+
+    pycolmap does not notice a full disk, so that what was written is checked. Raises StorageError, which names the file
+    that is not whole.
+    """
+    with storing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    try:
+        reconstruction.write_binary(str(folder))
+        check_binary(folder, folder)
+    except (MapError, RuntimeError, ValueError) as error:
+        path = (error.path if isinstance(error, MapError) else None) or folder
+        problem = f"cannot be written whole: is the disk full? ({getattr(error, 'problem', error)})"
+        raise StorageError(problem, path=path, fix=MAKE_ROOM) from error
 
 
 def model_arrays(reconstruction: Any) -> ModelArrays:
@@ -201,6 +219,9 @@ def _stored_points(reconstruction: Any) -> _StoredPoints:
         reconstruction.write_binary(folder)
         data = np.fromfile(Path(folder) / "points3D.bin", dtype=np.uint8)
     starts = point_starts(data.tobytes())
+    if starts[-1] < 0:  # pycolmap does not notice a full disk
+        path = Path(folder) / "points3D.bin"
+        raise StorageError("cannot be written whole: is the disk full?", path=path, fix=MAKE_ROOM)
     heads, elements = point_heads(data, starts), track_elements(data, starts).astype(np.int64)
     lengths, order = heads["n"].astype(np.int64), np.argsort(heads["id"])
     ends = np.cumsum(lengths)

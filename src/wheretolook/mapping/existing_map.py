@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ from wheretolook.mapping.colmap_model import (
     read_model,
     registered_names,
     save_mapping_poses,
+    write_model,
 )
 from wheretolook.mapping.config import MapConfig
 from wheretolook.mapping.descriptors import HDF5_SUFFIXES
@@ -34,6 +34,7 @@ from wheretolook.mapping.plausibility import warn_of_frame
 from wheretolook.mapping.scale import MapScale, Similarity
 from wheretolook.mapping.triangulation import choose_pairs, color_points, triangulate_model
 from wheretolook.utils.errors import ConfigError, MapError
+from wheretolook.utils.files import copy_file, write_text
 from wheretolook.utils.processes import Processes
 
 _PROPORTIONS = 0.01  # by which a photograph's proportions may differ from those of its camera
@@ -124,7 +125,7 @@ def map_existing(
                 n_removed = building.remove_inaccurate(model, worst_px, settings.model, fix)
             if anew:
                 color_points(model, features.colors)
-            model.write_binary(str(partial))
+            write_model(model, partial)
         with clock("landmarks"):
             landmarks = load_colmap_landmarks(settings.model, database, device=device, reconstruction=model)
             landmarks.save(partial / LANDMARKS_FILE)
@@ -134,7 +135,7 @@ def map_existing(
             (partial / DATABASE_FILE).unlink()
         elif config.keep_database and settings.database is not None:
             is_features = settings.database.suffix.lower() in HDF5_SUFFIXES
-            shutil.copyfile(settings.database, partial / (settings.database.name if is_features else DATABASE_FILE))
+            copy_file(settings.database, partial / (settings.database.name if is_features else DATABASE_FILE))
         report = ExistingMapReport(
             n_images=len(poses),
             n_points=n_points,
@@ -150,7 +151,7 @@ def map_existing(
             config=asdict(config),
             seconds={**clock.seconds, "total": sum(clock.seconds.values())},
         )
-        (partial / REPORT_FILE).write_text(json.dumps(asdict(report), indent=2, default=str) + "\n")
+        write_text(partial / REPORT_FILE, json.dumps(asdict(report), indent=2, default=str) + "\n")
     warn_of_frame(settings.model, landmarks.mapping_distance_m, poses)
     return report
 

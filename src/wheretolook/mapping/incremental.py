@@ -19,11 +19,12 @@ from wheretolook.features.extraction import KeypointExtractor
 from wheretolook.features.keypoints import ExtractorConfig
 from wheretolook.mapping import photographs
 from wheretolook.mapping.building import extract_with_colors
-from wheretolook.mapping.colmap_model import read_model
+from wheretolook.mapping.colmap_model import read_model, write_model
 from wheretolook.mapping.photographs import PhotographCameras, list_photographs, photograph_pairs
 from wheretolook.mapping.triangulation import Stored, fill_database, match_pairs, stored_keypoints
-from wheretolook.utils.colmap import quiet_colmap
+from wheretolook.utils.colmap import quiet_colmap, storing_in_database
 from wheretolook.utils.errors import MapError
+from wheretolook.utils.files import write_json
 from wheretolook.utils.npz_files import load_npz, save_npz
 from wheretolook.utils.processes import Processes
 from wheretolook.utils.reading import read_json_object
@@ -100,15 +101,16 @@ def map_incrementally(
     """
     seed %= 2**31  # COLMAP keeps it in an int
     pairs = photograph_pairs(len(features.names), exhaustive_up_to, overlap)
-    key = _key([features.key, pairs.tolist()])
+    key, database = _key([features.key, pairs.tolist()]), work / "database.db"
     kept = _load(work / "matches.npz", key)
     if kept is None:
-        matches = list(match_pairs(features.stored, pairs, work, processes, progress))
+        with storing_in_database(database):
+            matches = list(match_pairs(features.stored, pairs, work, processes, progress))
         kept = {"matches": np.concatenate(matches), "counts": np.array([len(found) for found in matches])}
         save_npz(work / "matches.npz", {"key": np.array(key), **kept})
     intrinsics = [camera.todict() for camera in cameras.cameras]
     key = _key([key, intrinsics, cameras.camera_of.tolist(), cameras.given, seed])
-    database, folder, note = work / "database.db", work / "sparse", work / "sparse.json"
+    folder, note = work / "sparse", work / "sparse.json"
     if not (database.is_file() and folder.is_dir() and _note(note).get("key") == key):
         for leftover in (database, note):
             leftover.unlink(missing_ok=True)
@@ -116,7 +118,7 @@ def map_incrementally(
         matches = np.split(kept["matches"], np.cumsum(kept["counts"])[:-1])
         _fill(database, features, cameras, pairs, matches)
         model_sizes = _reconstruct(database, folder, len(features.names), cameras.given, seed, processes, progress)
-        note.write_text(json.dumps({"key": key, "model_sizes": model_sizes}))
+        write_json(note, {"key": key, "model_sizes": model_sizes})
     return MappedPhotographs(read_model(folder), database, _note(note)["model_sizes"])
 
 
@@ -164,10 +166,11 @@ def _fill(
     for index, (name, row) in enumerate(zip(features.names, cameras.camera_of.tolist(), strict=True)):
         image = pycolmap.Image(name=name, camera_id=cameras.cameras[row].camera_id, image_id=index + 1)
         model.add_image_with_trivial_frame(image)
-    fill_database(database, model, features.stored)
-    with pycolmap.Database.open(str(database)) as db:
-        for (i, j), found in zip(pairs.tolist(), matches, strict=True):
-            db.write_matches(i + 1, j + 1, found)
+    with storing_in_database(database):
+        fill_database(database, model, features.stored)
+        with pycolmap.Database.open(str(database)) as db:
+            for (i, j), found in zip(pairs.tolist(), matches, strict=True):
+                db.write_matches(i + 1, j + 1, found)
 
 
 def _reconstruct(
@@ -191,7 +194,7 @@ def _reconstruct(
     models.mkdir()
     bar = tqdm(total=n_images, desc="map: register", disable=not progress, unit="image")
     steps: Any = {"initial_image_pair_callback": lambda: bar.update(2), "next_image_callback": lambda: bar.update(1)}
-    with quiet_colmap("ERROR"), bar:
+    with storing_in_database(database), quiet_colmap("ERROR"), bar:
         verifier = pycolmap.GeometricVerifierOptions(num_threads=threads)
         pycolmap.geometric_verification(str(database), verifier, two_view_geometry_options=verification)
         found = pycolmap.incremental_mapping(str(database), str(models), str(models), options, **steps)
@@ -202,8 +205,7 @@ def _reconstruct(
         fix = f"Give {enough}, from different places; a focal length (map.photographs.camera_params) helps."
         value = f"{n_images} photographs, none placed"
         raise MapError("the photographs do not overlap enough for a map", value=value, fix=fix)
-    models.mkdir()
-    ordered[0].write_binary(str(models))
+    write_model(ordered[0], models)
     os.replace(models, folder)
     return [model.num_reg_images() for model in ordered]
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 
 from wheretolook.mapping import building
 from wheretolook.mapping.building import DATABASE_FILE, REPORT_FILE, Clock
-from wheretolook.mapping.colmap_model import describe_intrinsics, registered_names
+from wheretolook.mapping.colmap_model import describe_intrinsics, registered_names, write_model
 from wheretolook.mapping.config import MapConfig
 from wheretolook.mapping.frame import KnownScale, find_scale
 from wheretolook.mapping.gravity import estimate_gravity
@@ -22,6 +21,7 @@ from wheretolook.mapping.photographs import photograph_cameras
 from wheretolook.mapping.scale import MapScale, Similarity
 from wheretolook.mapping.triangulation import color_points
 from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.files import copy_file, write_text
 from wheretolook.utils.processes import Processes
 
 
@@ -101,11 +101,11 @@ def map_photographs(
             fix = "Raise map.photographs.max_reprojection_error_px, or take sharper photographs."
             n_removed = building.remove_inaccurate(model, settings.max_reprojection_error_px, out_dir, fix)
             color_points(model, features.colors)
-            model.write_binary(str(partial))
+            write_model(model, partial)
         with clock("landmarks"):
             landmarks = building.save_landmarks(partial, mapped.database, settings.max_reprojection_error_px)
         if config.keep_database:
-            shutil.copyfile(mapped.database, partial / DATABASE_FILE)
+            copy_file(mapped.database, partial / DATABASE_FILE)
         off_deg = gravity.residual_deg
         upright_by = {"median_deg": float(np.median(off_deg)), "max_deg": float(off_deg.max())}
         registered = set(names.values())
@@ -127,5 +127,5 @@ def map_photographs(
             config=asdict(config),
             seconds={**clock.seconds, "total": sum(clock.seconds.values())},
         )
-        (partial / REPORT_FILE).write_text(json.dumps(asdict(report), indent=2, default=str) + "\n")
+        write_text(partial / REPORT_FILE, json.dumps(asdict(report), indent=2, default=str) + "\n")
     return report

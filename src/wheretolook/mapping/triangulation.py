@@ -15,7 +15,7 @@ from tqdm.auto import tqdm
 from wheretolook.features.keypoints import Keypoints, quantize_descriptors
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import camera_centers, transform
-from wheretolook.utils.colmap import quiet_colmap
+from wheretolook.utils.colmap import quiet_colmap, storing_in_database
 from wheretolook.utils.processes import Processes
 
 if TYPE_CHECKING:
@@ -80,16 +80,16 @@ def triangulate_model(
     folder = database.parent
     seed %= 2**31  # COLMAP keeps it in an int
     pycolmap.set_random_seed(seed)
-    with clock("database"):
+    with storing_in_database(database), clock("database"):
         for index, (pixels, _) in enumerate(stored):
             points = [pycolmap.Point2D(p) for p in pixels.astype(np.float64)]
             model.images[index + 1].points2D = pycolmap.Point2DList(points)
         fill_database(database, model, stored)
-    with clock("match"), pycolmap.Database.open(str(database)) as db:
+    with storing_in_database(database), clock("match"), pycolmap.Database.open(str(database)) as db:
         matches = match_pairs(stored, pairs, folder, processes, progress)
         for (i, j), matched in zip(pairs.tolist(), matches, strict=True):
             db.write_matches(i + 1, j + 1, matched)
-    with clock("verify"):
+    with storing_in_database(database), clock("verify"):
         verification = pycolmap.TwoViewGeometryOptions()
         verification.ransac.max_error = config.max_epipolar_error_px
         verification.ransac.random_seed = seed

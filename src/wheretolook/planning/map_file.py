@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.utils.errors import MapFormatError
-from wheretolook.utils.files import sha256, write_json, write_text
+from wheretolook.utils.files import moved_later, sha256, storing, write_json, write_text
 from wheretolook.utils.locks import hold
+from wheretolook.utils.npz_files import save_npy
 from wheretolook.utils.reading import read_json
 
 FORMAT, VERSION = "wheretolook viewpoint map", 1
@@ -112,11 +113,13 @@ def write_map(
         for left in folder.parent.glob(f".{glob.escape(folder.name)}.????????"):
             if [path.name for path in left.glob("*")] in ([], [_NEW]):  # of a process that was killed while it wrote
                 shutil.rmtree(left, ignore_errors=True)
-        work = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+        with storing(folder):
+            work = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
         new, old = work / _NEW, work / _OLD
         try:
-            new.mkdir()
-            _write(new, grid, origin, arrays)
+            with moved_later(new, folder), storing(folder):
+                new.mkdir()
+                _write(new, grid, origin, arrays)
             if folder.exists():
                 folder.rename(old)
             new.rename(folder)
@@ -145,7 +148,7 @@ def _refuse_something_else(folder: Path) -> None:
 def _write(folder: Path, grid: VoxelGrid, origin: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> None:
     checksums = {}
     for name, (kind, _, _) in ARRAYS.items():
-        np.save(folder / f"{name}.npy", np.ascontiguousarray(arrays[name], dtype=kind))
+        save_npy(folder / f"{name}.npy", np.ascontiguousarray(arrays[name], dtype=kind))
         checksums[f"{name}.npy"] = sha256(folder / f"{name}.npy")
     n_rows, n_directions = arrays["scores"].shape
     files = "\n".join(

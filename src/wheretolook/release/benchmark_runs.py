@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -10,6 +9,7 @@ import pandas as pd
 
 from wheretolook.figures.runtimes import runtime_figure, scaling_figure
 from wheretolook.figures.style import save_figure
+from wheretolook.utils.files import copy_file
 from wheretolook.utils.tracking import Tags, log, start_run
 from wheretolook.utils.tracking_config import TrackingConfig
 
@@ -38,7 +38,7 @@ def log_runtimes(
         if file is None:
             sizes.to_csv(Path(folder) / RUNTIMES_CSV, index=False)
         else:
-            shutil.copyfile(file, Path(folder) / RUNTIMES_CSV)
+            copy_file(file, Path(folder) / RUNTIMES_CSV)
         save_figure(runtime_figure(sizes), Path(folder) / "runtimes.png")
         if len(growth):
             growth.to_csv(Path(folder) / SCALING_CSV, index=False)

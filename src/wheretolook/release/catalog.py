@@ -6,7 +6,6 @@ that makes that run, and a function from `Source` to a figure, or to texts by th
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -55,8 +54,9 @@ from wheretolook.release.showcase_figures import (
 from wheretolook.utils.errors import ConfigError, MissingRunError, WhereToLookError
 from wheretolook.utils.files import write_text
 from wheretolook.utils.markdown import markdown_table
-from wheretolook.utils.tracking import artifact, finished_runs
+from wheretolook.utils.tracking import artifact, client, finished_runs
 from wheretolook.utils.tracking_config import TrackingConfig
+from wheretolook.utils.tracking_store import kept_if_not_logged
 
 if TYPE_CHECKING:
     from mlflow.entities import Run
@@ -320,11 +320,10 @@ def write_items(
             continue
         ids = [run.info.run_id for run in source.runs]
         files = _write(item.name, content, f"runs: {', '.join(ids)} ({item.stage})" if ids else "", out, config.kinds)
-        for run_id in ids:
-            folder = artifact(tracking, run_id, "figures")
-            folder.mkdir(parents=True, exist_ok=True)
-            for file in files:
-                shutil.copy(file, folder)
+        with kept_if_not_logged(f"{item.name} in {out}"):
+            for run_id in ids:
+                for file in files:
+                    client(tracking).log_artifact(run_id, str(file), "figures")
         say(f"{item.name}: -> {', '.join(str(file) for file in files)}")
     return missing
 

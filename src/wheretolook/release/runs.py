@@ -6,9 +6,7 @@ Here they are logged as the stages log them, once: a run with the same file as i
 
 from __future__ import annotations
 
-import fcntl
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -33,6 +31,8 @@ from wheretolook.methods.registry import learned
 from wheretolook.planning.path_report import PATHS_CSV, log_paths
 from wheretolook.release.benchmark_runs import RUNTIMES_CSV, SCALING_CSV, log_runtimes
 from wheretolook.release.card import GENERALIZATION_CSV
+from wheretolook.utils.files import write_text
+from wheretolook.utils.locks import hold
 from wheretolook.utils.tracking import NestedRun, artifact, experiment_ids, finished_runs, log, log_nested, start_run
 from wheretolook.utils.tracking import client as client_of
 from wheretolook.utils.tracking_config import TrackingConfig
@@ -43,6 +43,7 @@ from wheretolook.viewpoints.thresholds import ALL
 LEARNERS_CSV = "learners.csv"
 """In a release's `results/`: how all learners do on scenes of validation, test and others, a row for each seed."""
 
+_WAIT_S = 600.0  # for another process that logs a release, in seconds
 TAGS = {"logged_from": "release"}  # of runs that were not computed where they are logged
 
 Say = Callable[[str], None]
@@ -67,18 +68,9 @@ def log_release(dataset: Dataset, tracking: TrackingConfig, say: Say = lambda te
     The store is made if there is none. Runs that a killed call left unfinished are deleted first; calls made at the
     same time wait for each other.
     """
-    with _alone(tracking):
+    with hold(tracking.root / ".release.lock", "log-release", wait_s=_WAIT_S):
         _forget_halves(tracking)
         return _log_missing(dataset, tracking, say)
-
-
-@contextmanager
-def _alone(tracking: TrackingConfig) -> Iterator[None]:
-    """While another process logs a release into the store, wait."""
-    tracking.root.mkdir(parents=True, exist_ok=True)
-    with open(tracking.root / ".release.lock", "w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        yield
 
 
 def _forget_halves(tracking: TrackingConfig) -> None:
@@ -203,7 +195,7 @@ def _log_training(
         if history is not None:
             history = history.drop(columns="method").dropna(axis=1, how="all")
             log_history(tracking, run, history)
-            mlflow.log_text(run, history.to_csv(index=False), HISTORY_CSV)
+            write_text(artifact(tracking, run, HISTORY_CSV), history.to_csv(index=False))
     return run
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,7 @@ from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 from wheretolook.methods.set.network import SetNetwork
 from wheretolook.methods.set.score import MOST
 from wheretolook.utils.errors import CameraError, ConfigError
-from wheretolook.utils.files import sha256, write_json
+from wheretolook.utils.files import copy_file, sha256, write_bytes, write_json
 from wheretolook.utils.npz_files import save_npz
 from wheretolook.utils.version import VERSION
 
@@ -88,10 +87,9 @@ def export_robot(
         "range": known.record(),
         "serves_camera": bool(known.contains(camera_quantities(camera)[None])[0]),
     }
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "scorer.onnx").write_bytes(content)
+    write_bytes(out / "scorer.onnx", content)
     save_npz(out / "landmarks.npz", arrays)
-    shutil.copyfile(Path(__file__).with_name("wheretolook_robot.py"), out / "wheretolook_robot.py")
+    copy_file(Path(__file__).with_name("wheretolook_robot.py"), out / "wheretolook_robot.py")
     write_json(out / "robot.json", about)
     return out
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import os
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -20,6 +19,7 @@ from PIL import Image
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.scenes.glb_checks import check_glb, check_image
 from wheretolook.utils.errors import ConfigError, SceneError
+from wheretolook.utils.files import write_bytes
 
 # Rotations that turn the named axis of a file into the world's z axis.
 _Z_UP_FROM = {
@@ -97,13 +97,7 @@ def save_glb(mesh: TexturedMesh, path: str | PathLike[str], jpeg_quality: int = 
         faces = np.flatnonzero(mesh.triangle_texture == index)
         if len(faces):
             scene.add_geometry(_geometry(mesh, faces, _EncodedJpeg(texture, jpeg_quality)), node_name=f"part_{index}")
-    target = Path(path)
-    partial = target.with_name(f"{target.name}.partial")
-    try:
-        partial.write_bytes(trimesh.exchange.gltf.export_glb(scene, tree_postprocessor=_mark_unlit))
-        os.replace(partial, target)
-    finally:
-        partial.unlink(missing_ok=True)
+    write_bytes(Path(path), trimesh.exchange.gltf.export_glb(scene, tree_postprocessor=_mark_unlit))
 
 
 def _mesh_file(path: Path) -> Path:

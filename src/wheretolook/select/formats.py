@@ -66,23 +66,20 @@ def save_views(views: SelectedViews, path: Path, format: str | None = None) -> N
     Raises a ConfigError as `check_format`, a StorageError if the file cannot be written.
     """
     found = check_format(path, format, int(views.rank.max(initial=1)))
-    try:
-        if found == "csv":
-            write_text(path, _csv(views))
-        elif found == "json":
-            write_json(path, _json(views))
-        elif found == "tum":
-            write_text(path, _tum(views))
-        elif found == "benchmark":
-            write_text(path, _benchmark(views))
-        elif path.suffix:
-            write_text(path, _images(views))
-        else:
-            write_text(path / "cameras.txt", _cameras(views))
-            write_text(path / "images.txt", _images(views))
-            write_text(path / "points3D.txt", "# no points: poses of selected views\n")
-    except OSError as error:
-        raise StorageError(f"cannot write the views: {error.strerror}", path=path, fix="Name another file.") from error
+    if found == "csv":
+        write_text(path, _csv(views))
+    elif found == "json":
+        write_json(path, _json(views))
+    elif found == "tum":
+        write_text(path, _tum(views))
+    elif found == "benchmark":
+        write_text(path, _benchmark(views))
+    elif path.suffix:
+        write_text(path, _images(views))
+    else:
+        write_text(path / "cameras.txt", _cameras(views))
+        write_text(path / "images.txt", _images(views))
+        write_text(path / "points3D.txt", "# no points: poses of selected views\n")
 
 
 _MARK = "# Views selected by wheretolook"

@@ -18,9 +18,10 @@ from wheretolook.planning.config import FORWARD, PathsConfig
 from wheretolook.stages.inputs import Say, Tick, dataset_after, extractor_of, open_scene
 from wheretolook.stages.one_at_a_time import reading
 from wheretolook.utils.errors import ConfigError, SceneError
-from wheretolook.utils.files import fingerprint, write_json, write_text
+from wheretolook.utils.files import fingerprint, replacing, write_json, write_text
 from wheretolook.utils.reading import read_json, read_json_object
 from wheretolook.utils.tracking_config import TrackingConfig
+from wheretolook.utils.tracking_store import check_store, kept_if_not_logged
 from wheretolook.viewpoints.table import SCHEMA, UNLABELLED
 
 if TYPE_CHECKING:
@@ -39,12 +40,14 @@ def compare_paths(experiment: Experiment, say: Say = print, tick: Tick = lambda 
     Raises:
         ConfigError: no such scene or method, or no weights. WeightsError: the weights cannot be used.
         SceneError: a scene has no mesh, or too little room for starts and goals.
+        TrackingError: the tracking store cannot be used.
     """
     from wheretolook.planning.scene_map import check_methods
 
     with reading(experiment.root, "compare-paths", FOLDER):
         dataset, config = dataset_after(experiment, "map"), experiment.paths
         check_methods(config.methods)
+        check_store(experiment.tracking)
         scenes = [open_scene(experiment, dataset, files) for files in _chosen(dataset, config)]
         planned = {scene.name: _plan(scene, dataset, config, say) for scene in scenes}
         labelled = _localize(scenes, planned, dataset, experiment)
@@ -67,7 +70,6 @@ def _chosen(dataset: Dataset, config: PathsConfig) -> list[SceneFolder]:
 
 def _plan(scene: Scene, dataset: Dataset, config: PathsConfig, say: Say) -> ComparedPaths:
     """The paths of a scene: those that are there if they were planned with the same settings."""
-    from wheretolook.labelling.labeller import storing
     from wheretolook.planning.path_comparison import ComparedPaths, draw_pairs, plan_pairs
     from wheretolook.planning.scene_map import planner_map, planner_scorer, weights_for
 
@@ -88,11 +90,10 @@ def _plan(scene: Scene, dataset: Dataset, config: PathsConfig, say: Say) -> Comp
     maps = {name: planner_map(scene, config, planner_scorer(scene, dataset, name, weights[name])) for name in mapped}
     found = plan_pairs(draw_pairs(scene.space, config), scene.space, maps, config, f"plan {scene.name}")
     made.unlink(missing_ok=True)
-    with storing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, path in tables.items():
-            getattr(found, name).to_parquet(path, index=False)
-        write_json(made, key)
+    for name, path in tables.items():
+        with replacing(path) as partial:
+            getattr(found, name).to_parquet(partial, index=False)
+    write_json(made, key)
     failed, total = int((~found.paths["planned"]).sum()), len(found.paths)
     say(f"{scene.name}: {total - failed} of {total} paths found, {len(found.views):,} views -> {folder}")
     return found
@@ -142,19 +143,19 @@ def _report(
     """Count what localizes, write and log it."""
     from wheretolook.figures.paths import paths_figure
     from wheretolook.figures.style import save_figure
-    from wheretolook.labelling.labeller import storing
     from wheretolook.planning import path_report as report
 
     summary = report.summarize_paths(paths, views, config)
     folder, markdown = dataset.root / "results", report.path_markdown(summary, config)
-    with storing(folder / report.PATHS_CSV):
-        summary.to_csv(folder / report.PATHS_CSV, index=False, float_format="%.6g", lineterminator="\n")
-        write_text(folder / report.PATHS_MD, markdown)
-        views.to_parquet(folder / FOLDER / "views.parquet", index=False)
+    write_text(folder / report.PATHS_CSV, summary.to_csv(index=False, float_format="%.6g", lineterminator="\n"))
+    write_text(folder / report.PATHS_MD, markdown)
+    with replacing(folder / FOLDER / "views.parquet") as partial:
+        views.to_parquet(partial, index=False)
     save_figure(paths_figure(summary), folder / report.PATHS_PNG)
     params = {"dataset": dataset.name, "pairs": config.pairs, "seed": config.seed, "time_s": config.planner.time_s}
     params |= {"score_weight": config.planner.score_weight, "max_turn_deg": config.max_turn_deg}
-    report.log_paths(params, summary, folder, tracking)
+    with kept_if_not_logged(f"the comparison in {folder}"):
+        report.log_paths(params, summary, folder, tracking)
     say(markdown)
     say(f"-> {folder / report.PATHS_CSV}, {report.PATHS_MD}, {report.PATHS_PNG}; every view in {folder / FOLDER}")
     return summary

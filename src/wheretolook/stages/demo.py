@@ -22,12 +22,14 @@ from wheretolook.evaluation.results import SCORES_CSV, SCORES_MD, SCORES_PNG, re
 from wheretolook.evaluation.scores import read_scores
 from wheretolook.geometry.poses import camera_centers, poses_looking_along
 from wheretolook.methods.registry import best_weights, load_scorer, methods_named, scorers
+from wheretolook.stages.evaluate import not_logged
 from wheretolook.stages.inputs import Say, Tick, dataset_after, open_scene
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import fingerprint, write_json
 from wheretolook.utils.reading import read_json
 from wheretolook.utils.shipped import WEIGHTS, shipped
 from wheretolook.utils.tracking import ui_command
+from wheretolook.utils.tracking_store import check_store
 from wheretolook.utils.version import VERSION
 
 SECONDS = {"scenes": 5.0, "map": 15.0, "sample": 1.0, "label": 75.0, "train": 25.0, "evaluate": 6.0}
@@ -54,6 +56,7 @@ def run_demo(experiment: Experiment) -> None:
             fix = "Name weights in evaluate.weights, or leave methods that have learnt out of evaluate.methods."
             raise ConfigError("no scene to learn from, and no weights to evaluate", fix=fix)
     print(f"Data go to {experiment.root.resolve()}, runs to {experiment.tracking.root}.")
+    check_store(experiment.tracking)
     start = time.monotonic()
     layout = "{desc}: {percentage:3.0f}%|{bar}| {elapsed} elapsed, about {remaining} remain"
     with tqdm(total=sum(cost.values()), desc="demo", bar_format=layout, smoothing=0) as bar:
@@ -87,6 +90,7 @@ def compare(experiment: Experiment, say: Say, tick: Tick) -> None:
 
     try:
         known = read_json(stamp) == made() and (tracking.root / "mlflow.db").is_file()
+        known = known and not not_logged(dataset).exists()
     except (OSError, ValueError):
         known = False
     if not known:

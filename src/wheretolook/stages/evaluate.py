@@ -15,6 +15,7 @@ from wheretolook.stages.inputs import Say, Tick, dataset_after
 from wheretolook.stages.one_at_a_time import reading, reads_dataset
 from wheretolook.utils.files import write_text
 from wheretolook.utils.tracking_config import TrackingConfig
+from wheretolook.utils.tracking_store import check_store, kept_if_not_logged
 from wheretolook.visibility.config import OcclusionConfig
 
 if TYPE_CHECKING:
@@ -63,6 +64,8 @@ def evaluate_methods(
         MapError: a scene has no landmarks.
         ConfigError: the reference is none of the methods.
         InUseError: the dataset is being changed, or evaluated on the same split.
+        TrackingError: the tracking store cannot be used. If it fails later, the results are kept, and a TrackingWarning
+            says that they are not logged.
     """
     from wheretolook.evaluation.report import score_markdown
     from wheretolook.evaluation.results import log_evaluation, results_folder
@@ -71,12 +74,19 @@ def evaluate_methods(
     title = f"Localization score on {dataset.name}" + (f", {config.split} scenes" if config.split != "test" else "")
     folder = results_folder(dataset, config)
     with reading(dataset.root, "evaluate", folder.name):
+        check_store(tracking)
         found = compare_methods(dataset, config, models, progress, device, occlusion)
         write_results(folder, found.table, found.calibration, title)
-        log_evaluation(dataset, found, config, tracking, occlusion, folder)
+        with kept_if_not_logged(f"the evaluation in {folder}", not_logged(dataset)):
+            log_evaluation(dataset, found, config, tracking, occlusion, folder)
     if progress and show:
         print(score_markdown(found.table, title))
     return found.table
+
+
+def not_logged(dataset: Dataset) -> Path:
+    """A file that lies in a dataset's folder while its last evaluation is not logged."""
+    return dataset.root / "evaluation_not_logged.json"
 
 
 def write_results(folder: Path, table: pd.DataFrame, calibration: pd.DataFrame, title: str) -> None:

@@ -19,8 +19,10 @@ from wheretolook.stages.inputs import Say, Tick, dataset_after, existing, extrac
 from wheretolook.stages.one_at_a_time import changes_dataset
 from wheretolook.utils.errors import MapError, SceneError, TableError
 from wheretolook.utils.files import write_json, write_text
+from wheretolook.utils.reading import read_json_object
 from wheretolook.utils.tracking import log, start_run
 from wheretolook.utils.tracking_config import TrackingConfig
+from wheretolook.utils.tracking_store import check_store, kept_if_not_logged
 from wheretolook.viewpoints.table import is_good, write_table
 from wheretolook.viewpoints.thresholds import ALL
 
@@ -51,14 +53,12 @@ def label(experiment: Experiment, say: Say = print, tick: Tick = lambda work: No
             tick(1)
         else:
             to_label.append((files, key))
-    seconds = _label(experiment, dataset, to_label, say, tick) if to_label else {}
     summary = dataset.root / "results" / LABELS_MD
-    if not summary.is_file():
-        try:
-            log_labels(dataset, experiment.tracking, seconds)
-        except BaseException:
-            summary.unlink(missing_ok=True)
-            raise
+    if to_label or not summary.is_file() or _not_logged(dataset).is_file():
+        check_store(experiment.tracking)
+    seconds = _label(experiment, dataset, to_label, say, tick) if to_label else {}
+    if not summary.is_file() or _not_logged(dataset).is_file():
+        log_labels(dataset, experiment.tracking, seconds)
     if to_label:
         times = ", ".join(f"{step} {spent:.1f}" for step, spent in seconds.items())
         say(f"seconds: {times} (workers' time in each step, added up; then the clock's)")
@@ -69,7 +69,7 @@ def _label(
     experiment: Experiment, dataset: Dataset, to_label: list[tuple[SceneFolder, str]], say: Say, tick: Tick
 ) -> dict[str, float]:
     """Label scenes and stamp them with their keys. Returns the seconds that each step took."""
-    from wheretolook.labelling.labeller import LabelTask, label_scenes, storing
+    from wheretolook.labelling.labeller import LabelTask, label_scenes
     from wheretolook.labelling.shard import SceneJob
 
     config, keys = experiment.label, {files.name: (files, key) for files, key in to_label}
@@ -90,10 +90,9 @@ def _label(
                 (dataset.root / "results" / LABELS_MD).unlink(missing_ok=True)
                 for other, _ in to_label:
                     forget_stamp(other, "label")
-            with storing(files.table):
-                write_table(labelled.table, files.table)
-                write_json(files.label_manifest, labelled.manifest)
-                write_stamp(files, "label", key)
+            write_table(labelled.table, files.table)
+            write_json(files.label_manifest, labelled.manifest)
+            write_stamp(files, "label", key)
             shutil.rmtree(labelled.task.shards, ignore_errors=True)
             for step, spent in labelled.seconds.items():
                 seconds[step] = seconds.get(step, 0.0) + spent
@@ -118,7 +117,8 @@ def log_labels(
 
     The run is of stage "label"; its metrics are the numbers of `LabelSummary.shares` over all scenes and, with the
     split's name in front, over each split, and the seconds that each step took, `seconds_<name>`. Raises TableError if
-    there is no scene, a scene has no viewpoints, or one of them has no label.
+    there is no scene, a scene has no viewpoints, or one of them has no label. If the run cannot be logged, the files
+    are kept with the seconds, and a TrackingWarning says that logging is left to a later call.
     """
     from wheretolook.figures.labels import label_figure
     from wheretolook.figures.style import save_figure
@@ -127,21 +127,37 @@ def log_labels(
         raise TableError("the dataset has no scene", path=dataset.root, fix="Run the scenes stage.")
     tables = {scene.name: _labelled_table(scene) for scene in dataset.scenes}
     summary = label_summary(tables, {scene.name: scene.split for scene in dataset.scenes})
-    folder = dataset.root / "results"
+    folder, note = dataset.root / "results", _not_logged(dataset)
+    if not seconds and note.is_file():
+        seconds = _seconds_of(note)
+    write_json(note, seconds or {})  # before the files, which are taken as logged without it
     write_text(folder / LABELS_CSV, summary.shares.to_csv(index=False))
-    write_text(folder / LABELS_MD, label_markdown(summary, f"Labels of {dataset.name}"))
     save_figure(label_figure(summary), folder / LABELS_PNG)
+    write_text(folder / LABELS_MD, label_markdown(summary, f"Labels of {dataset.name}"))
 
     params = {"dataset": dataset.name, "dataset_fingerprint": dataset.fingerprint(), "scenes": " ".join(tables)}
     metrics = {f"seconds_{name}": value for name, value in (seconds or {}).items()}
     for row in summary.shares[summary.shares["scene"] == ALL].to_dict("records"):
         prefix = "" if row["split"] == ALL else f"{row['split']}_"
         metrics |= {f"{prefix}{name}": value for name, value in row.items() if name not in ("scene", "split")}
-    with start_run(tracking, "all scenes", "label", params, tags={"dataset": dataset.name}) as (client, run):
+    opened = start_run(tracking, "all scenes", "label", params, tags={"dataset": dataset.name})
+    with kept_if_not_logged(f"the summary of labels in {folder}", note, seconds or {}), opened as (client, run):
         log(client, run, metrics=metrics)
         for name in (LABELS_CSV, LABELS_MD, LABELS_PNG):
             client.log_artifact(run, str(folder / name))
     return summary
+
+
+def _not_logged(dataset: Dataset) -> Path:
+    """A file that lies in a dataset's folder while its labels are not logged: the seconds that each step took."""
+    return dataset.root / "labels_not_logged.json"
+
+
+def _seconds_of(note: Path) -> dict[str, float]:
+    try:
+        return {name: float(value) for name, value in read_json_object(note).items()}
+    except (OSError, ValueError, TypeError):
+        return {}  # damaged: only how long it took is lost
 
 
 def _labelled_table(scene: SceneFolder) -> pd.DataFrame:

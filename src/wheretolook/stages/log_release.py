@@ -12,6 +12,7 @@ from wheretolook.stages.inputs import Say
 from wheretolook.stages.one_at_a_time import reads_dataset
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.tracking import ui_command
+from wheretolook.utils.tracking_store import check_store
 
 _TABLES = ("table_vs_others", "table_input_variants")
 QUICK = ("top_n", *_TABLES, "training", "calibration", "scores", "regret", "paths", "runtimes")
@@ -32,6 +33,7 @@ def log_release(experiment: Experiment, say: Say = print, attach: bool = True) -
     if not is_release(dataset):
         fix = "Its runs are logged by the stages themselves; a release is made by `wheretolook release`."
         raise ConfigError("this dataset is no release", path=experiment.root, fix=fix)
+    check_store(experiment.tracking)
     runs = log_runs(dataset, experiment.tracking, say)
     if runs.new and attach:
         say("attaching figures and tables")

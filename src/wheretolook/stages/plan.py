@@ -19,6 +19,7 @@ from wheretolook.utils.files import write_text
 from wheretolook.utils.locks import hold
 from wheretolook.utils.tracking import log, start_run
 from wheretolook.utils.tracking_layout import joined
+from wheretolook.utils.tracking_store import check_store, kept_if_not_logged
 from wheretolook.viewpoints.table import pose_columns
 
 if TYPE_CHECKING:
@@ -35,6 +36,7 @@ def plan(experiment: Experiment, say: Say = print, tick: Tick = lambda work: Non
         ConfigError: no such scene or method, no start or goal, no weights, or Rerun is asked for and not installed.
         PlanningError: the start or the goal is not free, or no path was found. WeightsError: weights cannot be used.
         SceneError, MapError: the scene has no free place, or no map with a scale.
+        TrackingError: the tracking store cannot be used.
     """
     from wheretolook.figures.path_film import score_text
     from wheretolook.planning.method_paths import path_views, plan_by_methods
@@ -45,6 +47,7 @@ def plan(experiment: Experiment, say: Say = print, tick: Tick = lambda work: Non
         fix = "Give plan.start and plan.goal, such as --plan.start '[1, 1, 1.4]'."
         raise ConfigError("a path needs a start and a goal", value=(config.start, config.goal), fix=fix)
     rerun = _rerun() if config.rerun else None
+    check_store(experiment.tracking)
     scene = open_scene(experiment, dataset, files)
     methods = (*(name for name in config.against if name != config.method), config.method)
     paths = plan_by_methods(scene, dataset, methods, config.start, config.goal, config)
@@ -60,7 +63,8 @@ def plan(experiment: Experiment, say: Say = print, tick: Tick = lambda work: Non
             _record(rerun, views[method], scene.landmarks.points, scene.camera, folder / "path.rrd")
             written.append("path.rrd")
         written.insert(0, "path.csv")
-        _log(experiment, dataset, scene.name, list(paths), path, [folder / name for name in written])
+        with kept_if_not_logged(f"the path in {folder}"):
+            _log(experiment, dataset, scene.name, list(paths), path, [folder / name for name in written])
     score = "" if np.isnan(path.scores).any() else f", mean score {score_text(float(np.mean(path.scores)))}"
     found = f"{path.length_m:.2f} m, {path.turn_deg:.0f} degrees of turning, {len(path.positions)} views{score}"
     say(f"{scene.name}: {found} -> {folder}: {', '.join(written)}")
@@ -78,7 +82,6 @@ def _draw(views: dict[str, list[PathView]], landmarks: np.ndarray, title: str, f
     from wheretolook.figures.path_film import film_frames, methods_figure, save_film, still_figure
     from wheretolook.figures.style import save_figure
 
-    folder.mkdir(parents=True, exist_ok=True)
     written, seen = ["path.png"], list(views.values())[-1]
     save_figure(still_figure(seen, landmarks, title), folder / "path.png")
     if len(views) > 1:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -13,6 +12,8 @@ from wheretolook.dataset.stamps import read_stamp, write_stamp
 from wheretolook.stages.evaluate import evaluate
 from wheretolook.stages.inputs import Say, Tick, dataset_after
 from wheretolook.stages.one_at_a_time import changing, reading, reads_dataset
+from wheretolook.utils.files import copy_file
+from wheretolook.utils.tracking_store import check_store
 
 
 @reads_dataset("release")
@@ -53,13 +54,14 @@ def _finish(experiment: Experiment, dataset: Dataset, say: Say, tick: Tick) -> D
     from wheretolook.release import copy as releases
     from wheretolook.release.card import write_card
 
+    check_store(experiment.tracking)
     # on the CPU, so that machines without a GPU get the same scores
     on_cpu = replace(experiment, device="cpu", evaluate=replace(experiment.evaluate, weights=()))
     results = dataset.root / "results"
     if releases.choose_weights_to_ship(dataset).shelved:  # all that were trained, before only the best are left
         methods = tuple(method.name for method in releases.trained_weights(dataset).values())
         evaluate(replace(on_cpu, evaluate=replace(on_cpu.evaluate, methods=methods, reference="")), say)
-        shutil.copyfile(results / SCORES_CSV, results / VARIANTS_CSV)
+        copy_file(results / SCORES_CSV, results / VARIANTS_CSV)
     choice = releases.ship_weights(dataset)
     compared = ", ".join(f"{name} {value:.4f}" for name, value in choice.precision.items())
     say(f"validation average precision: {compared}")

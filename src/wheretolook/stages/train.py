@@ -16,9 +16,11 @@ from wheretolook.methods.train_config import TrainConfig
 from wheretolook.stages.inputs import Say, Tick, dataset_after
 from wheretolook.stages.one_at_a_time import reading, reads_dataset
 from wheretolook.utils.confine import entry_of
-from wheretolook.utils.files import sha256, write_json
+from wheretolook.utils.errors import TrackingError
+from wheretolook.utils.files import sha256, write_json, write_text
 from wheretolook.utils.tracking import log, start_run
 from wheretolook.utils.tracking_config import TrackingConfig
+from wheretolook.utils.tracking_store import check_store, kept_if_not_logged, warn_not_logged
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -59,6 +61,8 @@ def train_methods(
         MapError: a scene has no landmarks.
         ConfigError: there are fewer GPUs than asked for, cameras of datasets differ, or the views do not fit into
             memory shared by processes. InUseError: a dataset is being changed, or the same is being trained.
+        TrackingError: the tracking store cannot be used. If it fails later, weights and records are kept, a
+            TrackingWarning says that the training is not logged, and the next call logs it.
     """
     from wheretolook.learning.provenance import about_training, trained_before, weights_path
     from wheretolook.learning.scenes import with_also
@@ -73,35 +77,72 @@ def train_methods(
             with reading(dataset.root, "train", f"{method.name}-weights"):
                 about = about_training(dataset, method.name, config, config.options_of(method))
                 known = None if force else trained_before(weights_path(dataset, method.name), about)
-                models.append(known or _train(method, dataset, config, about, tracking, shared))
+                if known is None or not known.run_id:
+                    check_store(tracking)
+                if known is None:
+                    models.append(_train(method, dataset, config, about, tracking, shared))
+                else:
+                    models.append(known if known.run_id else _log_later(known, tracking))
     return models
 
 
 def _train(
     method: Method, dataset: Dataset, config: TrainConfig, about: Values, tracking: TrackingConfig, shared: Values
 ) -> TrainedModel:
-    """Train a method, log it, and write its weights; `shared` are further fields of its `Task`."""
+    """Train a method, write its weights and record, and log it; `shared` are further fields of its `Task`."""
     from lightning.pytorch import seed_everything
     from lightning.pytorch.utilities.seed import isolate_rng
 
     from wheretolook.learning.fit import RunLog
     from wheretolook.learning.learner import Task
     from wheretolook.learning.provenance import TrainedModel, weights_path
-    from wheretolook.learning.runs import kept_metrics, params_of
+    from wheretolook.learning.runs import NOT_LOGGED, kept_metrics, params_of
 
     assert method.learn is not None
     path, title = weights_path(dataset, method.name), f"train {method.name}"  # the title is that of its progress bar
-    params = {**params_of(about), "devices": config.devices}
-    with start_run(tracking, method.name, "train", params) as (client, run_id), isolate_rng():
-        seed_everything(config.seed, verbose=False)
-        options, run_log = config.options_of(method), RunLog(tracking, run_id)
-        learnt = method.learn(Task(dataset, method.name, config, options, title, run_log=run_log, **shared))
-        learnt.model.save(path, about)
-        log(client, run_id, params=learnt.counts, metrics=kept_metrics(learnt.metrics))
-        _log_artifacts(client, run_id, path, learnt.history, method.name)
-        content = {"about": about, "weights_sha256": sha256(path), "run_id": run_id, "metrics": learnt.metrics}
-        write_json(path.with_suffix(".json"), content)
-    return TrainedModel(method.name, path, run_id, learnt.metrics)
+    devices = {"devices": config.devices}
+    record: Values = {}
+    try:
+        with start_run(tracking, method.name, "train", params_of(about) | devices) as (client, run_id), isolate_rng():
+            seed_everything(config.seed, verbose=False)
+            options, run_log = config.options_of(method), RunLog(tracking, run_id)
+            learnt = method.learn(Task(dataset, method.name, config, options, title, run_log=run_log, **shared))
+            learnt.model.save(path, about)
+            history = "" if learnt.history is None else learnt.history.to_csv(index=False)
+            kept = {NOT_LOGGED: {"params": devices | learnt.counts, "history": history}}
+            record = {"about": about, "weights_sha256": sha256(path), "run_id": "", "metrics": learnt.metrics}
+            write_json(path.with_suffix(".json"), record | kept)
+            log(client, run_id, params=learnt.counts, metrics=kept_metrics(learnt.metrics))
+            _log_artifacts(client, run_id, path, learnt.history, method.name)
+            if run_log.failed is not None:
+                raise run_log.failed
+        write_json(path.with_suffix(".json"), record | {"run_id": run_id})
+    except TrackingError as error:
+        if not record:  # nothing is lost yet but the time
+            raise
+        warn_not_logged(f"the training of {method.name}, {path}", error)
+        run_id = ""
+    return TrainedModel(method.name, path, run_id, record["metrics"])
+
+
+def _log_later(model: TrainedModel, tracking: TrackingConfig) -> TrainedModel:
+    """Log a training whose weights and record lie on disk, from the record, as training itself does."""
+    from wheretolook.learning.runs import NOT_LOGGED, history_not_logged, kept_metrics, log_history, params_of
+    from wheretolook.learning.weights import read_record
+
+    record = read_record(model.path)
+    kept = record.pop(NOT_LOGGED, {})
+    params = params_of(record["about"]) | (kept.get("params", {}) if isinstance(kept, dict) else {})
+    history = history_not_logged({NOT_LOGGED: kept})
+    with kept_if_not_logged(f"the training of {model.method}, {model.path}"):
+        with start_run(tracking, model.method, "train", params) as (client, run_id):
+            log(client, run_id, metrics=kept_metrics(model.metrics))
+            if history is not None:
+                log_history(tracking, run_id, history)
+            _log_artifacts(client, run_id, model.path, history, model.method)
+        write_json(model.path.with_suffix(".json"), record | {"run_id": run_id})
+        return replace(model, run_id=run_id)
+    return model
 
 
 def _log_artifacts(client: MlflowClient, run_id: str, weights: Path, history: pd.DataFrame | None, method: str) -> None:
@@ -113,6 +154,8 @@ def _log_artifacts(client: MlflowClient, run_id: str, weights: Path, history: pd
     if history is None:
         return
     with TemporaryDirectory() as folder:
-        history.to_csv(Path(folder) / HISTORY_CSV, index=False)
-        save_figure(training_figure({method: history}), Path(folder) / "curves.png")
-        client.log_artifacts(run_id, folder)
+        table, curves = Path(folder) / HISTORY_CSV, Path(folder) / "curves.png"
+        write_text(table, history.to_csv(index=False))
+        save_figure(training_figure({method: history}), curves)
+        for file in (table, curves):
+            client.log_artifact(run_id, str(file))

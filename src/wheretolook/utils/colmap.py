@@ -1,10 +1,15 @@
-"""Quieter logs of COLMAP."""
+"""Quieter logs of COLMAP, and errors of its databases that name them."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Literal
+
+from wheretolook.utils.errors import StorageError
+from wheretolook.utils.files import MAKE_ROOM
 
 
 @contextmanager
@@ -18,3 +23,16 @@ def quiet_colmap(least: Literal["WARNING", "ERROR"] = "WARNING") -> Iterator[Non
         yield
     finally:
         pycolmap.logging.minloglevel = level
+
+
+@contextmanager
+def storing_in_database(database: Path) -> Iterator[None]:
+    """Turn what COLMAP says of a database that it cannot make or write to into a StorageError that names it."""
+    try:
+        yield
+    except RuntimeError as error:
+        found = re.search(r"SQLite error: (.*)|No registered database factory succeeded", str(error))
+        if not found:
+            raise
+        reason = found[1] or "SQLite cannot make it"
+        raise StorageError(f"cannot be written: {reason}", path=database, fix=MAKE_ROOM) from error

@@ -52,6 +52,10 @@ class InUseError(WhereToLookError):
     """Another run holds the lock on a dataset or a store."""
 
 
+class TrackingError(StorageError):
+    """The MLflow store cannot be used, or something cannot be logged to it."""
+
+
 class WeightsError(WhereToLookError):
     """Trained weights are missing or do not fit the network or the inputs asked for."""
 
@@ -78,6 +82,10 @@ class MapWarning(UserWarning):
 
 class LockWarning(UserWarning):
     """A file system has no locks, so that nothing keeps two runs apart."""
+
+
+class TrackingWarning(UserWarning):
+    """Results lie on disk, but are not logged."""
 
 
 class PoseError(WhereToLookError, ValueError):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import IO, Any
@@ -11,6 +10,7 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
+from wheretolook.utils.files import replacing
 from wheretolook.utils.reading import check_file
 
 MAX_RATIO = 100
@@ -21,12 +21,23 @@ FREE_BYTES = 128_000_000
 
 
 def save_npz(path: Path, arrays: Mapping[str, NDArray[Any]], compress: bool = False) -> None:
-    """Write arrays by name, atomically; the folder is there already. The same arrays give the same bytes."""
-    partial = path.with_name(path.name + ".partial")
+    """Write arrays by name, atomically. The same arrays give the same bytes."""
     write: Any = np.savez_compressed if compress else np.savez
-    with partial.open("wb") as file:
+    with replacing(path) as partial, partial.open("wb") as file:
         write(file, **arrays)
-    os.replace(partial, path)
+
+
+def save_npy(path: Path, array: NDArray[Any]) -> None:
+    """Write an array, atomically."""
+    with replacing(path) as partial, partial.open("wb") as file:
+        npy.write_array(_Plain(file), array, allow_pickle=False)
+
+
+class _Plain:
+    """A file to which NumPy writes as to any other object: of an error, `ndarray.tofile` does not tell the cause."""
+
+    def __init__(self, file: IO[bytes]) -> None:
+        self.write = file.write
 
 
 def load_npz(path: Path) -> dict[str, NDArray[Any]]:

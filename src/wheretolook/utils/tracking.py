@@ -1,6 +1,7 @@
 """Where runs are logged: an MLflow store of one SQLite file and one folder of artifacts, both in one place.
 
-`wheretolook.utils.tracking_layout` says which experiment a run goes to and how it is named.
+`wheretolook.utils.tracking_layout` says which experiment a run goes to and how it is named, and
+`wheretolook.utils.tracking_store` makes and opens the store.
 
 MLflow keeps absolute paths of artifacts. A store that was moved stays readable here, since a run's artifacts lie in a
 folder named by its id; MLflow's UI shows those of earlier runs only at the old place.
@@ -10,9 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-import logging
 import math
-import os
 import shlex
 import subprocess
 import sys
@@ -25,9 +24,10 @@ from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from wheretolook.utils.errors import MissingRunError
+from wheretolook.utils.errors import MissingRunError, TrackingError
 from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.utils.tracking_layout import experiment_name, note_of, run_name
+from wheretolook.utils.tracking_store import opened_client
 from wheretolook.utils.version import VERSION
 
 if TYPE_CHECKING:
@@ -52,10 +52,8 @@ PAGE = 50  # runs searched at a time
 
 
 def client(tracking: TrackingConfig) -> MlflowClient:
-    """A client of the store, which is made if there is none."""
-    tracking.root.mkdir(parents=True, exist_ok=True)
-    mlflow_client: MlflowClient = _mlflow().MlflowClient(tracking_uri=tracking.uri)
-    return mlflow_client
+    """A client of the store, which is made if there is none. What fails in it raises a TrackingError."""
+    return opened_client(tracking)
 
 
 def experiments(mlflow_client: MlflowClient, tracking: TrackingConfig) -> list[Experiment]:
@@ -116,15 +114,13 @@ def start_run(
 @contextmanager
 def _open_run(mlflow_client: MlflowClient, experiment: str, name: str, tags: Mapping[str, str]) -> Iterator[str]:
     run_id = str(mlflow_client.create_run(experiment, tags=dict(tags), run_name=name).info.run_id)
-    status = "FAILED"
     try:
         yield run_id
-        status = "FINISHED"
-    except KeyboardInterrupt:
-        status = "KILLED"
+    except BaseException as error:
+        with suppress(TrackingError):  # the error that ends the run says more
+            mlflow_client.set_terminated(run_id, status="KILLED" if isinstance(error, KeyboardInterrupt) else "FAILED")
         raise
-    finally:
-        mlflow_client.set_terminated(run_id, status=status)
+    mlflow_client.set_terminated(run_id, status="FINISHED")
 
 
 def log(mlflow_client: MlflowClient, run_id: str, params: Values = None, metrics: Values = None, step: int = 0) -> None:
@@ -179,7 +175,7 @@ def finished_runs(
     tracking: TrackingConfig, stage: str, tags: Tags = None, params: Tags = None, file: str = ""
 ) -> Iterator[Run]:
     """All finished top-level runs of a stage, the newest first; see `newest_run`."""
-    if not (tracking.root / "mlflow.db").is_file():
+    if not (tracking.root / "mlflow.db").exists():
         return
     mlflow_client = client(tracking)
     searched = experiment_ids(mlflow_client, tracking)
@@ -261,15 +257,3 @@ def code_version() -> dict[str, str]:
             changed = git("status", "--porcelain", "--untracked-files=no").strip()
             version["git_commit"] = commit + ("+" if changed else "")
     return version
-
-
-@cache
-def _mlflow() -> Any:
-    """MLflow, imported when first needed, without its notes on database migrations and without telemetry."""
-    os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
-    os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")
-    import mlflow
-
-    for name in ("mlflow", "alembic"):
-        logging.getLogger(name).setLevel(logging.WARNING)
-    return mlflow

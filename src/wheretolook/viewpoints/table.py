@@ -6,7 +6,6 @@ matched can be stored too, see `MATCH_FIELDS`.
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from wheretolook.geometry.poses import Float, camera_centers, quaternion_from_rotation, rotation_from_quaternion
 from wheretolook.utils.errors import TableError
+from wheretolook.utils.files import replacing
 
 POSE_COLUMNS = ("qw", "qx", "qy", "qz", "tx", "ty", "tz")
 CENTER_COLUMNS = ("x_m", "y_m", "z_m")
@@ -119,8 +119,6 @@ def write_table(table: pd.DataFrame, path: Path, compact: bool = False) -> None:
     Columns are those of `SCHEMA`, and of `CAMERA_FIELD` and `MATCH_FIELDS` if they are there. A compact table has
     `COMPACT_SCHEMA`, about 18 bytes a row; read back, its poses agree to 1e-12 and all else exactly.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
     schema, options = (COMPACT_SCHEMA, _COMPACT_FORMAT) if compact else (SCHEMA, {})
     if compact:
         table = table.assign(**dict(zip(CENTER_COLUMNS, _shared_centers(table).T, strict=True)))
@@ -130,12 +128,8 @@ def write_table(table: pd.DataFrame, path: Path, compact: bool = False) -> None:
     )
     content = pa.Table.from_pandas(table, schema=schema, preserve_index=False)
     content = content.replace_schema_metadata(None)  # it describes the data frame, not the rows
-    try:
+    with replacing(path) as partial:
         pq.write_table(content, partial, compression="zstd", write_page_checksum=True, **options)
-    except OSError:
-        partial.unlink(missing_ok=True)
-        raise
-    os.replace(partial, path)
 
 
 def _shared_centers(table: pd.DataFrame) -> Float:

@@ -1,0 +1,148 @@
+"""Results of stages whose logging fails: they are kept, a warning says so, and the stage run again logs them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from tests.learning_options import train_config
+from tests.synthetic_dataset import make_dataset
+
+from wheretolook.dataset.folders import Dataset
+from wheretolook.evaluation.config import EvaluateConfig
+from wheretolook.learning.fit import EpochRecord
+from wheretolook.learning.runs import keep_histories, train_runs
+from wheretolook.stages.evaluate import evaluate_methods, not_logged
+from wheretolook.stages.label import log_labels
+from wheretolook.stages.train import train_methods
+from wheretolook.utils.errors import StorageError, TrackingError, TrackingWarning
+from wheretolook.utils.files import sha256
+from wheretolook.utils.tracking import artifact, client, finished_runs
+from wheretolook.utils.tracking_config import TrackingConfig
+
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
+SMALL = train_config("mlp-2d", epochs=3, hidden=(8,), accelerator="cpu")
+
+
+@pytest.fixture
+def dataset(tmp_path: Path) -> Dataset:
+    return make_dataset(tmp_path / "tiny", ("train", "val", "test"), n_locations=6, n_directions=8)
+
+
+@pytest.fixture
+def tracking(tmp_path: Path) -> TrackingConfig:
+    return TrackingConfig(str(tmp_path / "mlruns"))
+
+
+def break_store(tracking: TrackingConfig) -> None:
+    """Nothing can be stored with runs from now on."""
+    folder = Path(tracking.artifacts)
+    if folder.is_dir():
+        folder.rename(folder.with_name("kept"))
+    folder.write_text("no folder")
+
+
+def mend_store(tracking: TrackingConfig) -> None:
+    folder = Path(tracking.artifacts)
+    folder.unlink()
+    folder.with_name("kept").rename(folder)
+
+
+def breaking(monkeypatch: pytest.MonkeyPatch, where: type, name: str, tracking: TrackingConfig) -> None:
+    """The store breaks when a method is called."""
+    original: Callable[..., object] = getattr(where, name)
+
+    def call(*arguments: object) -> object:
+        break_store(tracking)
+        return original(*arguments)
+
+    monkeypatch.setattr(where, name, call)
+
+
+def test_a_training_that_cannot_be_logged_is_kept_and_logged_later(
+    dataset: Dataset, tracking: TrackingConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        breaking(patch, EpochRecord, "on_train_end", tracking)
+        with pytest.warns(TrackingWarning, match=r"the training of mlp-2d.*kept, but not logged.*again"):
+            (model,) = train_methods(dataset, SMALL, tracking, progress=False)
+    assert model.run_id == "" and not model.reused
+    digest, record = sha256(model.path), json.loads(model.path.with_suffix(".json").read_text())
+    assert record["weights_sha256"] == digest and record["metrics"] == model.metrics
+    assert not list(finished_runs(tracking, "train"))
+    with pytest.raises(TrackingError, match="artifacts"):
+        train_methods(dataset, SMALL, tracking, progress=False)
+    mend_store(tracking)
+    (history,) = (rows for _, rows in keep_histories(dataset, tracking).groupby("method"))
+    assert len(history) == 3
+
+    (again,) = train_methods(dataset, SMALL, tracking, progress=False)
+    assert again.reused and again.run_id and sha256(model.path) == digest
+    ((method, run),) = train_runs(tracking, "tiny")
+    assert method == "mlp-2d" and run.info.run_id == again.run_id
+    assert artifact(tracking, again.run_id, model.path.name).read_bytes() == model.path.read_bytes()
+    logged = client(tracking).get_metric_history(again.run_id, "val_bce")
+    table = pd.read_csv(artifact(tracking, again.run_id, "history.csv"))
+    assert [metric.step for metric in logged] == [0, 1, 2]
+    assert [metric.value for metric in logged] == pytest.approx(list(table["val_bce"]), rel=1e-12)
+    assert {*json.loads(model.path.with_suffix(".json").read_text())} == {
+        "about",
+        "weights_sha256",
+        "run_id",
+        "metrics",
+    }
+
+    # as if nothing had failed
+    (straight,) = train_methods(dataset, SMALL, tracking, progress=False, force=True)
+    first, second = (client(tracking).get_run(one.run_id).data for one in (again, straight))
+    assert first.params == second.params and first.metrics == pytest.approx(second.metrics)
+    (last,) = train_methods(dataset, SMALL, tracking, progress=False)
+    assert last.run_id == straight.run_id and len(list(finished_runs(tracking, "train"))) == 2
+
+
+def test_weights_that_cannot_be_written_are_no_matter_of_the_store(dataset: Dataset, tracking: TrackingConfig) -> None:
+    (dataset.root / "weights").write_text("no folder")
+    with pytest.raises(StorageError, match="weights") as raised:
+        train_methods(dataset, SMALL, tracking, progress=False)
+    assert not isinstance(raised.value, TrackingError)
+
+
+def test_an_evaluation_that_cannot_be_logged_is_kept_and_logged_later(
+    dataset: Dataset, tracking: TrackingConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from wheretolook.evaluation import run
+
+    config = EvaluateConfig(("random", "visible"), resamples=50, top_n=(1,))
+    compare = run.compare_methods
+    with monkeypatch.context() as patch:
+        patch.setattr(run, "compare_methods", lambda *given: (break_store(tracking), compare(*given))[1])
+        with pytest.warns(TrackingWarning, match=r"the evaluation in .*kept, but not logged"):
+            table = evaluate_methods(dataset, config, tracking, progress=False)
+    scores = (dataset.root / "results" / "scores.csv").read_bytes()
+    assert len(table) and not_logged(dataset).is_file()
+    mend_store(tracking)
+    evaluate_methods(dataset, config, tracking, progress=False)
+    (logged,) = finished_runs(tracking, "evaluate")
+    assert artifact(tracking, logged.info.run_id, "scores.csv").read_bytes() == scores
+    assert not not_logged(dataset).exists()
+
+
+def test_labels_that_cannot_be_logged_are_summarized_and_logged_later(
+    dataset: Dataset, tracking: TrackingConfig
+) -> None:
+    tracking.root.mkdir()
+    (tracking.root / "kept").mkdir()
+    (tracking.root / "artifacts").write_text("")
+    with pytest.warns(TrackingWarning, match=r"the summary of labels in .*kept, but not logged"):
+        log_labels(dataset, tracking, {"render": 1.5})
+    assert (dataset.root / "results" / "labels.md").is_file()
+    note = dataset.root / "labels_not_logged.json"
+    assert json.loads(note.read_text()) == {"render": 1.5}
+    mend_store(tracking)
+    log_labels(dataset, tracking)
+    (run,) = finished_runs(tracking, "label")
+    assert run.data.metrics["seconds_render"] == 1.5 and not note.exists()

@@ -24,11 +24,7 @@ def corridor_poses() -> Float:
 
 
 def write_corridor(
-    folder: Path,
-    noise_px: float = 0.2,
-    photographs: int = N,
-    scale: float = 1.0,
-    rotation: Float = np.eye(3),
+    folder: Path, noise_px: float = 0.2, photographs: int = N, scale: float = 1.0, rotation: Float = np.eye(3)
 ) -> tuple[Path, Path]:
     """Write the model and its database of keypoints and descriptors; their paths.
 

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 
-from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.check.source import PhotographedMap
+from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.labelling.config import LocalizerConfig
 from wheretolook.utils.errors import MapError
 
@@ -42,9 +42,9 @@ def choose_blocks(source: PhotographedMap, views: int = VIEWS) -> list[Block]:
     wall is a neighbour, and a photograph of the next room is not. A block grows by the photograph that has most of its
     landmarks in common with it. The first 8 (fewer of few moments) have sizes in geometric progression, the largest 4
     times the smallest. The others grow from four places until a quarter of the photographs in them observe no more than
-    `KEPT` landmarks that the rest still has; so they hold views of all kinds, well covered ones at their edges and badly
-    covered ones within. At least a tenth of the photographs is never left out. What a rig took at one moment stays
-    together. No random numbers: the same map gives the same blocks.
+    `KEPT` landmarks that the rest still has; so they hold views of all kinds, well covered ones at their edges and
+    badly covered ones within. No block takes more than nine tenths of the photographs. What a rig took at one moment
+    stays together. No random numbers: the same map gives the same blocks.
 
     Raises MapError if fewer than two blocks leave a map.
     """
@@ -68,7 +68,9 @@ def choose_blocks(source: PhotographedMap, views: int = VIEWS) -> list[Block]:
         if left_out.tobytes() in known or _landmarks_without(sees, group) < LEAST_LANDMARKS:
             continue
         known.add(left_out.tobytes())
-        looked_at = left_out[np.unique(np.linspace(0, len(left_out) - 1, min(views, len(left_out))).round().astype(int))]
+        looked_at = left_out[
+            np.unique(np.linspace(0, len(left_out) - 1, min(views, len(left_out))).round().astype(int))
+        ]
         blocks.append(Block(len(blocks) + 1, left_out, looked_at, is_part))
     if len(blocks) < 2:
         problem = f"without a block of neighbouring photographs fewer than {LEAST_LANDMARKS} landmarks are left"

@@ -78,12 +78,8 @@ def run(arguments: Sequence[str]) -> int:
     """Run the command. Returns the exit code 0; raises a WhereToLookError for bad input."""
     options, start = parser().parse_args(arguments), time.monotonic()
     _refuse(options)
-    from tqdm.auto import tqdm
-
-    from wheretolook.check.blocks import choose_blocks
-    from wheretolook.check.leave_out import leave_out
-    from wheretolook.check.report import make_report
-    from wheretolook.check.scores import Scoring, score_views
+    from wheretolook.check.checking import check_map
+    from wheretolook.check.scores import Scoring
     from wheretolook.figures.check import check_figure
     from wheretolook.figures.style import save_figure
     from wheretolook.utils.devices import usable_device
@@ -92,15 +88,7 @@ def run(arguments: Sequence[str]) -> int:
     scoring = Scoring(options.method, options.weights, tuple(options.also))
     _ = scoring.chosen  # refused now if there is none, not after the work
     source, occlusion, out = _open(options, device, workers)
-    blocks = choose_blocks(source, options.views)
-    total = sum(len(block.looked_at) for block in blocks)
-    left_out = []
-    with tqdm(total=total, desc="check: leave out, localize", unit="view") as bar:
-        for one in leave_out(source, blocks, out / "work", workers, device):
-            left_out.append(one)
-            bar.update(len(one.views))
-    method, views = score_views(source, left_out, scoring, occlusion, device)
-    report = make_report(source, left_out, method, views, scoring.also)
+    report = check_map(source, out / "work", scoring, occlusion, options.views, workers, device)
     report.save(out)
     save_figure(check_figure(report), out / "check.png")
     print("\n".join(report.lines()))

@@ -152,7 +152,7 @@ def _run(job: _Job) -> int:
     rest = without(whole, image_ids[block.left_out].tolist())
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MapWarning)
-        landmarks = load_colmap_landmarks(job.model, job.features, device=job.device, reconstruction=rest)
+        landmarks = load_colmap_landmarks(job.model, job.features, None, job.device, rest, progress=False)
     localizer = Localizer(landmarks, job.cameras[0], device=job.device)
     rows, matched, inliers, kept = [], list[NDArray[np.int64]](), list[NDArray[np.int64]](), list[NDArray[np.int64]]()
     stored = read_features(job.features, job.names)
@@ -166,7 +166,12 @@ def _run(job: _Job) -> int:
         observed = np.unique([point.point3D_id for point in image.points2D if point.has_point3D()]).astype(np.int64)
         at = np.searchsorted(landmarks.ids, observed)
         at = at[landmarks.ids[np.minimum(at, len(landmarks) - 1)] == observed]
-        row = {"row": int(block.looked_at[place]), "image": job.names[place], "status": found.status, "good": bool(good)}
+        row = {
+            "row": int(block.looked_at[place]),
+            "image": job.names[place],
+            "status": found.status,
+            "good": bool(good),
+        }
         row |= {"error_m": error_m, "error_deg": error_deg, "limit_m": float(job.limits[place])}
         row |= {"n_matches": found.n_matches, "n_inliers": len(found.inlier_rows), "n_observed": len(observed)}
         rows.append({**row, "n_kept": len(at), "n_landmarks": len(landmarks)})

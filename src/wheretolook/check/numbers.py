@@ -70,8 +70,8 @@ class BlockResamples:
         return self.measured(_divided(self.times @ self.sums(top), self.times @ self.sums(bottom)))
 
     def auc(self, good: NDArray[np.bool_], score: Float, within: bool = False) -> Float:
-        """Area under the ROC curve (1 + R,): of all pairs of a view that is good and one that is not, the share in which
-        the good one has the higher score; equal scores count half. `within` takes pairs of the same block only."""
+        """Area under the ROC curve (1 + R,): of all pairs of a view that is good and one that is not, the share in
+        which the good one has the higher score; equal scores count half. `within` takes pairs of one block only."""
         k = len(self.numbers)
         wins, pairs = np.zeros((k, k)), np.zeros((k, k))
         good_of = [score[good & (self.row == block)] for block in range(k)]

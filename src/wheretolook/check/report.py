@@ -45,7 +45,12 @@ class CheckReport:
         for part in parts:
             part.pop("rows")
         record = {"map": self.source.name, "model": str(self.source.path), "method": self.method}
-        record |= {"in_metres": self.source.is_metric, "turned_upright": self.source.is_turned, "limits": self.limits(), "says": self.sentence()}
+        record |= {
+            "in_metres": self.source.is_metric,
+            "turned_upright": self.source.is_turned,
+            "limits": self.limits(),
+            "says": self.sentence(),
+        }
         record |= {"n_photographs": len(self.source.poses), **self.numbers, "weak_parts": parts}
         write_json(folder / "check.json", record)
 
@@ -108,7 +113,7 @@ class CheckReport:
             )
         if numbers["share_in_range"] < 1:
             found.append(
-                f"{100 * (1 - numbers['share_in_range']):.0f} % of the views are unlike those the weights have learnt from"
+                f"{100 * (1 - numbers['share_in_range']):.0f} % of the views are unlike those that were learnt from"
             )
         if source.is_turned:
             found.append(
@@ -176,7 +181,11 @@ def _blocks(source: PhotographedMap, left_out: Sequence[LeftOut], views: pd.Data
         of_block = views[views["block"] == one.block.number]
         center = np.median(source.own_centers[one.block.left_out], axis=0)
         row: dict[str, Any] = {"block": one.block.number, "kind": "part" if one.block.is_part else "grown"}
-        row |= {"left_out": len(one.block.left_out), "looked_at": len(of_block), "localized": int(of_block["good"].sum())}
+        row |= {
+            "left_out": len(one.block.left_out),
+            "looked_at": len(of_block),
+            "localized": int(of_block["good"].sum()),
+        }
         row |= {"share_localized": float(of_block["good"].mean()), "mean_score": float(of_block["score"].mean())}
         row |= {"landmarks": len(one.landmarks), "median_kept": float(of_block["n_kept"].median())}
         row |= {"median_inliers": float(of_block["n_inliers"].median())}
@@ -190,7 +199,9 @@ def _blocks(source: PhotographedMap, left_out: Sequence[LeftOut], views: pd.Data
 def _times(auc: dict[str, float | None]) -> str:
     if auc["value"] is None:
         return "an unknown number of times"
-    interval = "" if auc["low"] is None or auc["high"] is None else f" [{100 * auc['low']:.0f}, {100 * auc['high']:.0f}]"
+    interval = (
+        "" if auc["low"] is None or auc["high"] is None else f" [{100 * auc['low']:.0f}, {100 * auc['high']:.0f}]"
+    )
     return f"{100 * auc['value']:.0f} times in 100{interval}"
 
 

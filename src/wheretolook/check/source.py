@@ -41,8 +41,8 @@ LEAST_OBSERVED = 10  # landmarks that the median photograph observes; fewer are 
 class PhotographedMap:
     """A map, and what its photographs show of it. Photographs are rows, in the order of their ids in the model.
 
-    The model is turned upright if its cameras seem not to be, and where metres are not known scaled to a median depth of
-    `DEPTH_M`: `from_model` has done so; `own_centers` stay in the model's frame and unit.
+    The model is turned upright if its cameras seem not to be, and where metres are not known scaled to a median depth
+    of `DEPTH_M`: `from_model` has done so; `own_centers` stay in the model's frame and unit.
     """
 
     name: str  # what results call it
@@ -88,14 +88,19 @@ def open_map(
 ) -> PhotographedMap:
     """A map to check, from a COLMAP model and the features that it was built from.
 
-    `metric` says whether the model is in metres; `keep_frame` that it has z up, whatever it looks like. Raises MapError if the model or the features cannot be used
-    or do not belong together, the features are not SIFT, or the model has fewer than `LEAST_PHOTOGRAPHS` photographs.
+    `metric` says whether the model is in metres; `keep_frame` that it has z up, whatever it looks like. A
+    `reconstruction` is the model if it has been read already; it is turned and scaled in place.
+
+    Raises MapError if the model or the features cannot be used or do not belong together, the features are not SIFT, or
+    the model has fewer than `LEAST_PHOTOGRAPHS` photographs.
     """
     model = reconstruction or read_model(model_dir)
     n_posed = sum(image.has_pose for image in model.images.values())
     if n_posed < LEAST_PHOTOGRAPHS:
         fix = "Take more photographs of the place, and map them all."
-        raise MapError(f"a check needs at least {LEAST_PHOTOGRAPHS} photographs", path=model_dir, value=n_posed, fix=fix)
+        raise MapError(
+            f"a check needs at least {LEAST_PHOTOGRAPHS} photographs", path=model_dir, value=n_posed, fix=fix
+        )
     if model.num_points3D() == 0:
         fix = "Triangulate it, or give the folder of its photographs: --images."
         raise MapError("the model has no points", path=model_dir, fix=fix)
@@ -120,7 +125,10 @@ def open_map(
     known = cameras_by_id(model.cameras, model_dir)
     images = [model.images[int(number)] for number in arrays.image_ids]
     parts = [fingerprint(path) for path in sorted(model_dir.glob("*.bin")) + sorted(model_dir.glob("*.txt"))]
-    parts += [f"{features.resolve()} {features.stat().st_size} {features.stat().st_mtime_ns}", str((metric, keep_frame))]
+    parts += [
+        f"{features.resolve()} {features.stat().st_size} {features.stat().st_mtime_ns}",
+        str((metric, keep_frame)),
+    ]
     return PhotographedMap(
         name=name or ExistingModelConfig(model=model_dir).scene_name,
         path=model_dir,
@@ -203,7 +211,9 @@ def extract_anew(model_dir: Path, images: Path, work: Path, workers: int, device
     n_posed = sum(image.has_pose for image in model.images.values())
     if n_posed < LEAST_PHOTOGRAPHS:
         fix = "Take more photographs of the place, and map them all."
-        raise MapError(f"a check needs at least {LEAST_PHOTOGRAPHS} photographs", path=model_dir, value=n_posed, fix=fix)
+        raise MapError(
+            f"a check needs at least {LEAST_PHOTOGRAPHS} photographs", path=model_dir, value=n_posed, fix=fix
+        )
     note.unlink(missing_ok=True)
     shutil.rmtree(out, ignore_errors=True)
     config = MapConfig(

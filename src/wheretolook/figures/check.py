@@ -130,7 +130,10 @@ def _draw_blocks(axes: Axes, report: CheckReport) -> None:
     axes.set_xticks(at, [f"{row.left_out}" for row in blocks.itertuples()])
     axes.set(ylim=(0, 1.02), ylabel="share of the views")
     first = int((blocks["kind"] == "part").sum())
-    axes.set_xlabel(f"photographs left out ({first} blocks that share out all, {len(blocks) - first} that are grown)\nin the bars: landmarks that the rest still has of a photograph")
+    axes.set_xlabel(
+        f"photographs left out ({first} blocks that share out all, {len(blocks) - first} that are grown)\n"
+        "in the bars: landmarks that the rest still has of what a photograph shows"
+    )
     if 0 < first < len(blocks):
         axes.axvline(first - 0.5, color=INK, linewidth=0.8, linestyle=":")
     for place, row in enumerate(blocks.itertuples()):

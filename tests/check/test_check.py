@@ -14,15 +14,18 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
+from box_scenes import furnished_room
 from check.corridor import ALONE, N, corridor_poses, write_corridor
 from wheretolook.check.blocks import KEPT, LEAST_REST, choose_blocks, landmarks_kept, observation_matrix
 from wheretolook.check.command import run
 from wheretolook.check.leave_out import without
 from wheretolook.check.source import open_map
 from wheretolook.cli import main
-from wheretolook.geometry.poses import camera_centers
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.poses import camera_centers, poses_looking_along
 from wheretolook.mapping.colmap_model import model_arrays, read_model
 from wheretolook.mapping.descriptors import read_features
+from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.utils.errors import ConfigError, MapError, WeightsError
 
 
@@ -283,3 +286,32 @@ def test_features_are_read_by_names(corridor: tuple[Path, Path]) -> None:
 def test_a_scene_that_is_not_there_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["check", "--scene", "hall", "--data", str(tmp_path)]) == 2
     assert "there is no such scene" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_photographs_without_features_are_extracted_anew(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A room rendered from 24 places, of which nothing is known but the poses."""
+    angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    outward = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(24)])
+    poses = poses_looking_along((3.0, 2.5, 1.4) - 0.9 * outward, outward)
+    camera = PinholeCamera(320, 240, 200.0)
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(pycolmap.Camera(camera_id=1, **camera.colmap.record()))
+    (tmp_path / "photos").mkdir()
+    for row, (pose, rgb) in enumerate(
+        zip(poses, WarpRenderer(furnished_room()).render(camera, poses).rgb, strict=True)
+    ):
+        cv2.imwrite(str(tmp_path / "photos" / f"{row:02}.png"), rgb[..., ::-1])
+        image = pycolmap.Image(name=f"{row:02}.png", camera_id=1, image_id=row + 1)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
+    (tmp_path / "sparse").mkdir()
+    model.write_binary(str(tmp_path / "sparse"))
+    arguments = ["--map", str(tmp_path / "sparse"), "--images", str(tmp_path / "photos"), "--metres", "--workers", "1"]
+    run([*arguments, "--out", str(tmp_path / "out"), "--views", "8"])
+    assert "of two views" in capsys.readouterr().out
+    table = pd.read_csv(tmp_path / "out" / "check.csv")
+    assert table["localized"].sum() >= 12 and table["n_observed"].median() > 50
+    database = tmp_path / "out" / "work" / "map" / "database.db"
+    made = database.stat().st_mtime_ns
+    run([*arguments, "--out", str(tmp_path / "out"), "--views", "8"])
+    assert database.stat().st_mtime_ns == made

@@ -21,6 +21,7 @@ block: from plenty for a pose to hardly enough, since not all are found again.""
 COVERED_WORSE = 0.25
 LEAST_REST = 0.1  # share of the photographs that is never left out
 LEAST_LANDMARKS = 50  # that a map without a block has; with fewer it is none
+SAME = 0.8  # of two blocks together, photographs in both: from there on they are one, and the later is not taken
 VIEWS = 60  # photographs of a block that are localized, at most; then evenly spread ones
 _GOLDEN = 0.6180339887
 
@@ -43,8 +44,8 @@ def choose_blocks(source: PhotographedMap, views: int = VIEWS) -> list[Block]:
     landmarks in common with it. The first 8 (fewer of few moments) have sizes in geometric progression, the largest 4
     times the smallest. The others grow from four places until a quarter of the photographs in them observe no more than
     `KEPT` landmarks that the rest still has; so they hold views of all kinds, well covered ones at their edges and
-    badly covered ones within. No block takes more than nine tenths of the photographs. What a rig took at one moment
-    stays together. No random numbers: the same map gives the same blocks.
+    badly covered ones within. No block takes more than nine tenths of the photographs, and blocks that are mostly the
+    same are taken once. What a rig took at one moment stays together. The same map gives the same blocks.
 
     Raises MapError if fewer than two blocks leave a map.
     """
@@ -62,12 +63,11 @@ def choose_blocks(source: PhotographedMap, views: int = VIEWS) -> list[Block]:
     for number, kept in enumerate(KEPT, 1):
         order = _grow(share, places, int(walk[int(number * _GOLDEN % 1 * len(walk))]), np.ones(len(share), dtype=bool))
         groups.append((order[: _enough(sees, order, kept)], False))
-    blocks, known = [], set[bytes]()
+    blocks = list[Block]()
     for group, is_part in groups:
         left_out = np.flatnonzero(np.isin(source.moment, group))
-        if left_out.tobytes() in known or _landmarks_without(sees, group) < LEAST_LANDMARKS:
+        if _landmarks_without(sees, group) < LEAST_LANDMARKS or any(_same(left_out, one.left_out) for one in blocks):
             continue
-        known.add(left_out.tobytes())
         looked_at = left_out[
             np.unique(np.linspace(0, len(left_out) - 1, min(views, len(left_out))).round().astype(int))
         ]
@@ -77,6 +77,10 @@ def choose_blocks(source: PhotographedMap, views: int = VIEWS) -> list[Block]:
         fix = "Take more photographs, each part of the place from several sides, and map them all."
         raise MapError(problem, path=source.path, value=f"{len(source.poses)} photographs", fix=fix)
     return blocks
+
+
+def _same(one: NDArray[np.int64], other: NDArray[np.int64]) -> bool:
+    return len(np.intersect1d(one, other)) >= SAME * len(np.union1d(one, other))
 
 
 def observation_matrix(source: PhotographedMap) -> csr_array:

@@ -81,7 +81,7 @@ def _draw_map(axes: Axes, report: CheckReport) -> None:
     axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin), aspect="equal")
     upright = ", turned upright" if source.is_turned else ""
     axes.set(xlabel=f"x ({source.unit})", ylabel=f"y ({source.unit})")
-    axes.set_title(f"the map from above{upright}; photographs left out with their neighbours are", pad=24)
+    axes.set_title(f"from above{upright}; left out with their neighbours, photographs are", pad=24)
     axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, handletextpad=0.1, borderaxespad=0.2)
 
 

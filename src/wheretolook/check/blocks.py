@@ -21,7 +21,7 @@ block: from plenty for a pose to hardly enough, since not all are found again.""
 COVERED_WORSE = 0.25
 LEAST_REST = 0.1  # share of the photographs that is never left out
 LEAST_LANDMARKS = 50  # that a map without a block has; with fewer it is none
-SAME = 0.8  # of two blocks together, photographs in both: from there on they are one, and the later is not taken
+SAME = 0.9  # of two blocks together, photographs in both: from there on they are one, and the later is not taken
 VIEWS = 60  # photographs of a block that are localized, at most; then evenly spread ones
 _GOLDEN = 0.6180339887
 
@@ -55,8 +55,8 @@ def choose_blocks(source: PhotographedMap, views: int = VIEWS) -> list[Block]:
     np.fill_diagonal(shared, 0)
     share = shared / observed[:, None]  # of a moment's landmarks, those that it has in common with each other
     centers = camera_centers(source.poses)
-    places = np.stack([np.bincount(source.moment, weights=axis) for axis in centers.T], axis=1)
-    places /= np.bincount(source.moment)[:, None]
+    sums = np.stack([np.bincount(source.moment, weights=axis) for axis in centers.T], axis=1).astype(np.float64)
+    places = sums / np.bincount(source.moment)[:, None]
     parts = _share_out(share, places)
     walk = np.concatenate(parts)  # all moments, neighbours next to one another
     groups = [(part, True) for part in parts]

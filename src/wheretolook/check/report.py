@@ -44,7 +44,7 @@ class CheckReport:
         ]
         for part in parts:
             part.pop("rows")
-        record = {"map": self.source.name, "model": str(self.source.path), "method": self.method}
+        record: dict[str, Any] = {"map": self.source.name, "model": str(self.source.path), "method": self.method}
         record |= {
             "in_metres": self.source.is_metric,
             "turned_upright": self.source.is_turned,

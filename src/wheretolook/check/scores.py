@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -87,12 +88,12 @@ def _by_camera(cameras: Sequence[Camera]) -> list[tuple[Camera, NDArray[np.int64
     return [(camera, np.array(found)) for camera, found in rows.items()]
 
 
-def _score(around: LocalizationMap, poses: Float, scoring: Scoring) -> dict:  # type: ignore[type-arg]
+def _score(around: LocalizationMap, poses: Float, scoring: Scoring) -> dict[str, Any]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", OutOfRangeWarning)  # the results tell how many are in range
         scorer = scoring.scorer(around)
         told = scorer.report(poses)
-        found = {"name": scorer.name, "score": told.score * _number(scorer.name, around)}
+        found: dict[str, Any] = {"name": scorer.name, "score": told.score * _number(scorer.name, around)}
         found |= {"expected_inliers": told.expected_inliers, "n_visible": told.n_visible, "in_range": told.in_range}
         found[VISIBLE] = told.n_visible
         for other in scoring.also:

@@ -56,7 +56,7 @@ def _draw_map(axes: Axes, report: CheckReport) -> None:
     low, high = np.minimum(low, centers[:, :2].min(0)), np.maximum(high, centers[:, :2].max(0))
     margin = 0.04 * (high - low).max()
     step = max(1, len(points) // _DOTS)
-    axes.scatter(*points[::step, :2].T, s=1, color="#c4c4c4", linewidths=0, rasterized=True, zorder=1)
+    axes.scatter(points[::step, 0], points[::step, 1], s=1, color="#c4c4c4", linewidths=0, rasterized=True, zorder=1)
     length = 0.035 * float((high - low).max())
     localized = table["localized"].to_numpy(dtype=float, na_value=np.nan)
     kinds = [(np.isnan(localized), _UNTESTED, "not looked at"), (localized == 1, _GOOD, "localized")]
@@ -68,15 +68,15 @@ def _draw_map(axes: Axes, report: CheckReport) -> None:
         axes.quiver(
             *at.T, *along.T, color=color, angles="xy", scale_units="xy", scale=1, width=0.0025, headwidth=3, zorder=3
         )
-        axes.scatter(*at.T, s=14, color=color, label=f"{label} ({mask.sum()})", zorder=4, linewidths=0)
+        axes.scatter(at[:, 0], at[:, 1], s=14, color=color, label=f"{label} ({mask.sum()})", zorder=4, linewidths=0)
     for part in report.parts:
         middle = np.median(centers[part.rows, :2], axis=0)
         out = np.median(looks[part.rows, :2], axis=0) * -2.2 * length
         style: dict[str, Any] = {"arrowstyle": "-", "color": INK, "linewidth": 0.8}
         box: dict[str, Any] = {"boxstyle": "circle,pad=0.2", "facecolor": "white", "edgecolor": _BAD}
         axes.annotate(
-            str(part.number), middle, middle + out, fontsize=9, ha="center", va="center", arrowprops=style, bbox=box,
-            zorder=5,
+            str(part.number), tuple(middle), tuple(middle + out), fontsize=9, ha="center", va="center", zorder=5,
+            arrowprops=style, bbox=box,
         )  # fmt: skip
     axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin), aspect="equal")
     upright = ", turned upright" if source.is_turned else ""

@@ -21,7 +21,7 @@ block: from plenty for a pose to hardly enough, since not all are found again.""
 COVERED_WORSE = 0.25
 LEAST_REST = 0.1  # share of the photographs that is never left out
 LEAST_LANDMARKS = 50  # that a map without a block has; with fewer it is none
-SAME = 0.9  # of two blocks together, photographs in both: from there on they are one, and the later is not taken
+SAME = 0.95  # of two blocks together, photographs in both: from there on only the one that is grown further is taken
 VIEWS = 60  # photographs of a block that are localized, at most; then evenly spread ones
 _GOLDEN = 0.6180339887
 
@@ -63,11 +63,14 @@ def choose_blocks(source: PhotographedMap, views: int = VIEWS) -> list[Block]:
     for number, kept in enumerate(KEPT, 1):
         order = _grow(share, places, int(walk[int(number * _GOLDEN % 1 * len(walk))]), np.ones(len(share), dtype=bool))
         groups.append((order[: _enough(sees, order, kept)], False))
-    blocks = list[Block]()
-    for group, is_part in groups:
+    taken = list[tuple[NDArray[np.int64], bool]]()
+    for group, is_part in reversed(groups):
         left_out = np.flatnonzero(np.isin(source.moment, group))
-        if _landmarks_without(sees, group) < LEAST_LANDMARKS or any(_same(left_out, one.left_out) for one in blocks):
-            continue
+        leaves_map = _landmarks_without(sees, group) >= LEAST_LANDMARKS
+        if leaves_map and not any(_same(left_out, other) for other, _ in taken):
+            taken.append((left_out, is_part))
+    blocks = list[Block]()
+    for left_out, is_part in reversed(taken):
         looked_at = left_out[
             np.unique(np.linspace(0, len(left_out) - 1, min(views, len(left_out))).round().astype(int))
         ]

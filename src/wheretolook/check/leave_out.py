@@ -157,7 +157,7 @@ def _run(job: _Job) -> int:
     rows, matched, inliers, kept = [], list[NDArray[np.int64]](), list[NDArray[np.int64]](), list[NDArray[np.int64]]()
     stored = read_features(job.features, job.names)
     for place, (pixels, descriptors) in enumerate(stored):
-        keypoints = Keypoints(pixels, descriptors.astype(np.float32) / 512, np.ones(len(pixels), np.float32))
+        keypoints = Keypoints(pixels, (descriptors / 512).astype(np.float32), np.ones(len(pixels), np.float32))
         found = localizer.estimate(keypoints, *localizer.match([keypoints])[0], camera=job.cameras[place])
         pose = np.full((3, 4), np.nan) if found.cam_from_world is None else found.cam_from_world
         error_m, error_deg = (float(error) for error in pose_error(pose, job.poses[place]))

@@ -187,6 +187,7 @@ Without --config it is configs/release.yaml, whose runs are logged first. Tables
 
 OWN = {
     "select": ("wheretolook.select.command", "The best views at places of your own COLMAP model; needs no dataset."),
+    "check": ("wheretolook.check.command", "How well views of your own map are told apart, by its own photographs."),
     "export": ("wheretolook.robot.command", "What a robot needs to score views of your own map, without PyTorch."),
     "benchmark": ("wheretolook.benchmark.command", "The Active Localization Benchmark on its scene folders."),
 }
@@ -207,6 +208,7 @@ of your own map, without a dataset:
 {own}
 
   wheretolook select --map sparse/0 --at waypoints.csv --out views.csv
+  wheretolook check --map sparse/0 --database database.db
   wheretolook export --map sparse/0 --out FOLDER
   wheretolook STAGE --help         the options that matter to a stage, with their defaults
   wheretolook STAGE --help-all     every option it reads

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,8 @@ _SIFT = 128  # numbers in a descriptor
 _SIFT_TYPES = (-1, 0)  # in a database of COLMAP 4: not said, or SIFT
 # An image's keypoints (K, 2) in pixels, and its descriptors (K, 128) uint8; None where it has none that are SIFT.
 _Features = tuple[NDArray[np.float64], NDArray[np.uint8] | None]
+
+Stored = tuple[NDArray[np.float32], NDArray[np.uint8]]  # pixels (K, 2) and descriptors (K, 128) of an image
 
 
 def read_descriptors(
@@ -70,6 +72,26 @@ def read_descriptors(
         text += "is unknown; scores do without it"
         warnings.warn(text, MapWarning, stacklevel=2)
         return None
+    return found
+
+
+def read_features(features: str | Path, names: Sequence[str]) -> list[Stored]:
+    """Keypoints and descriptors of images by their names, from a file of features as `read_descriptors` reads.
+
+    Raises MapError if the file is missing or unreadable, lacks an image, or one of them has no SIFT descriptors.
+    """
+    path, found = Path(features), []
+    if not path.is_file():
+        raise MapError("there is no such database", path=path, fix="Give the database.db the model was built from.")
+    mismatch = "Give the database that the model was built from."
+    with (_hdf5 if path.suffix.lower() in HDF5_SUFFIXES else _database)(path, mismatch) as read:
+        for name in names:
+            keypoints, descriptors = read(name)
+            if descriptors is None and len(keypoints):
+                raise MapError("this image has no SIFT descriptors in the database", path=path, value=name)
+            if descriptors is None:
+                descriptors = np.zeros((0, _SIFT), dtype=np.uint8)
+            found.append((keypoints.astype(np.float32), descriptors))
     return found
 
 

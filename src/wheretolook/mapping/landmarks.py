@@ -126,6 +126,7 @@ def load_colmap_landmarks(
     max_reprojection_error_px: float | None = None,
     device: str = "cpu",
     reconstruction: pycolmap.Reconstruction | None = None,
+    progress: bool = True,
 ) -> Landmarks:
     """Landmarks of a COLMAP model (binary or text) in metres, with their attributes. Its images may have many cameras.
 
@@ -159,7 +160,7 @@ def load_colmap_landmarks(
     observations = None if database is None else read_descriptors(database, model_dir, reconstruction, model)
     if observations is not None:
         descriptors = _mean_descriptors(model, observations)
-        ambiguity = nearest_other_cosine(descriptors, device)
+        ambiguity = nearest_other_cosine(descriptors, device, progress)
     track_length, errors_px = np.diff(model.observation_start).astype(np.int32), model.errors_px.astype(np.float32)
     attributes: Any = {**_viewing_geometry(model), "descriptors": descriptors, "ambiguity": ambiguity}
     return Landmarks(model.point_ids, model.points, track_length, errors_px, **attributes)
@@ -175,7 +176,9 @@ def _tell_left_out(observed: NDArray[np.bool_], n_kept: int, worst_px: float, mo
     warnings.warn(text, MapWarning, stacklevel=3)
 
 
-def nearest_other_cosine(descriptors: NDArray[np.uint8], device: str = "cpu") -> NDArray[np.float32]:
+def nearest_other_cosine(
+    descriptors: NDArray[np.uint8], device: str = "cpu", progress: bool = True
+) -> NDArray[np.float32]:
     """Cosine between each descriptor (N, D) uint8 and the nearest one of another row. Returns (N,), NaN if N is 1.
 
     Sums of products of such integers are exact in float32, so the result does not depend on the machine.
@@ -187,7 +190,7 @@ def nearest_other_cosine(descriptors: NDArray[np.uint8], device: str = "cpu") ->
     best = torch.full((n,), -torch.inf, device=device)
     torch.set_num_threads(1)  # products are small: several threads would mostly wait for one another
     try:
-        tiles = tqdm(range(0, n, _TILE), "landmarks: ambiguity", delay=_SILENT_S, unit="block")
+        tiles = tqdm(range(0, n, _TILE), "landmarks: ambiguity", delay=_SILENT_S, unit="block", disable=not progress)
         for i in tiles:
             for j in range(i, n, _TILE):  # each pair of tiles once: its product serves rows and columns
                 rows, columns = slice(i, min(i + _TILE, n)), slice(j, min(j + _TILE, n))

@@ -1,0 +1,40 @@
+"""The whole check of a map, from its blocks to what is said of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tqdm.auto import tqdm
+
+from wheretolook.check.blocks import VIEWS, choose_blocks
+from wheretolook.check.leave_out import leave_out
+from wheretolook.check.report import CheckReport, make_report
+from wheretolook.check.scores import Scoring, score_views
+from wheretolook.check.source import PhotographedMap
+from wheretolook.visibility.hidden_points import HiddenPointRemoval
+from wheretolook.visibility.occlusion import OcclusionModel
+
+
+def check_map(
+    source: PhotographedMap,
+    work: Path,
+    scoring: Scoring = Scoring(),
+    occlusion: OcclusionModel | None = None,
+    views: int = VIEWS,
+    workers: int = 1,
+    device: str = "cpu",
+) -> CheckReport:
+    """Leave blocks of a map's photographs out, localize them against the rest, score them, and compare.
+
+    Finished blocks are kept in `work`. What hides landmarks is by default told by hidden-point removal; at most so many
+    `views` of a block are localized. Raises MapError if blocks leave no map; WeightsError if weights cannot be used.
+    """
+    blocks = choose_blocks(source, views)
+    left_out = []
+    total = sum(len(block.looked_at) for block in blocks)
+    with tqdm(total=total, desc="check: leave out, localize", unit="view") as bar:
+        for one in leave_out(source, blocks, work, workers, device):
+            left_out.append(one)
+            bar.update(len(one.views))
+    method, scored = score_views(source, left_out, scoring, occlusion or HiddenPointRemoval(), device)
+    return make_report(source, left_out, method, scored, scoring.also)

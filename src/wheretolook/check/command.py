@@ -1,0 +1,149 @@
+"""`wheretolook check`: does the scorer tell good views from bad ones on this map? Its own photographs tell."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from wheretolook.utils.errors import ConfigError, MapError
+from wheretolook.utils.options import CommandParser
+
+if TYPE_CHECKING:
+    from wheretolook.check.source import PhotographedMap
+    from wheretolook.visibility.occlusion import OcclusionModel
+
+ABOUT = """\
+How well the scorer tells good views from bad ones on your own map, measured with the map's own photographs.
+
+Blocks of neighbouring photographs are left out of the map, and localized against what remains. The model's poses are
+the truth, so no mesh and no labels are needed."""
+
+USAGE = "wheretolook check (--map SPARSE [--database FILE | --images FOLDER] | --scene NAME) [options]"
+
+_NOTES = """\
+FEATURES
+  Photographs are localized with the keypoints that the map was made from: a COLMAP database, or hloc's features in HDF5
+  (SIFT). A database.db beside the model is found by itself. With --images instead, SIFT is extracted anew, and the
+  landmarks are triangulated anew at the model's poses.
+
+METRES
+  A photograph counts as localized within 5 cm and 0.4 degrees. Where metres are not known, it is 1 % of the median
+  depth of what the photograph shows instead of 5 cm, and the map is scored as if its median depth were 5 m. A map of
+  this project says whether it is in metres; of another --metres says so. A map whose cameras lie on their side is
+  turned upright first, unless it has a mesh.
+
+RESULTS (--out)
+  check.csv    one row for each photograph, blocks.csv for each block, views.csv for each photograph of each block
+  check.json   all numbers with 95 % intervals over blocks; check.png shows them
+  work         finished blocks: an interrupted check goes on, and other weights are checked quickly
+
+EXAMPLES
+  wheretolook check --map sparse/0 --database database.db
+  wheretolook check --map sparse/0 --images photographs --metres
+  wheretolook check --scene photographs --weights my/weights/set.safetensors"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """The options of the command."""
+    made = CommandParser(prog="wheretolook check", usage=USAGE, description=ABOUT, epilog=_NOTES)
+    add = made.add_argument
+    add("--map", type=Path, metavar="SPARSE", help="folder of a COLMAP model, of any cameras")
+    add("--scene", metavar="NAME", help="instead: a scene of a dataset, as `wheretolook map` made it")
+    add("--database", type=Path, metavar="FILE", help="features: COLMAP's database.db, or hloc's feats-*.h5")
+    add("--images", type=Path, metavar="FOLDER", help="instead: photographs, to extract them anew")
+    add("--metres", action="store_true", help="the map is in metres")
+    add("--out", type=Path, metavar="FOLDER", help="where results go (data/checks/<name>)")
+    add("--data", type=Path, default=Path("data"), metavar="FOLDER", help="folder of the datasets (data)")
+    add("--name", default="", metavar="NAME", help="dataset of --scene, if several have such a scene")
+    score = made.add_argument_group("what is checked")
+    add = score.add_argument
+    add("--weights", type=Path, metavar="FILE", help="weights, or a folder of them (those that ship)")
+    add("--method", default="", metavar="NAME", help="`wheretolook evaluate --list-methods` (that of the weights)")
+    add("--also", nargs="+", default=[], metavar="NAME", help="further methods, by the weights that ship")
+    add("--mesh", type=Path, metavar="FILE", help="a mesh of the scene in the map's frame, in metres, for occlusion")
+    add("--occlusion", metavar="NAME", help="mesh, hidden-points (from the landmarks alone) or none")
+    how = made.add_argument_group("how")
+    add = how.add_argument
+    add("--views", type=int, default=60, metavar="N", help="photographs of a block that are localized, at most (60)")
+    add("--workers", type=int, default=0, metavar="N", help="processes; 0 for one on each core (0)")
+    add("--device", default="auto", metavar="NAME", help="auto, cpu, cuda, cuda:1 (auto)")
+    return made
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run the command. Returns the exit code 0; raises a WhereToLookError for bad input."""
+    options, start = parser().parse_args(arguments), time.monotonic()
+    _refuse(options)
+    from wheretolook.check.checking import check_map
+    from wheretolook.check.scores import Scoring
+    from wheretolook.figures.check import check_figure
+    from wheretolook.figures.style import save_figure
+    from wheretolook.utils.devices import usable_device
+
+    device, workers = usable_device(options.device), options.workers or len(os.sched_getaffinity(0))
+    scoring = Scoring(options.method, options.weights, tuple(options.also))
+    _ = scoring.chosen  # refused now if there is none, not after the work
+    source, occlusion, out = _open(options, device, workers)
+    report = check_map(source, out / "work", scoring, occlusion, options.views, workers, device)
+    report.save(out)
+    save_figure(check_figure(report), out / "check.png")
+    print("\n".join(report.lines()))
+    print(f"done in {time.monotonic() - start:.0f} s: {out}")
+    return 0
+
+
+def _refuse(options: argparse.Namespace) -> None:
+    """Raise ConfigError for options that do not go together, before anything is read."""
+    if (options.map is None) == (options.scene is None):
+        raise ConfigError("what is checked is given by --map or by --scene", fix="Give one of them.")
+    if options.database is not None and options.images is not None:
+        fix = "Leave --images out to use the features that the map was made from, --database to extract them anew."
+        raise ConfigError("features come from a database or from images", value=str(options.images), fix=fix)
+    if options.views < 1 or options.workers < 0:
+        fix = "Give --views of at least 1, --workers of at least 0."
+        raise ConfigError("not such numbers", value=(options.views, options.workers), fix=fix)
+    from wheretolook.methods.registry import check_method
+
+    for name in (*([options.method] if options.method else []), *options.also):
+        check_method(name)
+
+
+def _open(options: argparse.Namespace, device: str, workers: int) -> tuple[PhotographedMap, OcclusionModel, Path]:
+    """The map, what hides its landmarks, and the folder of results."""
+    from wheretolook.check import source
+    from wheretolook.mapping.config import ExistingModelConfig
+    from wheretolook.select.surroundings import surroundings
+
+    mesh, metric, name = options.mesh, options.metres, options.scene
+    if options.scene is not None:
+        scene = source.find_scene(options.data, options.scene, options.name)
+        model = scene.map
+        metric = metric or not scene.is_photographed or source.says_metric(model)
+        if mesh is None and scene.mesh.is_file():
+            mesh = scene.mesh
+    else:
+        model = options.map
+        name = ExistingModelConfig(model=model).scene_name
+        metric = metric or source.says_metric(model)
+    if mesh is not None and not metric:
+        fix = "Say --metres if it is, or leave --mesh out."
+        raise ConfigError("a mesh is of use only for a map in metres", value=str(mesh), fix=fix)
+    hides, _ = surroundings(mesh, None, 1000.0, options.occlusion, model, device)
+    out = options.out or Path("data") / "checks" / name
+    images, features = options.images, options.database
+    if images is None and features is None:
+        features = source.features_beside(model)
+        images = source.photographs_of(model) if features is None else None
+    if features is None and images is None:
+        from wheretolook.mapping.colmap_model import read_model
+
+        read_model(model)  # if there is no model at all, that is said
+        fix = "Give --database, the database.db that it was built from, or --images, the folder of its photographs."
+        raise MapError("neither the features nor the photographs of this map are known", path=model, fix=fix)
+    if features is None:
+        model, features = source.extract_anew(model, images, out / "work", workers, device)
+    return source.open_map(model, features, metric, name, keep_frame=mesh is not None), hides, out

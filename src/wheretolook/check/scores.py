@@ -1,0 +1,107 @@
+"""Scores photographs that were left out, by any methods, on the maps without them."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from tqdm.auto import tqdm
+
+from wheretolook.check.leave_out import LeftOut
+from wheretolook.check.source import PhotographedMap
+from wheretolook.geometry.camera import Camera
+from wheretolook.geometry.poses import Float
+from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.methods.base import Scorer
+from wheretolook.methods.registry import load_scorer, make_scorer
+from wheretolook.select.weights import weights_of
+from wheretolook.utils.errors import OutOfRangeWarning
+from wheretolook.visibility.occlusion import OcclusionModel
+from wheretolook.visibility.remembered import RememberedOcclusion
+
+VISIBLE = "visible"  # the method that all are compared with: its score here is the number of landmarks in view
+_OF_THE_MAP = ("expected-inliers",)  # methods that give a share of the map's landmarks, which here becomes their number
+
+
+@dataclass(frozen=True)
+class Scoring:
+    """The method that is checked, and others beside it."""
+
+    method: str = ""  # "" for that of the weights
+    weights: Path | None = None  # file or folder; None for those that ship
+    also: tuple[str, ...] = ()
+
+    @property
+    def chosen(self) -> Path | None:
+        """The file of weights of the method that is checked."""
+        return weights_of(self.method, self.weights)
+
+    def scorer(self, localization_map: LocalizationMap) -> Scorer:
+        """The scorer that is checked."""
+        chosen = self.chosen
+        if self.method:
+            return make_scorer(self.method, localization_map, weights=chosen)
+        return load_scorer(str(chosen), localization_map)
+
+
+def score_views(
+    source: PhotographedMap, left_out: Sequence[LeftOut], scoring: Scoring, occlusion: OcclusionModel, device: str
+) -> tuple[str, pd.DataFrame]:
+    """The name of the method that is checked, and the views of all blocks with what it tells of them.
+
+    The views of `LeftOut` have further columns: block, is_part, score, expected_inliers (NaN where the method does not
+    tell), n_visible, in_range, `visible` (n_visible once more), and one for each method beside. Scores of methods that
+    give a share of the map's landmarks are times their number: blocks have maps of different sizes.
+    """
+    parts, name = [], ""
+    with tqdm(total=sum(len(one.views) for one in left_out), desc="check: score", unit="view") as bar:
+        for one in left_out:
+            views = one.views.copy()
+            kept = np.setdiff1d(np.arange(len(source.poses)), one.block.left_out)
+            poses = source.poses[kept].astype(np.float32)
+            hides = occlusion if occlusion.name == "none" else RememberedOcclusion(occlusion)
+            looking = [source.cameras[row] for row in views["row"]]
+            around = LocalizationMap(one.landmarks, looking[0], hides, device, poses)
+            columns: dict[str, Float] = {}
+            for camera, rows in _by_camera(looking):
+                looked = source.poses[views["row"].to_numpy()[rows]]
+                found = _score(around.of_camera(camera), looked, scoring)
+                name = found.pop("name")
+                for column, values in found.items():
+                    columns.setdefault(column, np.full(len(views), np.nan))[rows] = values
+                bar.update(len(rows))
+            views = views.assign(**columns, block=one.block.number, is_part=one.block.is_part)
+            parts.append(views.astype({"in_range": bool, "n_visible": np.int64}))
+    return name, pd.concat(parts, ignore_index=True)
+
+
+def _by_camera(cameras: Sequence[Camera]) -> list[tuple[Camera, NDArray[np.int64]]]:
+    rows: dict[Camera, list[int]] = {}
+    for row, camera in enumerate(cameras):
+        rows.setdefault(camera, []).append(row)
+    return [(camera, np.array(found)) for camera, found in rows.items()]
+
+
+def _score(around: LocalizationMap, poses: Float, scoring: Scoring) -> dict[str, Any]:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", OutOfRangeWarning)  # the results tell how many are in range
+        scorer = scoring.scorer(around)
+        told = scorer.report(poses)
+        found: dict[str, Any] = {"name": scorer.name, "score": told.score * _number(scorer.name, around)}
+        found |= {"expected_inliers": told.expected_inliers, "n_visible": told.n_visible, "in_range": told.in_range}
+        found[VISIBLE] = told.n_visible
+        for other in scoring.also:
+            if other not in (VISIBLE, scorer.name):
+                values = make_scorer(other, around, weights=weights_of(other, None)).score(poses)
+                found[other] = values * _number(other, around)
+    return found
+
+
+def _number(method: str, around: LocalizationMap) -> int:
+    return len(around.landmarks) if method in (*_OF_THE_MAP, VISIBLE) else 1

@@ -18,10 +18,10 @@ import argparse
 import time
 from pathlib import Path
 
-from bench_photographs import MAP, MAX_ERROR_DEG, MAX_ERROR_M
 import cv2
 import numpy as np
 import pandas as pd
+from bench_photographs import MAP, MAX_ERROR_DEG, MAX_ERROR_M
 from scipy.stats import spearmanr
 from sklearn.metrics import cohen_kappa_score, roc_auc_score
 from tqdm.auto import tqdm
@@ -58,7 +58,12 @@ def label(localizer: Localizer, rgb: np.ndarray, pose: np.ndarray, prefix: str) 
     estimate = np.full((3, 4), np.nan) if found.cam_from_world is None else found.cam_from_world
     error_m, error_deg = (float(error) for error in pose_error(estimate, pose))
     good = found.status == LOCALIZED and error_m < MAX_ERROR_M and error_deg < MAX_ERROR_DEG
-    values = {"good": good, "error_m": error_m, "n_inliers": len(found.inlier_rows), "empty": float((rgb == 0).all(-1).mean())}
+    values = {
+        "good": good,
+        "error_m": error_m,
+        "n_inliers": len(found.inlier_rows),
+        "empty": float((rgb == 0).all(-1).mean()),
+    }
     return {f"{prefix} {name}": value for name, value in values.items()}
 
 
@@ -73,7 +78,8 @@ def rendered_labels(frames: RgbdFrames, config: RgbdConfig, block: Path, shown: 
     colors = fuse(part, frames.camera, poses, config, progress=False)
     fused = time.perf_counter()
     meshes = {"colors": colors, "texture": textured(colors, part, frames.camera, poses, progress=False)}
-    print(f"{block.name}: {len(colors.triangles):,} triangles, fused in {fused - start:.0f} s, textured in {time.perf_counter() - fused:.0f} s")  # fmt: skip
+    spent = f"fused in {fused - start:.0f} s, textured in {time.perf_counter() - fused:.0f} s"
+    print(f"{block.name}: {len(colors.triangles):,} triangles, {spent}")
     localizer = Localizer(Landmarks.load(block / "landmarks.npz"), frames.camera, extractor=MAP.extractor)
     columns = []
     renderers = {name: WarpRenderer(mesh) for name, mesh in meshes.items()}
@@ -84,8 +90,10 @@ def rendered_labels(frames: RgbdFrames, config: RgbdConfig, block: Path, shown: 
             found |= label(localizer, rgb, pose, name)
         columns.append(found)
     if shown is not None:
-        row = left_out[len(left_out) // 2]
-        cv2.imwrite(str(shown / f"{block.name}.png"), np.hstack([frames[int(row)].rgb, *(r.render(frames.camera, frames.cam_from_world[row][None]).rgb[0] for r in renderers.values())])[:, :, ::-1])  # fmt: skip
+        row = int(left_out[len(left_out) // 2])
+        pose = frames.cam_from_world[row][None]
+        pictures = [frames[row].rgb, *(one.render(frames.camera, pose).rgb[0] for one in renderers.values())]
+        cv2.imwrite(str(shown / f"{block.name}.png"), np.hstack(pictures)[:, :, ::-1])
     return pd.concat([labels, pd.DataFrame(columns)], axis=1).assign(block=block.name)
 
 
@@ -98,12 +106,17 @@ def summarize(views: pd.DataFrame, appearance: str) -> dict[str, object]:
     row["inliers_rank_correlation"] = float(spearmanr(views["n_inliers"], views[f"{appearance} n_inliers"])[0])
     both = views[good & rendered]
     row["inliers_ratio"] = float((both[f"{appearance} n_inliers"] / both["n_inliers"]).median())
-    row["error_m"], row["error_m_photographs"] = float(both[f"{appearance} error_m"].median()), float(both["error_m"].median())
+    row["error_m"], row["error_m_photographs"] = (
+        float(both[f"{appearance} error_m"].median()),
+        float(both["error_m"].median()),
+    )
     for method in METHODS:
         if method in views:
             scores = views[method] * (views["n_landmarks"] if method != "set" else 1)
             for name, truth in (("photographs", good), ("renders", rendered)):
-                row[f"auc_{method}_{name}"] = float(roc_auc_score(truth, scores)) if truth.nunique() == 2 else float("nan")
+                row[f"auc_{method}_{name}"] = (
+                    float(roc_auc_score(truth, scores)) if truth.nunique() == 2 else float("nan")
+                )
     return row
 
 
@@ -117,7 +130,9 @@ def main() -> None:
     parser.add_argument("--work", type=Path, required=True, help="what bench_photographs.py --work has kept")
     parser.add_argument("--blocks", nargs="*", help="names of the blocks to take (default: all)")
     parser.add_argument("--voxel-m", type=float, default=0.01, help="of the fusion (default: %(default)s)")
-    parser.add_argument("--out", type=Path, help="write every view to this CSV file, and a picture of each block beside it")
+    parser.add_argument(
+        "--out", type=Path, help="write every view to this CSV file, and a picture of each block beside it"
+    )
     args = parser.parse_args()
     cv2.setNumThreads(1)
     config = RgbdConfig(folder=args.recording, model=args.work / "map", voxel_m=args.voxel_m, appearance="colors")

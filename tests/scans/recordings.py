@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from tests.box_scenes import box_quads, quads_mesh
+from box_scenes import box_quads, quads_mesh
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import invert_poses, poses_looking_along, quaternion_from_rotation
 from wheretolook.rendering.warp_renderer import WarpRenderer
@@ -24,17 +24,17 @@ def room():
     rng = np.random.default_rng(0)
     quads = np.concatenate([box_quads(LOW, HIGH, inward=True), box_quads((2.6, 0.1, 0.0), (3.4, 1.1, 1.2))])
     textures = [
-        cv2.resize(rng.integers(30, 226, (24, 24, 3)).astype(np.uint8), (192, 192), interpolation=cv2.INTER_CUBIC)
+        cv2.resize(rng.integers(30, 226, (64, 64, 3)).astype(np.uint8), (256, 256), interpolation=cv2.INTER_CUBIC)
         for _ in quads
     ]
     return quads_mesh(quads, textures)
 
 
-def walk(n=48):
-    """Poses cam_from_world (n, 3, 4) around the room's middle, looking outwards at changing pitch."""
+def walk(n=60):
+    """Poses cam_from_world (n, 3, 4): twice around the room's middle, looking outwards, up and then down."""
     turn = np.linspace(0, 4 * np.pi, n, endpoint=False)
     where = np.array([1.7, 1.6, 1.3]) + 0.35 * np.stack([np.cos(turn), np.sin(turn), 0.5 * np.sin(3 * turn)], axis=1)
-    pitch = 0.7 * np.sin(turn / 2 + 0.3)
+    pitch = np.where(turn < 2 * np.pi, 0.4, -0.4)
     along = np.stack([np.cos(turn) * np.cos(pitch), np.sin(turn) * np.cos(pitch), np.sin(pitch)], axis=1)
     return poses_looking_along(where, along)
 

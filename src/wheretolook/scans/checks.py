@@ -18,7 +18,10 @@ _AGREE = 0.03  # by which two depths of the same point may differ, of the depth
 _PAIRS = 40  # pairs of frames that are compared
 _LEAST_PAIRS, _LEAST_SHARED = 3, 50  # of them, and readings that the two of a pair share
 _FACING = np.cos(np.radians(40.0))  # of the optical axes of a pair
-_FACTORS = np.geomspace(1 / 12, 12, 83)  # that depths are multiplied with: steps of 6 %
+_FACTORS = np.geomspace(1 / 12, 12, 83)  # that depths are multiplied with, in steps of 6 %
+_FACTORS = np.concatenate([_FACTORS, *(power * np.geomspace(0.8, 1.25, 7) for power in (0.001, 0.01, 100, 1000))])
+_ONE = 41  # where among them is 1
+_LEAST_AGREEMENT = 0.2  # share of the readings, or poses and depths have nothing to do with each other
 _CLEARLY = 0.15  # by how much more of the readings must agree with another factor
 _OFF = 1.25  # a factor by which a unit is wrong, not a camera
 _LANDMARK_OFF = 1.1  # a factor between depths and landmarks
@@ -39,15 +42,20 @@ def check_depth_unit(frames: RgbdFrames) -> None:
             fix = f"Give the model metres (`wheretolook map --model`), or {_option(scale / factor)} if its unit is one."
             raise SceneError(problem, path=frames.folder, value=f"{scale:g} units a metre", fix=fix)
     factor = pose_factor(frames.survey_m, frames.camera, frames.cam_from_world)
+    if factor is not None and np.isnan(factor):
+        problem = "by their poses, neighbouring frames do not show the same surfaces, whatever the unit of depth"
+        fix = "Give poses world_from_cam (not cam_from_world), x right, y down, z forward, of the same frames."
+        raise SceneError(problem, path=frames.folder, fix=fix)
     if factor is not None and not 1 / _OFF < factor < _OFF:
-        problem = "depths are in another unit than poses: neighbouring frames show the same surfaces only if depths are "
-        problem += f"about {factor:.2g} times as large"
+        problem = "depths are in another unit than poses: neighbouring frames show the same surfaces only if depths "
+        problem += f"are about {factor:.2g} times as large"
         fix = f"Give {_option(scale / factor)}, or poses in metres."
         raise SceneError(problem, path=frames.folder, value=f"{scale:g} units a metre", fix=fix)
     median = float(np.median(frames.survey_m[frames.survey_m > 0]))
     if not DEPTH_M[0] <= median <= DEPTH_M[1]:
         problem = f"depths seem not to be in metres: half of the readings are nearer than {median:.3g} m"
-        fix = f"Say how many units make a metre, such as {_option(5000 if scale < 5000 else 1000)}; poses in metres, too."
+        fix = f"Say how many units make a metre, such as {_option(5000 if scale < 5000 else 1000)}, and give poses in "
+        fix += "metres."
         raise SceneError(problem, path=frames.folder, value=f"{scale:g} units a metre", fix=fix)
 
 
@@ -71,7 +79,7 @@ def landmark_factor(frames: RgbdFrames) -> float | None:
 def pose_factor(survey_m: NDArray[np.float32], camera: PinholeCamera, cam_from_world: Float) -> float | None:
     """By what depths (F, h, w) must be multiplied for neighbouring frames to agree; 1 unless another is clearly better.
 
-    None if the camera moved too little, or too few frames share surface.
+    NaN if hardly any agree by any factor, None if the camera moved too little to tell.
     """
     pairs = _pairs(cam_from_world)
     agreements = []
@@ -91,9 +99,11 @@ def pose_factor(survey_m: NDArray[np.float32], camera: PinholeCamera, cam_from_w
     if len(agreements) < _LEAST_PAIRS:
         return None
     agreement = np.mean(agreements, axis=0)
-    best, one = int(agreement.argmax()), len(_FACTORS) // 2
+    best = int(agreement.argmax())
     near_one = agreement[np.abs(np.log(_FACTORS)) < np.log(_OFF)].max()
-    return float(_FACTORS[best]) if agreement[best] > near_one + _CLEARLY else float(_FACTORS[one])
+    if agreement[best] < _LEAST_AGREEMENT:
+        return float("nan")
+    return float(_FACTORS[best]) if agreement[best] > near_one + _CLEARLY else float(_FACTORS[_ONE])
 
 
 def _pairs(cam_from_world: Float) -> list[tuple[int, int]]:

@@ -18,7 +18,7 @@ from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import Float
 from wheretolook.mapping.colmap_model import camera_of_model, colmap_poses, read_model, registered_names
 from wheretolook.scans.config import RgbdConfig
-from wheretolook.scans.layouts import FrameFiles, Layout, Skipped, find_layout, frame_files
+from wheretolook.scans.layouts import FrameFiles, Skipped, find_layout, frame_files
 from wheretolook.utils.errors import ConfigError, SceneError
 
 SURVEY_STRIDE = 8  # pixels between the readings that are kept of each depth image
@@ -112,21 +112,21 @@ class RgbdFrames:
         return [frame for frame, size in zip(frames, sizes, strict=True) if size == most]
 
     def _set_cameras(self, config: RgbdConfig) -> None:
-        layout, (width, height) = self.layout, self._size
+        layout = self.layout
         source: Camera
         if self.model is not None:
             assert config.model is not None
             source = camera_of_model(self.model, config.model)
             if config.camera:
-                raise ConfigError("the model gives the camera", value=config.camera, fix="Leave scenes.rgbd.camera out.")
+                fix = "Leave scenes.rgbd.camera out."
+                raise ConfigError("the model gives the camera", value=config.camera, fix=fix)
             if (source.width, source.height) != self._size:
                 problem = "the model's camera has another size than the colour images"
                 fix = "Give a model of these images in their full size."
                 raise SceneError(problem, path=config.model, value=((source.width, source.height), self._size), fix=fix)
         else:
             source = _pinhole(config.camera or _scaled(layout.camera, self._size), self._size)
-        # what is brought to the pinhole: nothing to do if it is one
-        self.camera = source if isinstance(source, PinholeCamera) else PinholeCamera(width, height, source.mean_focal_px, center_px=source.principal_point)
+        self.camera = source if isinstance(source, PinholeCamera) else _without_distortion(source)
         self._undistort = None if isinstance(source, PinholeCamera) else _undistortion(source, self.camera)
         depth_camera = config.depth_camera or (layout.depth_camera and _scaled(layout.depth_camera, self._depth_size))
         if not depth_camera:
@@ -213,6 +213,10 @@ def _scaled(intrinsics: tuple[float, ...], size: tuple[int, int]) -> tuple[float
 def _pinhole(intrinsics: tuple[float, ...], size: tuple[int, int]) -> PinholeCamera:
     fx, fy, cx, cy = intrinsics
     return PinholeCamera(*size, fx, fy, (cx, cy))
+
+
+def _without_distortion(source: ColmapCamera) -> PinholeCamera:
+    return PinholeCamera(source.width, source.height, source.mean_focal_px, center_px=source.principal_point)
 
 
 def _undistortion(source: ColmapCamera, pinhole: PinholeCamera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -36,8 +36,10 @@ class Layout:
 
 
 # Kinect's nominal cameras, 2.5 cm apart. The pose is the depth camera's.
-SEVEN_SCENES = Layout("7-scenes", 1000.0, (525.0, 525.0, 320.0, 240.0), (585.0, 585.0, 320.0, 240.0), (-0.025, 0, 0), 65535)
-TUM = Layout("tum", 5000.0, (525.0, 525.0, 320.0, 240.0), None, (0, 0, 0), 0)  # ROS's defaults, as TUM advises
+SEVEN_SCENES = Layout(
+    "7-scenes", 1000.0, (525.0, 525.0, 320.0, 240.0), (585.0, 585.0, 320.0, 240.0), (-0.025, 0.0, 0.0), 65535
+)
+TUM = Layout("tum", 5000.0, (525.0, 525.0, 320.0, 240.0), None, (0.0, 0.0, 0.0), 0)  # ROS's defaults, as TUM advises
 
 
 @dataclass(frozen=True, eq=False)

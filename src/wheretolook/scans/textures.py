@@ -61,9 +61,7 @@ def textured(
     return replace(mesh, corner_uvs=uvs, triangle_texture=number, textures=tuple(textures), vertex_colors=None)
 
 
-def _areas_px(
-    mesh: TexturedMesh, renderer: WarpRenderer, camera: PinholeCamera, pose: Float
-) -> NDArray[np.float16]:
+def _areas_px(mesh: TexturedMesh, renderer: WarpRenderer, camera: PinholeCamera, pose: Float) -> NDArray[np.float16]:
     """How many pixels a photograph shows of each triangle (T,); 0 of those hidden, turned away or not all in it."""
     depth = renderer.render(camera, pose[None]).depth_m[0]
     nearest = cv2.erode(np.where(depth > 0, depth, np.float32(np.inf)), np.ones((_EDGE_PX, _EDGE_PX), np.uint8))

@@ -132,9 +132,7 @@ class TsdfVolume:
     averages the colours of images, too.
     """
 
-    def __init__(
-        self, config: TsdfConfig | None = None, expected_blocks: int = 1 << 13, colored: bool = False
-    ) -> None:
+    def __init__(self, config: TsdfConfig | None = None, expected_blocks: int = 1 << 13, colored: bool = False) -> None:
         import open3d as o3d
 
         self.config, self.colored = config or TsdfConfig(), colored

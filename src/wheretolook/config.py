@@ -70,7 +70,7 @@ class ScenesConfig:
         rgbd: an RGB-D recording to make one scene of. With its folder no other scene is made; those that the dataset
             has are kept.
         free_space: where a camera may be.
-        mapped_space: where it may be in a scene of photographs, which has no mesh.
+        mapped_space: where it may be in a scene of photographs, which has no mesh, or in a scan, which is in parts.
     """
 
     train: int = 3

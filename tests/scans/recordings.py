@@ -31,11 +31,14 @@ def room():
 
 
 def walk(n=60):
-    """Poses cam_from_world (n, 3, 4): twice around the room's middle, looking outwards, up and then down."""
+    """Poses cam_from_world (n, 3, 4): around the room looking outwards and up, then further out, inwards and down."""
     turn = np.linspace(0, 4 * np.pi, n, endpoint=False)
-    where = np.array([1.7, 1.6, 1.3]) + 0.35 * np.stack([np.cos(turn), np.sin(turn), 0.5 * np.sin(3 * turn)], axis=1)
-    pitch = np.where(turn < 2 * np.pi, 0.4, -0.4)
-    along = np.stack([np.cos(turn) * np.cos(pitch), np.sin(turn) * np.cos(pitch), np.sin(pitch)], axis=1)
+    inwards = turn >= 2 * np.pi
+    outwards = np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
+    where = np.array([1.7, 1.6, 1.3]) + np.where(inwards, 0.9, 0.35)[:, None] * outwards
+    where[:, 2] += 0.2 * np.sin(3 * turn)
+    pitch = np.where(inwards, -0.5, 0.2)
+    along = np.where(inwards, -1, 1)[:, None] * outwards * np.cos(pitch)[:, None] + np.sin(pitch)[:, None] * (0, 0, 1)
     return poses_looking_along(where, along)
 
 

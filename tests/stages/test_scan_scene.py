@@ -52,7 +52,7 @@ def test_a_recording_is_mapped_and_sampled(experiment):
 
 
 def test_it_joins_scenes_with_meshes_and_a_named_camera_looks(experiment, tmp_path):
-    plain = ApartmentConfig(n_rooms=3, texture_size=256, texels_per_m=10, light_rays=2)
+    plain = ApartmentConfig(n_rooms=3, texture_size=1024, texels_per_m=20, light_rays=2)
     generated = ScenesConfig(train=1, test=0, apartment=plain)
     wide = replace(experiment, data=tmp_path, camera=CameraConfig(width=320, height=240, fov_deg=90))
     make_scenes(replace(wide, scenes=generated), lambda _: None)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 from wheretolook.config import NOT_SCENES, Experiment
 from wheretolook.dataset.folders import Dataset, SceneFolder
@@ -17,7 +18,6 @@ from wheretolook.utils.files import write_json
 from wheretolook.utils.reading import read_json_object
 
 REPORT = "rgbd.json"  # in the scene's folder: what came of the recording
-FRAMES = "frames"  # and a COLMAP model of its colour images, in the mesh's world
 
 
 def scan_scene(experiment: Experiment, say: Say, tick: Tick) -> Dataset:
@@ -31,7 +31,7 @@ def scan_scene(experiment: Experiment, say: Say, tick: Tick) -> Dataset:
     scene = SceneFolder(entry_of(root, settings.scene_name, "a scene's name"), settings.split, experiment.camera.camera)
     others = _others(root, scene)
     key = stage_key("scenes", ["rgbd", *_made_from(settings)])
-    if is_done(scene, "scenes", key, scene.mesh, scene.folder / REPORT, scene.folder / FRAMES):
+    if is_done(scene, "scenes", key, scene.mesh, scene.folder / REPORT, scene.frames):
         say(f"{scene.name}: reusing {scene.mesh}")
     else:
         from wheretolook.scans.fusion import make_scan
@@ -41,8 +41,8 @@ def scan_scene(experiment: Experiment, say: Say, tick: Tick) -> Dataset:
         scene.folder.mkdir(parents=True, exist_ok=True)
         save_glb(scan.mesh, scene.mesh)
         scene.save_mapped_floor(())
-        scan.save_model(scene.folder / FRAMES)
-        write_json(scene.folder / REPORT, {**scan.report(), "config": asdict(settings)})
+        scan.save_model(scene.frames)
+        write_json(scene.folder / REPORT, {**scan.report(), "config": _as_text(settings)})
         write_stamp(scene, "scenes", key)
         for line in scan.describe():
             say(f"{scene.name}: {line}")
@@ -57,6 +57,10 @@ def scan_scene(experiment: Experiment, say: Say, tick: Tick) -> Dataset:
     dataset.save()
     tick(1)
     return dataset
+
+
+def _as_text(settings: RgbdConfig) -> dict[str, Any]:
+    return {name: str(value) if isinstance(value, Path) else value for name, value in asdict(settings).items()}
 
 
 def _others(root: Path, scene: SceneFolder) -> list[SceneFolder]:

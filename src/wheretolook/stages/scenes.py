@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -61,6 +62,7 @@ def make_scenes(experiment: Experiment, say: Say = print, tick: Tick = lambda wo
             scene.folder.mkdir(parents=True, exist_ok=True)
             forget_stamp(scene, "scenes")  # so that no stamp is of what it no longer stands for, whenever it is killed
             save_glb(mesh, scene.mesh)
+            shutil.rmtree(scene.frames, ignore_errors=True)  # of a recording that was here before
             scene.save_mapped_floor(mapped)
             write_stamp(scene, "scenes", key)
             say(f"{scene.name}: {len(mesh.triangles):,} triangles -> {scene.mesh}")

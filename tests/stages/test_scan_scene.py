@@ -7,15 +7,17 @@ from dataclasses import replace
 import pytest
 
 from scans.recordings import COLOR, room, walk, write_seven_scenes
-from wheretolook.config import Experiment, ScenesConfig
+from wheretolook.config import Experiment, MeshSource, ScenesConfig
 from wheretolook.dataset.folders import Dataset
 from wheretolook.geometry.camera import CameraConfig
+from wheretolook.geometry.poses import camera_centers
 from wheretolook.mapping.config import MapConfig
 from wheretolook.scans.config import RgbdConfig
-from wheretolook.scenes.config import ApartmentConfig
+from wheretolook.scenes.loading import save_glb
 from wheretolook.stages import make_maps, make_scenes, sample
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.viewpoints.config import SampleConfig
+from wheretolook.viewpoints.table import poses
 
 
 @pytest.fixture(scope="module")
@@ -47,19 +49,22 @@ def test_a_recording_is_mapped_and_sampled(experiment):
     sample(experiment, said.append)
     table = scene.read_table()
     assert table["location_id"].nunique() == 4 and (table["n_visible"] > 0).all()
-    at = table[["x", "y", "z"]].to_numpy()
+    at = camera_centers(poses(table))
     assert ((at > 0) & (at < (3.6, 3.0, 2.4))).all()
 
 
 def test_it_joins_scenes_with_meshes_and_a_named_camera_looks(experiment, tmp_path):
-    plain = ApartmentConfig(n_rooms=3, texture_size=1024, texels_per_m=20, light_rays=2)
-    generated = ScenesConfig(train=1, test=0, apartment=plain)
-    wide = replace(experiment, data=tmp_path, camera=CameraConfig(width=320, height=240, fov_deg=90))
-    make_scenes(replace(wide, scenes=generated), lambda _: None)
+    save_glb(room(), tmp_path / "loaded.glb")
+    loaded = ScenesConfig(train=0, test=0, meshes=(MeshSource(tmp_path / "loaded.glb", "train"),))
+    coarse = replace(experiment.scenes.rgbd, voxel_m=0.06, max_frames=20, appearance="colors")
+    camera = CameraConfig(width=320, height=240, fov_deg=90)
+    wide = replace(experiment, data=tmp_path, camera=camera, scenes=ScenesConfig(rgbd=coarse))
+    make_scenes(replace(wide, scenes=loaded), lambda _: None)
     dataset = make_scenes(wide, lambda _: None)
-    assert [(scene.name, scene.split) for scene in dataset.scenes] == [("apartment-000", "train"), ("room", "test")]
+    assert [(scene.name, scene.split) for scene in dataset.scenes] == [("loaded", "train"), ("room", "test")]
     assert {scene.camera for scene in dataset.scenes} == {wide.camera.camera}
-    changed = replace(wide, scenes=ScenesConfig(rgbd=replace(wide.scenes.rgbd, up="-z")))
+    assert [scene.is_scanned for scene in dataset.scenes] == [False, True]
+    changed = replace(wide, scenes=ScenesConfig(rgbd=replace(coarse, up="-z")))
     with pytest.warns(UserWarning, match="up is said to be -z"):
         make_scenes(changed, lambda _: None)  # other settings, so the scan is made anew
 

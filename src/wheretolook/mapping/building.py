@@ -99,8 +99,8 @@ def build_map(
                 walk = plan_walk(free_space, mesh.bounds, config.n_images, config.walk, seed)
                 poses = poses_looking_along(walk.positions, walk.directions)
             else:
-                at = camera_centers(poses)
-                walk = Walk(at, np.asarray(poses)[:, 2, :3], at, 1.0, 0.0)
+                at, ahead = (np.asarray(of, dtype=np.float64) for of in (camera_centers(poses), poses[:, 2, :3]))
+                walk = Walk(at, ahead, at, 1.0, 0.0)
         with clock("render_and_extract"):
             depth: list[NDArray[np.float32]] = []
             images = _rendered(renderer, camera, poses, depth, partial / IMAGES_FOLDER if config.keep_images else None)

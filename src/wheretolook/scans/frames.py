@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -31,6 +31,14 @@ class RgbdFrame:
 
     rgb: NDArray[np.uint8]  # (H, W, 3)
     depth_m: NDArray[np.float32]  # (H, W) along the optical axis of the colour camera; 0 where there is no reading
+
+
+class Frames(Protocol):
+    """Frames by number, each read when it is asked for."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: int) -> RgbdFrame: ...
 
 
 class RgbdFrames:
@@ -83,13 +91,19 @@ class RgbdFrames:
             raise SceneError("an image has vanished while it was used", path=frame.color, fix="Run the stage again.")
         rgb = np.ascontiguousarray(image[:, :, ::-1], dtype=np.uint8)
         if self._undistort is not None:
-            rgb = cv2.remap(rgb, *self._undistort, cv2.INTER_LINEAR)  # type: ignore[call-overload]
+            across, down = self._undistort
+            rgb = np.asarray(cv2.remap(rgb, across, down, cv2.INTER_LINEAR), dtype=np.uint8)
         return RgbdFrame(rgb, self._registered(depth))
 
     @cached_property
     def names(self) -> list[str]:
         """Paths of the colour images in the recording."""
         return [frame.name for frame in self._frames]
+
+    @cached_property
+    def names_in_model(self) -> list[str]:
+        """Names of the model's images that gave the poses."""
+        return [frame.in_model for frame in self._frames]
 
     @cached_property
     def cam_from_world(self) -> Float:
@@ -101,14 +115,16 @@ class RgbdFrames:
 
     def _of_one_size(self, frames: list[FrameFiles]) -> list[FrameFiles]:
         """The frames whose images have the sizes that most have; sets `_size` and `_depth_size`, width by height."""
-        sizes = [(_size(frame.color), _size(frame.depth)) for frame in frames]
-        (most, _), *_ = Counter(size for size in sizes if None not in size).most_common(1) or [((None, None), 0)]
-        if most[0] is None or most[1] is None:
+        pairs = [(_size(frame.color), _size(frame.depth)) for frame in frames]
+        sizes = [(color, depth) if color and depth else None for color, depth in pairs]
+        readable = Counter(size for size in sizes if size is not None)
+        if not readable:
             raise SceneError("no image can be read", path=self.folder, value=frames[0].name, fix="Copy it again.")
+        most = readable.most_common(1)[0][0]
         self._size, self._depth_size = most
         for size in sizes:
             if size != most:
-                self.skipped.add("of another size" if None not in size else "with an image that cannot be read")
+                self.skipped.add("with an image that cannot be read" if size is None else "of another size")
         return [frame for frame, size in zip(frames, sizes, strict=True) if size == most]
 
     def _set_cameras(self, config: RgbdConfig) -> None:
@@ -179,20 +195,25 @@ class RgbdFrames:
 def _with_poses_of(model: Any, path: Path | None, frames: list[FrameFiles], skipped: Skipped) -> list[FrameFiles]:
     """The frames that a COLMAP model has by the name of the colour image, or by its last part, with its poses."""
     poses = dict(zip(registered_names(model).values(), colmap_poses("", model), strict=True))
-    last: dict[str, list[str]] = {}
+    by_last, recorded = dict[str, list[str]](), Counter(_last(frame.name) for frame in frames)
     for name in poses:
-        last.setdefault(name.rpartition("/")[2], []).append(name)
+        by_last.setdefault(_last(name), []).append(name)
     found = []
     for frame in frames:
-        names = [frame.name] if frame.name in poses else last.get(frame.name.rpartition("/")[2], [])
+        alike = by_last.get(_last(frame.name), []) if recorded[_last(frame.name)] == 1 else []
+        names = [frame.name] if frame.name in poses else alike
         if len(names) == 1:
-            found.append(FrameFiles(frame.name, frame.color, frame.depth, poses[names[0]]))
+            found.append(replace(frame, cam_from_world=poses[names[0]], in_model=names[0]))
         else:
             skipped.add("without a pose in the model")
     if not found:
         value, fix = (next(iter(poses)), frames[0].name), "Give the model that was made of these colour images."
         raise SceneError("the model has none of the recording's colour images", path=path, value=value, fix=fix)
     return found
+
+
+def _last(name: str) -> str:
+    return name.rpartition("/")[2]
 
 
 def _size(path: Path) -> tuple[int, int] | None:

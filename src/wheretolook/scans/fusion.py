@@ -20,7 +20,7 @@ from wheretolook.mapping.gravity import estimate_gravity, rotation_to_z
 from wheretolook.mapping.scale import Similarity
 from wheretolook.scans.checks import check_depth_unit
 from wheretolook.scans.config import RgbdConfig
-from wheretolook.scans.frames import RgbdFrame, RgbdFrames
+from wheretolook.scans.frames import Frames, RgbdFrames
 from wheretolook.scans.textures import textured
 from wheretolook.scans.upright import find_up
 from wheretolook.utils.errors import MapWarning, SceneError
@@ -102,7 +102,7 @@ def make_scan(config: RgbdConfig, device: str = "cpu", progress: bool = True) ->
 
 
 def fuse(
-    frames: Sequence[RgbdFrame] | RgbdFrames,
+    frames: Frames,
     camera: PinholeCamera,
     cam_from_world: Float,
     config: RgbdConfig,
@@ -154,7 +154,7 @@ def _without_crumbs(mesh: TexturedMesh) -> TexturedMesh:
 class _DepthImages(Sequence[DepthImage]):
     """Frames as the fusion takes them, each read when it is asked for."""
 
-    def __init__(self, frames: Sequence[RgbdFrame] | RgbdFrames, camera: PinholeCamera, poses: NDArray[Any]) -> None:
+    def __init__(self, frames: Frames, camera: PinholeCamera, poses: NDArray[Any]) -> None:
         self.frames, self.camera, self.poses = frames, camera, poses
 
     def __len__(self) -> int:

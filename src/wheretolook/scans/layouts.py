@@ -49,7 +49,8 @@ class FrameFiles:
     name: str  # path of the colour image, relative to the recording
     color: Path
     depth: Path
-    cam_from_world: Float  # (3, 4), as the recording tells: of its depth camera
+    cam_from_world: Float  # (3, 4), as the recording tells: of its depth camera; or of a model's image
+    in_model: str = ""  # the name of that image
 
 
 @dataclass

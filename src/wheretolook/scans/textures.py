@@ -7,7 +7,6 @@ shows many of them is taken, greedily, so that seams are few (set cover; the pro
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import cv2
@@ -19,7 +18,7 @@ from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float, transform
 from wheretolook.rendering.warp_renderer import WarpRenderer
-from wheretolook.scans.frames import RgbdFrame
+from wheretolook.scans.frames import Frames
 
 MAX_PHOTOGRAPHS = 100  # that are looked at; of more, so many evenly
 _BEHIND_M = 0.03  # by which a corner may lie behind what a photograph sees: voxels and rounding
@@ -31,7 +30,7 @@ _NEARLY = 0.5  # share of the largest area in pixels that any photograph shows o
 
 def textured(
     mesh: TexturedMesh,
-    frames: Sequence[RgbdFrame],
+    frames: Frames,
     camera: PinholeCamera,
     cam_from_world: Float,
     device: str = "cpu",

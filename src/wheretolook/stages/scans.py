@@ -86,7 +86,7 @@ def _made_from(settings: RgbdConfig) -> list[object]:
     return [chosen, [(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats]]
 
 
-def _report(scene: SceneFolder) -> dict[str, object]:
+def _report(scene: SceneFolder) -> dict[str, Any]:
     path = scene.folder / REPORT
     try:
         report = read_json_object(path)

@@ -39,6 +39,7 @@ def scan_scene(experiment: Experiment, say: Say, tick: Tick) -> Dataset:
 
         scan = make_scan(settings, experiment.warp_device)
         scene.folder.mkdir(parents=True, exist_ok=True)
+        forget_stamp(scene, "scenes")  # so that no stamp is of what it no longer stands for, whenever it is killed
         save_glb(scan.mesh, scene.mesh)
         scene.save_mapped_floor(())
         scan.save_model(scene.frames)

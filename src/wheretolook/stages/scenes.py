@@ -61,8 +61,8 @@ def make_scenes(experiment: Experiment, say: Say = print, tick: Tick = lambda wo
             mesh, mapped = make()
             scene.folder.mkdir(parents=True, exist_ok=True)
             forget_stamp(scene, "scenes")  # so that no stamp is of what it no longer stands for, whenever it is killed
-            save_glb(mesh, scene.mesh)
             shutil.rmtree(scene.frames, ignore_errors=True)  # of a recording that was here before
+            save_glb(mesh, scene.mesh)
             scene.save_mapped_floor(mapped)
             write_stamp(scene, "scenes", key)
             say(f"{scene.name}: {len(mesh.triangles):,} triangles -> {scene.mesh}")

@@ -52,15 +52,10 @@ STAGES = {
         "Make or load the textured meshes, or fuse one from colour and depth images: --rgbd.",
         "scenes.train scenes.val scenes.test scenes.seed scenes.meshes scenes.apartment.n_rooms "
         "scenes.apartment.area_m2 scenes.apartment.texture_richness scenes.apartment.clutter scenes.apartment.vary "
-        "rgbd up scenes.rgbd.model scenes.rgbd.depth_scale scenes.rgbd.appearance scenes.rgbd.voxel_m",
+        "rgbd up",
         ("scenes",),
-        "--config configs/demo.yaml --scenes.train 5",
+        "--config configs/demo.yaml --scenes.train 5\n  wheretolook scenes --name kitchen --rgbd FOLDER",
         {"--rgbd": "--scenes.rgbd.folder", "--up": "--scenes.rgbd.up"},
-        notes="""\
-An RGB-D recording with poses, in the layout of 7-Scenes or TUM, becomes a scene for all later stages:
-  wheretolook scenes --name kitchen --rgbd FOLDER
-  wheretolook map --name kitchen
-Its colour camera looks, unless --camera names one. Up is found, or given: --up y.""",
     ),
     "map": Stage(
         "make_maps",

@@ -130,12 +130,18 @@ def main() -> None:
     parser.add_argument("--work", type=Path, required=True, help="what bench_photographs.py --work has kept")
     parser.add_argument("--blocks", nargs="*", help="names of the blocks to take (default: all)")
     parser.add_argument("--voxel-m", type=float, default=0.01, help="of the fusion (default: %(default)s)")
-    parser.add_argument(
-        "--out", type=Path, help="write every view to this CSV file, and a picture of each block beside it"
-    )
+    parser.add_argument("--depth-camera", type=float, nargs=4, help="fx, fy, cx, cy of the depth images")
+    parser.add_argument("--color-from-depth-m", type=float, nargs=3, help="the depth camera in the colour camera")
+    parser.add_argument("--depth-scale", type=float, default=0, help="units of depth in the map's metre")
+    parser.add_argument("--out", type=Path, help="CSV file of every view, with a picture of each block beside it")
     args = parser.parse_args()
     cv2.setNumThreads(1)
-    config = RgbdConfig(folder=args.recording, model=args.work / "map", voxel_m=args.voxel_m, appearance="colors")
+    given = {
+        "depth_camera": tuple(args.depth_camera or ()),
+        "color_from_depth_m": tuple(args.color_from_depth_m or ()),
+        "depth_scale": args.depth_scale,
+    }
+    config = RgbdConfig(args.recording, model=args.work / "map", voxel_m=args.voxel_m, appearance="colors", **given)
     frames = RgbdFrames(config)
     blocks = [path for path in sorted((args.work / "blocks").iterdir()) if not args.blocks or path.name in args.blocks]
     shown = args.out.parent if args.out else None

@@ -17,8 +17,8 @@ class RgbdConfig:
     """A scene from an RGB-D recording: colour images, depth images and poses.
 
     Args:
-        folder: the recording, in the layout of 7-Scenes (frame-*.color.*, .depth.png, .pose.txt; also in folders
-            seq-*) or of the TUM RGB-D benchmark (rgb.txt, depth.txt, groundtruth.txt).
+        folder: an RGB-D recording as of 7-Scenes or TUM. The former has frame-*.color.*,
+            .depth.png and .pose.txt, also in folders seq-*, the latter rgb.txt, depth.txt and groundtruth.txt.
         name: name of the scene; the folder's own if empty.
         split: where its viewpoints go: train, val or test.
         model: COLMAP model of the colour images, whose poses and camera are taken instead of the recording's. The
@@ -27,7 +27,7 @@ class RgbdConfig:
         camera: fx, fy, cx, cy of the colour images in pixels; the layout's if empty.
         depth_camera: the same of the depth images, where they are not registered to the colour images.
         color_from_depth_m: where the depth camera is in the colour camera's frame; x right, y down, z forward.
-        up: which way is up in the recording's world. `auto`, x, y, z, one of these with a minus sign, or three numbers
+        up: which way is up in that. `auto`, x, y, z, one of these with a minus sign, or three numbers
             such as "0 -0.9 -0.4". `auto` finds it by how the camera was held and by the surfaces that it saw.
         voxel_m: distance between two samples of the distance field. Finer ones need more memory and triangles.
         max_depth_m: farther readings are left out, as depth cameras are too noisy there.

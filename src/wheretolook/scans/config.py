@@ -27,7 +27,7 @@ class RgbdConfig:
         camera: fx, fy, cx, cy of the colour images in pixels; the layout's if empty.
         depth_camera: the same of the depth images, where they are not registered to the colour images.
         color_from_depth_m: where the depth camera is in the colour camera's frame; x right, y down, z forward.
-        up: which way is up in that. `auto`, x, y, z, one of these with a minus sign, or three numbers
+        up: which way is up in its world. `auto`, x, y, z, one of these with a minus sign, or three numbers
             such as "0 -0.9 -0.4". `auto` finds it by how the camera was held and by the surfaces that it saw.
         voxel_m: distance between two samples of the distance field. Finer ones need more memory and triangles.
         max_depth_m: farther readings are left out, as depth cameras are too noisy there.

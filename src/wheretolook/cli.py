@@ -49,11 +49,13 @@ _SPACE = ("occlusion", "scenes.free_space", "scenes.mapped_space", "map.photogra
 STAGES = {
     "scenes": Stage(
         "make_scenes",
-        "Make or load the textured meshes.",
+        "Make or load the textured meshes, or fuse one from colour and depth images: --rgbd.",
         "scenes.train scenes.val scenes.test scenes.seed scenes.meshes scenes.apartment.n_rooms "
-        "scenes.apartment.area_m2 scenes.apartment.texture_richness scenes.apartment.clutter scenes.apartment.vary",
+        "scenes.apartment.area_m2 scenes.apartment.texture_richness scenes.apartment.clutter scenes.apartment.vary "
+        "rgbd up",
         ("scenes",),
-        "--config configs/demo.yaml --scenes.train 5",
+        "--config configs/demo.yaml --scenes.train 5\n  wheretolook scenes --name kitchen --rgbd FOLDER",
+        {"--rgbd": "--scenes.rgbd.folder", "--up": "--scenes.rgbd.up"},
     ),
     "map": Stage(
         "make_maps",
@@ -214,6 +216,7 @@ of your own map, without a dataset:
   wheretolook STAGE --help-all     every option it reads
   wheretolook demo                 is configs/demo.yaml unless --config names another
   wheretolook map --config configs/demo.yaml --map.n_images 120
+  wheretolook scenes --name scan --rgbd FOLDER        a scene from colour and depth images with poses
   wheretolook map --name photos --images FOLDER       a scene known from photographs alone
   wheretolook map --name mymap --model sparse/0       a scene from a COLMAP model of your own
   wheretolook label --config configs/paper.yaml --engine ray     on a Ray cluster; the default is local

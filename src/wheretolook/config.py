@@ -15,6 +15,7 @@ from wheretolook.mapping.config import MapConfig
 from wheretolook.methods.train_config import MOVED as MOVED_TRAIN_OPTIONS
 from wheretolook.methods.train_config import TrainConfig
 from wheretolook.planning.config import PathsConfig, PlanConfig, ViewpointMapConfig
+from wheretolook.scans.config import RgbdConfig
 from wheretolook.scenes.config import ApartmentConfig, SceneKind
 from wheretolook.space.config import FreeSpaceConfig, MappedSpaceConfig
 from wheretolook.utils.confine import check_folder_name, entry_of
@@ -66,8 +67,10 @@ class ScenesConfig:
             part. These draw their sizes and difficulty from the seed, as apartments do that `vary`.
         apartment: what an apartment is like, and the texture and light of all generated scenes.
         meshes: scenes from meshes of one's own, beside the generated ones, such as [{path: scans/office.glb}].
+        rgbd: an RGB-D recording to make one scene of. With its folder no other scene is made; those that the dataset
+            has are kept.
         free_space: where a camera may be.
-        mapped_space: where it may be in a scene of photographs, which has no mesh.
+        mapped_space: where it may be in a scene of photographs, which has no mesh, or in a scan, which is in parts.
     """
 
     train: int = 3
@@ -77,6 +80,7 @@ class ScenesConfig:
     kinds: tuple[SceneKind, ...] = ("apartment",)
     apartment: ApartmentConfig = field(default_factory=ApartmentConfig)
     meshes: tuple[MeshSource, ...] = ()
+    rgbd: RgbdConfig = field(default_factory=RgbdConfig)
     free_space: FreeSpaceConfig = field(default_factory=FreeSpaceConfig)
     mapped_space: MappedSpaceConfig = field(default_factory=MappedSpaceConfig)
 

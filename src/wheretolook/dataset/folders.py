@@ -97,6 +97,16 @@ class SceneFolder:
         return self.folder / "occlusion.npz"
 
     @property
+    def frames(self) -> Path:
+        """COLMAP model of the frames of the recording that the mesh was fused from; only if it was."""
+        return self.folder / "frames"
+
+    @property
+    def is_scanned(self) -> bool:
+        """Whether the mesh was fused from a recording, and so shows what its camera saw, not a whole room."""
+        return self.mesh.is_file() and holds_model(self.frames)
+
+    @property
     def is_photographed(self) -> bool:
         """Whether the scene is known from photographs alone, or a model of such.
 

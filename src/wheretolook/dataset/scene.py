@@ -128,10 +128,21 @@ class Scene:
         centers = camera_centers(self.mapping_poses.astype(np.float64))
         return MappedSpace(self.landmarks.points, centers, self.config.mapped_space)
 
+    @cached_property
+    def scanned_space(self) -> MappedSpace:
+        """Where a camera can be according to a scan: near where the recording's was, clear of what it saw."""
+        from wheretolook.mapping.colmap_model import colmap_poses
+        from wheretolook.space.mapped_space import MappedSpace
+
+        centers = camera_centers(colmap_poses(self.files.frames))
+        return MappedSpace(self.mesh.vertices, centers, self.config.mapped_space)
+
     @property
     def sampled_space(self) -> FreeSpace | MappedSpace:
         """Where viewpoints are sampled: the same for all occlusion models."""
-        return self.mapped_space if self.is_photographed else self.mesh_space
+        if self.is_photographed:
+            return self.mapped_space
+        return self.scanned_space if self.files.is_scanned else self.mesh_space
 
     @cached_property
     def space(self) -> FreeSpace | MappedSpace:

@@ -20,13 +20,13 @@ from wheretolook.features.extraction import KeypointExtractor
 from wheretolook.features.keypoints import Keypoints
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
-from wheretolook.geometry.poses import Float, poses_looking_along
+from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
 from wheretolook.mapping import triangulation
 from wheretolook.mapping.colmap_model import CAMERAS_FILE, colmap_poses, save_mapping_poses, write_model
 from wheretolook.mapping.config import MapConfig
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
 from wheretolook.mapping.triangulation import image_name, triangulate_known_poses
-from wheretolook.mapping.walk import FreeSpaceQueries, plan_walk
+from wheretolook.mapping.walk import FreeSpaceQueries, Walk, plan_walk
 from wheretolook.utils.errors import MapError
 from wheretolook.utils.files import moved_later, storing, write_bytes, write_json
 from wheretolook.utils.processes import Processes
@@ -74,8 +74,11 @@ def build_map(
     device: str = "cpu",
     progress: bool = True,
     replacing: Callable[[], None] = lambda: None,
+    poses: NDArray[np.floating[Any]] | None = None,
 ) -> MapReport:
     """Map a scene in metres, z up: walk, render, extract, match, triangulate with known poses, filter.
+
+    With `poses` (M, 3, 4), images are taken there instead of along a walk.
 
     The result is a COLMAP model (binary) that any COLMAP tool opens, with `landmarks.npz`, `cameras.npz` and
     `report.json`, which is also returned, beside it. The model holds the filtered points only, so that every reader
@@ -92,8 +95,12 @@ def build_map(
     refuse_foreign_folder(out_dir)
     with partial_folder(out_dir, replacing) as partial, Processes(workers) as processes:
         with clock("walk"):
-            walk = plan_walk(free_space, mesh.bounds, config.n_images, config.walk, seed)
-            poses = poses_looking_along(walk.positions, walk.directions)
+            if poses is None:
+                walk = plan_walk(free_space, mesh.bounds, config.n_images, config.walk, seed)
+                poses = poses_looking_along(walk.positions, walk.directions)
+            else:
+                at, ahead = (np.asarray(of, dtype=np.float64) for of in (camera_centers(poses), poses[:, 2, :3]))
+                walk = Walk(at, ahead, at, 1.0, 0.0)
         with clock("render_and_extract"):
             depth: list[NDArray[np.float32]] = []
             images = _rendered(renderer, camera, poses, depth, partial / IMAGES_FOLDER if config.keep_images else None)

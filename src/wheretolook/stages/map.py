@@ -13,6 +13,7 @@ from wheretolook.config import NOT_SCENES, Experiment
 from wheretolook.dataset.folders import Dataset, SceneFolder
 from wheretolook.dataset.stamps import forget_stamp, is_done, read_stamp, stage_key, write_stamp
 from wheretolook.geometry.camera import Camera, CameraConfig, PinholeCamera, describe_camera, draw_camera
+from wheretolook.geometry.poses import Float
 from wheretolook.mapping.config import MapConfig, ScaleConfig
 from wheretolook.mapping.scale import read_scale
 from wheretolook.stages.inputs import (
@@ -35,9 +36,10 @@ from wheretolook.utils.files import fingerprint
 def make_maps(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> Dataset:
     """Stage 2: a COLMAP model of every scene with its landmarks' attributes, `<scene>/map/`.
 
-    With `map.photographs.images`, of one scene, made of the photographs there, which needs no mesh. With
-    `map.existing.model`, of one scene made from that model, with or without a mesh. Raises SceneError or MapError if a
-    mesh or a model cannot be read, or no landmark could be triangulated.
+    Images are rendered along a walk, or for a scan where its frames were taken. With `map.photographs.images`, of one
+    scene, made of the photographs there, which needs no mesh. With `map.existing.model`, of one scene made from that
+    model, with or without a mesh. Raises SceneError or MapError if a mesh or a model cannot be read, or no landmark
+    could be triangulated.
     """
     if experiment.map.existing.model is not None:
         refuse_release(experiment.root)
@@ -62,19 +64,30 @@ def make_maps(experiment: Experiment, say: Say = print, tick: Tick = lambda work
             from wheretolook.mapping.building import build_map
             from wheretolook.mapping.walk import PartOfFloor
 
+            taken = _poses_of_recording(files, experiment.map.n_images)
             with naming_scene(files.mesh):
                 space = PartOfFloor(scene.mesh_space, floor) if floor else scene.mesh_space
                 shown = (scene.mesh, scene.renderer, space, camera)
                 workers, device = experiment.n_workers, scene.device
                 how = (scene.raycaster, workers, device)
                 forget = partial(forget_stamp, files, "map")
-                report = build_map(*shown, experiment.map, seed, files.map, *how, replacing=forget)
+                report = build_map(*shown, experiment.map, seed, files.map, *how, replacing=forget, poses=taken)
             write_stamp(files, "map", key)
             found = f"{report.n_landmarks:,} landmarks from {report.n_registered} images"
             off = f"median {report.median_distance_to_mesh_cm:.2f} cm from the mesh"
             say(f"{scene.name}: {found}, {off} -> {files.map}")
         tick(1)
     return dataset
+
+
+def _poses_of_recording(scene: SceneFolder, at_most: int) -> Float | None:
+    """Poses (M, 3, 4) of a scan's frames, evenly so many of them, for its map: only there the mesh is whole."""
+    if not scene.is_scanned:
+        return None
+    from wheretolook.mapping.colmap_model import colmap_poses
+
+    poses = colmap_poses(scene.frames)
+    return poses[np.unique(np.linspace(0, len(poses) - 1, min(len(poses), at_most)).round().astype(int))]
 
 
 def _mapping_camera(config: MapConfig, looking: Camera, seed: int) -> PinholeCamera:

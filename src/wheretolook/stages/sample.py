@@ -23,8 +23,9 @@ def sample(experiment: Experiment, say: Say = print, tick: Tick = lambda work: N
     """Stage 3: viewpoints and which landmarks their locations see, `<scene>/viewpoints.parquet` and `occlusion.npz`.
 
     A camera looks in every direction from the centre of every free voxel, and the landmarks in view are counted
-    exactly. In a scene of photographs a camera can be near where these were taken, and hidden-point removal tells what
-    is occluded. Raises SceneError if no location is free, MapError if there is no map, or one without a scale.
+    exactly. In a scene of photographs or a scan, a camera can be near where these were taken; without a mesh,
+    hidden-point removal tells what is occluded. Raises SceneError if no location is free, MapError if there is no map,
+    or one without a scale.
     """
     dataset, config = dataset_after(experiment, "map"), experiment.sample
     for files in dataset.scenes:
@@ -44,6 +45,8 @@ def _key(scene: Scene, config: SampleConfig) -> str:
     if scene.is_photographed:
         scene.require_metres()
         space, stage = asdict(scene.config.mapped_space), "map"
+    elif files.is_scanned:
+        space = asdict(scene.config.mapped_space)
     chosen = {name: value for name, value in asdict(config).items() if name != "memory_gb"}
     if not config.cameras:  # as before there was the option
         del chosen["cameras"]

@@ -1,7 +1,8 @@
-"""The scenes stage: a textured mesh for every scene."""
+"""The scenes stage: a textured mesh for every scene, generated, loaded, or fused from a recording."""
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -24,11 +25,16 @@ if TYPE_CHECKING:
 def make_scenes(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> Dataset:
     """Stage 1: a textured mesh for every scene, `<scene>/mesh.glb`, and the dataset's description.
 
-    Raises SceneError if a mesh in `scenes.meshes` cannot be used or two scenes have the same name, ConfigError if the
-    dataset's folder holds a release.
+    With `scenes.rgbd.folder`, of one scene, fused from the RGB-D recording there, which joins the dataset's others.
+    Raises SceneError if a mesh in `scenes.meshes` or the recording cannot be used or two scenes have the same name,
+    ConfigError if the dataset's folder holds a release.
     """
     config, root, camera = experiment.scenes, experiment.root, experiment.camera.camera
     refuse_release(root)
+    if config.rgbd.folder is not None:
+        from wheretolook.stages.scans import scan_scene
+
+        return scan_scene(experiment, say, tick)
     numbers: dict[Split, int] = {"train": config.train, "val": config.val, "test": config.test}
     splits = [split for split, number in numbers.items() for _ in range(number)]
     sources: dict[SceneFolder, Callable[[], tuple[TexturedMesh, MappedFloor]]] = {}
@@ -55,6 +61,7 @@ def make_scenes(experiment: Experiment, say: Say = print, tick: Tick = lambda wo
             mesh, mapped = make()
             scene.folder.mkdir(parents=True, exist_ok=True)
             forget_stamp(scene, "scenes")  # so that no stamp is of what it no longer stands for, whenever it is killed
+            shutil.rmtree(scene.frames, ignore_errors=True)  # of a recording that was here before
             save_glb(mesh, scene.mesh)
             scene.save_mapped_floor(mapped)
             write_stamp(scene, "scenes", key)

@@ -28,6 +28,7 @@ from wheretolook.visibility.occlusion import MeshOcclusion
 
 BLOCK_VOXELS = 8  # voxels along the side of a block
 BYTES_PER_BLOCK = 24 * 1024  # peak memory for each block, from fusion to ray casting: 19 to 23 KiB on three scenes
+_COLOR_BYTES_PER_BLOCK = 12 * 1024  # and with colours so much more
 MAX_BLOCKS = 1 << 20  # more are refused: Open3D's extraction of triangles numbers four entries of each voxel by 32 bits
 
 _TOUCH_STRIDE = 4  # Open3D looks for blocks at every fourth pixel
@@ -82,6 +83,7 @@ class DepthImage:
     depth_m: NDArray[Any]  # (H, W) floats, metres along the optical axis; 0, negative, NaN and infinite mean no reading
     camera: Camera  # intrinsics: a pinhole, or a COLMAP camera of the model SIMPLE_PINHOLE or PINHOLE
     cam_from_world: Float  # (3, 4)
+    rgb: NDArray[np.uint8] | None = None  # (H, W, 3), for a volume with colours
 
     def __post_init__(self) -> None:
         _ = self.camera.matrix  # raises if the camera has distortion
@@ -90,6 +92,9 @@ class DepthImage:
             problem = f"the camera has {height} x {width} pixels (height x width), the depth image another size"
             fix = "Give the camera of the depth image, or scale one of them."
             raise ConfigError(problem, value=np.shape(self.depth_m), fix=fix)
+        if self.rgb is not None and np.shape(self.rgb) != (height, width, 3):
+            fix = "Give colours of the same camera, or none."
+            raise ConfigError("the colours of a depth image have another size", value=np.shape(self.rgb), fix=fix)
         dtype = np.asarray(self.depth_m).dtype
         if not np.issubdtype(dtype, np.floating):
             fix = "Divide a 16-bit image by its depth scale, mostly 1000 a metre."
@@ -123,21 +128,28 @@ class TsdfVolume:
 
     Use `from_images` where all images are at hand: it also checks the memory beforehand.
 
-    It starts with room for `expected_blocks`; when they are used up, all are copied to more.
+    It starts with room for `expected_blocks`; when they are used up, all are copied to more. If it is `colored`, it
+    averages the colours of images, too.
     """
 
-    def __init__(self, config: TsdfConfig | None = None, expected_blocks: int = 1 << 13) -> None:
+    def __init__(self, config: TsdfConfig | None = None, expected_blocks: int = 1 << 13, colored: bool = False) -> None:
         import open3d as o3d
 
-        self.config = config or TsdfConfig()
+        self.config, self.colored = config or TsdfConfig(), colored
         self._limit = self.config.memory_limit_bytes or _available_bytes() * 4 // 5
-        layout = ("tsdf", "weight"), (o3d.core.float32,) * 2, (o3d.core.SizeVector([1]),) * 2
+        names, sizes = ("tsdf", "weight", "color"), (1, 1, 3)
+        n = 3 if colored else 2
+        layout = names[:n], (o3d.core.float32,) * n, [o3d.core.SizeVector([size]) for size in sizes[:n]]
         size_m = self.config.voxel_size_m
         self._grid: Any = o3d.t.geometry.VoxelBlockGrid(*layout, size_m, BLOCK_VOXELS, expected_blocks)
 
     @classmethod
     def from_images(
-        cls, images: Sequence[DepthImage], config: TsdfConfig | None = None, progress: bool = True
+        cls,
+        images: Sequence[DepthImage],
+        config: TsdfConfig | None = None,
+        progress: bool = True,
+        colored: bool = False,
     ) -> TsdfVolume:
         """Fuse depth images, in any order. A sequence that reads each from disk when asked for it keeps memory low.
 
@@ -146,8 +158,8 @@ class TsdfVolume:
         """
         config = config or TsdfConfig()
         n_blocks = estimate_blocks(images, config)
-        _check_memory(n_blocks, config, config.memory_limit_bytes or _available_bytes() * 4 // 5)
-        volume = cls(config, n_blocks)
+        _check_memory(n_blocks, config, config.memory_limit_bytes or _available_bytes() * 4 // 5, colored)
+        volume = cls(config, n_blocks, colored)
         for i in tqdm(range(len(images)), desc="fuse depth", unit="image", disable=not progress):
             volume.integrate(images[i])
         return volume
@@ -168,13 +180,20 @@ class TsdfVolume:
         pose = np.vstack([np.asarray(image.cam_from_world, dtype=np.float64), (0, 0, 0, 1)])
         tensor: Any = core.Tensor
         limits = 1.0, float(self.config.max_depth_m), float(self.config.truncation_voxels)
-        view = Image(tensor(np.ascontiguousarray(depth))), tensor(image.camera.matrix), tensor(pose), *limits
-        blocks = self._grid.compute_unique_block_coordinates(*view)
-        self._grid.integrate(blocks, *view)
-        _check_memory(len(self), self.config, self._limit)
+        shown, from_where = Image(tensor(np.ascontiguousarray(depth))), (tensor(image.camera.matrix), tensor(pose))
+        blocks = self._grid.compute_unique_block_coordinates(shown, *from_where, *limits)
+        if self.colored:
+            assert image.rgb is not None
+            color = Image(tensor(np.asarray(image.rgb, dtype=np.float32) / np.float32(255)))
+            self._grid.integrate(blocks, shown, color, *from_where, *limits)
+        else:
+            self._grid.integrate(blocks, shown, *from_where, *limits)
+        _check_memory(len(self), self.config, self._limit, self.colored)
 
-    def surface(self) -> TexturedMesh:
-        """The zero crossing as triangles without colours, whose fronts face the cameras that saw them.
+    def surface(self, least_weight: float = 0.5) -> TexturedMesh:
+        """The zero crossing as triangles, whose fronts face the cameras that saw them; with colours if it has them.
+
+        Of voxels with at least so many readings.
 
         Several threads find the triangles, so their order may differ from run to run; the triangles do not. Raises
         SceneError if there is none.
@@ -188,7 +207,7 @@ class TsdfVolume:
         values = self._grid.attribute("tsdf").numpy()  # shares its memory
         values -= shift
         try:
-            mesh = self._grid.extract_triangle_mesh(0.5, -1)  # all voxels with at least one reading
+            mesh = self._grid.extract_triangle_mesh(least_weight, -1)
         except RuntimeError:  # Open3D cannot colour a mesh without vertices
             raise nothing from None
         finally:
@@ -198,7 +217,10 @@ class TsdfVolume:
         triangles = mesh.triangle.indices.numpy().astype(np.int32)
         uvs = np.broadcast_to(np.float32(0), (len(triangles), 3, 2))  # takes no memory
         texture, white = np.broadcast_to(np.int32(0), (len(triangles),)), (np.full((1, 1, 3), 255, np.uint8),)
-        return TexturedMesh(mesh.vertex.positions.numpy(), triangles, uvs, texture, white)
+        colors = None
+        if self.colored:
+            colors = np.clip(np.rint(255 * mesh.vertex.colors.numpy()), 0, 255).astype(np.uint8)
+        return TexturedMesh(mesh.vertex.positions.numpy(), triangles, uvs, texture, white, colors)
 
 
 class TsdfOcclusion(MeshOcclusion):
@@ -246,15 +268,16 @@ def estimate_blocks(images: Sequence[DepthImage], config: TsdfConfig) -> int:
     return int(np.ceil(_BLOCKS_PER_CELL * len(cells) * (cell_m / config.block_m) ** 2))
 
 
-def _check_memory(n_blocks: int, config: TsdfConfig, limit_bytes: int) -> None:
-    fits = min(limit_bytes // BYTES_PER_BLOCK, MAX_BLOCKS)
+def _check_memory(n_blocks: int, config: TsdfConfig, limit_bytes: int, colored: bool = False) -> None:
+    block_bytes = BYTES_PER_BLOCK + colored * _COLOR_BYTES_PER_BLOCK
+    fits = min(limit_bytes // block_bytes, MAX_BLOCKS)
     if n_blocks <= fits:
         return
     enough = config.voxel_size_m * np.sqrt(n_blocks / max(fits, 1))
     step = 10.0 ** (np.floor(np.log10(enough)) - 1)
-    needed, available = (n * BYTES_PER_BLOCK / 2**30 for n in (n_blocks, fits))
-    need = f"about {needed:.2f} GiB ({n_blocks * BYTES_PER_BLOCK:,} bytes) for what the depth images show"
-    problem = f"voxels of this size need {need}, {available:.2f} GiB ({fits * BYTES_PER_BLOCK:,} bytes) can be used"
+    needed, available = (n * block_bytes / 2**30 for n in (n_blocks, fits))
+    need = f"about {needed:.2f} GiB ({n_blocks * block_bytes:,} bytes) for what the depth images show"
+    problem = f"voxels of this size need {need}, {available:.2f} GiB ({fits * block_bytes:,} bytes) can be used"
     fix = f"A voxel_size_m of {np.ceil(enough / step) * step:.2g} would fit."
     raise ConfigError(problem, value=f"voxel_size_m={config.voxel_size_m:g}", fix=fix)
 

@@ -1,0 +1,1 @@
+"""RGB-D recordings: read, checked, fused to a coloured mesh."""

@@ -1,0 +1,134 @@
+"""Whether a recording's depths and poses are in the same unit, and that in metres."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.poses import Float, camera_centers, invert_poses
+from wheretolook.scans.frames import SURVEY_STRIDE, RgbdFrames
+from wheretolook.utils.errors import SceneError
+
+DEPTH_M = (0.2, 20.0)
+"""Median reading of depth cameras where people walk: they do not see farther."""
+_AGREE = 0.03  # by which two depths of the same point may differ, of the depth
+_PAIRS = 40  # pairs of frames that are compared
+_LEAST_PAIRS, _LEAST_SHARED = 3, 50  # of them, and readings that the two of a pair share
+_FACING = np.cos(np.radians(40.0))  # of the optical axes of a pair
+_FACTORS = np.geomspace(1 / 12, 12, 83)  # that depths are multiplied with, in steps of 6 %
+_FACTORS = np.concatenate([_FACTORS, *(power * np.geomspace(0.8, 1.25, 7) for power in (0.001, 0.01, 100, 1000))])
+_ONE = 41  # where among them is 1
+_LEAST_AGREEMENT = 0.2  # share of the readings, or poses and depths have nothing to do with each other
+_CLEARLY = 0.15  # by how much more of the readings must agree with another factor
+_OFF = 1.25  # a factor by which a unit is wrong, not a camera
+_LANDMARK_OFF = 1.1  # a factor between depths and landmarks
+
+
+def check_depth_unit(frames: RgbdFrames) -> None:
+    """Raise SceneError if depths are in another unit than poses or landmarks, or no depths in metres.
+
+    Frames that share surface tell it: a reading of one, moved into the other by the poses, is as deep there as that
+    one's own reading says, but only with depths and poses in one unit. With a model, the readings at its landmarks do.
+    """
+    scale = frames.depth_scale
+    if frames.model is not None:
+        factor = landmark_factor(frames, frames.model)
+        if factor is not None and not 1 / _LANDMARK_OFF < factor < _LANDMARK_OFF:
+            problem = "depths are in another unit than the model: its landmarks are "
+            problem += f"{factor:.3g} times as far as the depth images say"
+            fix = f"Give the model metres (`wheretolook map --model`), or {_option(scale / factor)} if its unit is one."
+            raise SceneError(problem, path=frames.folder, value=f"{scale:g} units a metre", fix=fix)
+    factor = pose_factor(frames.survey_m, frames.camera, frames.cam_from_world)
+    if factor is not None and np.isnan(factor):
+        problem = "by their poses, neighbouring frames do not show the same surfaces, whatever the unit of depth"
+        fix = "Give poses world_from_cam (not cam_from_world), x right, y down, z forward, of the same frames."
+        raise SceneError(problem, path=frames.folder, fix=fix)
+    if factor is not None and not 1 / _OFF < factor < _OFF:
+        problem = "depths are in another unit than poses: neighbouring frames show the same surfaces only if depths "
+        problem += f"are about {factor:.2g} times as large"
+        fix = f"Give {_option(scale / factor)}, or poses in metres."
+        raise SceneError(problem, path=frames.folder, value=f"{scale:g} units a metre", fix=fix)
+    median = float(np.median(frames.survey_m[frames.survey_m > 0]))
+    if not DEPTH_M[0] <= median <= DEPTH_M[1]:
+        problem = f"depths seem not to be in metres: half of the readings are nearer than {median:.3g} m"
+        fix = f"Say how many units make a metre, such as {_option(5000 if scale < 5000 else 1000)}, and give poses in "
+        fix += "metres."
+        raise SceneError(problem, path=frames.folder, value=f"{scale:g} units a metre", fix=fix)
+
+
+def landmark_factor(frames: RgbdFrames, model: Any) -> float | None:
+    """Median of how many times as deep a model's landmarks are as the depth images say where they were observed.
+
+    Takes the `pycolmap.Reconstruction` that gave the poses. None if there are fewer than 20 of both.
+    """
+    factors = []
+    by_name = {image.name: image for image in model.images.values()}
+    for name, depth, pose in zip(frames.names_in_model, frames.survey_m, frames.cam_from_world, strict=True):
+        image: Any = by_name[name]
+        points = [model.points3D[seen.point3D_id].xyz for seen in image.points2D if seen.has_point3D()]
+        if points:
+            there = _readings_at(depth, frames.camera, np.array(points) @ pose[:, :3].T + pose[:, 3])
+            factors.append(there[:, 0] / there[:, 1])
+    found = np.concatenate(factors) if factors else np.zeros(0)
+    return float(np.median(found)) if len(found) >= 20 else None
+
+
+def pose_factor(survey_m: NDArray[np.float32], camera: PinholeCamera, cam_from_world: Float) -> float | None:
+    """By what depths (F, h, w) must be multiplied for neighbouring frames to agree; 1 unless another is clearly better.
+
+    NaN if hardly any agree by any factor, None if the camera moved too little to tell.
+    """
+    pairs = _pairs(cam_from_world)
+    agreements = []
+    for i, j in pairs:
+        row, column = np.nonzero(survey_m[i])
+        pixels = np.column_stack([column, row]) * SURVEY_STRIDE + SURVEY_STRIDE // 2 + 0.5
+        rays = camera.unproject(pixels)
+        points = rays / rays[:, 2:] * survey_m[i][row, column, None]
+        relative = cam_from_world[j] @ np.vstack([invert_poses(cam_from_world[i]), (0, 0, 0, 1)])
+        turned = points @ relative[:, :3].T
+        shares = []
+        for factor in _FACTORS:
+            both = _readings_at(survey_m[j], camera, turned + relative[:, 3] / factor)
+            agree = np.abs(both[:, 0] - both[:, 1]) < _AGREE * both[:, 1]
+            shares.append(agree.mean() if len(both) >= _LEAST_SHARED else 0.0)
+        agreements.append(shares)
+    if len(agreements) < _LEAST_PAIRS:
+        return None
+    agreement = np.mean(agreements, axis=0)
+    best = int(agreement.argmax())
+    near_one = agreement[np.abs(np.log(_FACTORS)) < np.log(_OFF)].max()
+    if agreement[best] < _LEAST_AGREEMENT:
+        return float("nan")
+    return float(_FACTORS[best]) if agreement[best] > near_one + _CLEARLY else float(_FACTORS[_ONE])
+
+
+def _pairs(cam_from_world: Float) -> list[tuple[int, int]]:
+    """Pairs of frames that look the same way from places some way apart."""
+    centers, axes = camera_centers(cam_from_world), cam_from_world[:, 2, :3]
+    first = np.unique(np.linspace(0, len(centers) - 1, _PAIRS).round().astype(int))
+    apart = np.linalg.norm(centers[first][:, None] - centers, axis=-1)
+    facing = axes[first] @ axes.T > _FACING
+    if not (apart[facing] > 0).any():
+        return []
+    wanted = np.median(apart[facing & (apart > 0)])
+    off = np.where(facing & (apart > 0.2 * wanted), np.abs(apart - wanted), np.inf)
+    partner = off.argmin(1)
+    return [(int(i), int(j)) for i, j, row in zip(first, partner, off, strict=True) if np.isfinite(row[j])]
+
+
+def _readings_at(survey_m: NDArray[np.float32], camera: PinholeCamera, points_cam: Float) -> Float:
+    """Depth of points (N, 3) in a camera, and what its survey reads there, (M, 2), of those where it reads anything."""
+    pixels, z = camera.project(points_cam), points_cam[:, 2]
+    inside = (z > 0) & camera.in_image(pixels)
+    cell = (pixels[inside] // SURVEY_STRIDE).astype(np.int64)
+    height, width = survey_m.shape
+    there = survey_m[np.minimum(cell[:, 1], height - 1), np.minimum(cell[:, 0], width - 1)]
+    return np.column_stack([z[inside], there])[there > 0]
+
+
+def _option(scale: float) -> str:
+    return f"--scenes.rgbd.depth_scale {scale:.4g}"

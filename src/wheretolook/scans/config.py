@@ -1,0 +1,88 @@
+"""How a recording of colour and depth becomes a mesh: options only, so that the command line reads them quickly."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from math import inf
+from pathlib import Path
+from typing import Literal
+
+from wheretolook.utils.errors import ConfigError
+
+UP_AXES = {"x": (1, 0, 0), "-x": (-1, 0, 0), "y": (0, 1, 0), "-y": (0, -1, 0), "z": (0, 0, 1), "-z": (0, 0, -1)}
+
+
+@dataclass(frozen=True)
+class RgbdConfig:
+    """A scene from an RGB-D recording: colour images, depth images and poses.
+
+    Args:
+        folder: an RGB-D recording as of 7-Scenes or TUM. The former has frame-*.color.*,
+            .depth.png and .pose.txt, also in folders seq-*, the latter rgb.txt, depth.txt and groundtruth.txt.
+        name: name of the scene; the folder's own if empty.
+        split: where its viewpoints go: train, val or test.
+        model: COLMAP model of the colour images, whose poses and camera are taken instead of the recording's. The
+            mesh is then in its frame, turned upright, and depths are checked against its landmarks.
+        depth_scale: units of a depth image in a metre; 0 for the layout's, 1000 in 7-Scenes and 5000 in TUM.
+        camera: fx, fy, cx, cy of the colour images in pixels; the layout's if empty.
+        depth_camera: the same of the depth images, where they are not registered to the colour images.
+        color_from_depth_m: where the depth camera is in the colour camera's frame; x right, y down, z forward.
+        up: which way is up in its world. `auto`, x, y, z, one of these with a minus sign, or three numbers
+            such as "0 -0.9 -0.4". `auto` finds it by how the camera was held and by the surfaces that it saw.
+        voxel_m: distance between two samples of the distance field. Finer ones need more memory and triangles.
+        max_depth_m: farther readings are left out, as depth cameras are too noisy there.
+        max_frames: of more frames, so many are taken, evenly.
+        appearance: `texture` projects the sharpest colour image on each triangle, `colors` averages all at the
+            vertices.
+    """
+
+    folder: Path | None = None
+    name: str = ""
+    split: Literal["train", "val", "test"] = "test"
+    model: Path | None = None
+    depth_scale: float = 0.0
+    camera: tuple[float, ...] = ()
+    depth_camera: tuple[float, ...] = ()
+    color_from_depth_m: tuple[float, ...] = ()
+    up: str = "auto"
+    voxel_m: float = 0.01
+    max_depth_m: float = 4.0
+    max_frames: int = 1000
+    appearance: Literal["texture", "colors"] = "texture"
+
+    # Voxels behind a surface that count as inside it: 4 cm hold what a depth camera's noise and poses are off by.
+    truncation_voxels: float = field(default=4.0, init=False)
+
+    def __post_init__(self) -> None:
+        for name, length in (("camera", 4), ("depth_camera", 4), ("color_from_depth_m", 3)):
+            values = getattr(self, name)
+            if len(values) not in (0, length) or not all(-inf < value < inf for value in values):
+                raise ConfigError(f"scenes.rgbd.{name} are {length} numbers", value=values)
+        if not 0 <= self.depth_scale < inf:
+            raise ConfigError("scenes.rgbd.depth_scale must not be negative", value=self.depth_scale)
+        for name in ("voxel_m", "max_depth_m", "max_frames"):
+            if not 0 < getattr(self, name) < inf:
+                raise ConfigError(f"scenes.rgbd.{name} must be positive", value=getattr(self, name))
+        _ = self.up_direction
+
+    @property
+    def scene_name(self) -> str:
+        """Name of the scene's folder."""
+        assert self.folder is not None
+        return self.name or self.folder.resolve().name
+
+    @property
+    def up_direction(self) -> tuple[float, ...] | None:
+        """Up in the recording's world, not of unit length; None to find it. Raises ConfigError if `up` is none."""
+        if self.up == "auto":
+            return None
+        if self.up in UP_AXES:
+            return UP_AXES[self.up]
+        try:
+            direction = tuple(float(value) for value in self.up.replace(",", " ").split())
+        except ValueError:
+            direction = ()
+        if len(direction) != 3 or not 0 < sum(value * value for value in direction) < inf:
+            fix = f'Use auto, {", ".join(UP_AXES)}, or three numbers such as "0 -0.9 -0.4".'
+            raise ConfigError("scenes.rgbd.up is no direction", value=self.up, fix=fix)
+        return direction

@@ -1,0 +1,171 @@
+"""A recording of colour and depth fused to a mesh, upright, in metres."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, overload
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.mesh import TexturedMesh
+from wheretolook.geometry.poses import Float
+from wheretolook.mapping.gravity import estimate_gravity, rotation_to_z
+from wheretolook.mapping.scale import Similarity
+from wheretolook.scans.checks import check_depth_unit
+from wheretolook.scans.config import RgbdConfig
+from wheretolook.scans.frames import Frames, RgbdFrames
+from wheretolook.scans.textures import textured
+from wheretolook.scans.upright import find_up
+from wheretolook.utils.errors import MapWarning, SceneError
+from wheretolook.visibility.tsdf import DepthImage, TsdfConfig, TsdfVolume
+
+_LEAST_READINGS = 3.0  # of a voxel, for its surface to be believed
+_LEAST_PIECE_M2 = 0.01  # smaller pieces that hang in the air are noise
+_DISAGREE_DEG = 30.0  # between up as it is said to be and as it seems
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """What became of a recording."""
+
+    mesh: TexturedMesh  # metres, z up
+    frames: RgbdFrames
+    up: Float  # (3,) unit, up in the recording's world, or the model's
+    rotation: Float  # (3, 3) that turned that world upright
+
+    def describe(self) -> list[str]:
+        """In sentences: frames used and skipped, the unit of depth, up."""
+        skipped = self.frames.skipped.describe()
+        used = f"{len(self.frames)} frames of a recording of {self.frames.layout.name}'s layout"
+        up = " ".join(f"{value:.2f}" for value in np.round(self.up, 2) + 0.0)
+        return [
+            f"{used}{f'; not used: {skipped}' if skipped else ''}",
+            f"{self.frames.depth_scale:g} units of depth a metre; up is ({up}) in the recording's world, z here",
+        ]
+
+    def report(self) -> dict[str, Any]:
+        """The same and more, as values of JSON."""
+        frames = self.frames
+        return {
+            "layout": frames.layout.name,
+            "n_frames": len(frames),
+            "skipped": frames.skipped.reasons,
+            "depth_scale": frames.depth_scale,
+            "up": self.up.tolist(),
+            "rotation": self.rotation.tolist(),
+            "n_triangles": len(self.mesh.triangles),
+            "n_textures": len(self.mesh.textures),
+            "camera": frames.camera.record(),
+        }
+
+    def save_model(self, folder: Path) -> None:
+        """Write the frames as a COLMAP model in the mesh's world: cameras, poses and names, and a given model's points.
+
+        So `wheretolook map --model` makes a map of the colour images that has this mesh.
+        """
+        import pycolmap
+
+        folder.mkdir(parents=True, exist_ok=True)
+        model = self.frames.model
+        if model is not None:
+            model = pycolmap.Reconstruction(model)
+            Similarity(1.0, self.rotation, np.zeros(3)).transform_model(model)
+        else:
+            model = pycolmap.Reconstruction()
+            model.add_camera_with_trivial_rig(pycolmap.Camera(camera_id=1, **self.frames.camera.colmap.record()))
+            for number, (name, pose) in enumerate(zip(self.frames.names, self.frames.cam_from_world, strict=True), 1):
+                turned = pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:, :3] @ self.rotation.T), pose[:, 3])
+                model.add_image_with_trivial_frame(pycolmap.Image(name=name, camera_id=1, image_id=number), turned)
+        model.write_binary(str(folder))
+
+
+def make_scan(config: RgbdConfig, device: str = "cpu", progress: bool = True) -> Scan:
+    """Read, check and fuse the recording in `config.folder`.
+
+    Warns with a `MapWarning` if up as it is given seems wrong. Raises SceneError if the recording lacks something, its
+    depths are in another unit, or show no surface; MapError if the model cannot be read; ConfigError if the voxels do
+    not fit into memory.
+    """
+    frames = RgbdFrames(config, progress)
+    check_depth_unit(frames)
+    mesh = fuse(frames, frames.camera, frames.cam_from_world, config, device, progress)
+    up = _up(config, frames, mesh)
+    rotation = rotation_to_z(up)
+    return Scan(replace(mesh, vertices=(mesh.vertices @ rotation.T).astype(np.float32)), frames, up, rotation)
+
+
+def fuse(
+    frames: Frames,
+    camera: PinholeCamera,
+    cam_from_world: Float,
+    config: RgbdConfig,
+    device: str = "cpu",
+    progress: bool = True,
+) -> TexturedMesh:
+    """The mesh of frames (F) of one camera at poses (F, 3, 4), in their world. Raises SceneError if they show none."""
+    tsdf = TsdfConfig(config.voxel_m, config.truncation_voxels, config.max_depth_m)
+    volume = TsdfVolume.from_images(_DepthImages(frames, camera, cam_from_world), tsdf, progress, colored=True)
+    mesh = _without_crumbs(volume.surface(min(_LEAST_READINGS, len(frames))))
+    del volume
+    if config.appearance == "texture":
+        return textured(mesh, frames, camera, cam_from_world, device, progress)
+    return mesh
+
+
+def _up(config: RgbdConfig, frames: RgbdFrames, mesh: TexturedMesh) -> Float:
+    if config.up_direction is None:
+        return find_up(frames.cam_from_world, mesh)
+    up = np.asarray(config.up_direction, dtype=np.float64)
+    up = up / np.linalg.norm(up)
+    held = estimate_gravity(frames.cam_from_world).up
+    off_deg = float(np.degrees(np.arccos(np.clip(up @ held, -1, 1))))
+    if off_deg > _DISAGREE_DEG:
+        seems = " ".join(f"{value:.2f}" for value in np.round(held, 2) + 0.0)
+        text = f"{frames.folder}: up is said to be {config.up}, but as the camera was held it is ({seems}), "
+        text += f"{off_deg:.0f} degrees from it. --scenes.rgbd.up auto finds it"
+        warnings.warn(text, MapWarning, stacklevel=3)
+    return up
+
+
+def _without_crumbs(mesh: TexturedMesh) -> TexturedMesh:
+    """The mesh without small pieces that are connected to nothing, and without vertices that nothing uses."""
+    n, (a, b, c) = len(mesh.vertices), mesh.triangles.T
+    edges = coo_array((np.ones(2 * len(a), dtype=np.int8), (np.r_[a, b], np.r_[b, c])), shape=(n, n))
+    _, piece = connected_components(edges, directed=False)
+    piece_of = piece[a]
+    area_m2 = np.bincount(piece_of, np.linalg.norm(mesh.normals, axis=1) / 2)
+    keep = area_m2[piece_of] >= _LEAST_PIECE_M2
+    if not keep.any():
+        fix = "Check the poses, and that depths are in metres."
+        raise SceneError("the depth images show no surface, only crumbs", value=f"{area_m2.max():.2g} m2", fix=fix)
+    used, triangles = np.unique(mesh.triangles[keep], return_inverse=True)
+    colors = None if mesh.vertex_colors is None else mesh.vertex_colors[used]
+    rest: dict[str, Any] = {"vertices": mesh.vertices[used], "vertex_colors": colors}
+    return replace(mesh.only(keep), triangles=triangles.reshape(-1, 3).astype(np.int32), **rest)
+
+
+class _DepthImages(Sequence[DepthImage]):
+    """Frames as the fusion takes them, each read when it is asked for."""
+
+    def __init__(self, frames: Frames, camera: PinholeCamera, poses: NDArray[Any]) -> None:
+        self.frames, self.camera, self.poses = frames, camera, poses
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+    @overload
+    def __getitem__(self, index: int) -> DepthImage: ...
+    @overload
+    def __getitem__(self, index: slice) -> _DepthImages: ...
+    def __getitem__(self, index: int | slice) -> DepthImage | _DepthImages:
+        if isinstance(index, slice):
+            raise TypeError("frames are read one by one")
+        frame = self.frames[int(index)]
+        return DepthImage(frame.depth_m, self.camera, self.poses[index], frame.rgb)

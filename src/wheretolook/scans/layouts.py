@@ -1,0 +1,200 @@
+"""Which files make the frames of an RGB-D recording, in the layouts of 7-Scenes and of the TUM RGB-D benchmark.
+
+Shotton et al., "Scene Coordinate Regression Forests for Camera Relocalization in RGB-D Images", CVPR 2013; Sturm et
+al., "A Benchmark for the Evaluation of RGB-D SLAM Systems", IROS 2012.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wheretolook.geometry.poses import Float, invert_poses, rotation_from_quaternion
+from wheretolook.utils.confine import path_within
+from wheretolook.utils.errors import SceneError
+from wheretolook.utils.reading import read_text
+
+_MAX_APART_S = 0.02  # between a colour image and its depth image or pose: as TUM's own associate.py has it
+_RIGID = 1e-2  # by which a rotation's entries may be off
+_IMAGES = (".png", ".jpg", ".jpeg")
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What the images of a layout are like, where nothing else is said; intrinsics are fx, fy, cx, cy in pixels."""
+
+    name: str
+    depth_scale: float  # units in a metre
+    camera: tuple[float, float, float, float]
+    depth_camera: tuple[float, float, float, float] | None  # None: depth images are registered to the colour images
+    color_from_depth_m: tuple[float, float, float]
+    no_reading: int  # value of a depth pixel without one, beside 0
+
+
+# Kinect's nominal cameras, 2.5 cm apart. The pose is the depth camera's.
+SEVEN_SCENES = Layout(
+    "7-scenes", 1000.0, (525.0, 525.0, 320.0, 240.0), (585.0, 585.0, 320.0, 240.0), (-0.025, 0.0, 0.0), 65535
+)
+TUM = Layout("tum", 5000.0, (525.0, 525.0, 320.0, 240.0), None, (0.0, 0.0, 0.0), 0)  # ROS's defaults, as TUM advises
+
+
+@dataclass(frozen=True, eq=False)
+class FrameFiles:
+    """One frame."""
+
+    name: str  # path of the colour image, relative to the recording
+    color: Path
+    depth: Path
+    cam_from_world: Float  # (3, 4), as the recording tells: of its depth camera; or of a model's image
+    in_model: str = ""  # the name of that image
+
+
+@dataclass
+class Skipped:
+    """How many frames were not used, and why."""
+
+    reasons: dict[str, int] = field(default_factory=dict)
+
+    def add(self, reason: str) -> None:
+        """Count a frame."""
+        self.reasons[reason] = self.reasons.get(reason, 0) + 1
+
+    def describe(self) -> str:
+        """Such as "3 without a pose, 1 without depth"; empty for none."""
+        return ", ".join(f"{number} {reason}" for reason, number in self.reasons.items())
+
+
+def find_layout(folder: Path) -> Layout:
+    """The layout of a recording. Raises SceneError if it has neither."""
+    if not folder.is_dir():
+        raise SceneError("there is no such folder", path=folder, fix="Name the folder of an RGB-D recording.")
+    if (folder / "rgb.txt").is_file() and (folder / "depth.txt").is_file():
+        return TUM
+    if any(_color_files(folder)):
+        return SEVEN_SCENES
+    fix = "A recording has frame-*.color.png, frame-*.depth.png and frame-*.pose.txt, as in 7-Scenes, or rgb.txt, "
+    raise SceneError("this is no RGB-D recording", path=folder, fix=fix + "depth.txt and groundtruth.txt, as in TUM.")
+
+
+def frame_files(folder: Path, layout: Layout, need_poses: bool = True) -> tuple[list[FrameFiles], Skipped]:
+    """The frames of a recording that have all their files and a pose, in order, and how many have not.
+
+    Where poses come from elsewhere, those missing are the identity. Raises SceneError if a list of files or all poses
+    are missing.
+    """
+    skipped = Skipped()
+    read = _tum_frames if layout is TUM else _seven_scenes_frames
+    frames = list(read(folder, skipped, need_poses))
+    if not frames:
+        where = "groundtruth.txt" if layout is TUM else "frame-*.pose.txt (world_from_cam, four rows of four)"
+        fix = f"Each frame needs a colour image, a depth image and a pose, here from {where}; "
+        fix += "poses of a COLMAP model of the colour images will do: --scenes.rgbd.model SPARSE."
+        raise SceneError("no frame can be used", path=folder, value=skipped.describe(), fix=fix)
+    return frames, skipped
+
+
+def _color_files(folder: Path) -> Iterator[Path]:
+    for pattern in ("frame-*.color.*", "seq-*/frame-*.color.*"):
+        yield from (path for path in folder.glob(pattern) if path.suffix.lower() in _IMAGES)
+
+
+def _seven_scenes_frames(folder: Path, skipped: Skipped, need_poses: bool) -> Iterator[FrameFiles]:
+    for color in sorted(_color_files(folder)):
+        stem = color.name.partition(".color.")[0]
+        depth, pose = color.with_name(f"{stem}.depth.png"), color.with_name(f"{stem}.pose.txt")
+        found = _read_pose(pose) if need_poses else np.eye(3, 4)
+        if not depth.is_file():
+            skipped.add("without a depth image")
+        elif found is None:
+            skipped.add("without a pose" if not pose.is_file() else "whose pose is lost (not finite, or no rotation)")
+        else:
+            yield FrameFiles(color.relative_to(folder).as_posix(), color, depth, found)
+
+
+def _read_pose(path: Path) -> Float | None:
+    """cam_from_world of a file of world_from_cam, four rows of four numbers; None if it is missing or no pose."""
+    try:
+        matrix = np.array(read_text(path, 10_000).split(), dtype=np.float64)
+    except (OSError, ValueError):
+        return None
+    return _checked(matrix.reshape(4, 4)[:3]) if matrix.size == 16 else None
+
+
+def _checked(world_from_cam: Float) -> Float | None:
+    """cam_from_world with an exact rotation; None if there is none."""
+    rotation = world_from_cam[:, :3]
+    if not np.isfinite(world_from_cam).all() or not np.allclose(rotation @ rotation.T, np.eye(3), atol=_RIGID):
+        return None
+    u, _, vt = np.linalg.svd(rotation)
+    if np.linalg.det(u @ vt) < 0:
+        return None
+    return invert_poses(np.column_stack([u @ vt, world_from_cam[:, 3]]))
+
+
+def _tum_frames(folder: Path, skipped: Skipped, need_poses: bool) -> Iterator[FrameFiles]:
+    rgb, depth = (_read_list(folder / name, 1) for name in ("rgb.txt", "depth.txt"))
+    times, poses = np.zeros(0), np.zeros((0, 7))
+    if need_poses:
+        rows = _read_list(folder / "groundtruth.txt", 7)
+        times = np.array([time for time, _ in rows])
+        poses = np.array([[_number(value) for value in values] for _, values in rows])
+    depth_times = np.array([time for time, _ in depth])
+    for time, (name,) in rgb:
+        at, pose = _nearest(depth_times, time), _nearest(times, time)
+        color = path_within(folder, name, "the name of a colour image")
+        distance = None if at is None else path_within(folder, depth[at][1][0], "the name of a depth image")
+        if not color.is_file():
+            skipped.add("without a colour image")
+        elif distance is None or not distance.is_file():
+            skipped.add("without a depth image")
+        elif not need_poses:
+            yield FrameFiles(name, color, distance, np.eye(3, 4))
+        elif pose is None:
+            skipped.add("without a pose")
+        else:
+            found = _tum_pose(poses[pose])
+            if found is None:
+                skipped.add("whose pose is lost (not finite, or no rotation)")
+            else:
+                yield FrameFiles(name, color, distance, found)
+
+
+def _tum_pose(values: Float) -> Float | None:
+    """cam_from_world of tx, ty, tz, qx, qy, qz, qw of world_from_cam; None if that is no pose."""
+    if not np.isfinite(values).all() or abs(np.linalg.norm(values[3:]) - 1) > _RIGID:
+        return None
+    rotation = rotation_from_quaternion(values[[6, 3, 4, 5]])
+    return _checked(np.column_stack([rotation, values[:3]]))
+
+
+def _nearest(times: NDArray[np.float64], time: float) -> int | None:
+    if len(times) == 0:
+        return None
+    at = int(np.abs(times - time).argmin())
+    return at if abs(times[at] - time) <= _MAX_APART_S else None
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return float("nan")
+
+
+def _read_list(path: Path, n_values: int) -> list[tuple[float, list[str]]]:
+    """Rows of a TUM list: a time, and so many values. Raises SceneError if it is missing or has other rows."""
+    try:
+        lines = [line.replace(",", " ").split() for line in read_text(path).splitlines()]
+    except (OSError, ValueError) as error:
+        problem = f"a list of the recording cannot be read: {error}"
+        raise SceneError(problem, path=path, fix="A recording of TUM's layout has it.") from error
+    rows = [(_number(words[0]), words[1:]) for words in lines if words and not words[0].startswith("#")]
+    for time, values in rows:
+        if not np.isfinite(time) or len(values) != n_values:
+            problem = f"a row of this list is not a time and {n_values} value{'s' * (n_values > 1)}"
+            raise SceneError(problem, path=path, value=(time, values), fix="Copy the recording again.")
+    return rows

@@ -1,0 +1,120 @@
+"""Textures from photographs: every triangle shows the piece of one photograph that it projects to.
+
+Each photograph is a texture, so nothing is resampled. Of photographs that show a triangle about as large, one that
+shows many of them is taken, greedily, so that seams are few (set cover; the problem is that of Lempitsky and Ivanov,
+"Seamless Mosaicing of Image-Based Texture Maps", CVPR 2007).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from tqdm.auto import tqdm
+
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.mesh import TexturedMesh
+from wheretolook.geometry.poses import Float, transform
+from wheretolook.rendering.warp_renderer import WarpRenderer
+from wheretolook.scans.frames import Frames
+
+MAX_PHOTOGRAPHS = 100  # that are looked at; of more, so many evenly
+_BEHIND_M = 0.03  # by which a corner may lie behind what a photograph sees: voxels and rounding
+_EDGE_PX = 5  # pixels around that must see nothing nearer: at an edge, poses decide which side a pixel shows
+_MARGIN_PX = 8  # at the image's border
+_GAINS = (0.5, 2.0)  # least and greatest by which a photograph's exposure is changed
+_NEARLY = 0.5  # share of the largest area in pixels that any photograph shows of a triangle, to be taken, too
+
+
+def textured(
+    mesh: TexturedMesh,
+    frames: Frames,
+    camera: PinholeCamera,
+    cam_from_world: Float,
+    device: str = "cpu",
+    progress: bool = True,
+) -> TexturedMesh:
+    """The mesh with photographs (F) of poses (F, 3, 4) as its textures; vertex colours where none shows a triangle."""
+    chosen = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), MAX_PHOTOGRAPHS)).round().astype(int))
+    poses, areas = cam_from_world[chosen], np.zeros((len(chosen), len(mesh.triangles)), dtype=np.float16)
+    renderer = WarpRenderer(mesh, device)
+    for row, pose in enumerate(tqdm(poses, desc="find textures", unit="photograph", disable=not progress)):
+        areas[row] = _areas_px(mesh, renderer, camera, pose)
+    photograph = _cover(areas)
+    textures: list[NDArray[np.uint8]] = []
+    uvs = np.zeros((len(mesh.triangles), 3, 2), dtype=np.float32)
+    number = np.zeros(len(mesh.triangles), dtype=np.int32)
+    for row in np.unique(photograph[photograph >= 0]).tolist():
+        shown, rgb = np.flatnonzero(photograph == row), frames[int(chosen[row])].rgb
+        pixels = camera.project(transform(poses[row], mesh.vertices[mesh.triangles[shown]].reshape(-1, 3)))
+        pixels = pixels.reshape(-1, 3, 2)
+        uvs[shown], number[shown] = pixels / (camera.width, camera.height), len(textures)
+        textures.append(_as_exposed(rgb, pixels.mean(1), mesh, shown))
+    rest = np.flatnonzero(photograph < 0)
+    if len(rest):
+        texture, uvs[rest] = _flat_colors(mesh, rest)
+        number[rest] = len(textures)
+        textures.append(texture)
+    return replace(mesh, corner_uvs=uvs, triangle_texture=number, textures=tuple(textures), vertex_colors=None)
+
+
+def _areas_px(mesh: TexturedMesh, renderer: WarpRenderer, camera: PinholeCamera, pose: Float) -> NDArray[np.float16]:
+    """How many pixels a photograph shows of each triangle (T,); 0 of those hidden, turned away or not all in it."""
+    depth = renderer.render(camera, pose[None]).depth_m[0]
+    nearest = cv2.erode(np.where(depth > 0, depth, np.float32(np.inf)), np.ones((_EDGE_PX, _EDGE_PX), np.uint8))
+    points = transform(pose, mesh.vertices)
+    pixels, z = camera.project(points), points[:, 2]
+    low, high = _MARGIN_PX, np.array([camera.width, camera.height]) - _MARGIN_PX
+    seen = (z > 0) & ((pixels >= low) & (pixels < high)).all(1)
+    column, row = pixels[seen].astype(np.int64).T
+    seen[seen] = z[seen] < nearest[row, column] + _BEHIND_M
+    whole = np.flatnonzero(seen[mesh.triangles].all(1))
+    a, b, c = np.moveaxis(pixels[mesh.triangles[whole]], 1, 0)
+    (ux, uy), (vx, vy) = (b - a).T, (c - a).T
+    areas = np.zeros(len(mesh.triangles), dtype=np.float16)
+    areas[whole] = np.clip((uy * vx - ux * vy) / 2, 0, 60_000)  # fronts are clockwise where y points down
+    return areas
+
+
+def _cover(areas: NDArray[np.float16]) -> NDArray[np.int64]:
+    """The photograph of each triangle (T,), -1 for none, by the areas (F, T) that each shows."""
+    best = areas.max(0)
+    good = (areas > 0) & (areas >= np.float16(_NEARLY) * best)
+    chosen = np.full(areas.shape[1], -1)
+    open_ones = good.sum(1)
+    while open_ones.max() > 0:
+        row = int(open_ones.argmax())
+        taken = np.flatnonzero(good[row])
+        chosen[taken] = row
+        open_ones -= good[:, taken].sum(1)
+        good[:, taken] = False
+    return chosen
+
+
+def _as_exposed(
+    rgb: NDArray[np.uint8], pixels: Float, mesh: TexturedMesh, triangles: NDArray[np.int64]
+) -> NDArray[np.uint8]:
+    """A photograph as bright, channel by channel, as the mean of all is where it shows triangles (N,), at (N, 2) px.
+
+    Cameras set their exposure and white balance anew for every photograph, which would leave edges at seams.
+    """
+    if mesh.vertex_colors is None:
+        return rgb
+    column, row = pixels.astype(np.int64).T
+    here = rgb[row, column].mean(0)
+    wanted = mesh.vertex_colors[mesh.triangles[triangles]].mean((0, 1))
+    gain = np.clip(wanted / np.maximum(here, 1), *_GAINS)
+    return np.asarray(np.clip(np.rint(rgb * gain), 0, 255), dtype=np.uint8)
+
+
+def _flat_colors(mesh: TexturedMesh, rows: NDArray[np.int64]) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """A texture of one texel for each of some triangles, in the mean colour of its corners, and their corners' uvs."""
+    side = int(np.ceil(np.sqrt(len(rows))))
+    texels = np.full((side * side, 3), 255, dtype=np.uint8)
+    if mesh.vertex_colors is not None:
+        texels[: len(rows)] = mesh.vertex_colors[mesh.triangles[rows]].mean(1).round()
+    index = np.arange(len(rows))
+    uv = (np.column_stack([index % side, index // side]) + 0.5) / side
+    return texels.reshape(side, side, 3), np.repeat(uv[:, None], 3, axis=1).astype(np.float32)

@@ -1,0 +1,283 @@
+"""A recording of a known room becomes that room's mesh: where it is, upright, and in its colours."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+
+from scans.recordings import COLOR, HIGH, LOW, room, turned, walk, write_seven_scenes, write_tum
+from wheretolook.geometry.poses import camera_centers, transform
+from wheretolook.mapping.colmap_model import colmap_poses
+from wheretolook.rendering.raycasting import MeshRaycaster
+from wheretolook.rendering.warp_renderer import WarpRenderer
+from wheretolook.scans.config import RgbdConfig
+from wheretolook.scans.fusion import make_scan
+from wheretolook.utils.errors import ConfigError, MapError, MapWarning, SceneError
+
+VOXEL_M = 0.03
+Y_DOWN = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # takes a world with y down to the room's
+
+
+@pytest.fixture(scope="module")
+def mesh():
+    return room()
+
+
+@pytest.fixture(scope="module")
+def seven_scenes(mesh, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("seven") / "room"
+    write_seven_scenes(folder, mesh, walk(), Y_DOWN)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def tum(mesh, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("tum") / "room"
+    write_tum(folder, mesh, walk())
+    return folder
+
+
+def scan(folder, **options):
+    return make_scan(RgbdConfig(folder=folder, **{"voxel_m": VOXEL_M, "max_depth_m": 5.0, **options}), progress=False)
+
+
+def copied(folder, to, every=1):
+    to.mkdir()
+    for path in sorted(folder.glob("*")):
+        if int(path.name[6:12]) % every == 0:
+            (to / path.name).write_bytes(path.read_bytes())
+    return to
+
+
+def off_m(found, truth):
+    """Distances of the found vertices to the truth, and to what was found of surface that three frames and more saw."""
+    caster, rng, poses = MeshRaycaster(truth), np.random.default_rng(1), walk()
+    there = caster.distance_to_surface(found.vertices, 1.0)
+    walls = rng.uniform(np.add(LOW, 0.1), np.subtract(HIGH, 0.1), (3000, 3))
+    axis, side = rng.integers(0, 3, 3000), rng.integers(0, 2, 3000)
+    walls[np.arange(3000), axis] = np.where(side, np.array(HIGH)[axis], np.array(LOW)[axis])
+    at = transform(poses, walls)
+    pixels = COLOR.project(at)
+    within = (at[..., 2] > 0) & ((pixels > 6) & (pixels < (COLOR.width - 6, COLOR.height - 6))).all(-1)
+    seen = (within & ~caster.occluded(camera_centers(poses), walls)).sum(0) > 3
+    assert seen.sum() > 500
+    return there, MeshRaycaster(found).distance_to_surface(walls[seen], 1.0)
+
+
+def test_a_recording_of_7_scenes_is_the_room_within_a_voxel(seven_scenes, mesh):
+    found = scan(seven_scenes)
+    assert len(found.frames) == 60 and found.frames.skipped.reasons == {}
+    assert np.degrees(np.arccos(found.up @ Y_DOWN.T @ (0, 0, 1))) < 1.0  # z of the room, in the recording's world
+    # what is left after the upright rotation is a turn about z and nothing else: undo it
+    to_room = Y_DOWN @ found.rotation.T
+    moved = replace(found.mesh, vertices=(found.mesh.vertices @ to_room.T).astype(np.float32))
+    there, back = off_m(moved, mesh)
+    assert np.quantile(there, 0.99) < VOXEL_M and np.median(there) < VOXEL_M / 4
+    assert np.quantile(back, 0.9) < VOXEL_M
+
+
+def test_a_recording_of_tum_is_the_room_within_a_voxel_and_stays_in_its_world(tum, mesh):
+    found = scan(tum, up="auto")
+    assert len(found.frames) == 60 and found.frames.depth_scale == 5000
+    assert np.array_equal(found.rotation, np.eye(3))  # its z is up to within a degree: it is meant to be
+    there, back = off_m(found.mesh, mesh)
+    assert np.quantile(there, 0.99) < VOXEL_M and np.quantile(back, 0.9) < VOXEL_M
+
+
+@pytest.mark.parametrize("appearance", ["texture", "colors"])
+def test_renders_look_like_the_colour_images(tum, mesh, appearance):
+    found = scan(tum, appearance=appearance)
+    poses = walk()[[10, 40]]
+    truth, rendered = (WarpRenderer(one).render(COLOR, poses).rgb.astype(float) for one in (mesh, found.mesh))
+    seen = rendered.any(-1)
+    assert seen.mean() > 0.85
+    off = np.abs(truth - rendered)[seen].mean()
+    assert off < (16 if appearance == "texture" else 28)  # levels of 255; the mean level of an image is 127 off by 45
+    assert (len(found.mesh.textures) > 3) == (appearance == "texture")
+
+
+def test_textures_are_sharper_than_colours_at_vertices(tum, mesh):
+    pose, images = walk()[[25]], []
+    for one in (mesh, scan(tum).mesh, scan(tum, appearance="colors").mesh):
+        grey = cv2.cvtColor(WarpRenderer(one).render(COLOR, pose).rgb[0], cv2.COLOR_RGB2GRAY)
+        images.append(np.median(np.abs(cv2.Laplacian(grey, cv2.CV_32F))))
+    truth, texture, colors = images
+    assert colors < texture < 1.5 * truth
+
+
+@pytest.mark.parametrize(
+    ("written", "said", "needed"),
+    [
+        ({"depth_scale": 5000.0}, 1000.0, r"depth_scale (4[89]|5[012])\d\d"),
+        ({}, 5000.0, r"depth_scale (9[5-9]\d|10[0-5]\d)"),
+        ({"poses_scale": 1000.0}, 0.0, r"depth_scale 1(\.0\d*)?, or poses in metres"),
+        ({"depth_scale": 50.0, "poses_scale": 0.05}, 0.0, "and give poses in metres"),
+    ],
+)
+def test_depth_in_another_unit_is_found_out(mesh, tmp_path, written, said, needed):
+    write_seven_scenes(tmp_path / "room", mesh, walk(30), **written)
+    with pytest.raises(SceneError, match=r"in another unit than poses|not to be in metres") as caught:
+        scan(tmp_path / "room", depth_scale=said)
+    assert re.search(needed, str(caught.value)), caught.value
+
+
+def test_poses_the_wrong_way_round_are_found_out(seven_scenes, tmp_path):
+    folder = copied(seven_scenes, tmp_path / "some")
+    for path in folder.glob("*.pose.txt"):
+        np.savetxt(path, np.linalg.inv(np.loadtxt(path)))
+    with pytest.raises(SceneError, match=r"do not show the same surfaces.*world_from_cam \(not cam_from_world\)"):
+        scan(folder)
+
+
+def test_frames_that_cannot_be_used_are_counted(seven_scenes, tmp_path):
+    folder = copied(seven_scenes, tmp_path / "some", every=2)
+    lost = folder / "frame-000000.pose.txt"
+    lost.write_text(lost.read_text().replace(lost.read_text().split()[0], "nan", 1))
+    (folder / "frame-000002.pose.txt").unlink()
+    (folder / "frame-000004.depth.png").unlink()
+    cv2.imwrite(str(folder / "frame-000006.depth.png"), np.full((120, 160), 65535, dtype=np.uint16))
+    cv2.imwrite(str(folder / "frame-000008.color.png"), np.zeros((60, 80, 3), dtype=np.uint8))
+    color = folder / "frame-000010.color.png"
+    color.write_bytes(color.read_bytes()[:100])
+    (folder / "frame-000012.depth.png").write_bytes(b"no image")
+    (folder / "frame-000014.pose.txt").write_text("-inf " * 16)
+    found = scan(folder)
+    assert len(found.frames) == 30 - 8
+    assert found.frames.skipped.reasons == {
+        "whose pose is lost (not finite, or no rotation)": 2,
+        "without a pose": 1,
+        "without a depth image": 1,
+        "without depth": 1,
+        "of another size": 1,
+        "with an image that cannot be read": 2,
+    }
+    assert "not used: 2 whose pose is lost" in " ".join(found.describe())
+
+
+def test_lost_poses_and_late_images_of_tum_are_counted(tum, tmp_path):
+    folder = tmp_path / "some"
+    folder.mkdir()
+    for path in sorted(tum.rglob("*")):
+        if path.is_file():
+            (folder / path.relative_to(tum)).parent.mkdir(exist_ok=True)
+            (folder / path.relative_to(tum)).write_bytes(path.read_bytes())
+    truth = folder / "groundtruth.txt"
+    lines = truth.read_text().splitlines()
+    lines[1] = lines[1].split()[0] + " nan nan nan nan nan nan nan"
+    lines[2] = lines[2].split()[0] + " 0 0 0 0 0 0 0"
+    del lines[3]
+    truth.write_text("\n".join(lines))
+    depth = folder / "depth.txt"
+    depth.write_text("\n".join(depth.read_text().splitlines()[:-1]))
+    found = scan(folder)
+    expected = {"whose pose is lost (not finite, or no rotation)": 2, "without a pose": 1, "without a depth image": 1}
+    assert found.frames.skipped.reasons == expected
+
+
+def test_a_recording_without_poses_says_what_is_needed(seven_scenes, tum, tmp_path):
+    folder = copied(seven_scenes, tmp_path / "some", every=10)
+    for path in folder.glob("*.pose.txt"):
+        path.unlink()
+    with pytest.raises(SceneError, match=r"no frame can be used .*6 without a pose.*pose\.txt.*scenes\.rgbd\.model"):
+        scan(folder)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(SceneError, match="this is no RGB-D recording"):
+        scan(tmp_path / "empty")
+    with pytest.raises(SceneError, match="no such folder"):
+        scan(tmp_path / "none")
+
+
+def test_lists_of_tum_do_not_lead_out_of_the_folder(tum, tmp_path):
+    (tmp_path / "some").mkdir()
+    for name in ("rgb.txt", "depth.txt", "groundtruth.txt"):
+        (tmp_path / "some" / name).write_text((tum / name).read_text().replace("rgb/", "../rgb/"))
+    with pytest.raises(ConfigError, match="lead out of its folder"):
+        scan(tmp_path / "some")
+    (tmp_path / "some" / "rgb.txt").write_text("1.0 a.png b.png\n")
+    with pytest.raises(SceneError, match="not a time and 1 value"):
+        scan(tmp_path / "some")
+
+
+def test_depth_of_8_bits_is_refused(seven_scenes, tmp_path):
+    folder = copied(seven_scenes, tmp_path / "some", every=10)
+    for path in folder.glob("*.depth.png"):
+        cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
+    with pytest.raises(SceneError, match=r"no depth image .*uint8"):
+        scan(folder)
+
+
+def test_up_can_be_given_and_a_wrong_one_is_warned_of(seven_scenes):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", MapWarning)
+        found = scan(seven_scenes, up="-y", max_frames=30)
+    assert len(found.frames) == 30
+    assert np.allclose(found.rotation @ (0, -1, 0), (0, 0, 1))
+    with pytest.warns(MapWarning, match="90 degrees"):
+        found = scan(seven_scenes, up="0 0 2", max_frames=30)
+    assert np.array_equal(found.rotation, np.eye(3))
+    for wrong in ("w", "0 0 0", "1 2", "nan 1 1"):
+        with pytest.raises(ConfigError, match="is no direction"):
+            RgbdConfig(up=wrong)
+
+
+def model_of(names, poses, points=None, scale=1.0):
+    """A COLMAP model of images with poses, that observe points (N, 3) wherever they are in the image."""
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(pycolmap.Camera(camera_id=1, **COLOR.colmap.record()))
+    tracks = [pycolmap.Track() for _ in range(0 if points is None else len(points))]
+    for number, (name, pose) in enumerate(zip(names, poses, strict=True), 1):
+        image = pycolmap.Image(name=name, camera_id=1, image_id=number)
+        seen = []
+        if points is not None:
+            at = points @ pose[:, :3].T + pose[:, 3]
+            pixels = COLOR.project(at)
+            seen = np.flatnonzero((at[:, 2] > 0) & COLOR.in_image(pixels))
+            image.points2D = pycolmap.Point2DList([pycolmap.Point2D(pixels[k]) for k in seen])
+        model.add_image_with_trivial_frame(
+            image, pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:, :3]), scale * pose[:, 3])
+        )
+        for index, k in enumerate(seen):
+            tracks[k].add_element(number, index)
+    for point, track in zip([] if points is None else points, tracks, strict=True):
+        if track.length() >= 2:
+            model.add_point3D(scale * point, track)
+    return model
+
+
+def test_poses_of_a_model_serve_instead_and_tell_the_unit(seven_scenes, mesh, tmp_path):
+    folder = copied(seven_scenes, tmp_path / "some")
+    for path in folder.glob("*.pose.txt"):
+        path.unlink()
+    names = [f"frame-{i:06d}.color.png" for i in range(50)]  # ten images were not placed
+    y = np.random.default_rng(0).uniform(LOW, HIGH, (300, 3))
+    y[:, 0] = LOW[0]  # points of a wall
+    poses = turned(walk(), Y_DOWN)[:50]
+    for scale in (1.0, 3.0):
+        (tmp_path / f"{scale}").mkdir()
+        model_of(names, poses, y @ Y_DOWN, scale).write_binary(str(tmp_path / f"{scale}"))
+    found = scan(folder, model=tmp_path / "1.0")
+    assert found.frames.skipped.reasons == {"without a pose in the model": 10}
+    found.save_model(tmp_path / "frames")
+    upright = colmap_poses(tmp_path / "frames")
+    assert np.allclose(upright[:, :, :3] @ found.rotation, poses[:, :, :3], atol=1e-6)
+    there = MeshRaycaster(found.mesh).distance_to_surface(y @ Y_DOWN @ found.rotation.T, 1.0)
+    assert np.median(there) < VOXEL_M  # the model's points lie on the scan
+    with pytest.raises(SceneError, match="another unit than the model: its landmarks are 3 times as far"):
+        scan(folder, model=tmp_path / "3.0")
+    with pytest.raises(MapError):
+        scan(folder, model=tmp_path)
+
+
+def test_without_a_model_the_frames_are_written_as_one(seven_scenes, tmp_path):
+    found = scan(seven_scenes, max_frames=30)
+    found.save_model(tmp_path / "frames")
+    model = pycolmap.Reconstruction(str(tmp_path / "frames"))
+    assert sorted(image.name for image in model.images.values()) == found.frames.names
+    upright = colmap_poses(tmp_path / "frames")
+    assert np.allclose(upright[:, :, :3] @ found.rotation, found.frames.cam_from_world[:, :, :3], atol=1e-6)

@@ -1,0 +1,76 @@
+"""A recording of colour and depth goes through the stages like any other scene with a mesh."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from scans.recordings import COLOR, room, walk, write_seven_scenes
+from wheretolook.config import Experiment, MeshSource, ScenesConfig
+from wheretolook.dataset.folders import Dataset
+from wheretolook.geometry.camera import CameraConfig
+from wheretolook.geometry.poses import camera_centers
+from wheretolook.mapping.config import MapConfig
+from wheretolook.scans.config import RgbdConfig
+from wheretolook.scenes.loading import save_glb
+from wheretolook.stages import make_maps, make_scenes, sample
+from wheretolook.utils.errors import ConfigError, SceneError
+from wheretolook.viewpoints.config import SampleConfig
+from wheretolook.viewpoints.table import poses
+
+
+@pytest.fixture(scope="module")
+def experiment(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("recording")
+    write_seven_scenes(folder / "room", room(), walk())
+    rgbd = RgbdConfig(folder=folder / "room", voxel_m=0.03, max_depth_m=5.0)
+    few = SampleConfig(max_locations=4, max_directions=6, min_visible=1)
+    scenes = ScenesConfig(rgbd=rgbd)
+    return Experiment("scan", folder / "data", device="cpu", scenes=scenes, map=MapConfig(n_images=30), sample=few)
+
+
+def test_a_recording_is_mapped_and_sampled(experiment):
+    said = []
+    dataset = make_scenes(experiment, said.append)
+    (scene,) = dataset.scenes
+    assert scene.name == "room" and scene.split == "test"
+    assert (scene.camera, scene.own_camera) == (COLOR, True)  # the recording's, as none was named
+    text = "\n".join(said)
+    assert (
+        "60 frames of a recording of 7-scenes's layout" in text and "1000 units of depth a metre; up is (0.00" in text
+    )
+    again: list[str] = []
+    assert make_scenes(experiment, again.append) == dataset == Dataset.load(experiment.root)
+    assert "reusing" in again[0]
+
+    make_maps(experiment, said.append)
+    assert not scene.is_photographed and len(scene.read_landmarks()) > 200
+    sample(experiment, said.append)
+    table = scene.read_table()
+    assert table["location_id"].nunique() == 4 and (table["n_visible"] > 0).all()
+    at = camera_centers(poses(table))
+    assert ((at > 0) & (at < (3.6, 3.0, 2.4))).all()
+
+
+def test_it_joins_scenes_with_meshes_and_a_named_camera_looks(experiment, tmp_path):
+    save_glb(room(), tmp_path / "loaded.glb")
+    loaded = ScenesConfig(train=0, test=0, meshes=(MeshSource(tmp_path / "loaded.glb", "train"),))
+    coarse = replace(experiment.scenes.rgbd, voxel_m=0.06, max_frames=20, appearance="colors")
+    camera = CameraConfig(width=320, height=240, fov_deg=90)
+    wide = replace(experiment, data=tmp_path, camera=camera, scenes=ScenesConfig(rgbd=coarse))
+    make_scenes(replace(wide, scenes=loaded), lambda _: None)
+    dataset = make_scenes(wide, lambda _: None)
+    assert [(scene.name, scene.split) for scene in dataset.scenes] == [("loaded", "train"), ("room", "test")]
+    assert {scene.camera for scene in dataset.scenes} == {wide.camera.camera}
+    assert [scene.is_scanned for scene in dataset.scenes] == [False, True]
+    changed = replace(wide, scenes=ScenesConfig(rgbd=replace(coarse, up="-z")))
+    with pytest.warns(UserWarning, match="up is said to be -z"):
+        make_scenes(changed, lambda _: None)  # other settings, so the scan is made anew
+
+
+def test_bad_names_and_folders_are_refused(experiment, tmp_path):
+    for wrong, error in (({"name": "a/b"}, ConfigError), ({"folder": tmp_path / "none"}, SceneError)):
+        rgbd = replace(experiment.scenes.rgbd, **wrong)
+        with pytest.raises(error):
+            make_scenes(replace(experiment, data=tmp_path, scenes=ScenesConfig(rgbd=rgbd)), lambda _: None)

@@ -16,6 +16,7 @@ import trimesh
 from numpy.typing import NDArray
 from PIL import Image
 
+from wheretolook.geometry.local_origin import local_origin
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.scenes.glb_checks import check_glb, check_image
 from wheretolook.utils.errors import ConfigError, SceneError
@@ -86,7 +87,8 @@ def load_mesh(path: str | PathLike[str], up: str = "z", colored: bool = True) ->
 def save_glb(mesh: TexturedMesh, path: str | PathLike[str], jpeg_quality: int = 90) -> None:
     """Write a mesh as a binary glTF file with JPEG textures, unlit and double sided, in its own z-up coordinates.
 
-    Positions and texture coordinates keep their float32 values (v to within rounding, since it is flipped twice), but
+    Positions and texture coordinates keep their float32 values (v to within rounding, since it is flipped twice); nodes
+    hold the mesh's origin, in double precision. But
     triangles are grouped by texture, and corners with the same position and texture coordinates share a vertex. The
     file is replaced in one step. Raises ConfigError if the quality is not in 1 to 100.
     """
@@ -96,7 +98,9 @@ def save_glb(mesh: TexturedMesh, path: str | PathLike[str], jpeg_quality: int = 
     for index, texture in enumerate(mesh.textures):
         faces = np.flatnonzero(mesh.triangle_texture == index)
         if len(faces):
-            scene.add_geometry(_geometry(mesh, faces, _EncodedJpeg(texture, jpeg_quality)), node_name=f"part_{index}")
+            part = _geometry(mesh, faces, _EncodedJpeg(texture, jpeg_quality))
+            at = trimesh.transformations.translation_matrix(mesh.origin) if mesh.origin.any() else None
+            scene.add_geometry(part, node_name=f"part_{index}", transform=at)
     write_bytes(Path(path), trimesh.exchange.gltf.export_glb(scene, tree_postprocessor=_mark_unlit))
 
 
@@ -214,9 +218,11 @@ def _merge(parts: list[_Part], rotation: NDArray[np.float64]) -> TexturedMesh:
         white = [np.full((len(p.vertices), 3), 255, np.uint8) if p.colors is None else p.colors for p in parts]
         colors = np.concatenate(white)
     with np.errstate(invalid="ignore"):
-        vertices = (np.concatenate([part.vertices for part in parts]) @ rotation.T).astype(np.float32)
+        world = np.concatenate([part.vertices for part in parts]) @ rotation.T
+        origin = local_origin(world)
+        vertices = (world - origin).astype(np.float32)
     indices, all_uvs = np.concatenate(triangles).astype(np.int32), np.concatenate(corner_uvs).astype(np.float32)
-    return TexturedMesh(vertices, indices, all_uvs, np.concatenate(triangle_texture), tuple(images), colors)
+    return TexturedMesh(vertices, indices, all_uvs, np.concatenate(triangle_texture), tuple(images), colors, origin)
 
 
 def _check(mesh: TexturedMesh, path: Path) -> None:

@@ -16,12 +16,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
 from wheretolook.geometry.camera import Camera
+from wheretolook.geometry.local_origin import local_origin, poses_from
 from wheretolook.geometry.mesh import TexturedMesh
-from wheretolook.geometry.poses import Float
+from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.visibility.occlusion import MeshOcclusion
@@ -123,13 +124,16 @@ class TsdfVolume:
 
     Use `from_images` where all images are at hand: it also checks the memory beforehand.
 
-    It starts with room for `expected_blocks`; when they are used up, all are copied to more.
+    It starts with room for `expected_blocks`; when they are used up, all are copied to more. Open3D works in single
+    precision, about `origin` (3,) m.
     """
 
-    def __init__(self, config: TsdfConfig | None = None, expected_blocks: int = 1 << 13) -> None:
+    def __init__(
+        self, config: TsdfConfig | None = None, expected_blocks: int = 1 << 13, origin: ArrayLike = (0.0, 0.0, 0.0)
+    ) -> None:
         import open3d as o3d
 
-        self.config = config or TsdfConfig()
+        self.config, self.origin = config or TsdfConfig(), np.asarray(origin, dtype=np.float64)
         self._limit = self.config.memory_limit_bytes or _available_bytes() * 4 // 5
         layout = ("tsdf", "weight"), (o3d.core.float32,) * 2, (o3d.core.SizeVector([1]),) * 2
         size_m = self.config.voxel_size_m
@@ -147,7 +151,7 @@ class TsdfVolume:
         config = config or TsdfConfig()
         n_blocks = estimate_blocks(images, config)
         _check_memory(n_blocks, config, config.memory_limit_bytes or _available_bytes() * 4 // 5)
-        volume = cls(config, n_blocks)
+        volume = cls(config, n_blocks, _origin_of(images))
         for i in tqdm(range(len(images)), desc="fuse depth", unit="image", disable=not progress):
             volume.integrate(images[i])
         return volume
@@ -165,7 +169,7 @@ class TsdfVolume:
         rows, columns = (side // _TOUCH_STRIDE * _TOUCH_STRIDE for side in depth.shape)
         if not depth[:rows:_TOUCH_STRIDE, :columns:_TOUCH_STRIDE].any():
             return  # Open3D would raise
-        pose = np.vstack([np.asarray(image.cam_from_world, dtype=np.float64), (0, 0, 0, 1)])
+        pose = np.vstack([poses_from(image.cam_from_world, self.origin), (0, 0, 0, 1)])
         tensor: Any = core.Tensor
         limits = 1.0, float(self.config.max_depth_m), float(self.config.truncation_voxels)
         view = Image(tensor(np.ascontiguousarray(depth))), tensor(image.camera.matrix), tensor(pose), *limits
@@ -198,7 +202,7 @@ class TsdfVolume:
         triangles = mesh.triangle.indices.numpy().astype(np.int32)
         uvs = np.broadcast_to(np.float32(0), (len(triangles), 3, 2))  # takes no memory
         texture, white = np.broadcast_to(np.int32(0), (len(triangles),)), (np.full((1, 1, 3), 255, np.uint8),)
-        return TexturedMesh(mesh.vertex.positions.numpy(), triangles, uvs, texture, white)
+        return TexturedMesh(mesh.vertex.positions.numpy(), triangles, uvs, texture, white, origin=self.origin)
 
 
 class TsdfOcclusion(MeshOcclusion):
@@ -231,12 +235,12 @@ class TsdfOcclusion(MeshOcclusion):
 def estimate_blocks(images: Sequence[DepthImage], config: TsdfConfig) -> int:
     """Blocks of voxels that the images' surfaces will touch, from some pixels of up to 100; SceneError without any."""
     cell_m = max(config.block_m, _SURVEY_CELL_M)
-    cells = np.empty(0, dtype=np.int64)
+    cells, origin = np.empty(0, dtype=np.int64), _origin_of(images) if len(images) else np.zeros(3)
     number = np.array([1, 1 << 21, 1 << 42])  # one number a cell sorts faster than three
     for i in np.unique(np.linspace(0, len(images) - 1, _SURVEY_IMAGES).astype(int)) if len(images) else ():
         image = images[i]
         stride = max(1, int(np.sqrt(np.size(image.depth_m) / _SURVEY_PIXELS)))
-        points = image.points(config.max_depth_m, stride)
+        points = image.points(config.max_depth_m, stride) - origin
         cells = np.union1d(cells, np.floor(points / cell_m).astype(np.int64) @ number)
     if len(cells) == 0:
         problem = f"no depth image has a reading up to {config.max_depth_m:g} m"
@@ -244,6 +248,11 @@ def estimate_blocks(images: Sequence[DepthImage], config: TsdfConfig) -> int:
         raise SceneError(problem, value=f"{len(images)} images", fix=fix)
     # The number of blocks that a surface touches grows with its area.
     return int(np.ceil(_BLOCKS_PER_CELL * len(cells) * (cell_m / config.block_m) ** 2))
+
+
+def _origin_of(images: Sequence[DepthImage]) -> Float:
+    """The local origin (3,) m of images of one scene, by the place of the first."""
+    return local_origin(camera_centers(images[0].cam_from_world))
 
 
 def _check_memory(n_blocks: int, config: TsdfConfig, limit_bytes: int) -> None:

@@ -9,10 +9,8 @@ things.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,6 +23,7 @@ from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.utils.errors import ConfigError, SceneError
+from wheretolook.utils.memory import fitting
 from wheretolook.visibility.occlusion import MeshOcclusion
 
 BLOCK_VOXELS = 8  # voxels along the side of a block
@@ -134,7 +133,7 @@ class TsdfVolume:
         import open3d as o3d
 
         self.config, self.origin = config or TsdfConfig(), np.asarray(origin, dtype=np.float64)
-        self._limit = self.config.memory_limit_bytes or _available_bytes() * 4 // 5
+        self._limit = self.config.memory_limit_bytes or fitting(1)
         layout = ("tsdf", "weight"), (o3d.core.float32,) * 2, (o3d.core.SizeVector([1]),) * 2
         size_m = self.config.voxel_size_m
         self._grid: Any = o3d.t.geometry.VoxelBlockGrid(*layout, size_m, BLOCK_VOXELS, expected_blocks)
@@ -150,7 +149,7 @@ class TsdfVolume:
         """
         config = config or TsdfConfig()
         n_blocks = estimate_blocks(images, config)
-        _check_memory(n_blocks, config, config.memory_limit_bytes or _available_bytes() * 4 // 5)
+        _check_memory(n_blocks, config, config.memory_limit_bytes or fitting(1))
         volume = cls(config, n_blocks, _origin_of(images))
         for i in tqdm(range(len(images)), desc="fuse depth", unit="image", disable=not progress):
             volume.integrate(images[i])
@@ -266,14 +265,3 @@ def _check_memory(n_blocks: int, config: TsdfConfig, limit_bytes: int) -> None:
     problem = f"voxels of this size need {need}, {available:.2f} GiB ({fits * BYTES_PER_BLOCK:,} bytes) can be used"
     fix = f"A voxel_size_m of {np.ceil(enough / step) * step:.2g} would fit."
     raise ConfigError(problem, value=f"voxel_size_m={config.voxel_size_m:g}", fix=fix)
-
-
-def _available_bytes() -> int:
-    """Memory this machine can give without swapping; all it has, where the system does not say."""
-    try:
-        for line in Path("/proc/meminfo").read_text().splitlines():
-            if line.startswith("MemAvailable:"):
-                return int(line.split()[1]) * 1024
-    except OSError:
-        pass
-    return int(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))

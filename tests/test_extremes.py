@@ -113,7 +113,7 @@ def test_images_of_one_pixel() -> None:
     around = LocalizationMap(room_landmarks(300), camera)
     ahead = around.landmarks_in_view(pose)
     assert len(ahead.indices) > 0
-    for method in ("bins", "set", "mlp-2d+z"):
+    for method in ("bins", "set"):
         weights = WEIGHTS / f"{LEARNT[method]}.safetensors" if method in LEARNT else None
         assert np.isfinite(make_scorer(method, around, weights=weights).score(pose)).all()
 

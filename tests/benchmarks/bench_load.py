@@ -56,7 +56,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--limit-gb", type=float, default=float("inf"))
-    parser.add_argument("--every", type=float, default=1.0)
+    parser.add_argument("--every", type=float, default=2.0)
     parser.add_argument("command", nargs=argparse.REMAINDER, help="what follows `wheretolook`")
     args = parser.parse_args()
     start, told, rows, ended = time.monotonic(), 0, list[tuple[float, float, float]](), ""

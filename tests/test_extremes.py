@@ -138,6 +138,12 @@ def test_seventy_thousand_directions() -> None:
         build_viewpoint_map(scorer, GRID, [30], axes)
 
 
+def test_more_directions_than_memory_holds_are_refused_at_once() -> None:
+    for refused in (lambda: SampleConfig(directions=10**11), lambda: fibonacci_sphere(10**15)):
+        with pytest.raises(ConfigError, match="There is room for"):
+            refused()
+
+
 def test_the_cells_of_very_many_directions_stay_few() -> None:
     many = FrustumCounter(CAMERA, np.broadcast_to(np.eye(3), (70_000, 3, 3)), 10)
     assert many.size == 8

@@ -6,8 +6,8 @@
 Runs `wheretolook` with what is given, interrupts it as Ctrl-C does when the minutes are over, and kills it beyond the
 limit. The memory of the command and of all its processes is read every `--every` seconds: the resident, and the
 processes' own, in which what several of them share counts once. A line a minute is told while it runs; at the end the
-peaks, and the slope of a line through all readings after the first tenth of the time, by when every worker has met its
-largest batches. Nothing here fails on time.
+peaks and, of what took ten minutes or more, the slope of a line through all readings after the first tenth of the time,
+by when every worker has met its largest batches. Nothing here fails on time.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def tell(rows: list[tuple[float, float, float]]) -> None:
     settled = seconds >= seconds[-1] / 10
     for name, megabytes in (("resident", resident), ("own", own)):
         line = f"{name:8} peak {megabytes.max():.0f} MB"
-        if settled.sum() >= 10:
+        if seconds[-1] >= 600:
             slope = np.polyfit(seconds[settled] / 3600, megabytes[settled], 1)[0]
             quarters = ", ".join(f"{np.median(part):.0f}" for part in np.array_split(megabytes[settled], 4))
             line += f"; slope {slope:+.1f} MB an hour; medians of the quarters {quarters} MB"

@@ -16,6 +16,7 @@ from wheretolook.utils.memory import fitting
 
 GOLDEN_ANGLE = np.pi * (1 + np.sqrt(5))  # radians between neighbours of the spiral: the paper's i * pi * (1 + sqrt 5)
 BYTES_PER_VOXEL = 160  # while the locations of a grid are computed, and which of them are free
+BYTES_PER_DIRECTION = 500  # while rotations are made of it, and it is looked along
 MOST_VOXELS = 2**31 - 1  # tables hold ids of locations in 32 bits
 Lattice = Literal["fibonacci", "azimuth-elevation", "released", "yaw-pitch"]
 
@@ -186,4 +187,7 @@ LATTICES: dict[str, Callable[[int], Float]] = {
 def _positive(n: int) -> int:
     if n < 1:
         raise ConfigError("a lattice needs at least one direction", value=n)
+    if n > (most := fitting(BYTES_PER_DIRECTION)):
+        fix = f"There is room for {most:,}."
+        raise ConfigError("so many directions are more than there is memory for", value=n, fix=fix)
     return n

@@ -179,15 +179,9 @@ def test_short_sides_of_a_grid_too_large_stay(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_more_counts_or_viewpoints_than_memory_holds_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    landmarks = room_landmarks(60)
+    landmarks, rotations = room_landmarks(60), rotation_looking_along(fibonacci_sphere(20_000))
     monkeypatch.setattr(memory, "available_bytes", lambda: 2_000_000)
     with pytest.raises(ConfigError, match="directions would fit"):
-        survey(
-            CAMERA,
-            rotation_looking_along(fibonacci_sphere(20_000)),
-            GRID.centers()[:10],
-            landmarks.points,
-            NoOcclusion(),
-        )
+        survey(CAMERA, rotations, GRID.centers()[:10], landmarks.points, NoOcclusion())
     with pytest.raises(ConfigError, match="max_directions"):
         sample_viewpoints(GRID, np.arange(60), landmarks, CAMERA, NoOcclusion(), SampleConfig(keep=0, directions=100))

@@ -60,6 +60,7 @@ def main() -> int:
     parser.add_argument("command", nargs=argparse.REMAINDER, help="what follows `wheretolook`")
     args = parser.parse_args()
     start, told, rows, ended = time.monotonic(), 0, list[tuple[float, float, float]](), ""
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # which a shell's background commands would ignore
     process = subprocess.Popen([*COMMAND, *args.command], start_new_session=True)
     root = psutil.Process(process.pid)
     while process.poll() is None:

@@ -59,7 +59,8 @@ def main() -> int:
     parser.add_argument("--every", type=float, default=2.0)
     parser.add_argument("command", nargs=argparse.REMAINDER, help="what follows `wheretolook`")
     args = parser.parse_args()
-    start, told, rows, ended = time.monotonic(), 0, list[tuple[float, float, float]](), ""
+    start, told, asked, ended = time.monotonic(), 0, 0.0, ""
+    rows: list[tuple[float, float, float]] = []
     signal.signal(signal.SIGINT, signal.default_int_handler)  # which a shell's background commands would ignore
     process = subprocess.Popen([*COMMAND, *args.command], start_new_session=True)
     root = psutil.Process(process.pid)
@@ -77,8 +78,8 @@ def main() -> int:
                 child.kill()
             process.kill()
             process.wait()
-        elif seconds > 60 * args.minutes and not ended:
-            ended = ", interrupted when the time was over"
+        elif seconds > max(60 * args.minutes, asked + 30):  # again if it came at a bad time
+            ended, asked = ", interrupted when the time was over", seconds
             process.send_signal(signal.SIGINT)
         time.sleep(args.every)
     print(f"exit {process.returncode} after {time.monotonic() - start:.1f} s{ended}")

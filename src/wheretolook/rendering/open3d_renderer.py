@@ -38,7 +38,7 @@ class Open3DRenderer:
 
     def render(self, camera: Camera, cam_from_world: ArrayLike) -> Rendering:
         """Render poses (B, 3, 4); see `Renderer.render`."""
-        poses = check_poses(cam_from_world)
+        poses: Float = check_poses(cam_from_world)
         if isinstance(camera, ColmapCamera):
             return render_distorted(self, camera, poses)
         poses = poses_from(poses, self.mesh.origin)

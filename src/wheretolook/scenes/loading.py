@@ -205,7 +205,7 @@ def _merge(parts: list[_Part], rotation: NDArray[np.float64]) -> TexturedMesh:
     triangle_texture, corner_uvs, triangles = [], [], []
     n_vertices = 0
     for part in parts:
-        key = (part.texture.shape, hashlib.sha256(np.ascontiguousarray(part.texture)).digest())
+        key = (part.texture.shape, hashlib.sha256(np.ascontiguousarray(part.texture).data).digest())
         if key not in textures:
             textures[key] = len(images)
             images.append(part.texture)

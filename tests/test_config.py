@@ -71,6 +71,29 @@ def test_bad_settings_exit_with_two_and_no_traceback(
     assert said in errors and "Traceback" not in errors
 
 
+def test_a_file_of_one_group_is_read_with_the_same_limits(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    good, wrong, bomb = (tmp_path / f"{name}.yaml" for name in ("good", "wrong", "bomb"))
+    good.write_text("n_images: 7\nwalk: {coverage: 0.5}\n")
+    wrong.write_text("n_imagez: 7\n")
+    aliases = [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 9)]
+    bomb.write_text("\n".join(["a0: &a0 [x, x, x, x, x, x, x, x, x]", *aliases]) + "\n")
+    for arguments in (["--map", str(good)], [f"--map={good}"]):
+        experiment = parse_experiment("map", arguments)
+        assert experiment is not None and (experiment.map.n_images, experiment.map.walk.coverage) == (7, 0.5)
+    written_out = parse_experiment("map", ["--map", '{"n_images": 8}'])
+    assert written_out is not None and written_out.map.n_images == 8
+    for path, said in (
+        (wrong, "Did you mean map.n_images?"),
+        (bomb, "aliases written out"),
+        (Path("/dev/zero"), "a device"),
+        (tmp_path / "none.yaml", "no such file"),
+    ):
+        assert main(["map", "--map", str(path)]) == 2
+        errors = capsys.readouterr().err
+        assert said in errors and str(path) in errors
+    assert main(["map", "--map.walk", str(bomb)]) == 2
+
+
 def test_an_unknown_key_names_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "experiment.yaml"
     path.write_text("map:\n  n_imagess: 3\n")

@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from importlib import import_module
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -318,6 +319,9 @@ def parse_experiment(command: str, arguments: list[str]) -> Experiment | None:
     for place in places:
         arguments[place] = str(or_shipped(arguments[place]))
         _check_file(Path(arguments[place]), options)
+    for flag, value in _groups_given(arguments, options):
+        if not value.lstrip().startswith("{"):  # settings themselves, written out
+            _check_file(Path(value), options, f"{flag.removeprefix('--')}.")
     return _with_shipped_weights(_parsed(command, arguments, ", ".join(arguments[place] for place in places) or None))
 
 
@@ -330,8 +334,19 @@ def _with_shipped_weights(experiment: Experiment) -> Experiment:
     return replace(experiment, **{name: replace(getattr(experiment, name), weights=w) for name, w in found.items()})
 
 
-def _check_file(path: Path, options: Mapping[str, Option]) -> None:
-    """Raise ConfigError, with the file's path, unless it can be read and every key in it is an option's."""
+def _groups_given(arguments: list[str], options: Mapping[str, Option]) -> list[tuple[str, str]]:
+    """The flags of whole groups of options, such as --map, each with its value: a file of the group's settings."""
+    split = [one.split("=", 1) if one.startswith("--") else [one] for one in arguments]
+    words = [part for parts in split for part in parts]
+    groups = {f"--{name}" for name, option in options.items() if option.is_group}
+    return [(flag, value) for flag, value in pairwise(words) if flag in groups]
+
+
+def _check_file(path: Path, options: Mapping[str, Option], group: str = "") -> None:
+    """Raise ConfigError, with the file's path, unless it can be read and every key in it is an option's, or a group's.
+
+    A group's name ends on a dot.
+    """
     from wheretolook.config import MOVED
     from wheretolook.utils.reading import read_yaml
 
@@ -346,7 +361,7 @@ def _check_file(path: Path, options: Mapping[str, Option]) -> None:
     try:
         if not isinstance(content, dict):
             raise ConfigError("a file of settings is a mapping", fix="Write settings, such as `name: demo`.")
-        check_names(names_in(content, options), options, MOVED)
+        check_names(names_in(content, options, group), options, MOVED)
     except ConfigError as error:
         raise ConfigError(error.problem, path=path, value=error.value, fix=error.fix) from error
 

@@ -13,8 +13,9 @@ import pytest
 
 import wheretolook
 from mapping.test_own_models import rig_model, written
+from wheretolook.geometry.camera import read_cameras
 from wheretolook.mapping.colmap_model import read_model
-from wheretolook.utils.errors import MapError
+from wheretolook.utils.errors import MapError, TableError
 
 NAN = float("nan")
 # File, offset in the binary model of `rig_model`, layout and value of what is changed there.
@@ -70,6 +71,18 @@ def test_text_models_too(tmp_path, name, old, new):
     with pytest.raises(MapError) as caught:
         read_model(path.parent)
     assert caught.value.path == path
+
+
+def test_a_camera_of_no_known_model_is_told_with_its_file_and_model(tmp_path):
+    path = written(rig_model(), tmp_path / "model", text=True) / "cameras.txt"
+    lines = path.read_text().splitlines()
+    row = next(row for row, line in enumerate(lines) if not line.startswith("#"))
+    words = lines[row].split()
+    path.write_text("\n".join([*lines[:row], " ".join([words[0], "MAGIC", *words[2:]]), *lines[row + 1 :]]) + "\n")
+    with pytest.raises(MapError, match=r"cameras\.txt.*no known model.*MAGIC"):
+        read_model(path.parent)
+    with pytest.raises(TableError, match=r"cameras\.txt.*no such camera model.*MAGIC"):
+        read_cameras(path)
 
 
 FLIPS = """

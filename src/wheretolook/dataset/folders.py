@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from wheretolook.geometry.camera import Camera, PinholeCamera, camera_of_record, read_cameras
 from wheretolook.geometry.poses import Float
-from wheretolook.mapping.colmap_model import CAMERAS_FILE, colmap_poses, holds_model, load_mapping_poses
+from wheretolook.mapping.colmap_model import CAMERAS_FILE, colmap_poses, compact_poses, holds_model, load_mapping_poses
 from wheretolook.mapping.scale import read_scale
 from wheretolook.utils.confine import check_links, entry_of
 from wheretolook.utils.errors import ConfigError, SceneError, TableError
@@ -141,14 +141,14 @@ class SceneFolder:
         return read_table(self.table, matches)
 
     def mapping_poses(self) -> Float | None:
-        """Poses cam_from_world (M, 3, 4) float32 of the mapping images; None if neither their file nor a model is left.
+        """Poses cam_from_world (M, 3, 4) of the mapping images; None if neither their file nor a model is left.
 
         Maps made before there was such a file have a COLMAP model, which tells the same. Raises MapError if the file or
         the model is damaged.
         """
         if self.mapping_cameras.is_file():
             return load_mapping_poses(self.mapping_cameras)
-        return colmap_poses(self.map).astype(np.float32) if holds_model(self.map) else None
+        return compact_poses(colmap_poses(self.map)) if holds_model(self.map) else None
 
     def read_landmarks(self) -> Landmarks:
         """The map's landmarks. Raises MapError if there is no file of them, or it is damaged."""

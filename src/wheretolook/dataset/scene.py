@@ -182,7 +182,7 @@ class Scene:
 
     @cached_property
     def mapping_poses(self) -> Float | None:
-        """Poses cam_from_world (M, 3, 4) float32 of the mapping images, if they are known."""
+        """Poses cam_from_world (M, 3, 4) of the mapping images, if they are known."""
         return self.files.mapping_poses()
 
     @property

@@ -64,7 +64,7 @@ def _mesh_geometries(mesh: TexturedMesh) -> list[dict[str, Any]]:
         # triangles share no vertices here, so that each vertex has texture coordinates
         corners = mesh.triangles[rows].reshape(-1)
         part = o3d.geometry.TriangleMesh(
-            o3d.utility.Vector3dVector(mesh.vertices[corners].astype(np.float64)),
+            o3d.utility.Vector3dVector(mesh.vertices[corners] + mesh.origin),
             o3d.utility.Vector3iVector(np.arange(len(corners), dtype=np.int32).reshape(-1, 3)),
         )
         uvs = mesh.corner_uvs[rows].reshape(-1, 2).astype(np.float64)

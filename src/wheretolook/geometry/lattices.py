@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
@@ -11,8 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.geometry.poses import Float
 from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.memory import fitting
 
 GOLDEN_ANGLE = np.pi * (1 + np.sqrt(5))  # radians between neighbours of the spiral: the paper's i * pi * (1 + sqrt 5)
+BYTES_PER_VOXEL = 160  # while the locations of a grid are computed, and which of them are free
+BYTES_PER_DIRECTION = 500  # while rotations are made of it, and it is looked along
+MOST_VOXELS = 2**31 - 1  # tables hold ids of locations in 32 bits
 Lattice = Literal["fibonacci", "azimuth-elevation", "released", "yaw-pitch"]
 
 
@@ -40,7 +45,7 @@ class VoxelGrid:
         return cls((x0, y0, z0), (x1, y1, z1), shape)
 
     def __len__(self) -> int:
-        return int(np.prod(self.shape))
+        return math.prod(self.shape)
 
     @property
     def voxel_m(self) -> Float:
@@ -48,7 +53,8 @@ class VoxelGrid:
         return (np.asarray(self.upper) - self.lower) / self.shape
 
     def centers(self) -> Float:
-        """All locations in the order of their ids, (len(self), 3) metres."""
+        """All locations in the order of their ids, (len(self), 3) metres. ConfigError if memory does not hold them."""
+        check_voxels(self.shape)
         index = np.stack(np.unravel_index(np.arange(len(self)), self.shape), axis=-1)
         return np.asarray(self.lower) + (index + 0.5) * self.voxel_m
 
@@ -60,6 +66,19 @@ class VoxelGrid:
         index = np.minimum(scaled.astype(np.int64), np.asarray(self.shape) - 1)
         _, ny, nz = self.shape
         return np.where(inside, (index[..., 0] * ny + index[..., 1]) * nz + index[..., 2], -1)
+
+
+def check_voxels(shape: tuple[int, int, int]) -> None:
+    """Raise ConfigError, which names a grid that would fit, if memory does not hold the locations of this one."""
+    voxels, most = math.prod(shape), min(fitting(BYTES_PER_VOXEL), MOST_VOXELS)
+    if voxels <= most:
+        return
+    fits, shrunk = list(shape), sorted(range(3), key=lambda axis: shape[axis])
+    for left, axis in zip((3, 2, 1), shrunk, strict=True):  # short sides stay as they are
+        others = math.prod(fits[other] for other in shrunk[: 3 - left])
+        fits[axis] = max(1, min(fits[axis], math.floor((most / others) ** (1 / left))))
+    problem = f"a grid of {voxels:,} voxels is too large: there is room for {most:,}"
+    raise ConfigError(problem, value=shape, fix=f"{fits} would fit.")
 
 
 @dataclass(frozen=True)
@@ -74,7 +93,7 @@ class ViewLattice:
             x 18 yaws, whatever `directions` says.
 
     Raises:
-        ConfigError: no voxel, no direction, or no such lattice.
+        ConfigError: no voxel, more voxels than fit into memory, no direction, or no such lattice.
     """
 
     grid: tuple[int, int, int] = (8, 8, 8)
@@ -84,6 +103,7 @@ class ViewLattice:
     def __post_init__(self) -> None:
         if min(self.grid) < 1:
             raise ConfigError("grid needs at least one voxel along every axis", value=self.grid)
+        check_voxels(self.grid)
         _positive(self.directions)
         if self.lattice not in LATTICES:
             raise ConfigError("unknown lattice", value=self.lattice, fix=f"Use one of {', '.join(LATTICES)}.")
@@ -167,4 +187,7 @@ LATTICES: dict[str, Callable[[int], Float]] = {
 def _positive(n: int) -> int:
     if n < 1:
         raise ConfigError("a lattice needs at least one direction", value=n)
+    if n > (most := fitting(BYTES_PER_DIRECTION)):
+        fix = f"There is room for {most:,}."
+        raise ConfigError("so many directions are more than there is memory for", value=n, fix=fix)
     return n

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -17,17 +17,19 @@ class TexturedMesh:
     [0, 1] repeat the texture.
     """
 
-    vertices: NDArray[np.float32]  # (V, 3) world coordinates in metres
+    vertices: NDArray[np.float32]  # (V, 3) metres from `origin`
     triangles: NDArray[np.int32]  # (T, 3), counter-clockwise seen from the front
     corner_uvs: NDArray[np.float32]  # (T, 3, 2)
     triangle_texture: NDArray[np.int32]  # (T,) index into `textures`
     textures: tuple[NDArray[np.uint8], ...]  # each (H, W, 3), sRGB
     vertex_colors: NDArray[np.uint8] | None = None  # (V, 3), multiply the texture; None for white
+    # (3,) metres in the world, from which single precision measures, see `wheretolook.geometry.local_origin`
+    origin: NDArray[np.floating[Any]] = field(default_factory=lambda: np.zeros(3))
 
     @property
     def bounds(self) -> NDArray[np.float64]:
-        """Lowest and highest corner of the vertices, (2, 3) metres."""
-        return np.stack([self.vertices.min(0), self.vertices.max(0)]).astype(np.float64)
+        """Lowest and highest corner of the vertices in the world, (2, 3) metres."""
+        return np.stack([self.vertices.min(0), self.vertices.max(0)]).astype(np.float64) + self.origin
 
     @property
     def normals(self) -> NDArray[np.float64]:

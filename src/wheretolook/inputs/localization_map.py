@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from wheretolook.geometry.camera import Camera, ColmapCamera
 from wheretolook.geometry.poses import Float, camera_centers, check_poses
 from wheretolook.inputs.bins import BinnedViews, bin_views, count_bins
-from wheretolook.mapping.colmap_model import camera_of_model, colmap_poses, read_model
+from wheretolook.mapping.colmap_model import camera_of_model, colmap_poses, compact_poses, read_model
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
 from wheretolook.mapping.plausibility import warn_of_frame
 from wheretolook.utils.errors import ConfigError
@@ -95,7 +95,7 @@ class LocalizationMap:
 
             space = FreeSpace(load_mesh(Path(mesh), colored=False), device=device)
             occlusion = MeshOcclusion(space.raycaster, two_sided=space.two_sided)
-        return cls(landmarks, camera, occlusion, device, poses.astype(np.float32))
+        return cls(landmarks, camera, occlusion, device, compact_poses(poses))
 
     def of_camera(self, camera: Camera) -> LocalizationMap:
         """The same map, looked at with another camera."""

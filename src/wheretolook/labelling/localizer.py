@@ -14,6 +14,7 @@ from wheretolook.features.extraction import KeypointExtractor
 from wheretolook.features.keypoints import ExtractorConfig, Keypoints, quantize_descriptors
 from wheretolook.features.matching import DescriptorMatcher, Matches, match
 from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
+from wheretolook.geometry.local_origin import local_origin, poses_from
 from wheretolook.geometry.poses import Float
 from wheretolook.labelling.config import LocalizerConfig
 from wheretolook.mapping.landmarks import Landmarks
@@ -62,7 +63,7 @@ class Localizer:
         self.landmarks, self.config = landmarks, config or LocalizerConfig()
         self.extractor = KeypointExtractor(extractor, device)
         self._matcher = DescriptorMatcher(landmarks.descriptors, device)
-        self._camera = camera
+        self._camera, self._origin = camera, local_origin(landmarks.points)
         self._ransac = {
             "max_reproj_error": self.config.max_error_px,
             "seed": self.config.seed,
@@ -105,12 +106,14 @@ class Localizer:
             return Localization(TOO_FEW_MATCHES, None, n_matches, matched_rows=landmark_rows)
         pixels, points = keypoints.pixels[keypoint_rows].astype(np.float64), self.landmarks.points[landmark_rows]
         taken_with, seen = _known_to_poselib((camera or self._camera).colmap, pixels)
-        pose, found = poselib.estimate_absolute_pose(seen, points, taken_with, self._ransac, self._refinement)
+        pose, found = poselib.estimate_absolute_pose(
+            seen, points - self._origin, taken_with, self._ransac, self._refinement
+        )
         if found["num_inliers"] < 3 or not np.isfinite(pose.Rt).all():  # no three matches determine a pose
             return Localization(NO_POSE, None, n_matches, matched_rows=landmark_rows)
         status = LOCALIZED if found["num_inliers"] >= self.config.min_inliers else NO_POSE
         inlier_rows = landmark_rows[np.asarray(found["inliers"], dtype=bool)]
-        return Localization(status, pose.Rt, n_matches, inlier_rows, landmark_rows)
+        return Localization(status, poses_from(pose.Rt, -self._origin), n_matches, inlier_rows, landmark_rows)
 
 
 POSELIBS_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from wheretolook.geometry.camera import Camera, cameras_by_id, mean_focal_px, only_camera
-from wheretolook.geometry.poses import Float
+from wheretolook.geometry.local_origin import local_origin
+from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.mapping.colmap_files import (
     REBUILD,
     blame_binary,
@@ -179,12 +180,18 @@ def holds_model(folder: Path) -> bool:
 
 
 def save_mapping_poses(cam_from_world: Float, path: str | Path) -> None:
-    """Write poses (M, 3, 4) in single precision as an NPZ file, atomically. The same poses give the same bytes."""
-    save_npz(Path(path), {"cam_from_world": np.asarray(cam_from_world, dtype=np.float32)})
+    """Write poses (M, 3, 4) as an NPZ file, see `compact_poses`, atomically. The same poses give the same bytes."""
+    save_npz(Path(path), {"cam_from_world": compact_poses(cam_from_world)})
+
+
+def compact_poses(cam_from_world: Float) -> Float:
+    """Poses (M, 3, 4) in single precision; in double where single is too coarse, far from the world's origin."""
+    near = not local_origin(camera_centers(cam_from_world)).any()
+    return np.asarray(cam_from_world, dtype=np.float32 if near else np.float64)
 
 
 def load_mapping_poses(path: str | Path) -> Float:
-    """Read what `save_mapping_poses` wrote, (M, 3, 4) float32. MapError if the file is missing, damaged or another."""
+    """Read what `save_mapping_poses` wrote, (M, 3, 4). MapError if the file is missing, damaged or another."""
     path, fix = Path(path), "Run the map stage again, or remove it to read the COLMAP model beside it instead."
     if not path.is_file():
         raise MapError("there is no file of the mapping images' poses", path=path, fix="Run the map stage again.")
@@ -195,7 +202,7 @@ def load_mapping_poses(path: str | Path) -> Float:
     shape = poses.shape if poses.dtype.kind == "f" else ()
     if len(shape) != 3 or shape[1:] != (3, 4) or not len(poses) or not np.isfinite(poses).all():
         raise MapError("these are no poses of mapping images", path=path, value=poses.shape, fix=fix)
-    return np.asarray(poses, dtype=np.float32)
+    return np.asarray(poses)
 
 
 def _listed(folders: list[Path]) -> str:

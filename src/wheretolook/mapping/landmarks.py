@@ -13,6 +13,7 @@ from numpy.typing import DTypeLike, NDArray
 from tqdm.auto import tqdm
 
 from wheretolook.features.keypoints import quantize_descriptors, unit_descriptors
+from wheretolook.geometry.local_origin import local_origin
 from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 from wheretolook.mapping.colmap_model import ModelArrays, model_arrays, read_model
 from wheretolook.mapping.descriptors import read_descriptors
@@ -70,13 +71,15 @@ class Landmarks:
     def save(self, path: str | Path, compact: bool = False) -> None:
         """Write an NPZ file, atomically. The same landmarks give the same bytes.
 
-        `compact` leaves out the descriptors, writes points in single and attributes in half precision, and compresses:
-        about 28 bytes a landmark. Such landmarks serve visibility, features and scorers, but not localization.
+        `compact` leaves out the descriptors, writes points in single (far from the origin in double) and attributes in
+        half precision, and compresses: about 28 bytes a landmark. Such landmarks serve visibility, features and
+        scorers, but not localization.
         """
         values = {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not None}
         if compact:
             values.pop("descriptors", None)
-            values = _floats(values, points=np.float32, others=np.float16)
+            far = local_origin(self.points).any()
+            values = _floats(values, points=np.float64 if far else np.float32, others=np.float16)
         save_npz(Path(path), values, compress=compact)
 
     @classmethod

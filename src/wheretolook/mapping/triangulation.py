@@ -14,6 +14,7 @@ from tqdm.auto import tqdm
 
 from wheretolook.features.keypoints import Keypoints, quantize_descriptors
 from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.local_origin import local_origin
 from wheretolook.geometry.poses import camera_centers, transform
 from wheretolook.utils.colmap import quiet_colmap, storing_in_database
 from wheretolook.utils.processes import Processes
@@ -78,6 +79,8 @@ def triangulate_model(
     import pycolmap
 
     folder = database.parent
+    to_local, back = _local_frame(model)
+    model.transform(to_local)  # rays that meet far from the origin are ill-conditioned
     seed %= 2**31  # COLMAP keeps it in an int
     pycolmap.set_random_seed(seed)
     with storing_in_database(database), clock("database"):
@@ -105,10 +108,20 @@ def triangulate_model(
         options.triangulation.min_angle = options.mapper.filter_min_tri_angle = config.min_triangulation_angle_deg
         with quiet_colmap("ERROR"):  # it warns of every image it cannot read colours from
             model = pycolmap.triangulate_points(model, str(database), str(folder), str(folder), options=options)
+        model.transform(back)
         model.update_point_3d_errors()
     with clock("color"):
         color_points(model, colors)
     return model
+
+
+def _local_frame(model: Any) -> tuple[Any, Any]:
+    """The `pycolmap.Sim3d` to a frame with its origin near a reconstruction's cameras, and the one back."""
+    import pycolmap
+
+    posed = [image.projection_center() for image in model.images.values() if image.has_pose]
+    origin, straight = local_origin(posed), pycolmap.Rotation3d(np.eye(3))
+    return pycolmap.Sim3d(1.0, straight, -origin), pycolmap.Sim3d(1.0, straight, origin)
 
 
 def color_points(model: Any, colors: Sequence[NDArray[np.uint8]]) -> None:

@@ -14,9 +14,23 @@ from wheretolook.utils.errors import ConfigError
 FORWARD = ForwardScorer.name
 """The method that needs no map: the shortest path, looking ahead. Others are compared with it."""
 
+MAX_DIRECTIONS = 1 << 16
+"""Directions of a viewpoint map at most: their ids are stored in 16 bits."""
+
 
 @dataclass(frozen=True)
-class ViewpointMapConfig(ViewLattice):
+class MappedLattice(ViewLattice):
+    """The views that a viewpoint map holds. Raises ConfigError, too, if these are too many directions for it."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.directions > MAX_DIRECTIONS:
+            problem = f"a viewpoint map holds at most {MAX_DIRECTIONS:,} directions"
+            raise ConfigError(problem, value=self.directions, fix=f"Give {MAX_DIRECTIONS} or fewer.")
+
+
+@dataclass(frozen=True)
+class ViewpointMapConfig(MappedLattice):
     """What a viewpoint map is made of.
 
     Args:
@@ -79,7 +93,7 @@ class PathConfig:
 
 
 @dataclass(frozen=True)
-class PathsConfig(ViewLattice):
+class PathsConfig(MappedLattice):
     """How methods are compared by planned paths.
 
     Args:
@@ -124,7 +138,7 @@ class PathsConfig(ViewLattice):
 
 
 @dataclass(frozen=True)
-class PlanConfig(ViewLattice):
+class PlanConfig(MappedLattice):
     """A path to plan, and what to write about it.
 
     Args:

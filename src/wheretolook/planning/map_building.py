@@ -15,6 +15,7 @@ from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float, rotation_looking_along
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.methods.base import Scorer
+from wheretolook.planning.config import MAX_DIRECTIONS
 from wheretolook.planning.refine import score_directions
 from wheretolook.planning.viewpoint_map import MapOrigin, ViewpointMap
 from wheretolook.utils.errors import ConfigError, MapError, SceneError
@@ -27,7 +28,6 @@ VIEWS_AT_ONCE = 16_384
 """Views scored at a time, in whole locations: enough to fill a GPU, few enough for the progress bar to move."""
 
 SIGHT_BYTES = 1 << 28  # lines of sight tested at a time in an update, one byte each
-MAX_DIRECTIONS = 1 << 16  # ids of directions are stored in 16 bits
 
 SAME_SCORE = 1e-4
 """Absolute and relative tolerance for scores of a voxel computed again; networks may sum in another order."""
@@ -164,7 +164,9 @@ def _unit(directions: ArrayLike) -> Float:
     if axes.ndim != 2 or axes.shape[1] != 3 or len(axes) == 0:
         raise ValueError(f"directions must have shape (D, 3), got {axes.shape}")
     if len(axes) > MAX_DIRECTIONS:
-        raise ConfigError(f"a viewpoint map holds at most {MAX_DIRECTIONS:,} directions", value=len(axes))
+        raise ConfigError(
+            f"a viewpoint map holds at most {MAX_DIRECTIONS:,} directions", value=len(axes), fix="Give fewer."
+        )
     length = np.linalg.norm(axes, axis=1, keepdims=True)
     if not np.all((length > 0) & (length < np.inf)):
         raise ValueError("directions must be finite and of some length")

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
+from wheretolook.geometry.local_origin import poses_from
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import check_poses
 from wheretolook.rendering.distorted import render_distorted
@@ -18,7 +19,7 @@ Float = NDArray[np.floating[Any]]
 
 
 def raycasting_scene(mesh: TexturedMesh) -> Any:
-    """The mesh as an `open3d.t.geometry.RaycastingScene`."""
+    """The mesh about its own origin as an `open3d.t.geometry.RaycastingScene`."""
     import open3d as o3d
 
     scene = o3d.t.geometry.RaycastingScene()
@@ -37,9 +38,10 @@ class Open3DRenderer:
 
     def render(self, camera: Camera, cam_from_world: ArrayLike) -> Rendering:
         """Render poses (B, 3, 4); see `Renderer.render`."""
-        poses = check_poses(cam_from_world)
+        poses: Float = check_poses(cam_from_world)
         if isinstance(camera, ColmapCamera):
             return render_distorted(self, camera, poses)
+        poses = poses_from(poses, self.mesh.origin)
         shape = (len(poses), camera.height, camera.width)
         rgb, depth_m = np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.float32)
         for i in range(len(poses)):

@@ -36,7 +36,7 @@ class MeshRaycaster:
         self.device = start_warp(device)
         self.block_rays = block_rays
         wp.load_module(ray_kernels, device=self.device)  # only one thread may do that
-        self.warp_mesh = warp_mesh(mesh, self.device)
+        self.warp_mesh, self.origin = warp_mesh(mesh, self.device), mesh.origin
 
     def occluded(self, origins: ArrayLike, points: ArrayLike, margin_m: float = 0.02) -> NDArray[np.bool_]:
         """Whether something lies between each of origins (L, 3) and each of points (N, 3), in metres; (L, N).
@@ -45,7 +45,7 @@ class MeshRaycaster:
         error, a little behind) a surface is not hidden by that surface. Shorter segments are never occluded.
         """
         origins_at = np.asarray(origins, dtype=np.float64).reshape(-1, 3)
-        points_on_device = vec3_array(points, self.device)
+        points_on_device = self.upload(points)
         n_points = points_on_device.shape[0]
         occluded = np.zeros((len(origins_at), n_points), dtype=np.bool_)
         threads = len(os.sched_getaffinity(0)) if self.device == "cpu" else 1
@@ -61,21 +61,22 @@ class MeshRaycaster:
         return occluded
 
     def unoccluded_on_device(self, origins: ArrayLike, points: Any, margin_m: float = 0.02) -> Any:
-        """The negation of `occluded`, as a Warp array (L, N) of bool; `points` (N,) is a Warp array of vec3."""
-        origins_on_device = vec3_array(origins, self.device)
+        """The negation of `occluded`, as a Warp array (L, N) of bool; `points` (N,) are what `upload` gives."""
+        origins_on_device: Any = self.upload(origins)
         shape = (origins_on_device.shape[0], points.shape[0])
         return self._launch(unoccluded_kernel, shape, [origins_on_device, points, margin_m], wp.bool)[0]
 
     def cast(self, origins: ArrayLike, directions: ArrayLike) -> RayHits:
         """First hits of rays from origins (R, 3) metres along directions (R, 3) of any length."""
-        rays = self._upload_pairs(origins=origins, directions=directions)
+        rays = [self.upload(origins), vec3_array(directions, self.device)]
+        _check_pairs(rays, "origins", "directions")
         outputs = self._launch(cast_kernel, rays[0].shape, rays, wp.float32, wp.int32, wp.bool)
         distance_m, triangle, front = (values.numpy() for values in outputs)
         return RayHits(distance_m, triangle, front.astype(np.bool_))
 
     def distance_to_surface(self, points: ArrayLike, max_distance_m: float) -> NDArray[np.float32]:
         """Distance from points (N, 3) to the nearest triangle, (N,) metres; infinite beyond `max_distance_m`."""
-        points_on_device: Any = vec3_array(points, self.device)
+        points_on_device: Any = self.upload(points)
         inputs = [points_on_device, max_distance_m]
         (distance_m,) = self._launch(distance_kernel, points_on_device.shape, inputs, wp.float32)
         return np.asarray(distance_m.numpy())
@@ -86,17 +87,14 @@ class MeshRaycaster:
         Where a segment runs parallel to a surface at about this distance it is tested every tenth of it, and may come
         closer by less than 0.2 %.
         """
-        segments = self._upload_pairs(starts=a, ends=b)
+        segments = [self.upload(a), self.upload(b)]
+        _check_pairs(segments, "starts", "ends")
         (clear,) = self._launch(clear_kernel, segments[0].shape, [*segments, clearance_m], wp.bool)
         return np.asarray(clear.numpy().astype(np.bool_))
 
-    def _upload_pairs(self, **arrays: ArrayLike) -> list[Any]:
-        """Two arrays (N, 3) on the device. Raises ValueError if their lengths differ."""
-        uploaded: list[Any] = [vec3_array(values, self.device) for values in arrays.values()]
-        if uploaded[0].shape != uploaded[1].shape:
-            lengths = [f"{array.shape[0]} {name}" for name, array in zip(arrays, uploaded, strict=True)]
-            raise ValueError(" for ".join(lengths))
-        return uploaded
+    def upload(self, points: ArrayLike) -> Any:
+        """Points (N, 3) m of the world as a Warp array of vec3 on the device, from the mesh's origin."""
+        return vec3_array(np.asarray(points) - self.origin, self.device)
 
     def _launch(self, kernel: Any, shape: tuple[int, ...], inputs: list[Any], *dtypes: Any) -> list[Any]:
         """New arrays of a shape, one for each type, that a kernel has filled."""
@@ -105,8 +103,15 @@ class MeshRaycaster:
         return outputs
 
 
+def _check_pairs(arrays: list[Any], *names: str) -> None:
+    """Raise ValueError if the lengths of two arrays differ."""
+    if arrays[0].shape != arrays[1].shape:
+        lengths = [f"{array.shape[0]} {name}" for name, array in zip(names, arrays, strict=True)]
+        raise ValueError(" for ".join(lengths))
+
+
 def warp_mesh(mesh: TexturedMesh, device: str) -> wp.Mesh:
-    """The mesh with its bounding volume hierarchy on a device. Warp must have been started."""
+    """The mesh, about its own origin, with its bounding volume hierarchy on a device. Warp must have been started."""
     return wp.Mesh(
         points=wp.array(mesh.vertices, dtype=wp.vec3, device=device),
         indices=wp.array(np.ascontiguousarray(mesh.triangles).reshape(-1), dtype=wp.int32, device=device),

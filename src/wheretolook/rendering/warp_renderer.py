@@ -9,6 +9,7 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
+from wheretolook.geometry.local_origin import poses_from
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float, check_poses
 from wheretolook.rendering.distorted import render_distorted
@@ -55,7 +56,7 @@ class WarpRenderer:
             self._vertices: Any = vec3_array(mesh.vertices, self.device)
         else:
             self._mesh = warp_mesh(mesh, self.device)
-        self._appearance = self._upload(mesh)
+        self._appearance, self._origin = self._upload(mesh), mesh.origin
 
     def _array(self, values: NDArray[Any], dtype: Any) -> Any:
         return wp.array(values, dtype=dtype, device=self.device)
@@ -79,6 +80,7 @@ class WarpRenderer:
         poses = check_poses(cam_from_world)
         if isinstance(camera, ColmapCamera):
             return render_distorted(self, camera, poses)
+        poses = poses_from(poses, self._origin)
         height, width = camera.height, camera.width
         rgb = np.empty((len(poses), height, width, 3), dtype=np.uint8)
         depth_m = np.empty((len(poses), height, width), dtype=np.float32)

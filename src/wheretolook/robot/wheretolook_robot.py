@@ -137,7 +137,7 @@ class RobotScorer:
         rotations = poses[:, :, :3]
         centers = -np.einsum("bji,bj->bi", rotations, poses[:, :, 3])
         # views at one place, one after the other, share what depends on the place
-        moved = (np.abs(np.diff(centers, axis=0)) > 1e-9).any(axis=1)
+        moved = (np.abs(np.diff(centers, axis=0)) > 1e-8).any(axis=1)
         firsts = [0, *(np.flatnonzero(moved) + 1).tolist(), len(poses)] if len(poses) else []
         parts = [self._views_at(centers[a], rotations[a:b], unoccluded) for a, b in pairwise(firsts)]
         return _joined(parts)

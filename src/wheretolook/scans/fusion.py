@@ -98,7 +98,8 @@ def make_scan(config: RgbdConfig, device: str = "cpu", progress: bool = True) ->
     mesh = fuse(frames, frames.camera, frames.cam_from_world, config, device, progress)
     up = _up(config, frames, mesh)
     rotation = rotation_to_z(up)
-    return Scan(replace(mesh, vertices=(mesh.vertices @ rotation.T).astype(np.float32)), frames, up, rotation)
+    turned = replace(mesh, vertices=(mesh.vertices @ rotation.T).astype(np.float32), origin=rotation @ mesh.origin)
+    return Scan(turned, frames, up, rotation)
 
 
 def fuse(

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.local_origin import poses_from
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float, transform
 from wheretolook.rendering.warp_renderer import WarpRenderer
@@ -48,7 +49,9 @@ def textured(
     number = np.zeros(len(mesh.triangles), dtype=np.int32)
     for row in np.unique(photograph[photograph >= 0]).tolist():
         shown, rgb = np.flatnonzero(photograph == row), frames[int(chosen[row])].rgb
-        pixels = camera.project(transform(poses[row], mesh.vertices[mesh.triangles[shown]].reshape(-1, 3)))
+        pixels = camera.project(
+            transform(poses_from(poses[row], mesh.origin), mesh.vertices[mesh.triangles[shown]].reshape(-1, 3))
+        )
         pixels = pixels.reshape(-1, 3, 2)
         uvs[shown], number[shown] = pixels / (camera.width, camera.height), len(textures)
         textures.append(_as_exposed(rgb, pixels.mean(1), mesh, shown))
@@ -64,7 +67,7 @@ def _areas_px(mesh: TexturedMesh, renderer: WarpRenderer, camera: PinholeCamera,
     """How many pixels a photograph shows of each triangle (T,); 0 of those hidden, turned away or not all in it."""
     depth = renderer.render(camera, pose[None]).depth_m[0]
     nearest = cv2.erode(np.where(depth > 0, depth, np.float32(np.inf)), np.ones((_EDGE_PX, _EDGE_PX), np.uint8))
-    points = transform(pose, mesh.vertices)
+    points = transform(poses_from(pose, mesh.origin), mesh.vertices)
     pixels, z = camera.project(points), points[:, 2]
     low, high = _MARGIN_PX, np.array([camera.width, camera.height]) - _MARGIN_PX
     seen = (z > 0) & ((pixels >= low) & (pixels < high)).all(1)

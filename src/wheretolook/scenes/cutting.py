@@ -12,6 +12,7 @@ from wheretolook.geometry.mesh import TexturedMesh
 
 def cut_above(mesh: TexturedMesh, height_m: float) -> TexturedMesh:
     """The part of a mesh at or below a world height; triangles that reach above it are cut."""
+    height_m -= float(mesh.origin[2])
     below = mesh.vertices[mesh.triangles][..., 2] <= height_m
     n_below = below.sum(1)
     whole, rows = n_below == 3, np.flatnonzero((n_below == 1) | (n_below == 2))
@@ -46,4 +47,4 @@ def cut_above(mesh: TexturedMesh, height_m: float) -> TexturedMesh:
     vertices, numbered = with_cuts(mesh.vertices)[used], renamed.reshape(-1, 3).astype(np.int32)
     colors = None if mesh.vertex_colors is None else with_cuts(mesh.vertex_colors)[used]
     uv = np.concatenate(corner_uvs).astype(np.float32)
-    return TexturedMesh(vertices, numbered, uv, np.concatenate(texture), mesh.textures, colors)
+    return TexturedMesh(vertices, numbered, uv, np.concatenate(texture), mesh.textures, colors, mesh.origin)

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import base64
 import io
 from pathlib import Path
 from typing import Any
 
-from PIL import Image
-
+from wheretolook.scenes.mesh_checks import check_image, check_texture_file
 from wheretolook.utils.errors import SceneError
 
 _COMPONENT_BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}  # glTF 2.0 specification, section 3.6.2.2
 _COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _DEEPEST = 500  # nodes within nodes
+_READABLE = ("image/png", "image/jpeg", "image/webp")
 _FIX = "Export the scene again"
 _LISTS = ("buffers", "bufferViews", "accessors", "meshes", "nodes", "scenes", "materials", "textures", "images")
 
@@ -26,13 +27,67 @@ def check_glb(tree: Any, path: Path, n_bytes: int) -> None:
         raise SceneError("the glTF file is corrupt", path=path, value=value, fix=_FIX) from error
 
 
-def check_image(data: bytes, index: int, path: Path) -> None:
-    """Raise SceneError if PIL cannot open an image, which trimesh leaves out without an error."""
+def check_glb_images(tree: Any, path: Path, begin: int) -> list[int]:
+    """The number of pixels of each image of a checked GLB file whose data begin at byte `begin`.
+
+    Images lie in the file, as base64 in its JSON, or in files beside it. Raises SceneError if one cannot be read.
+    """
+    pixels = []
+    for index, image in enumerate(tree.get("images", [])):
+        name, uri = f"texture {index}", image.get("uri")
+        if "bufferView" not in image and not isinstance(uri, str):
+            raise SceneError(f"the glTF file is corrupt: {name} is nowhere", path=path, value=str(image)[:80], fix=_FIX)
+        if "bufferView" not in image and not uri.startswith("data:"):
+            pixels.append(check_texture_file(path.parent / uri, path))
+            continue
+        if "bufferView" not in image:
+            pixels.append(check_image(io.BytesIO(_decoded(uri, name, path)), name, path))
+            continue
+        mime_type, views = image.get("mimeType", ""), tree.get("bufferViews", [])
+        if mime_type not in _READABLE:
+            fix = "Use the GLB with JPEG or PNG textures; a .basis.glb holds compressed ones"
+            raise SceneError("a texture is in a format that is not supported", path=path, value=mime_type, fix=fix)
+        if not _is_whole(image["bufferView"]) or image["bufferView"] >= len(views):
+            problem = "the glTF file is corrupt: an image has no such view"
+            raise SceneError(problem, path=path, value=image["bufferView"], fix=_FIX)
+        view = views[image["bufferView"]]
+        data = _view_bytes(view, tree["buffers"][view["buffer"]].get("uri"), name, path, begin)
+        pixels.append(check_image(io.BytesIO(data), name, path))
+    return pixels
+
+
+def _view_bytes(view: dict[str, Any], uri: str | None, name: str, path: Path, begin: int) -> bytes:
+    """What a view holds of the file's own data, of a `data:` URI, or of a file beside it."""
+    start, length = view.get("byteOffset", 0), view["byteLength"]
+    if uri is not None and uri.startswith("data:"):
+        return _decoded(uri, name, path)[start : start + length]
+    with (path if uri is None else path.parent / uri).open("rb") as file:
+        file.seek(start + (begin if uri is None else 0))
+        return file.read(length)
+
+
+def _decoded(uri: str, name: str, path: Path) -> bytes:
+    """What a `data:` URI holds. SceneError if that is not base64."""
+    kind, comma, content = uri.partition(",")
     try:
-        Image.open(io.BytesIO(data)).close()
-    except Exception as error:  # decoders raise errors of many kinds
-        problem = f"texture {index} is damaged or too large"
-        raise SceneError(problem, path=path, value=str(error)[:200], fix=_FIX) from error
+        if not comma or not kind.endswith(";base64"):
+            raise ValueError(f"no base64 but {kind[:40]!r}")
+        return base64.b64decode(content, validate=True)
+    except ValueError as error:
+        raise SceneError(f"{name} in a data: URI cannot be read", path=path, value=str(error), fix=_FIX) from error
+
+
+def _bytes_of(buffer: dict[str, Any], path: Path, n_bytes: int) -> int:
+    """How many bytes a buffer can hold at most: the file's own, of a `data:` URI, or of a file beside it."""
+    uri = buffer.get("uri")
+    if uri is None:
+        return n_bytes
+    if uri.startswith("data:"):
+        return len(uri) * 3 // 4
+    beside = path.parent / uri
+    if not beside.is_file():
+        raise SceneError("a file of the glTF scene is missing", path=path, value=str(beside), fix="Put it there")
+    return beside.stat().st_size
 
 
 def _check(tree: Any, path: Path, n_bytes: int) -> None:
@@ -48,8 +103,8 @@ def _check(tree: Any, path: Path, n_bytes: int) -> None:
     views, accessors, nodes = (tree.get(name, []) for name in ("bufferViews", "accessors", "nodes"))
     for index, view in enumerate(views):
         begin, length = view.get("byteOffset", 0), view["byteLength"]
-        embedded = "uri" in tree["buffers"][view["buffer"]]  # of a size that is not the file's to tell
-        if not (_is_whole(begin) and _is_whole(length)) or (not embedded and begin + length > n_bytes):
+        room = _bytes_of(tree["buffers"][_index(view["buffer"], tree["buffers"])], path, n_bytes)
+        if not (_is_whole(begin) and _is_whole(length)) or begin + length > room:
             refuse(f"view {index} lies outside of the file", (begin, length))
     for index, accessor in enumerate(accessors):
         count, begin = accessor["count"], accessor.get("byteOffset", 0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import struct
@@ -16,8 +17,10 @@ import trimesh
 from numpy.typing import NDArray
 from PIL import Image
 
+from wheretolook.geometry.local_origin import local_origin
 from wheretolook.geometry.mesh import TexturedMesh
-from wheretolook.scenes.glb_checks import check_glb, check_image
+from wheretolook.scenes.glb_checks import check_glb, check_glb_images
+from wheretolook.scenes.mesh_checks import check_all_images, check_obj, check_ply, check_texture_file
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.utils.files import write_bytes
 
@@ -31,7 +34,6 @@ _Z_UP_FROM = {
     "-z": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
 }
 _SUFFIXES = (".glb", ".ply", ".obj")
-_READABLE = ("image/png", "image/jpeg", "image/webp")
 _MIN_AREA_M2 = 1e-12  # a square of a thousandth of a millimetre
 _MIN_EXTENT_M = 1e-3
 _WHITE = np.full((1, 1, 3), 255, dtype=np.uint8)
@@ -67,7 +69,7 @@ def load_mesh(path: str | PathLike[str], up: str = "z", colored: bool = True) ->
     if up not in _Z_UP_FROM:
         raise ConfigError("unknown up axis", value=up, fix=f"Use one of {', '.join(_Z_UP_FROM)}")
     file = _mesh_file(Path(path))
-    _check_texture_references(file)
+    _check_content(file)
     try:
         scene = trimesh.load_scene(str(file), process=False)
         parts = list(_parts(scene))
@@ -86,7 +88,8 @@ def load_mesh(path: str | PathLike[str], up: str = "z", colored: bool = True) ->
 def save_glb(mesh: TexturedMesh, path: str | PathLike[str], jpeg_quality: int = 90) -> None:
     """Write a mesh as a binary glTF file with JPEG textures, unlit and double sided, in its own z-up coordinates.
 
-    Positions and texture coordinates keep their float32 values (v to within rounding, since it is flipped twice), but
+    Positions and texture coordinates keep their float32 values (v to within rounding, since it is flipped twice); nodes
+    hold the mesh's origin, in double precision. But
     triangles are grouped by texture, and corners with the same position and texture coordinates share a vertex. The
     file is replaced in one step. Raises ConfigError if the quality is not in 1 to 100.
     """
@@ -96,7 +99,9 @@ def save_glb(mesh: TexturedMesh, path: str | PathLike[str], jpeg_quality: int = 
     for index, texture in enumerate(mesh.textures):
         faces = np.flatnonzero(mesh.triangle_texture == index)
         if len(faces):
-            scene.add_geometry(_geometry(mesh, faces, _EncodedJpeg(texture, jpeg_quality)), node_name=f"part_{index}")
+            part = _geometry(mesh, faces, _EncodedJpeg(texture, jpeg_quality))
+            at = trimesh.transformations.translation_matrix(mesh.origin) if mesh.origin.any() else None
+            scene.add_geometry(part, node_name=f"part_{index}", transform=at)
     write_bytes(Path(path), trimesh.exchange.gltf.export_glb(scene, tree_postprocessor=_mark_unlit))
 
 
@@ -195,12 +200,12 @@ def _as_uint8(colors: NDArray[Any]) -> NDArray[np.uint8]:
 
 def _merge(parts: list[_Part], rotation: NDArray[np.float64]) -> TexturedMesh:
     """One mesh of all parts; parts that share an image share a texture."""
-    textures: dict[bytes, int] = {}
+    textures: dict[tuple[tuple[int, ...], bytes], int] = {}
     images: list[NDArray[np.uint8]] = []
     triangle_texture, corner_uvs, triangles = [], [], []
     n_vertices = 0
     for part in parts:
-        key = bytes(str(part.texture.shape), "ascii") + part.texture.tobytes()
+        key = (part.texture.shape, hashlib.sha256(np.ascontiguousarray(part.texture).data).digest())
         if key not in textures:
             textures[key] = len(images)
             images.append(part.texture)
@@ -214,9 +219,11 @@ def _merge(parts: list[_Part], rotation: NDArray[np.float64]) -> TexturedMesh:
         white = [np.full((len(p.vertices), 3), 255, np.uint8) if p.colors is None else p.colors for p in parts]
         colors = np.concatenate(white)
     with np.errstate(invalid="ignore"):
-        vertices = (np.concatenate([part.vertices for part in parts]) @ rotation.T).astype(np.float32)
+        world = np.concatenate([part.vertices for part in parts]) @ rotation.T
+        origin = local_origin(world)
+        vertices = (world - origin).astype(np.float32)
     indices, all_uvs = np.concatenate(triangles).astype(np.int32), np.concatenate(corner_uvs).astype(np.float32)
-    return TexturedMesh(vertices, indices, all_uvs, np.concatenate(triangle_texture), tuple(images), colors)
+    return TexturedMesh(vertices, indices, all_uvs, np.concatenate(triangle_texture), tuple(images), colors, origin)
 
 
 def _check(mesh: TexturedMesh, path: Path) -> None:
@@ -286,8 +293,8 @@ def _mark_unlit(tree: dict[str, Any]) -> None:
     tree.setdefault("extensionsUsed", []).append("KHR_materials_unlit")
 
 
-def _check_texture_references(path: Path) -> None:
-    """Raise SceneError if a GLB, PLY or OBJ file refers to a texture that is missing or in a format not supported.
+def _check_content(path: Path) -> None:
+    """Raise SceneError if a GLB, PLY or OBJ file lies about its size, or a texture is missing or cannot be read.
 
     trimesh leaves such images out, or puts a grey placeholder in their place, without an error.
     """
@@ -295,28 +302,11 @@ def _check_texture_references(path: Path) -> None:
     if suffix == ".glb":
         tree, begin = _glb_json(path)
         check_glb(tree, path, path.stat().st_size)
-        for index, image in enumerate(tree.get("images", [])):
-            mime_type = image.get("mimeType", "")
-            if "bufferView" in image and mime_type not in _READABLE:
-                fix = "Use the GLB with JPEG or PNG textures; a .basis.glb holds compressed ones"
-                raise SceneError("a texture is in a format that is not supported", path=path, value=mime_type, fix=fix)
-            if "bufferView" in image:
-                view = _item(tree["bufferViews"], image["bufferView"], path)
-                if "uri" not in tree["buffers"][view["buffer"]]:
-                    with path.open("rb") as file:
-                        file.seek(begin + view.get("byteOffset", 0))
-                        check_image(file.read(view["byteLength"]), index, path)
-        return
-    for texture in _ply_textures(path) if suffix == ".ply" else _obj_textures(path):
-        if not texture.is_file():
-            fix = "Put the image where the mesh expects it"
-            raise SceneError("a texture is missing", path=path, value=str(texture), fix=fix)
-
-
-def _item(items: list[Any], index: Any, path: Path) -> Any:
-    if not isinstance(index, int) or not 0 <= index < len(items):
-        raise SceneError("the glTF file is corrupt: an image has no such view", path=path, value=index)
-    return items[index]
+        pixels = check_glb_images(tree, path, begin)
+    else:
+        textures = check_ply(path) if suffix == ".ply" else check_obj(path)
+        pixels = [check_texture_file(texture, path) for texture in dict.fromkeys(textures)]
+    check_all_images(pixels, path)
 
 
 def _glb_json(path: Path) -> tuple[Any, int]:
@@ -335,30 +325,3 @@ def _glb_json(path: Path) -> tuple[Any, int]:
         except (ValueError, RecursionError) as error:
             raise SceneError("the glTF file is corrupt", path=path, value=str(error)) from error
         return content, 20 + json_length + 8
-
-
-def _ply_textures(path: Path) -> list[Path]:
-    with path.open("rb") as file:
-        for raw in file:
-            line = raw.decode("utf-8", errors="replace").strip()
-            if line.lower().startswith("comment texturefile "):
-                return [path.parent / line[len("comment texturefile ") :].strip()]
-            if line == "end_header":
-                break
-    return []
-
-
-def _obj_textures(path: Path) -> list[Path]:
-    textures = []
-    with path.open(encoding="utf-8", errors="replace") as file:
-        libraries = [path.parent / line[7:].strip() for line in file if line.startswith("mtllib ")]
-    for library in libraries:
-        if not library.is_file():
-            fix = "Put it where the mesh expects it"
-            raise SceneError("the material library is missing", path=path, value=str(library), fix=fix)
-        for line in library.read_text(encoding="utf-8", errors="replace").splitlines():
-            # A map with options (-s, -o ...) before its file name is not checked.
-            words = line.split(maxsplit=1)
-            if len(words) == 2 and words[0].lower() == "map_kd" and not words[1].startswith("-"):
-                textures.append(library.parent / words[1].strip().replace("\\", "/"))
-    return textures

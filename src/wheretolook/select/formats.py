@@ -118,6 +118,7 @@ def _rows(views: SelectedViews) -> list[dict[str, Any]]:
     return rows
 
 
+FAR_M = 1000.0  # of a camera from the origin
 _DIGITS = {"yaw_deg": ".3f", "pitch_deg": ".3f", "score": ".9g", "expected_inliers": ".2f"}
 
 
@@ -188,11 +189,15 @@ def _cameras(views: SelectedViews) -> str:
 
 
 def _cam_from_world(views: SelectedViews) -> list[list[str]]:
-    """qw qx qy qz tx ty tz of each view, world-to-camera."""
+    """qw qx qy qz tx ty tz of each view, world-to-camera.
+
+    Far from the origin quaternions get more decimals, which decide where the camera is: its centre follows from both.
+    """
     quaternions = quaternion_from_rotation(views.cam_from_world[:, :, :3])
     poses = zip(quaternions, views.cam_from_world[:, :, 3], strict=True)
-    return [[*_numbers(quaternion), *_numbers(shift)] for quaternion, shift in poses]
+    decimals = 9 if np.abs(views.cam_from_world[:, :, 3]).max(initial=0) < FAR_M else 15
+    return [[*_numbers(quaternion, decimals), *_numbers(shift)] for quaternion, shift in poses]
 
 
-def _numbers(values: Any) -> list[str]:
-    return [f"{value:.9f}" for value in values]
+def _numbers(values: Any, decimals: int = 9) -> list[str]:
+    return [f"{value:.{decimals}f}" for value in values]

@@ -122,6 +122,11 @@ def _read_depth(path: Path, scale: float) -> NDArray[np.float32]:
     return depth
 
 
+def _short(x: float) -> str:
+    """A coordinate to three digits, but to the metre at least."""
+    return f"{x:.0f}" if abs(x) >= 1000 else f"{x:.3g}"
+
+
 def _scaled(camera: Camera, width: int, height: int, path: Path) -> PinholeCamera:
     try:
         matrix = camera.matrix
@@ -195,7 +200,7 @@ def usable_waypoints(localization_map: LocalizationMap, waypoints: Waypoints, sk
     more = f", and {bad.sum() - LISTED} more" if bad.sum() > LISTED else ""
     problem = f"{bad.sum()} of {len(waypoints)} waypoints lie outside the map or inside geometry"
     low, high = np.quantile(landmarks.points, (0.01, 0.99), axis=0)
-    box = " to ".join("(" + ", ".join(f"{x:.3g}" for x in corner) + ")" for corner in (low, high))
+    box = " to ".join("(" + ", ".join(_short(x) for x in corner) + ")" for corner in (low, high))
     fix = f"The map's landmarks lie within {box}, in its unit: check unit and axes"
     fix += "." if bad.all() else ", or leave these out: --skip, in Python skip=True."
     raise TableError(problem, path=waypoints.path, value="; ".join(told) + more, fix=fix)

@@ -41,7 +41,7 @@ class Waypoints:
 
     def where(self, row: int) -> str:
         """A waypoint in words: its line or name, and its coordinates."""
-        at = ", ".join(f"{value:g}" for value in self.points[row])
+        at = ", ".join(f"{value:.10g}" for value in self.points[row])
         return f"{f'line {self.lines[row]}' if self.lines else f'waypoint {self.ids[row]}'}: ({at})"
 
     @classmethod

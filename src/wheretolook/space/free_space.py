@@ -9,6 +9,7 @@ from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.rendering.raycasting import MeshRaycaster, RayHits
 from wheretolook.space.config import FreeSpaceConfig
 
+AT_ONCE = 1 << 18  # points around which it is looked at a time: 34 rays each, about 2 KB
 _N_SIDEDNESS_POINTS = 1024  # random points that decide whether triangles are one-sided
 
 
@@ -64,6 +65,9 @@ class FreeSpace:
         return np.where(is_floor, at[:, 2] - hits.distance_m, np.nan)
 
     def _is_enclosed(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+        if len(points) > AT_ONCE:
+            parts = [self._is_enclosed(points[start : start + AT_ONCE]) for start in range(0, len(points), AT_ONCE)]
+            return np.concatenate(parts)
         hits = self._look_around(points)
         surface = np.isfinite(hits.distance_m) & (hits.front | self.two_sided)
         enclosed: NDArray[np.bool_] = surface.mean(axis=1) >= self.config.min_enclosure

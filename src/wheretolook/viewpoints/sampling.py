@@ -13,11 +13,14 @@ from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float, poses_looking_along, rotation_looking_along
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.utils.errors import SceneError
+from wheretolook.utils.errors import ConfigError, SceneError
+from wheretolook.utils.memory import fitting
 from wheretolook.viewpoints.config import SampleConfig, Split
 from wheretolook.viewpoints.table import CAMERA_ID, UNLABELLED, pose_columns
 from wheretolook.visibility.occlusion import OcclusionModel, StoredOcclusion
 from wheretolook.visibility.survey import Survey, survey
+
+BYTES_PER_VIEWPOINT = 600  # while a table of viewpoints is made and written
 
 if TYPE_CHECKING:
     from wheretolook.space.free_space import FreeSpace
@@ -56,6 +59,7 @@ def sample_viewpoints(
     Raises:
         SceneError: no viewpoint sees enough landmarks, or a location lies inside geometry.
         MapError: there are no landmarks.
+        ConfigError: so many viewpoints do not fit into memory.
     """
     config = config or SampleConfig()
     rng = np.random.default_rng(config.seed)
@@ -70,7 +74,7 @@ def sample_viewpoints(
         rng.shuffle(numbers)
     around = (rotation_looking_along(directions), locations, landmarks.points, occlusion)
     seen = _survey_by_camera(several, numbers, *around, **options)
-    counts, rank = seen.counts, np.full(seen.counts.shape, -1)
+    counts, rank = seen.counts, np.full(seen.counts.shape, -1, dtype=np.int32)
     np.put_along_axis(rank, seen.best, np.arange(seen.best.shape[1])[None], axis=1)
 
     kept_directions = []
@@ -83,6 +87,9 @@ def sample_viewpoints(
         n_landmarks, fix = len(landmarks.points), "Lower sample.min_visible, or map the scene with more images."
         problem = f"from no location does a viewpoint see {config.min_visible} of the {n_landmarks} landmarks"
         raise SceneError(problem, value=int(counts.max(initial=0)), fix=fix)
+    if len(direction) > (most := fitting(BYTES_PER_VIEWPOINT)):
+        fix = f"Set sample.max_directions to {max(1, most // len(ids)):,} or less, or sample.max_locations."
+        raise ConfigError("the table has more viewpoints than there is memory for", value=len(direction), fix=fix)
     columns = {
         "viewpoint_id": ids[row_index] * len(directions) + direction,
         "location_id": ids[row_index],

@@ -57,7 +57,7 @@ class FrustumCounter:
         self.lanes = GPU_LANES if wp.get_device(self.device).is_cuda else 1
         on_host = isinstance(camera, ColmapCamera) and distinct_pixels
         self._field = tabulate(camera) if isinstance(camera, ColmapCamera) and not on_host else None
-        self.size = size or choose_size(n_points)
+        self.size = size or choose_size(n_points, len(self.rotations))
         if not on_host:
             self.cells = SphereCells.of(camera, rotations, self.size, self.device)
         self._axes: Any = wp.array(self.rotations, dtype=wp.mat33, device=self.device)

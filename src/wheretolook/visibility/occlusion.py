@@ -40,15 +40,18 @@ class DevicePoints:
         self.positions = np.asarray(positions, dtype=np.float64).reshape(-1, 3)
         self.device = start_warp(device)
         self.order = np.argsort(morton_codes(self.positions), kind="stable")
+        self._single: dict[tuple[float, ...], Any] = {}
         self.double: Any = wp.array(self.positions[self.order], dtype=wp.vec3d, device=self.device)
 
     def __len__(self) -> int:
         return len(self.positions)
 
-    @cached_property
-    def single(self) -> Any:
-        """(N,) Warp array of vec3."""
-        return vec3_array(self.positions[self.order], self.device)
+    def single(self, origin: Float) -> Any:
+        """(N,) Warp array of vec3, from an origin (3,) m; made once for each."""
+        key = tuple(origin.tolist())
+        if key not in self._single:
+            self._single[key] = vec3_array(self.positions[self.order] - origin, self.device)
+        return self._single[key]
 
     @cached_property
     def rank(self) -> Any:
@@ -153,7 +156,7 @@ class MeshOcclusion(OcclusionModel):
         """As `unoccluded`, on the raycaster's device."""
         if points.device != self.raycaster.device:
             return super().unoccluded_on_device(locations, points)
-        return self.raycaster.unoccluded_on_device(locations, points.single, self.margin_m)
+        return self.raycaster.unoccluded_on_device(locations, points.single(self.raycaster.origin), self.margin_m)
 
     def inside_geometry(self, locations: Float) -> NDArray[np.bool_]:
         """Whether locations (L, 3) m are on a surface or, in a one-sided mesh, surrounded mostly by backs; (L,)."""

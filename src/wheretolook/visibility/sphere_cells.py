@@ -25,9 +25,16 @@ from wheretolook.visibility.frustum import frustum_sides
 ROUNDING = 1e-5  # least relative distance of a cell's corners from a plane, since rounding may move landmarks into it
 
 
-def choose_size(n_points: int) -> int:
-    """Cells along a side of the map, an even number. About six landmarks a cell were fastest on CPU and GPU."""
-    return int(np.clip(2 * round(np.sqrt(n_points / 6) / 2), 8, 256))
+MOST_CELLS = 1 << 28  # of all orientations together, a byte each while they are classified
+
+
+def choose_size(n_points: int, n_rotations: int = 1) -> int:
+    """Cells along a side of the map, an even number. About six landmarks a cell were fastest on CPU and GPU.
+
+    Fewer where the cells of very many orientations would take too much memory.
+    """
+    most = min(256, 2 * int(np.sqrt(MOST_CELLS / max(n_rotations, 1)) / 2))
+    return int(np.clip(2 * round(np.sqrt(n_points / 6) / 2), 8, max(8, most)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,10 +15,12 @@ from tqdm.auto import tqdm
 
 from wheretolook.geometry.camera import Camera
 from wheretolook.utils.errors import ConfigError, SceneError
+from wheretolook.utils.memory import fitting
 from wheretolook.visibility.counting import FrustumCounter
 from wheretolook.visibility.counting_kernel import pack_kernel
 from wheretolook.visibility.occlusion import DevicePoints, OcclusionModel, StoredOcclusion
 
+BYTES_TO_RANK = 4  # of every direction at every location, for those who ask which rank it has
 CPU_BLOCK_BYTES = 1 << 24  # on a CPU a block of locations should fit into the cache
 
 
@@ -56,7 +58,7 @@ def survey(
     many threads as said, 0 for all cores. The progress bar has a text; None shows none.
 
     Raises a MapError if there are no landmarks; a SceneError if there are no locations, or `OcclusionModel.check`
-    refuses one; a ConfigError if a single location takes more memory than allowed.
+    refuses one; a ConfigError if a single location takes more memory than allowed, or the counts more than there is.
     """
     at = np.asarray(locations, dtype=np.float64).reshape(-1, 3)
     if len(at) == 0:
@@ -73,6 +75,10 @@ def survey(
     counter = FrustumCounter(camera, orientations, n_points, landmarks.device, distinct_pixels, scratch_bytes=scratch)
     n_directions = len(counter.rotations)
     keep = min(keep or n_directions, n_directions)
+    if len(at) * n_directions > (most := fitting(4 + 4 + BYTES_TO_RANK)):
+        problem = f"{n_directions:,} directions at {len(at):,} locations are more than there is memory for"
+        fix = f"{most // len(at):,} directions would fit, or fewer locations."
+        raise ConfigError(problem, value=len(at) * n_directions, fix=fix)
     per_location = counter.bytes_per_location(n_points) + n_points  # and its mask
     least = per_location + counter.fixed_bytes
     if least > memory_bytes:

@@ -9,21 +9,21 @@ things.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
 from wheretolook.geometry.camera import Camera
+from wheretolook.geometry.local_origin import local_origin, poses_from
 from wheretolook.geometry.mesh import TexturedMesh
-from wheretolook.geometry.poses import Float
+from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.utils.errors import ConfigError, SceneError
+from wheretolook.utils.memory import fitting
 from wheretolook.visibility.occlusion import MeshOcclusion
 
 BLOCK_VOXELS = 8  # voxels along the side of a block
@@ -128,15 +128,21 @@ class TsdfVolume:
 
     Use `from_images` where all images are at hand: it also checks the memory beforehand.
 
-    It starts with room for `expected_blocks`; when they are used up, all are copied to more. If it is `colored`, it
-    averages the colours of images, too.
+    It starts with room for `expected_blocks`; when they are used up, all are copied to more. Open3D works in single
+    precision, about `origin` (3,) m. If it is `colored`, it averages the colours of images, too.
     """
 
-    def __init__(self, config: TsdfConfig | None = None, expected_blocks: int = 1 << 13, colored: bool = False) -> None:
+    def __init__(
+        self,
+        config: TsdfConfig | None = None,
+        expected_blocks: int = 1 << 13,
+        origin: ArrayLike = (0.0, 0.0, 0.0),
+        colored: bool = False,
+    ) -> None:
         import open3d as o3d
 
-        self.config, self.colored = config or TsdfConfig(), colored
-        self._limit = self.config.memory_limit_bytes or _available_bytes() * 4 // 5
+        self.config, self.origin = config or TsdfConfig(), np.asarray(origin, dtype=np.float64)
+        self.colored, self._limit = colored, self.config.memory_limit_bytes or fitting(1)
         names, sizes = ("tsdf", "weight", "color"), (1, 1, 3)
         n = 3 if colored else 2
         layout = names[:n], (o3d.core.float32,) * n, [o3d.core.SizeVector([size]) for size in sizes[:n]]
@@ -158,8 +164,8 @@ class TsdfVolume:
         """
         config = config or TsdfConfig()
         n_blocks = estimate_blocks(images, config)
-        _check_memory(n_blocks, config, config.memory_limit_bytes or _available_bytes() * 4 // 5, colored)
-        volume = cls(config, n_blocks, colored)
+        _check_memory(n_blocks, config, config.memory_limit_bytes or fitting(1), colored)
+        volume = cls(config, n_blocks, _origin_of(images), colored)
         for i in tqdm(range(len(images)), desc="fuse depth", unit="image", disable=not progress):
             volume.integrate(images[i])
         return volume
@@ -177,7 +183,7 @@ class TsdfVolume:
         rows, columns = (side // _TOUCH_STRIDE * _TOUCH_STRIDE for side in depth.shape)
         if not depth[:rows:_TOUCH_STRIDE, :columns:_TOUCH_STRIDE].any():
             return  # Open3D would raise
-        pose = np.vstack([np.asarray(image.cam_from_world, dtype=np.float64), (0, 0, 0, 1)])
+        pose = np.vstack([poses_from(image.cam_from_world, self.origin), (0, 0, 0, 1)])
         tensor: Any = core.Tensor
         limits = 1.0, float(self.config.max_depth_m), float(self.config.truncation_voxels)
         shown, from_where = Image(tensor(np.ascontiguousarray(depth))), (tensor(image.camera.matrix), tensor(pose))
@@ -220,7 +226,7 @@ class TsdfVolume:
         colors = None
         if self.colored:
             colors = np.clip(np.rint(255 * mesh.vertex.colors.numpy()), 0, 255).astype(np.uint8)
-        return TexturedMesh(mesh.vertex.positions.numpy(), triangles, uvs, texture, white, colors)
+        return TexturedMesh(mesh.vertex.positions.numpy(), triangles, uvs, texture, white, colors, self.origin)
 
 
 class TsdfOcclusion(MeshOcclusion):
@@ -253,12 +259,12 @@ class TsdfOcclusion(MeshOcclusion):
 def estimate_blocks(images: Sequence[DepthImage], config: TsdfConfig) -> int:
     """Blocks of voxels that the images' surfaces will touch, from some pixels of up to 100; SceneError without any."""
     cell_m = max(config.block_m, _SURVEY_CELL_M)
-    cells = np.empty(0, dtype=np.int64)
+    cells, origin = np.empty(0, dtype=np.int64), _origin_of(images) if len(images) else np.zeros(3)
     number = np.array([1, 1 << 21, 1 << 42])  # one number a cell sorts faster than three
     for i in np.unique(np.linspace(0, len(images) - 1, _SURVEY_IMAGES).astype(int)) if len(images) else ():
         image = images[i]
         stride = max(1, int(np.sqrt(np.size(image.depth_m) / _SURVEY_PIXELS)))
-        points = image.points(config.max_depth_m, stride)
+        points = image.points(config.max_depth_m, stride) - origin
         cells = np.union1d(cells, np.floor(points / cell_m).astype(np.int64) @ number)
     if len(cells) == 0:
         problem = f"no depth image has a reading up to {config.max_depth_m:g} m"
@@ -266,6 +272,11 @@ def estimate_blocks(images: Sequence[DepthImage], config: TsdfConfig) -> int:
         raise SceneError(problem, value=f"{len(images)} images", fix=fix)
     # The number of blocks that a surface touches grows with its area.
     return int(np.ceil(_BLOCKS_PER_CELL * len(cells) * (cell_m / config.block_m) ** 2))
+
+
+def _origin_of(images: Sequence[DepthImage]) -> Float:
+    """The local origin (3,) m of images of one scene, by the place of the first."""
+    return local_origin(camera_centers(images[0].cam_from_world))
 
 
 def _check_memory(n_blocks: int, config: TsdfConfig, limit_bytes: int, colored: bool = False) -> None:
@@ -280,14 +291,3 @@ def _check_memory(n_blocks: int, config: TsdfConfig, limit_bytes: int, colored: 
     problem = f"voxels of this size need {need}, {available:.2f} GiB ({fits * block_bytes:,} bytes) can be used"
     fix = f"A voxel_size_m of {np.ceil(enough / step) * step:.2g} would fit."
     raise ConfigError(problem, value=f"voxel_size_m={config.voxel_size_m:g}", fix=fix)
-
-
-def _available_bytes() -> int:
-    """Memory this machine can give without swapping; all it has, where the system does not say."""
-    try:
-        for line in Path("/proc/meminfo").read_text().splitlines():
-            if line.startswith("MemAvailable:"):
-                return int(line.split()[1]) * 1024
-    except OSError:
-        pass
-    return int(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))

@@ -1,0 +1,92 @@
+"""How much memory a command takes with all its processes, and whether it grows.
+
+    python tests/benchmarks/bench_load.py --minutes 60 label --config configs/small.yaml
+    python tests/benchmarks/bench_load.py --limit-gb 16 select --map sparse/0 --at waypoints.csv --out views.csv
+
+Runs `wheretolook` with what is given, interrupts it as Ctrl-C does when the minutes are over, and kills it beyond the
+limit. The memory of the command and of all its processes is read every `--every` seconds: the resident, and the
+processes' own, in which what several of them share counts once. A line a minute is told while it runs; at the end the
+peaks and, of what took ten minutes or more, the slope of a line through all readings after the first tenth of the time,
+by when every worker has met its largest batches. Nothing here fails on time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import psutil
+
+COMMAND = [sys.executable, "-c", "import sys; from wheretolook.cli import main; sys.exit(main(sys.argv[1:]))"]
+
+
+def memory_mb(root: psutil.Process) -> tuple[float, float, int]:
+    """Resident and own memory in 10^6 bytes of a process and of all below it, and how many they are."""
+    resident, own, n = 0, 0, 0
+    try:
+        processes = [root, *root.children(recursive=True)]
+    except psutil.NoSuchProcess:
+        processes = []
+    for process in processes:
+        try:
+            memory = process.memory_full_info()
+        except psutil.Error:  # it has just ended
+            continue
+        resident, own, n = resident + memory.rss, own + memory.pss, n + 1
+    return resident / 1e6, own / 1e6, n
+
+
+def tell(rows: list[tuple[float, float, float]]) -> None:
+    seconds, resident, own = np.array(rows).T
+    settled = seconds >= seconds[-1] / 10
+    for name, megabytes in (("resident", resident), ("own", own)):
+        line = f"{name:8} peak {megabytes.max():.0f} MB"
+        if seconds[-1] >= 600:
+            slope = np.polyfit(seconds[settled] / 3600, megabytes[settled], 1)[0]
+            quarters = ", ".join(f"{np.median(part):.0f}" for part in np.array_split(megabytes[settled], 4))
+            line += f"; slope {slope:+.1f} MB an hour; medians of the quarters {quarters} MB"
+        print(line)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--minutes", type=float, default=60.0)
+    parser.add_argument("--limit-gb", type=float, default=float("inf"))
+    parser.add_argument("--every", type=float, default=2.0)
+    parser.add_argument("command", nargs=argparse.REMAINDER, help="what follows `wheretolook`")
+    args = parser.parse_args()
+    start, told, asked, ended = time.monotonic(), 0, 0.0, ""
+    rows: list[tuple[float, float, float]] = []
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # which a shell's background commands would ignore
+    process = subprocess.Popen([*COMMAND, *args.command], start_new_session=True)
+    root = psutil.Process(process.pid)
+    while process.poll() is None:
+        resident, own, n = memory_mb(root)
+        seconds = time.monotonic() - start
+        if n:
+            rows.append((seconds, resident, own))
+        if seconds // 60 > told:
+            told = int(seconds // 60)
+            print(f"{told:4} min: {resident:6.0f} MB resident, {own:6.0f} MB own, {n} processes", flush=True)
+        if resident > 1e3 * args.limit_gb:
+            ended = f", killed beyond {args.limit_gb} GB"
+            for child in root.children(recursive=True):
+                child.kill()
+            process.kill()
+            process.wait()
+        elif seconds > max(60 * args.minutes, asked + 30):  # again if it came at a bad time
+            ended, asked = ", interrupted when the time was over", seconds
+            process.send_signal(signal.SIGINT)
+        time.sleep(args.every)
+    print(f"exit {process.returncode} after {time.monotonic() - start:.1f} s{ended}")
+    if rows:
+        tell(rows)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,187 @@
+"""Maps, images and grids at the ends of what there can be are answered, or refused at once with what would fit."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from planning.rooms import CAMERA, DIRECTIONS, GRID, room_landmarks
+from selection.room import WEIGHTS
+from synthetic_dataset import make_landmarks
+from wheretolook.cli import main
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.lattices import VoxelGrid, check_voxels, fibonacci_sphere
+from wheretolook.geometry.poses import Float, poses_looking_along, rotation_looking_along
+from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.methods.registry import make_scorer, scorers
+from wheretolook.planning.config import ViewpointMapConfig
+from wheretolook.planning.map_building import build_viewpoint_map
+from wheretolook.rendering.open3d_renderer import Open3DRenderer
+from wheretolook.rendering.warp_renderer import WarpRenderer
+from wheretolook.space.mapped_space import MappedSpace
+from wheretolook.utils import memory
+from wheretolook.utils.errors import ConfigError, SceneError
+from wheretolook.viewpoints.config import SampleConfig
+from wheretolook.viewpoints.sampling import sample_viewpoints
+from wheretolook.visibility.counting import FrustumCounter, count_plain
+from wheretolook.visibility.hidden_points import HiddenPointRemoval
+from wheretolook.visibility.occlusion import NoOcclusion
+from wheretolook.visibility.survey import survey
+
+pytestmark = pytest.mark.filterwarnings("ignore::wheretolook.utils.errors.OutOfRangeWarning")
+
+FORWARD = np.array([(1.0, 0.0, 0.0)])
+LEARNT = {"set": "set", "expected-inliers": "matchability", "mlp-2d+z": "mlp-2d+z"}
+
+
+def at(points: Float) -> Landmarks:
+    """Landmarks with made-up attributes at points (N, 3)."""
+    return replace(make_landmarks(np.random.default_rng(0), len(points)), points=np.asarray(points, dtype=np.float64))
+
+
+MAPS = {
+    "single": at(np.array([(2.0, 0.1, 0.0)])),
+    "coincident": at(np.tile([(2.0, 0.1, 0.2)], (40, 1))),
+    "on a line": at(np.column_stack([np.full(30, 2.0), np.linspace(-0.5, 0.5, 30), np.zeros(30)])),
+    "coplanar": at(np.column_stack([np.full(50, 2.0), np.random.default_rng(0).uniform(-0.5, 0.5, (50, 2))])),
+    "in the camera's plane": at(np.column_stack([np.random.default_rng(0).uniform(1, 3, (50, 2)), np.zeros(50)])),
+}
+
+
+@pytest.mark.parametrize("name", MAPS)
+def test_flat_and_tiny_maps_are_scored_by_every_method(name: str) -> None:
+    landmarks = MAPS[name]
+    poses = poses_looking_along(np.zeros((2, 3)), [(1.0, 0.0, 0.0), (-1.0, 0.0, 0.0)])
+    known = poses_looking_along([(0.5, 0.5, 0.0)], FORWARD)
+    for hides in (NoOcclusion(), HiddenPointRemoval()):
+        around = LocalizationMap(landmarks, CAMERA, hides, mapping_poses=known)
+        seen = np.diff(around.landmarks_in_view(poses).starts)
+        in_image = CAMERA.in_image(CAMERA.project(landmarks.points @ poses[0, :, :3].T))
+        expected = in_image & (landmarks.points[:, 0] > 0)
+        free = hides.unoccluded(np.zeros((1, 3)), landmarks.points)[0]
+        np.testing.assert_array_equal(seen, [np.sum(expected & free), 0])
+        assert seen[0] > 0
+        rules = [rule for rule, method in scorers().items() if method.learn is None and not method.weights]
+        for method in (*rules, *LEARNT):
+            weights = WEIGHTS / f"{LEARNT[method]}.safetensors" if method in LEARNT else None
+            score = make_scorer(method, around, weights=weights).score(poses)
+            assert score.shape == (2,) and not np.isnan(score).any(), (method, score)
+    counts = survey(CAMERA, rotation_looking_along(FORWARD), np.zeros((1, 3)), landmarks.points, NoOcclusion()).counts
+    assert counts[0, 0] == seen[0] or hides.name != "none"
+    assert np.isfinite(MappedSpace(landmarks.points, [(0.5, 0.5, 0.0)]).bounds).all()
+
+
+def test_landmarks_that_coincide_are_free_together() -> None:
+    assert HiddenPointRemoval().unoccluded(np.zeros((1, 3)), MAPS["coincident"].points).all()
+    assert HiddenPointRemoval().unoccluded(np.zeros((1, 3)), MAPS["coplanar"].points).any()
+
+
+def test_a_view_exactly_on_a_landmark() -> None:
+    landmarks = room_landmarks(200)
+    here = landmarks.points[17]
+    poses = poses_looking_along(np.tile(here, (len(DIRECTIONS), 1)), DIRECTIONS)
+    around = LocalizationMap(landmarks, CAMERA, NoOcclusion(), mapping_poses=poses[:3])
+    seen = around.landmarks_in_view(poses)
+    assert not np.isin(17, seen.indices)  # it has no direction as seen from there
+    rotations = poses[:, :, :3]
+    free = np.ones((1, 200), dtype=bool)
+    np.testing.assert_array_equal(
+        count_plain(CAMERA, rotations, here[None], landmarks.points, free)[0], np.diff(seen.starts)
+    )
+    for method in ("visible", "bins", "fisher-mineig-exact", "fisher-logdet-gp", "fisher-trace-quadratic", *LEARNT):
+        weights = WEIGHTS / f"{LEARNT[method]}.safetensors" if method in LEARNT else None
+        score = make_scorer(method, around, weights=weights).score(poses)
+        assert not np.isnan(score).any(), method
+    with pytest.raises(SceneError, match="landmark lies at the location"):
+        HiddenPointRemoval().unoccluded(here[None], landmarks.points)
+
+
+def test_images_of_one_pixel() -> None:
+    from box_scenes import furnished_room
+
+    camera, pose = PinholeCamera(1, 1, 1.0), poses_looking_along([(3.0, 2.5, 1.5)], FORWARD)
+    images = [WarpRenderer(furnished_room(), method=method).render(camera, pose) for method in ("raster", "rays")]
+    images.append(Open3DRenderer(furnished_room()).render(camera, pose))
+    for image in images:
+        assert image.rgb.shape == (1, 1, 1, 3)
+        np.testing.assert_allclose(image.depth_m, images[0].depth_m, rtol=1e-4)
+        np.testing.assert_allclose(image.rgb.astype(float), images[0].rgb, atol=3)
+    around = LocalizationMap(room_landmarks(300), camera)
+    ahead = around.landmarks_in_view(pose)
+    assert len(ahead.indices) > 0
+    for method in ("bins", "set"):
+        weights = WEIGHTS / f"{LEARNT[method]}.safetensors" if method in LEARNT else None
+        assert np.isfinite(make_scorer(method, around, weights=weights).score(pose)).all()
+
+
+def test_seventy_thousand_directions() -> None:
+    axes, points = fibonacci_sphere(70_000), room_landmarks(60).points
+    place = np.array([(3.0, 2.5, 1.5)])
+    rotations = rotation_looking_along(axes)
+    counts = survey(CAMERA, rotations, place, points, NoOcclusion(), keep=5).counts
+    some = np.arange(0, 70_000, 701)
+    np.testing.assert_array_equal(
+        counts[0, some], count_plain(CAMERA, rotations[some], place, points, np.ones((1, 60), dtype=bool))[0]
+    )
+    table, _ = sample_viewpoints(
+        GRID, [30], room_landmarks(60), CAMERA, NoOcclusion(), SampleConfig(directions=70_000, keep=3)
+    )
+    assert table["direction_id"].max() > 65_535 or table["n_visible"].min() > 0
+    with pytest.raises(ConfigError, match="at most 65,536"):
+        ViewpointMapConfig(directions=70_000)
+    scorer = make_scorer("visible", LocalizationMap(room_landmarks(60), CAMERA))
+    with pytest.raises(ConfigError, match="at most 65,536"):
+        build_viewpoint_map(scorer, GRID, [30], axes)
+
+
+def test_more_directions_than_memory_holds_are_refused_at_once() -> None:
+    for refused in (lambda: SampleConfig(directions=10**11), lambda: fibonacci_sphere(10**15)):
+        with pytest.raises(ConfigError, match="There is room for"):
+            refused()
+
+
+def test_the_cells_of_very_many_directions_stay_few() -> None:
+    many = FrustumCounter(CAMERA, np.broadcast_to(np.eye(3), (70_000, 3, 3)), 10)
+    assert many.size == 8
+    from wheretolook.visibility.sphere_cells import MOST_CELLS, choose_size
+
+    assert choose_size(2_000_000) == 256
+    assert choose_size(2_000_000, 70_000) ** 2 * 70_000 <= MOST_CELLS
+    assert choose_size(2_000_000, 500) == 256
+
+
+def test_a_grid_of_a_hundred_thousand_along_each_side_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    huge = (100_000, 100_000, 100_000)
+    with pytest.raises(ConfigError, match="1,000,000,000,000,000 voxels") as caught:
+        SampleConfig(grid=huge)
+    numbers = (caught.value.fix or "").partition("[")[2].partition("]")[0].split(",")
+    fits = tuple(int(number) for number in numbers)
+    assert min(fits) > 100 and max(fits) < 2000
+    check_voxels(fits)
+    with pytest.raises(ConfigError, match="would fit"):
+        VoxelGrid((0, 0, 0), (1, 1, 1), huge).centers()
+    assert main(["sample", "--data", str(tmp_path), "--sample.grid", "[100000, 100000, 100000]"]) == 2
+    assert "would fit" in capsys.readouterr().err
+
+
+def test_short_sides_of_a_grid_too_large_stay(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "available_bytes", lambda: 200_000_000)
+    with pytest.raises(ConfigError) as caught:
+        check_voxels((100_000, 3, 100_000))
+    assert caught.value.fix is not None and ", 3, " in caught.value.fix
+    check_voxels((100, 100, 100))
+
+
+def test_more_counts_or_viewpoints_than_memory_holds_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    landmarks, rotations = room_landmarks(60), rotation_looking_along(fibonacci_sphere(20_000))
+    monkeypatch.setattr(memory, "available_bytes", lambda: 2_000_000)
+    with pytest.raises(ConfigError, match="directions would fit"):
+        survey(CAMERA, rotations, GRID.centers()[:10], landmarks.points, NoOcclusion())
+    with pytest.raises(ConfigError, match="max_directions"):
+        sample_viewpoints(GRID, np.arange(60), landmarks, CAMERA, NoOcclusion(), SampleConfig(keep=0, directions=100))

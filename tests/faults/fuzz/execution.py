@@ -157,7 +157,7 @@ class Execution:
         base = os.readlink(f"/proc/self/fd/{within}") if within >= 0 else ""
         text = os.path.realpath(os.path.join(base, os.fsdecode(path)))
         if not f"{text}/".startswith(f"{self.folder}/"):
-            self.written.append(f"{event} {text}")
+            self.written.append(f"{event} {os.path.relpath(text, self.folder)}")
 
     def _resolve_all(self) -> None:
         """Read each file as it is, so that all is imported and made that is made once."""

@@ -1,30 +1,29 @@
-"""A reader with faults of four kinds, for the fuzzer to find."""
+"""A reader with faults, for the fuzzer to find."""
 
 from __future__ import annotations
 
 import ctypes
+import subprocess
 from pathlib import Path
 
 from faults.fuzz.execution import Target
 from wheretolook.utils.errors import TableError
 
 
-def _whole(folder: Path) -> None:
-    (folder / "a.txt").write_text("0" * 40)
-
-
 def _read(path: Path) -> None:
-    rest = sum(path.read_bytes()) % 20
-    if rest == 1:
+    fault = path.read_text()
+    if fault == "divide":
         raise ZeroDivisionError
-    if rest == 2:
+    if fault == "crash":
         ctypes.string_at(0)
-    elif rest == 3:
+    elif fault == "write":
         (path.parent.parent / "outside").write_text("")
-    elif rest == 4:
+    elif fault == "fill":
         _ = b"x" * 1_200_000_000
-    elif rest == 5:
+    elif fault == "start":
+        subprocess.run(["true"], check=False)
+    elif fault == "refuse":
         raise TableError("not this one")
 
 
-FAULTY = Target("faulty", _whole, ("a.txt",), _read)
+FAULTY = Target("faulty", lambda folder: (folder / "a.txt").write_text("whole"), ("a.txt",), _read)

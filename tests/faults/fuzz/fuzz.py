@@ -3,7 +3,8 @@
 Needs Linux. With atheris (`pip install -e '.[test,fuzz]'`) inputs follow the code that they reach, without it bytes
 are changed at random. Each target has processes of its own, one after the other, that read in a folder in memory, with
 limits on time and memory. FOLDER keeps what was found: of each finding the smallest input and its error, `report.json`,
-and the corpus, from which the next run with the same FOLDER goes on. Exits with 1 if there is any finding.
+and the corpus, from which the next run with the same FOLDER goes on. Exits with 1 if there is any finding. An input is
+looked at again by `fuzz.py TARGET --replay FILE`; once mended, it goes to found/TARGET/, where a test replays it.
 """
 
 from __future__ import annotations
@@ -27,10 +28,12 @@ from threading import Lock
 from typing import Any
 
 _TESTS = Path(__file__).resolve().parents[2]
-_HEAD = struct.Struct("<QQQI")  # executions, of these read, of these refused; length of the input that runs
+# When the process was ready; executions, of these read, of these refused; length of the input that runs.
+_HEAD = struct.Struct("<dQQQI")
 _MOST_BYTES = 1 << 20
+_MOST_STARTS = 200  # of processes of a target
 _MOST_KINDS = 100  # of findings of a target
-_IDLE_S = 90  # without a single execution, on a busy machine
+_IDLE_S = 300  # without a single execution, on a busy machine
 _SHARE = {"settings": 0.3, "arguments": 0.3}  # of the time that a target has; 1 if it is not named
 
 
@@ -40,6 +43,7 @@ def main() -> int:
     if options.worker:
         return _work(options)
     options.out.mkdir(parents=True, exist_ok=True)
+    signal.signal(signal.SIGTERM, lambda *_: _stop())
     names = options.targets
     if not names:
         from faults.fuzz.targets import TARGETS
@@ -72,6 +76,7 @@ def _options() -> argparse.Namespace:
     add("--fast", type=float, default=3.0, help="how much more time targets have that are quick (3)")
     add("--out", type=Path, default=Path("fuzzed"), metavar="FOLDER", help="findings, report and corpus (fuzzed)")
     add("--engine", choices=("atheris", "bytes"), default=_engine(), help="atheris if it is installed")
+    add("--replay", type=Path, metavar="FILE", help="read this input of one TARGET, with all limits, and nothing else")
     add("--worker", help=argparse.SUPPRESS)
     add("--seconds", type=float, help=argparse.SUPPRESS)
     add("--seed", type=int, default=0, help="of what is random (0)")
@@ -89,22 +94,28 @@ def _fuzz(name: str, seconds: float, options: argparse.Namespace) -> dict[str, A
     folder = options.out / name
     (folder / "findings").mkdir(parents=True, exist_ok=True)
     state = _State(folder / "state", new=True)
-    begin, starts, seed = time.monotonic(), 0, options.seed
-    while (left := seconds - (time.monotonic() - begin)) > 0 and starts < 200:
+    starts, seed, took = 0, options.seed, 0.0
+    while (left := seconds - took) > 0 and starts < _MOST_STARTS:
         command = [sys.executable, str(Path(__file__).resolve()), "--worker", name, "--out", str(options.out)]
         command += ["--seconds", f"{left:.1f}", "--seed", str(seed + starts), "--engine", options.engine]
+        if options.replay:
+            command += ["--replay", str(options.replay)]
         environment = os.environ | {"OMP_NUM_THREADS": "1", "GLOG_minloglevel": "3", "PYTHONWARNINGS": "ignore"}
         starts += 1
+        state.start(0.0)
         with (folder / "log.txt").open("ab") as log:
             process = subprocess.Popen(command, stdout=log, stderr=log, env=environment, start_new_session=True)
+            _RUNNING.add(process.pid)
             ended = _wait(process, state)
-        if ended == "":
-            break
-        if not state.counts()[0] and starts > 1:
+            _RUNNING.discard(process.pid)
+        if not state.ready():
             raise SystemExit(f"{name} does not start, see {folder / 'log.txt'}")
-        _keep(folder, ended, "", state.input())
+        took += time.monotonic() - state.ready()
+        if ended != "":
+            _keep(folder, ended, "", state.input())
+        if ended == "" or options.replay:
+            break
     executions, read, refused = state.counts()
-    took = time.monotonic() - begin
     findings = sorted(path.stem for path in (folder / "findings").glob("*.bin"))
     kinds = [(folder / "findings" / f"{stem}.txt").read_text().partition("\n")[0] for stem in findings]
     result = {"target": name, "executions": executions, "seconds": round(took, 1), "read": read, "refused": refused}
@@ -118,6 +129,16 @@ def _fuzz(name: str, seconds: float, options: argparse.Namespace) -> dict[str, A
 _PRINTING = Lock()
 
 
+_RUNNING: set[int] = set()
+
+
+def _stop() -> None:
+    """End with all processes of targets."""
+    for number in _RUNNING:
+        os.kill(number, signal.SIGKILL)
+    os._exit(143)
+
+
 def _wait(process: subprocess.Popen[bytes], state: _State) -> str:
     """How a process has ended that should not have ended so; "" if its time was over."""
     last, since = state.counts()[0], time.monotonic()
@@ -128,7 +149,7 @@ def _wait(process: subprocess.Popen[bytes], state: _State) -> str:
             now = state.counts()[0]
             if now != last:
                 last, since = now, time.monotonic()
-            elif time.monotonic() - since > _IDLE_S:
+            elif state.ready() and time.monotonic() - max(since, state.ready()) > _IDLE_S:
                 process.kill()
                 process.wait()
                 return f"hangs for {_IDLE_S} s"
@@ -146,18 +167,28 @@ class _State:
     def __init__(self, path: Path, new: bool = False) -> None:
         if new:
             path.write_bytes(bytes(_HEAD.size + _MOST_BYTES))
+        self.since = 0.0
         with path.open("r+b") as file:
             self.map = mmap.mmap(file.fileno(), _HEAD.size + _MOST_BYTES)
 
     def counts(self) -> tuple[int, int, int]:
-        return _HEAD.unpack_from(self.map)[:3]
+        return _HEAD.unpack_from(self.map)[1:4]
+
+    def ready(self) -> float:
+        """When the last process began to read, by a clock that all have; 0 if it has not."""
+        return float(_HEAD.unpack_from(self.map)[0])
 
     def input(self) -> bytes:
-        return self.map[_HEAD.size : _HEAD.size + _HEAD.unpack_from(self.map)[3]]
+        return self.map[_HEAD.size : _HEAD.size + _HEAD.unpack_from(self.map)[4]]
 
     def begin(self, counts: list[int], data: bytes) -> None:
         self.map[_HEAD.size : _HEAD.size + len(data)] = data
-        _HEAD.pack_into(self.map, 0, *counts, len(data))
+        _HEAD.pack_into(self.map, 0, self.since, *counts, len(data))
+
+    def start(self, at: float) -> None:
+        """Note when a process is ready; 0 when it is not yet."""
+        self.since = at
+        struct.pack_into("<d", self.map, 0, at)
 
 
 def _work(options: argparse.Namespace) -> int:
@@ -183,6 +214,7 @@ def _loop(name: str, folder: Path, scratch: Path, options: argparse.Namespace) -
 
     execution, state = Execution(target, scratch / name, limits=True), _State(folder / "state")
     counts = list(state.counts())
+    state.start(time.monotonic())
 
     def one(data: bytes) -> None:
         if len(data) > _MOST_BYTES:
@@ -195,6 +227,10 @@ def _loop(name: str, folder: Path, scratch: Path, options: argparse.Namespace) -
         else:
             counts[1 if found else 2] += 1
 
+    if options.replay:
+        one(options.replay.read_bytes())
+        state.begin(counts, b"")
+        return 0
     longest = max(4096, 2 * max(map(len, execution.seeds)))
     end = time.monotonic() + options.seconds
     if options.engine == "bytes":

@@ -250,7 +250,7 @@ def _loop(name: str, folder: Path, scratch: Path, options: argparse.Namespace) -
     escaped = ("".join(f"\\x{byte:02x}" for byte in word[:60]) for word in WORDS)
     words.write_text("".join(f'"{word}"\n' for word in escaped))
     flags = {"max_total_time": max(1, int(options.seconds)), "max_len": longest, "seed": options.seed + 1}
-    flags |= {"rss_limit_mb": 0, "timeout": 0, "verbosity": 0, "reload": 0, "len_control": 0, "detect_leaks": 0}
+    flags |= {"rss_limit_mb": 0, "timeout": 86_400, "verbosity": 0, "reload": 0, "len_control": 0, "detect_leaks": 0}
     flags |= dict.fromkeys([f"handle_{name}" for name in ("segv", "bus", "abrt", "ill", "fpe")], 0)
     arguments = [sys.argv[0], *(f"-{name}={value}" for name, value in flags.items()), f"-dict={words}", str(corpus)]
     atheris.Setup(arguments, one)

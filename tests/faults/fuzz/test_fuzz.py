@@ -22,7 +22,8 @@ def test_a_short_run_finds_nothing(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     results = {row["target"]: row for row in json.loads((tmp_path / "report.json").read_text())}
     assert {*results} == {*TARGETS}
-    assert all(row["executions"] > row["refused"] > 0 for row in results.values())  # some were read, some refused
+    assert all(row["executions"] > 0 for row in results.values())
+    assert all(sum(row[kind] for row in results.values()) > 100 for kind in ("read", "refused"))
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="limits on time and memory are those of Linux")

@@ -120,7 +120,7 @@ class BoostedTrees:
             problem = f"these trees ask for other statistics of a view: {error}"
             raise WeightsError(problem, path=path, fix=fix) from error
         try:
-            numbers = {name: float(header[name]) for name in _NUMBERS}
+            numbers: dict[str, Any] = {name: float(header[name]) for name in _NUMBERS}
             if not all(map(isfinite, numbers.values())) or not 0 <= numbers["depth"] <= len(tensors["value"]):
                 raise ValueError(f"numbers out of range: {numbers}")
             camera = None if header["camera"] is None else camera_of_record(header["camera"])

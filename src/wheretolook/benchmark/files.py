@@ -60,7 +60,12 @@ def read_poses(path: Path) -> PoseFile:
     """Read a file of poses. Raises a TableError, with the line, if it is missing, a line is no pose, or ids repeat."""
     ids, values = _read(path, 8, "a pose is id qw qx qy qz tx ty tz")
     table = np.array(values, dtype=np.float64).reshape(-1, 7)
-    off = np.abs(np.linalg.norm(table[:, :4], axis=1) - 1) > _UNIT
+    off = ~(np.abs(np.linalg.norm(table[:, :4], axis=1) - 1) <= _UNIT)  # nor NaN
+    lost = ~np.isfinite(table).all(axis=1)
+    if lost.any():
+        row = int(np.flatnonzero(lost)[0])
+        value, fix = f"{ids[row]}: {table[row]}", "Leave such a pose out."
+        raise TableError("a pose is NaN or infinite", path=path, value=value, fix=fix)
     if off.any():
         row = int(np.flatnonzero(off)[0])
         fix = "Write qw qx qy qz, of length 1."

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,8 @@ from wheretolook.utils.files import write_text
 if TYPE_CHECKING:
     import pycolmap
 
+MAX_SIDE_PX = 10**6  # of an image; COLMAP's numbers end not far beyond
+MAX_PX = 1e12  # of a focal length or a principal point, whose products stay finite; and no integers without end
 MAX_RAY_ERROR = 1e-4  # largest distance between a point's direction and its pixel's ray (chord, about radians)
 
 
@@ -49,7 +52,7 @@ class PinholeCamera:
         if self.center_px is not None and tuple(self.center_px) == (self.width / 2, self.height / 2):
             object.__setattr__(self, "center_px", None)
         check_focal_lengths((self.fx, self.fy), self.width, self.height)
-        if not np.isfinite((self.cx, self.cy)).all():
+        if not all(abs(value) <= MAX_PX for value in (self.cx, self.cy)):
             raise ConfigError("a camera's principal point must be finite", value=self.center_px)
 
     @classmethod
@@ -128,9 +131,13 @@ class PinholeCamera:
 
 def check_size(width: int, height: int) -> None:
     """Raise ConfigError if no image has that size in pixels."""
-    if width < 1 or height < 1:
-        fix = "Give the image's width and height in pixels."
+    fix = "Give the image's width and height in pixels."
+    if not (width >= 1 and height >= 1):  # nor NaN
         raise ConfigError("a camera needs a positive image size", value=(width, height), fix=fix)
+    if not (isinstance(width, Integral) and isinstance(height, Integral)):
+        raise ConfigError("an image's size is whole pixels", value=(width, height), fix=fix)
+    if max(width, height) > MAX_SIDE_PX:
+        raise ConfigError(f"no image has more than {MAX_SIDE_PX:,} pixels a side", value=(width, height), fix=fix)
 
 
 def check_focal_lengths(focal_px: tuple[float, ...], width: int, height: int) -> None:
@@ -138,7 +145,7 @@ def check_focal_lengths(focal_px: tuple[float, ...], width: int, height: int) ->
 
     A pinhole of that focal length would see 179 degrees; a smaller number is a focal length in metres or millimetres.
     """
-    if not all(np.isfinite(focal) and focal > 0 for focal in focal_px):
+    if not all(0 < focal <= MAX_PX for focal in focal_px):
         raise ConfigError("a camera needs a positive, finite focal length in pixels", value=focal_px)
     if min(focal_px, default=np.inf) < max(width, height) / 100:
         fix = f"Give it in pixels: half the width ({width / 2:g}) divided by the tangent of half the angle across."
@@ -283,7 +290,11 @@ def mean_focal_px(camera: pycolmap.Camera) -> float:
 def camera_of_record(record: Mapping[str, Any]) -> Camera:
     """The camera of a `record` read from a file. Raises ConfigError, KeyError, TypeError, ValueError if it is none."""
     if "model" in record:
-        return camera_of(str(record["model"]), int(record["width"]), int(record["height"]), record["params"])
+        try:
+            width, height = int(record["width"]), int(record["height"])
+        except OverflowError as error:
+            raise ValueError(f"no size of an image: {error}") from error
+        return camera_of(str(record["model"]), width, height, record["params"])
     return PinholeCamera(**record)
 
 

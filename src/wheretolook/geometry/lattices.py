@@ -35,7 +35,8 @@ class VoxelGrid:
     def __post_init__(self) -> None:
         if min(self.shape) < 1:
             raise ConfigError("a grid needs at least one voxel along every axis", value=self.shape)
-        if not np.all(np.isfinite([*self.lower, *self.upper])) or not np.all(np.less(self.lower, self.upper)):
+        lower, upper = np.asarray(self.lower, dtype=np.float64), np.asarray(self.upper, dtype=np.float64)
+        if not (np.isfinite(lower).all() and np.isfinite(upper).all() and (lower < upper).all()):
             raise ConfigError("grid bounds must be finite and lower < upper", value=(self.lower, self.upper))
 
     @classmethod

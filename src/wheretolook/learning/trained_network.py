@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from math import isfinite
 from pathlib import Path
 from typing import Any, Generic, Self, TypeVar
 
+import torch
 from torch import Tensor, nn
 
 from wheretolook.geometry.camera import Camera, camera_of_record
@@ -83,9 +85,14 @@ class TrainedNetwork(Generic[NetworkT]):
         check_serves(path, header, *methods)
         fix = f"Train again, or give other weights of {methods[0]}."
         try:
+            with torch.device("meta"):  # so that what is described is only made if it is as large as what is stored
+                expected = network_class.of_description(header).stored.state_dict()
+            _check_sizes(expected, tensors)
             network = network_class.of_description(header)
             camera = None if header["camera"] is None else camera_of_record(header["camera"])
             scale, offset = float(header.get("scale", 1.0)), float(header.get("offset", 0.0))
+            if not (isfinite(scale) and isfinite(offset)):
+                raise ValueError(f"scale {scale} and offset {offset} are not finite")
             known = TrainingRange.of_record(header["range"]) if "range" in header else None
         except WeightsError as error:
             raise WeightsError(error.problem, path=path, value=error.value, fix=error.fix or fix) from error
@@ -98,3 +105,11 @@ class TrainedNetwork(Generic[NetworkT]):
             raise WeightsError(problem, path=path, fix=fix) from error
         found = network.to(device).requires_grad_(False)
         return TrainedNetwork(name_of_header(header), found, camera, scale, offset, known)
+
+
+def _check_sizes(expected: Mapping[str, Tensor], found: Mapping[str, Tensor]) -> None:
+    for name in sorted({*expected, *found}):
+        sizes = [tuple(tensors[name].shape) if name in tensors else None for tensors in (expected, found)]
+        if sizes[0] != sizes[1]:
+            problem = f"the weights do not fit the network they describe: {name} is of size {sizes[1]}, not {sizes[0]}"
+            raise WeightsError(problem)

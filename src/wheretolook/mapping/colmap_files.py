@@ -19,6 +19,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from wheretolook.geometry.camera import MAX_SIDE_PX
 from wheretolook.utils.errors import MapError
 
 REBUILD = "Copy or build the model again."
@@ -27,7 +28,6 @@ POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", 
 _TRACK_LENGTH = Struct("<Q")
 _POINT_2D = np.dtype([("xy", "<f8", 2), ("point", "<u8")])
 _MAX_COORDINATE = 1e12  # of a point or a camera: its square is still a number in single precision
-_MAX_SIDE_PX = 10**6
 # What pycolmap says of a model whose files contradict one another, and the file that says it.
 _CONTRADICTIONS = (
     ("point2D.point3D_id", "images"),
@@ -279,7 +279,7 @@ def _add(path: Path, what: str, seen: set[int], number: int) -> None:
 
 def _check_camera(path: Path, number: int, model: str, width: int, height: int, params: tuple[float, ...]) -> None:
     fix = "Give the model of images, with their size and focal length in pixels."
-    if not (0 < width <= _MAX_SIDE_PX and 0 < height <= _MAX_SIDE_PX):
+    if not (0 < width <= MAX_SIDE_PX and 0 < height <= MAX_SIDE_PX):
         raise MapError(f"camera {number}: no image has this size", path=path, value=(width, height), fix=fix)
     n, focal = _params(model)
     if len(params) != n or not np.isfinite(params).all() or not all(params[i] > 0 for i in focal):

@@ -147,7 +147,9 @@ def _hdf5(path: Path, mismatch: str) -> Iterator[Callable[[str], _Features]]:
                 return keypoints, quantize_descriptors(unit_descriptors(descriptors))
 
             yield read
-    except (OSError, KeyError, ValueError, IndexError) as error:
+    except MapError:
+        raise
+    except Exception as error:  # h5py raises errors of many kinds
         raise MapError(
             f"cannot read the features: {error}", path=path, fix="Give hloc's feats-*.h5, or none."
         ) from error

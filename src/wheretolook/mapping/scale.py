@@ -6,7 +6,7 @@ import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -215,11 +215,25 @@ def read_scale(map_dir: Path) -> MapScale | None:
     path = map_dir / REPORT_FILE
     try:
         scale = read_json_object(path).get("scale")
-        return None if scale is None else MapScale(**scale)
+        return None if scale is None else _of_record(scale)
     except FileNotFoundError:
         return None
     except (OSError, ValueError, TypeError, AttributeError) as error:
         raise MapError(f"the map's report is damaged: {error}", path=path, fix="Run the map stage again.") from error
+
+
+def _of_record(scale: Mapping[str, Any]) -> MapScale:
+    """The scale of a report. Raises TypeError, ValueError or AttributeError if it is none."""
+    found = MapScale(**scale)
+    if found.source not in get_args(Source) or not 0 < found.factor < np.inf:
+        raise ValueError(f"a scale of {found.factor} by {found.source}")
+    for values in (found.residuals, found.marker_error_px, found.marker_views):
+        if not np.isfinite([float(value) for value in values.values()]).all():
+            raise ValueError("a residual is not finite")
+    unit_fits = found.unit in ("percent", "m") or not found.residuals
+    if not unit_fits or not isinstance(found.unused, Mapping):
+        raise ValueError(f"residuals in {found.unit}, of {found.unused} unused")
+    return found
 
 
 def _rows(path: Path, columns: tuple[str, ...]) -> list[dict[str, str]]:

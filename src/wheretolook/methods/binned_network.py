@@ -14,6 +14,7 @@ from wheretolook.geometry.poses import Float, check_poses
 from wheretolook.inputs.bins import BinnedViews, InputStatistics
 from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS
 from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.learning.attribute_statistics import mean_and_std
 from wheretolook.learning.trained_network import StoredNetwork, TrainedNetwork
 from wheretolook.learning.training_range import TrainingRange, bin_quantities
 from wheretolook.methods.base import BLOCK, BinnedScorer, check_field_of_view
@@ -36,7 +37,8 @@ def stored_statistics(stored: Mapping[str, Any]) -> InputStatistics:
         if name not in ALL_CHANNELS:
             fix = "Use the version that wrote them, or train again."
             raise WeightsError("these weights ask for an unknown channel of the bins", value=name, fix=fix)
-    return InputStatistics(tuple(values["channels"]), tuple(values["mean"]), tuple(values["std"]))
+    channels = tuple(values["channels"])
+    return InputStatistics(channels, *mean_and_std(values, channels))
 
 
 class StandardBins(nn.Module):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import math
 import shutil
 import tempfile
 from collections.abc import Mapping
@@ -33,6 +34,8 @@ ARRAYS = {
     "landmark_digests": ("<u8", "N, 2", "of these"),
 }
 """Type, little-endian, shape and meaning of each array; each is a file `<name>.npy`."""
+
+_MOST_VOXELS = 2**40
 
 _OLD = "old"  # name of a map that is being replaced, in the hidden folder where the new one is written
 _NEW = "new"  # name of the new one there
@@ -184,6 +187,10 @@ def read_map(folder: str | Path, mmap: bool = False) -> tuple[VoxelGrid, dict[st
     try:
         corners = content["grid"]
         grid = VoxelGrid(tuple(corners["lower"]), tuple(corners["upper"]), tuple(corners["shape"]))
+        lengths = {len(values) for values in (grid.lower, grid.upper, grid.shape)}
+        whole = all(type(side) is int for side in grid.shape)
+        if not whole or lengths != {3} or math.prod(grid.shape) > _MOST_VOXELS:
+            raise ValueError(f"a grid of shape {grid.shape} between {grid.lower} and {grid.upper}")
         origin, sizes, checksums = (dict(content[name]) for name in ("origin", "sizes", "sha256"))
         sides = {name: shape.split(", ") for name, (_, shape, _) in ARRAYS.items()}
         expected = {name: tuple(int(sizes.get(side, side)) for side in sides[name]) for name in ARRAYS}

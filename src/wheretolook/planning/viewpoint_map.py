@@ -107,6 +107,9 @@ class ViewpointMap:
         for name in ("ranked", "scores", "n_visible"):
             if getattr(self, name).shape != cells:
                 raise ValueError(f"{name} must be of shape {cells}, got {getattr(self, name).shape}")
+        length = np.linalg.norm(self.directions, axis=1)
+        if not (np.abs(length - 1) <= 1e-6).all() or (cells[0] and not cells[1]):
+            raise ValueError("directions must be unit vectors, and not none")
         if len(self.row_of_voxel) != len(self.grid):
             raise ValueError(f"row_of_voxel must be of length {len(self.grid)}, got {len(self.row_of_voxel)}")
         used = self.row_of_voxel[self.row_of_voxel >= 0]
@@ -251,11 +254,17 @@ class ViewpointMap:
         if row < 0 or not allowed.any():
             return None
         ranked = self.ranked[row]
-        return self._choice(row, ranked.item(allowed[ranked].argmax()))
+        try:
+            return self._choice(row, ranked.item(allowed[ranked].argmax()))
+        except IndexError as error:
+            raise _ranks_nothing(error) from error
 
     def _choice(self, row: int, direction: int) -> ViewChoice:
-        score, n_visible = self.scores.item(row, direction), self.n_visible.item(row, direction)
-        return ViewChoice(direction, self._axes[direction], score, n_visible)
+        try:
+            score, n_visible = self.scores.item(row, direction), self.n_visible.item(row, direction)
+            return ViewChoice(direction, self._axes[direction], score, n_visible)
+        except IndexError as error:
+            raise _ranks_nothing(error) from error
 
     @cached_property
     def _hash(self) -> tuple[Any, ...]:
@@ -278,8 +287,16 @@ class ViewpointMap:
         """Id, score and landmarks in view of the best direction of each row; a last entry stands for row -1."""
         best = self.ranked[:, 0].astype(np.int64)
         at = np.arange(len(best)), best
-        scores, counts = self.scores[at], self.n_visible[at].astype(np.int64)
+        try:
+            scores, counts = self.scores[at], self.n_visible[at].astype(np.int64)
+        except IndexError as error:
+            raise _ranks_nothing(error) from error
         return np.append(best, -1), np.append(scores, np.float32(np.nan)), np.append(counts, 0)
+
+
+def _ranks_nothing(error: IndexError) -> MapFormatError:
+    """For a damaged file that was mapped into memory, so that its checksum was not compared."""
+    return MapFormatError(f"ranked.npy is damaged, it names a direction that is none: {error}", fix=REBUILD)
 
 
 _CORNERS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(8, 3)

@@ -96,13 +96,15 @@ def read_waypoints(path: str | Path) -> Waypoints:
             raise TableError("there are no waypoints below the header", path=path, fix=f"Give {FORMATS}.")
     else:
         columns, name = _numbered(*cells[0], path)
+    n_named = 1 + max(*columns, name or 0)  # a header may be longer than what stands below it
     points: list[list[float]] = []
     ids: list[str] = []
     for number, row in cells:
         width = len(cells[0][1])
-        if len(row) != width or not all(_is_number(row[column]) for column in columns):
+        if len(row) != width or width < n_named or not all(_is_number(row[column]) for column in columns):
             value = f"line {number}: {(separator or ' ').join(row)[:80]}"
-            problem = f"a waypoint needs numbers in {width} columns, as the first has"
+            n, like = (n_named, "the header names") if width < n_named else (width, "as the first has")
+            problem = f"a waypoint needs numbers in {n} columns, {like}"
             raise TableError(problem, path=path, value=value, fix=f"Give {FORMATS}.")
         points.append([float(row[column]) for column in columns])
         ids.append(str(len(ids)) if name is None else row[name])

@@ -52,7 +52,10 @@ def load_npz(path: Path) -> dict[str, NDArray[Any]]:
             unfolded = sum(member.file_size for member in stored.zip.infolist())
             if unfolded > max(FREE_BYTES, MAX_RATIO * n_bytes):
                 raise ValueError(f"its {n_bytes:,} bytes would unfold to {unfolded:,}")
-            return {name: stored[name] for name in stored.files}
+            arrays = {name: stored[name] for name in stored.files}
+            if not all(isinstance(array, np.ndarray) for array in arrays.values()):  # of a strange file, its bytes
+                raise ValueError("a file in it is no array")
+            return arrays
     except Exception as error:  # a damaged zip raises many kinds of errors
         raise ValueError(f"not a readable NPZ file: {error}") from error
 

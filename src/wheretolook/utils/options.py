@@ -53,6 +53,7 @@ class Option:
     default: str = ""  # as the command line takes it; empty for a group, and for a default that is worked out
     is_group: bool = False
     is_fixed: bool = False
+    may_be_none: bool = False
 
 
 def all_options(settings: type, prefix: str = "") -> dict[str, Option]:
@@ -67,7 +68,8 @@ def all_options(settings: type, prefix: str = "") -> dict[str, Option]:
             found |= all_options(group, f"{name}.")
         else:
             default = "" if field.default is MISSING else _shown(field.default)
-            found[name] = Option(name, text, default, is_fixed=not field.init)
+            kind = field.type if isinstance(field.type, str) else repr(field.type)
+            found[name] = Option(name, text, default, is_fixed=not field.init, may_be_none="None" in kind)
     return found
 
 
@@ -121,7 +123,7 @@ def nearest(name: str, names: Iterable[str]) -> str | None:
 def names_in(content: Any, options: Mapping[str, Option], prefix: str = "") -> Iterator[str]:
     """Names of the options that a file's content sets, (nested) mappings as a YAML file holds them.
 
-    Raises ConfigError if the value of a group is no mapping.
+    Raises ConfigError if the value of a group is no mapping, or of a setting is missing.
     """
     for key, value in content.items():
         name = f"{prefix}{key}"
@@ -133,6 +135,8 @@ def names_in(content: Any, options: Mapping[str, Option], prefix: str = "") -> I
         elif name not in options and isinstance(value, dict):
             yield from (names_in(value, options, f"{name}.") if value else [name])
         else:
+            if value is None and name in options and not options[name].may_be_none:
+                raise ConfigError(f"{name} has no value", fix="Give it one, or leave it out.")
             yield name
 
 

@@ -145,7 +145,7 @@ def has_matches(path: Path) -> bool:
     """Whether a table holds `MATCH_FIELDS`; a file that cannot be read does not."""
     try:
         return {*MATCH_FIELDS.names} <= {*pq.read_schema(path).names}
-    except (pa.ArrowException, OSError):
+    except (pa.ArrowException, OSError, ValueError):
         return False
 
 
@@ -162,7 +162,7 @@ def read_table(path: Path, matches: bool = False) -> pd.DataFrame:
         with pq.ParquetFile(path, page_checksum_verification=True) as file:
             names = file.schema_arrow.names  # matches take long to read, so only if they are asked for
             table = file.read([name for name in names if matches or name not in MATCH_FIELDS.names])
-    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
+    except (pa.ArrowException, OSError, ValueError) as error:
         fix = "It may be truncated: get it anew, or delete it and run the stage that writes it."
         raise TableError(f"not a readable Parquet file: {error}", path=path, fix=fix) from error
     compact = any(name in names for name in CENTER_COLUMNS)

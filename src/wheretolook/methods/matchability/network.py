@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from wheretolook.inputs.landmarks_in_view import ATTRIBUTES
-from wheretolook.learning.attribute_statistics import AttributeStatistics
+from wheretolook.learning.attribute_statistics import AttributeStatistics, mean_and_std
 from wheretolook.learning.trained_network import StoredNetwork
 from wheretolook.utils.errors import WeightsError
 
@@ -55,7 +55,7 @@ class LandmarkNetwork(StoredNetwork):
             if name not in names:
                 raise WeightsError("these weights do not ask where a landmark lies", value=name)
         options = {name: tuple(x) if isinstance(x, list) else x for name, x in stored["options"].items()}
-        return cls(AttributeStatistics(tuple(statistics["mean"]), tuple(statistics["std"]), names), **options)
+        return cls(AttributeStatistics(*mean_and_std(statistics, names), names), **options)
 
 
 class StandardAttributes(nn.Module):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -119,12 +120,16 @@ class BoostedTrees:
             problem = f"these trees ask for other statistics of a view: {error}"
             raise WeightsError(problem, path=path, fix=fix) from error
         try:
-            numbers = {name: header[name] for name in _NUMBERS}
+            numbers: dict[str, Any] = {name: float(header[name]) for name in _NUMBERS}
+            if not all(map(isfinite, numbers.values())) or not 0 <= numbers["depth"] <= len(tensors["value"]):
+                raise ValueError(f"numbers out of range: {numbers}")
             camera = None if header["camera"] is None else camera_of_record(header["camera"])
             known = TrainingRange.of_record(header["range"]) if "range" in header else None
             arrays = {name: tensors[name] for name in _ARRAYS}
         except (KeyError, TypeError, ValueError, IndexError, AttributeError, ConfigError) as error:
             raise WeightsError(f"damaged description of trees: {error}", path=path, fix=fix) from error
+        if any(array.ndim != 1 for array in arrays.values()):
+            raise WeightsError("the trees are no lists of nodes", path=path, fix=fix)
         arrays |= {name: arrays[name].long() for name in ("roots", "feature", "left", "right")}
         arrays["missing_left"] = arrays["missing_left"].bool()
         n_nodes = len(arrays["value"])
@@ -133,7 +138,8 @@ class BoostedTrees:
         if not inside or len({len(arrays[name]) for name in _ARRAYS if name != "roots"}) != 1:
             raise WeightsError("the trees lead out of their own arrays", path=path, fix=fix)
         arrays["feature"] = features[arrays["feature"]]  # statistics may have come since, or stand in another order
-        return cls(camera, **arrays, **numbers, training_range=known)
+        depth = int(numbers.pop("depth"))
+        return cls(camera, **arrays, depth=depth, **numbers, training_range=known)
 
 
 _ARRAYS = ("roots", "feature", "threshold", "missing_left", "left", "right", "value")

@@ -77,7 +77,7 @@ class WarpRenderer:
 
     def render(self, camera: Camera, cam_from_world: ArrayLike) -> Rendering:
         """RGB (B, H, W, 3) and z-depth (B, H, W) of poses (B, 3, 4); see `Renderer.render`."""
-        poses = check_poses(cam_from_world)
+        poses: Float = check_poses(cam_from_world)
         if isinstance(camera, ColmapCamera):
             return render_distorted(self, camera, poses)
         poses = poses_from(poses, self._origin)

@@ -135,7 +135,7 @@ def test_a_file_of_adapted_weights_scores_as_it_says(place: tuple[LocalizationMa
 def test_they_are_refused_in_another_place_unless_forced(place: tuple[LocalizationMap, Path]) -> None:
     around, path = place
     landmarks = around.landmarks
-    moved = Landmarks(**{**landmarks.__dict__, "points": landmarks.points + [0.5, 0, 0]})
+    moved = Landmarks(**{**landmarks.__dict__, "points": landmarks.points + np.array([0.5, 0, 0])})
     elsewhere = LocalizationMap(moved, around.camera)
     with pytest.raises(WeightsError, match="adapted to another place") as caught:
         load_scorer(path, elsewhere)

@@ -19,6 +19,7 @@ from wheretolook.stages.one_at_a_time import reading
 from wheretolook.utils.errors import ConfigError, SceneError, TableError, WeightsError
 from wheretolook.utils.files import fingerprint, write_text
 from wheretolook.utils.shipped import WEIGHTS, shipped
+from wheretolook.utils.tracking_store import check_store, kept_if_not_logged
 
 if TYPE_CHECKING:
     from wheretolook.evaluation.adaptation import Gain
@@ -49,12 +50,13 @@ def adapt(experiment: Experiment, say: Say = print, tick: Tick = lambda work: No
     config = experiment.adapt
     refuse_release(experiment.root)
     with reading(experiment.root, "adapt", FOLDER):
+        check_store(experiment.tracking)
         dataset = Dataset.load(experiment.root)
         files = _scene(dataset, config.scene)
         weights = config.weights or shipped(WEIGHTS) / "set.safetensors"
         scene = open_scene(experiment, dataset, files)
         table = _labelled(experiment, files, scene, say)
-        views = _views(files, scene, table, weights)
+        views = labelled_views(files, scene, table, weights)
         _check_enough(views, files)
         say(f"{files.name}: learning from {len(views):,} views, {views.good.mean():.0%} of which localize")
         learnt = learn(views, config.seed)
@@ -68,7 +70,8 @@ def adapt(experiment: Experiment, say: Say = print, tick: Tick = lambda work: No
         else:
             path.unlink(missing_ok=True)
             say(f"{text}\n{files.name}: adapting does not make the weights better here: use {weights}")
-        _log(experiment, dataset, files, weights, path, learnt, views, gain)
+        with kept_if_not_logged(f"what was gained, {path.with_suffix('.md')},"):
+            _log(experiment, dataset, files, weights, path, learnt, views, gain)
         tick(1)
         return path if gain.is_better else None
 
@@ -127,7 +130,7 @@ def _label_for(experiment: Experiment, files: SceneFolder, scene: Scene, say: Sa
     return found
 
 
-def _views(files: SceneFolder, scene: Scene, table: pd.DataFrame, weights: Path) -> LocalizedViews:
+def labelled_views(files: SceneFolder, scene: Scene, table: pd.DataFrame, weights: Path) -> LocalizedViews:
     """The labelled views, and what the weights to start from think of them."""
     from wheretolook.geometry.poses import camera_centers
     from wheretolook.methods.adapted.fit import LocalizedViews

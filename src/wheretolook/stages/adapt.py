@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,7 +17,7 @@ from wheretolook.dataset.scene import Scene
 from wheretolook.dataset.stamps import read_stamp
 from wheretolook.stages.inputs import Say, Tick, extractor_of, open_scene, refuse_release
 from wheretolook.stages.one_at_a_time import reading
-from wheretolook.utils.errors import ConfigError, SceneError, TableError, WeightsError
+from wheretolook.utils.errors import ConfigError, OutOfRangeWarning, SceneError, TableError, WeightsError
 from wheretolook.utils.files import fingerprint, write_text
 from wheretolook.utils.shipped import WEIGHTS, shipped
 from wheretolook.utils.tracking_store import check_store, kept_if_not_logged
@@ -143,7 +144,9 @@ def labelled_views(files: SceneFolder, scene: Scene, table: pd.DataFrame, weight
         rows = np.arange(len(table)) if numbers is None else np.flatnonzero(numbers == number)
         if len(rows):
             scorer = _scorer(weights, files.localization_map(camera, scene.device))
-            log_odds[rows] = log_odds_of(scorer.score(cam_from_world[rows]))
+            with warnings.catch_warnings():  # how far the weights hold here is what is measured
+                warnings.simplefilter("ignore", OutOfRangeWarning)
+                log_odds[rows] = log_odds_of(scorer.score(cam_from_world[rows]))
     axes, group = cam_from_world[:, 2, :3], table["location_id"].to_numpy(np.int64)
     return LocalizedViews(log_odds, is_good(table), camera_centers(cam_from_world), axes, group)
 

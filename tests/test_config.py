@@ -223,7 +223,7 @@ def test_every_stage_explains_itself(
     text = capsys.readouterr().out
     for group in cli.STAGES[stage].groups:
         assert f"--{group}" in text
-    assert ("--label.shard_size" in text) == (stage in ("label", "compare-paths", "demo"))
+    assert ("--label.shard_size" in text) == (stage in ("label", "adapt", "compare-paths", "demo"))
     assert "--map.walk.cell_m" not in text  # a constant
     monkeypatch.setenv("COLUMNS", "80")
     assert main([stage, "--help"]) == 0

@@ -106,6 +106,19 @@ Mesh and database may be left out. With --images its landmarks are triangulated 
         "--config configs/demo.yaml --evaluate.methods '[random, visible, set]'",
         notes="What evaluate.methods may name: wheretolook evaluate --list-methods",
     ),
+    "adapt": Stage(
+        "adapt",
+        "Adapt the weights that ship to one scene, by views localized there; kept only if that makes them better.",
+        "scene weights out minutes adapt.seed label.workers tracking.folder",
+        ("adapt", *_SPACE, "label", "tracking"),
+        "--config configs/demo.yaml --scene apartment-000 --minutes 5",
+        {f"--{name}": f"--adapt.{name}" for name in ("scene", "weights", "out", "minutes")},
+        notes="""\
+Takes the scene's labels, or, where it has none, labels as many of its viewpoints as the minutes allow; done again, it
+goes on with more. The weights are for this place alone:
+  wheretolook viewpoint-map --config configs/demo.yaml --scene apartment-000 \\
+      --weights data/demo/adapted/apartment-000.safetensors --out room.map""",
+    ),
     "viewpoint-map": Stage(
         "viewpoint_map",
         "Score every direction at every free voxel of a scene, for planners to look up. Needs no labels.",
@@ -329,7 +342,7 @@ def parse_experiment(command: str, arguments: list[str]) -> Experiment | None:
 def _with_shipped_weights(experiment: Experiment) -> Experiment:
     """The experiment with weights that are named as they lie in the project's folder found from any other."""
     found: dict[str, Any] = {"evaluate": tuple(map(or_shipped, experiment.evaluate.weights))}
-    for name in ("viewpoint_map", "plan", "paths"):
+    for name in ("adapt", "viewpoint_map", "plan", "paths"):
         weights = getattr(experiment, name).weights
         found[name] = weights and or_shipped(weights)
     return replace(experiment, **{name: replace(getattr(experiment, name), weights=w) for name, w in found.items()})

@@ -12,6 +12,7 @@ from wheretolook.figures.config import FiguresConfig
 from wheretolook.geometry.camera import CameraConfig
 from wheretolook.labelling.config import LabelConfig
 from wheretolook.mapping.config import MapConfig
+from wheretolook.methods.adapted.config import AdaptConfig
 from wheretolook.methods.train_config import MOVED as MOVED_TRAIN_OPTIONS
 from wheretolook.methods.train_config import TrainConfig
 from wheretolook.planning.config import PathsConfig, PlanConfig, ViewpointMapConfig
@@ -25,7 +26,12 @@ from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.config import SampleConfig
 from wheretolook.visibility.config import OcclusionConfig
 
-NOT_SCENES = ("weights", "results", "all")  # folders of a dataset that are no scenes, and what all scenes are called
+NOT_SCENES = (
+    "weights",
+    "results",
+    "adapted",
+    "all",
+)  # folders of a dataset that are no scenes, and what all scenes are called
 
 
 @dataclass(frozen=True)
@@ -116,6 +122,7 @@ class Experiment:
         label: stage 4, localization errors.
         train: stage 5, what is learnt from the labels.
         evaluate: stage 6, scores of all methods.
+        adapt: weights adapted to one scene.
         viewpoint_map: what planners query.
         plan: one path to plan.
         paths: planned paths of several methods, to be compared.
@@ -135,6 +142,7 @@ class Experiment:
     label: LabelConfig = field(default_factory=LabelConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
     evaluate: EvaluateConfig = field(default_factory=EvaluateConfig)
+    adapt: AdaptConfig = field(default_factory=AdaptConfig)
     viewpoint_map: ViewpointMapConfig = field(default_factory=ViewpointMapConfig)
     plan: PlanConfig = field(default_factory=PlanConfig)
     paths: PathsConfig = field(default_factory=PathsConfig)

@@ -38,6 +38,7 @@ class ScorerOptions:
     # for methods that look where a robot goes: one direction, or the waypoints of a path; empty for one drawn for each
     # location
     heading: tuple[tuple[float, float, float], ...] = ()
+    anywhere: bool = False  # whether weights that are adapted to one place may score in another
 
 
 def no_params(camera: Camera) -> dict[str, Any]:

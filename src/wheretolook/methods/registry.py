@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from wheretolook.methods.base import Scorer
 
 _RULES = ("random", "forward", "visible", "bins", "max_visibility", "fisher")
-MODULES = (*_RULES, "mlp", "matchability", "trees", "conv", "set", "sphere")
+MODULES = (*_RULES, "mlp", "matchability", "trees", "conv", "set", "sphere", "adapted")
 """Modules of `wheretolook.methods` whose `METHODS` are the package's own, in the order of tables."""
 
 GROUP = "wheretolook.methods"  # entry points of this group give a `Method`, or several, of another package
@@ -158,20 +158,23 @@ def load_scorer(localization_map: LocalizationMap, /) -> Scorer: ...
 
 
 @overload
-def load_scorer(weights: str | Path | None, localization_map: LocalizationMap) -> Scorer: ...
+def load_scorer(weights: str | Path | None, localization_map: LocalizationMap, anywhere: bool = False) -> Scorer: ...
 
 
 def load_scorer(
-    weights: str | Path | LocalizationMap | None = None, localization_map: LocalizationMap | None = None
+    weights: str | Path | LocalizationMap | None = None,
+    localization_map: LocalizationMap | None = None,
+    anywhere: bool = False,
 ) -> Scorer:
     """The learned scorer of a map: `load_scorer(map).score(cam_from_world)`, or with `load_scorer(weights, map)`.
 
     Without weights, or with None, the best of those that ship score. Else they are a file that the train stage wrote,
     in which stands what method it is; or a folder of such files, of which `best_weights` takes one; what ships is found
-    under its name, such as `data/release/weights`, from any folder.
+    under its name, such as `data/release/weights`, from any folder. With `anywhere`, weights that are adapted to one
+    place score in another, too.
 
-    Raises a WeightsError if the file cannot be used, or was trained for another field of view than the map's camera; a
-    MapError if the map lacks what the method needs.
+    Raises a WeightsError if the file cannot be used, was trained for another field of view than the map's camera, or is
+    adapted to another place; a MapError if the map lacks what the method needs.
     """
     if weights is not None and not isinstance(weights, (str, Path)):
         weights, localization_map = None, weights
@@ -181,7 +184,7 @@ def load_scorer(
     path = shipped(WEIGHTS) if weights is None else or_shipped(weights)
     path = best_weights(path) if path.is_dir() else path
     method = _of_weights("a scorer", [method for method in scorers().values() if method.name == method.weights], path)
-    return _build(method, localization_map, ScorerOptions(weights=path))
+    return _build(method, localization_map, ScorerOptions(weights=path, anywhere=anywhere))
 
 
 def best_weights(folder: str | Path) -> Path:

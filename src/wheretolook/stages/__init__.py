@@ -4,6 +4,7 @@ A stage works through the scenes of an experiment and leaves its result on disk.
 result was made from: called again, a stage reuses what is there if its settings and inputs are the same.
 """
 
+from wheretolook.stages.adapt import adapt
 from wheretolook.stages.compare_paths import compare_paths
 from wheretolook.stages.evaluate import evaluate
 from wheretolook.stages.figures import figures
@@ -18,6 +19,7 @@ from wheretolook.stages.train import train
 from wheretolook.stages.viewpoint_map import viewpoint_map
 
 __all__ = [
+    "adapt",
     "compare_paths",
     "evaluate",
     "figures",

@@ -68,6 +68,12 @@ the lowest mean regret (tag `best`). Open it (+) to compare: in it is a run for 
 
 Runs that differ by `seed` alone tell how much of a difference is luck.""",
     ),
+    "adapt": Purpose(
+        "adapting",
+        """\
+Weights adapted to single scenes. Compare `regret`, `auc`, `calibration_error` and `log_loss` with the same names ending
+in `_before`: all of views that were not learnt from. `better` is 1 where the adapted weights were kept.""",
+    ),
     "paths": Purpose(
         "paths",
         """\

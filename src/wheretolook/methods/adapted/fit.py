@@ -1,0 +1,153 @@
+"""Adapting a scorer to a place: how its log-odds are calibrated and corrected there, by views that were localized.
+
+The log-odds of a view become scale * log-odds + offset + g(pose), where g is a Gaussian process over poses with the
+kernel of `wheretolook.methods.adapted.kernel` (Rasmussen and Williams, "Gaussian Processes for Machine Learning",
+2006, Sec. 3.4: binary classification by the Laplace approximation, found by Newton's method). So a place is told where
+the scorer was wrong nearby, as where it resembles another; far from localized views g is 0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+from scipy.special import expit
+
+from wheretolook.geometry.poses import Float
+from wheretolook.methods.adapted.kernel import nearness
+
+LENGTHS_M, AMPLITUDES, SHARPNESS = (0.5, 1.0, 2.0), (1.0, 3.0), 4.0
+"""Kernels that are tried: lengths, and variances of g. Chosen on the val scenes of configs/cameras.yaml, as was the
+sharpness."""
+PRIOR = 5.0  # precision of scale (about 1) and offset (about 0)
+MAX_SUPPORT, TRIED_SUPPORT = 2000, 800  # views that g stands on, finally and while kernels are tried; evenly spread
+FOLDS = 5
+STEPS = 20  # of Newton's method, at most
+JITTER = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class LocalizedViews:
+    """B views of a place: what a scorer thought of each, and whether it localized."""
+
+    log_odds: Float  # (B,) of the scorer to be adapted
+    good: NDArray[np.bool_]  # (B,)
+    centers: Float  # (B, 3) m, cameras in the map's frame
+    axes: Float  # (B, 3) unit optical axes
+    group: NDArray[np.int64]  # (B,) views of a group are never learnt from and judged by at once: of a location, say
+
+    def __len__(self) -> int:
+        return len(self.good)
+
+    def rows(self, rows: NDArray[np.integer] | NDArray[np.bool_]) -> LocalizedViews:
+        """Some of the views."""
+        parts = (self.log_odds, self.good, self.centers, self.axes, self.group)
+        return LocalizedViews(*(part[rows] for part in parts))  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True, eq=False)
+class Adaptation:
+    """How log-odds change at a place; without support they are calibrated only."""
+
+    scale: float
+    offset: float
+    length_m: float
+    sharpness: float
+    centers: Float  # (N, 3)
+    axes: Float  # (N, 3)
+    weights: Float  # (N,)
+
+    def log_odds(self, views: LocalizedViews) -> Float:
+        """Adapted log-odds (B,)."""
+        found = self.scale * views.log_odds + self.offset
+        if len(self.weights):
+            of_views, of_support = (views.centers, views.axes), (self.centers, self.axes)
+            found = found + nearness(*of_views, *of_support, self.length_m, self.sharpness) @ self.weights
+        return found
+
+
+def fit(
+    views: LocalizedViews, length_m: float, amplitude: float, sharpness: float = SHARPNESS, most: int = MAX_SUPPORT
+) -> Adaptation:
+    """The adaptation that views make most likely, with a kernel of this length and variance; 0 calibrates only."""
+    learnt = evenly(views, most) if amplitude else views
+    y, fixed = learnt.good.astype(np.float64), np.column_stack([learnt.log_odds, np.ones(len(learnt))])
+    if not amplitude:
+        scale, offset = _calibration(fixed, y)
+        return Adaptation(scale, offset, length_m, sharpness, np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+    poses = learnt.centers, learnt.axes
+    kernel = amplitude * nearness(*poses, *poses, length_m, sharpness)
+    mean, covariance = fixed @ (1.0, 0.0), kernel + fixed @ fixed.T / PRIOR
+    z, residual = mean.copy(), np.zeros(len(y))
+    for _ in range(STEPS):
+        p = expit(z)
+        information = np.maximum(p * (1 - p), 1e-6)
+        target = z + (y - p) / information - mean
+        factor = cho_factor(covariance + np.diag(1 / information + JITTER), check_finite=False)
+        before, residual = residual, cho_solve(factor, target, check_finite=False)
+        z = mean + covariance @ residual
+        if np.abs(residual - before).max() < 1e-3:
+            break
+    scale, offset = (1.0, 0.0) + fixed.T @ residual / PRIOR
+    return Adaptation(float(scale), float(offset), length_m, sharpness, *poses, amplitude * residual)
+
+
+def _calibration(fixed: Float, y: Float) -> tuple[float, float]:
+    """Scale and offset of log-odds (Platt scaling), with their prior."""
+    at, prior = np.array([1.0, 0.0]), np.array([1.0, 0.0])
+    for _ in range(STEPS):
+        p = expit(fixed @ at)
+        gradient = fixed.T @ (p - y) + PRIOR * (at - prior)
+        step = np.linalg.solve(fixed.T @ (fixed * (p * (1 - p))[:, None]) + PRIOR * np.eye(2), gradient)
+        at = at - step * min(1.0, 2.0 / max(1e-12, float(np.abs(step).max())))
+        if np.abs(step).max() < 1e-8:
+            break
+    return float(at[0]), float(at[1])
+
+
+def evenly(views: LocalizedViews, most: int) -> LocalizedViews:
+    """At most so many of the views, evenly spread over their order."""
+    if len(views) <= most:
+        return views
+    return views.rows(np.arange(most, dtype=np.int64) * len(views) // max(most, 1))
+
+
+def folds_of(group: NDArray[np.int64], count: int = FOLDS, seed: int = 0) -> NDArray[np.int64]:
+    """A fold (B,) of each view; groups stay together."""
+    names, row = np.unique(group, return_inverse=True)
+    order = np.random.default_rng(seed).permutation(len(names))
+    return np.asarray(order[row.reshape(-1)] % min(count, max(2, len(names))))
+
+
+@dataclass(frozen=True, eq=False)
+class Adapted:
+    """The adaptation to a place, and what it gave for views that it had not learnt from."""
+
+    adaptation: Adaptation
+    length_m: float  # of the kernel that was chosen
+    amplitude: float  # its variance; 0 where calibration alone was as good
+    held_out: Float  # (B,) log-odds of each view, by what was learnt without its fold
+
+
+def adapt(views: LocalizedViews, seed: int = 0) -> Adapted:
+    """Adapt by cross-validation: the kernel with the least log loss over views that were not learnt from."""
+    fold = folds_of(views.group, seed=seed)
+    kernels = [(1.0, 0.0), *product(LENGTHS_M, AMPLITUDES)]
+
+    def held_out(kernel: tuple[float, float], most: int) -> Float:
+        found = np.zeros(len(views))
+        for number in np.unique(fold):
+            out = fold == number
+            found[out] = fit(views.rows(~out), *kernel, most=most).log_odds(views.rows(out))
+        return found
+
+    best = min(kernels, key=lambda kernel: log_losses(held_out(kernel, TRIED_SUPPORT), views.good).mean())
+    return Adapted(fit(views, *best), *best, held_out(best, MAX_SUPPORT))
+
+
+def log_losses(log_odds: Float, good: NDArray[np.bool_]) -> Float:
+    """Negative log-likelihood (B,) of whether each view localizes."""
+    return np.asarray(np.logaddexp(0.0, np.where(good, -log_odds, log_odds)))

@@ -1,0 +1,98 @@
+"""The score of weights that are adapted to a place."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.special import expit, logit
+
+from wheretolook.geometry.poses import Float, camera_centers, check_locations, check_poses
+from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.learning.trained_network import TrainedNetwork
+from wheretolook.methods.adapted.kernel import Correction
+from wheretolook.methods.adapted.network import AdaptedNetwork
+from wheretolook.methods.base import Scorer, ViewReport
+from wheretolook.methods.method import ScorerOptions
+from wheretolook.methods.set.score import SetScorer
+from wheretolook.utils.errors import WeightsError
+
+TINY = 1e-12  # chances are kept this far from 0 and 1, so that their log-odds are finite
+SAME_M, LEAST_SAME = 0.05, 0.5
+"""A map is of the place if so large a share of the landmarks that are known has one of the map's within this distance:
+a map with other filters, or made anew in the same frame, still is."""
+
+
+def adapted_scorer(localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
+    """The scorer of a file of adapted weights; a WeightsError if the map is of another place."""
+    assert options.weights is not None
+    trained = TrainedNetwork.load(options.weights, AdaptedNetwork, "adapted", device="cpu")
+    return AdaptedScorer(localization_map, trained, anywhere=options.anywhere)
+
+
+class AdaptedScorer(Scorer):
+    """The set network adapted to one place: its log-odds, calibrated there, and corrected where it was wrong nearby."""
+
+    name = "adapted"
+
+    def __init__(
+        self, localization_map: LocalizationMap, trained: TrainedNetwork[AdaptedNetwork], anywhere: bool = False
+    ) -> None:
+        super().__init__(localization_map)
+        network = trained.network
+        self.trained = trained
+        if not anywhere:
+            _check_place(network.place.numpy(), localization_map)
+        of_base = network.network, trained.camera, network.base_scale, network.base_offset, trained.training_range
+        self.base = SetScorer(localization_map, TrainedNetwork("set", *of_base))
+        support = network.support_centers, network.support_axes, network.support_weights
+        arrays = [part.cpu().numpy() for part in support]
+        self.correction = Correction(*arrays, network.length_m, network.sharpness)
+
+    def score(self, cam_from_world: Float) -> Float:
+        """(B,) probabilities in [0, 1]."""
+        poses = check_poses(cam_from_world)
+        return self._corrected(self.base.score(poses), self.correction.at(camera_centers(poses), poses[:, 2, :3]))
+
+    def score_around(self, locations: Float, directions: Float) -> Float:
+        """(L, D) probabilities, as of the network that it starts from."""
+        locations = check_locations(locations)
+        return self._corrected(
+            self.base.score_around(locations, directions), self.correction.grid(locations, directions)
+        )
+
+    def report(self, cam_from_world: Float) -> ViewReport:
+        """As of the network that it starts from, but for the score."""
+        poses = check_poses(cam_from_world)
+        told, correction = self.base.report(poses), self.correction.at(camera_centers(poses), poses[:, 2, :3])
+        return replace(told, score=self._corrected(told.score, correction))
+
+    def in_range(self, cam_from_world: Float) -> NDArray[np.bool_]:
+        """Which poses (B, 3, 4) see what is like the views that the network has learnt from, (B,)."""
+        return self.base.in_range(cam_from_world)
+
+    def expected_inliers(self, cam_from_world: Float) -> Float:
+        """How many landmarks poses (B, 3, 4) can be expected to find, (B,)."""
+        return self.base.expected_inliers(cam_from_world)
+
+    def _corrected(self, chance: Float, correction: Float) -> Float:
+        return np.asarray(expit(self.trained.scale * log_odds_of(chance) + self.trained.offset + correction))
+
+
+def log_odds_of(chance: Float) -> Float:
+    """Finite log-odds of chances in [0, 1]."""
+    return np.asarray(logit(np.clip(chance, TINY, 1 - TINY)))
+
+
+def _check_place(place: Float, localization_map: LocalizationMap) -> None:
+    points = localization_map.landmarks.points
+    if len(place) == 0:
+        return
+    distance = cKDTree(points).query(place)[0] if len(points) else np.full(len(place), np.inf)
+    same = float((distance <= SAME_M).mean())
+    if same < LEAST_SAME:
+        fix = "Adapt to this map, or use weights that are for any place, such as those that ship."
+        problem = f"these weights are adapted to another place: of its landmarks this map has {same:.0%}"
+        raise WeightsError(problem, fix=fix)

@@ -1,0 +1,80 @@
+"""How much adapting to a place gains: learnt from half of each scene's labelled locations, judged by the other half.
+
+    python tests/benchmarks/bench_adapt.py data/cameras --split val
+    python tests/benchmarks/bench_adapt.py data/test-90 --split test --out adapted.csv
+
+A row for each scene, and the means: regret in percentage points, AUC and calibration error of the weights that ship, of
+the adapted ones and, to compare, of bins.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from wheretolook.dataset.folders import Dataset
+from wheretolook.dataset.scene import Scene
+from wheretolook.evaluation.adaptation import compare_log_odds
+from wheretolook.methods.adapted.fit import adapt
+from wheretolook.methods.registry import make_scorer
+from wheretolook.stages.adapt import labelled_views
+from wheretolook.utils.shipped import WEIGHTS, shipped
+from wheretolook.viewpoints.table import CAMERA_ID, poses
+
+
+def main() -> None:
+    """Measure, print and write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path, help="a labelled dataset")
+    parser.add_argument("--split", default="test")
+    parser.add_argument("--scenes", nargs="*", default=[])
+    parser.add_argument("--seed", type=int, default=0, help="which half is learnt from")
+    parser.add_argument("--out", type=Path)
+    options = parser.parse_args()
+    rows = []
+    for files in Dataset.load(options.data).split(options.split):
+        if options.scenes and files.name not in options.scenes:
+            continue
+        table, scene = files.read_table(), Scene(files, device="cpu")
+        views = labelled_views(files, scene, table, shipped(WEIGHTS) / "set.safetensors")
+        numbers = table[CAMERA_ID].to_numpy() if CAMERA_ID in table else np.zeros(len(table), dtype=int)
+        bins = np.empty(len(table))
+        for number in np.unique(numbers):
+            camera = files.cameras()[number] if CAMERA_ID in table else scene.camera
+            at = numbers == number
+            bins[at] = make_scorer("bins", files.localization_map(camera, "cpu")).score(poses(table)[at])
+        locations = np.random.default_rng(options.seed).permutation(np.unique(views.group))
+        learn = np.isin(views.group, locations[: len(locations) // 2])
+        start, rest = time.monotonic(), views.rows(~learn)
+        learnt = adapt(views.rows(learn))
+        seconds = time.monotonic() - start
+        judged = rest.good, rest.group, rest.centers
+        gain = compare_log_odds(rest.log_odds, learnt.adaptation.log_odds(rest), *judged)
+        by_bins = compare_log_odds(rest.log_odds, bins[~learn], *judged).after
+        row = {
+            "scene": files.name,
+            "views": int(learn.sum()),
+            "regret_bins": by_bins["regret"],
+            "auc_bins": by_bins["auc"],
+        }
+        row |= {f"{name}_set": value for name, value in gain.before.items()}
+        row |= {f"{name}_adapted": value for name, value in gain.after.items()}
+        less = zip(("less", "low", "high"), gain.regret_less, strict=True)
+        row |= {f"regret_{name}": value for name, value in less}
+        rows.append({**row, "length_m": learnt.length_m, "amplitude": learnt.amplitude, "seconds": seconds})
+        print(
+            {name: round(value, 3) if isinstance(value, float) else value for name, value in rows[-1].items()},
+            flush=True,
+        )
+    found = pd.DataFrame(rows)
+    print(found.mean(numeric_only=True).round(3).to_string())
+    if options.out is not None:
+        found.to_csv(options.out, index=False)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,114 @@
+"""The adapt stage, from labels that are there to weights that score."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from synthetic_dataset import make_dataset
+from wheretolook.cli import main
+from wheretolook.dataset.folders import Dataset
+from wheretolook.dataset.stamps import write_stamp
+from wheretolook.evaluation.adaptation import compare_log_odds
+from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.learning.weights import read_training
+from wheretolook.methods.registry import load_scorer
+from wheretolook.utils.tracking import finished_runs
+from wheretolook.utils.tracking_config import TrackingConfig
+from wheretolook.viewpoints.table import is_good, poses, write_table
+
+
+@pytest.fixture
+def dataset(tmp_path: Path) -> Dataset:
+    """Two labelled scenes of weak landmarks, of which the weights that ship expect other labels than they have."""
+    dataset = make_dataset(tmp_path / "data" / "tiny", ("train", "test"))
+    for scene in dataset.scenes:
+        write_stamp(scene, "label", "key")
+    return dataset
+
+
+def run(dataset: Dataset, *options: str) -> int:
+    root = dataset.root
+    camera = ["--camera.width", "160", "--camera.height", "120", "--camera.focal_px", "80", "--camera.fov_deg", "null"]
+    where = ["--name", root.name, "--data", str(root.parent), "--tracking.folder", str(root.parent / "mlruns")]
+    return main(["adapt", *where, "--device", "cpu", *camera, *options])
+
+
+def test_adapted_weights_are_truer_and_logged(dataset: Dataset, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(dataset, "--scene", "scene-1") == 0
+    said = capsys.readouterr().out
+    path = dataset.root / "adapted" / "scene-1.safetensors"
+    assert "the adapted weights are better" in said and path.is_file() and "| regret" in said
+    assert path.with_suffix(".md").is_file()
+    scene = dataset.scenes[1]
+    around, table = scene.localization_map(scene.camera, "cpu"), scene.read_table()
+    good = is_good(table)
+    losses = []
+    for weights in (None, path):
+        chance = load_scorer(weights, around).score(poses(table)).clip(1e-9, 1 - 1e-9)
+        losses.append(-np.log(np.where(good, chance, 1 - chance)).mean())
+    assert losses[1] < losses[0]
+    told = read_training(path)
+    assert told["scene"] == "scene-1" and told["after"]["log_loss"] < told["before"]["log_loss"]
+    tracking = TrackingConfig(dataset.root.parent / "mlruns")
+    (one,) = finished_runs(tracking, "adapt")
+    assert one.data.metrics["better"] == 1.0
+
+
+def test_where_nothing_is_gained_nothing_is_kept(dataset: Dataset, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = dataset.scenes[1]
+    table = scene.read_table()
+    around = LocalizationMap(scene.read_landmarks(), scene.camera, scene.localization_map(scene.camera).occlusion)
+    chance = load_scorer(around).score(poses(table))
+    draws = np.random.default_rng(5).random(len(table))
+    localized = draws < chance  # the scorer is right
+    table["status"] = np.where(localized, "localized", "no_pose")
+    table["error_m"] = np.where(localized, 0.01, np.nan).astype(np.float32)
+    table["error_deg"] = np.where(localized, 0.1, np.nan).astype(np.float32)
+    if min(localized.sum(), (~localized).sum()) < 10:
+        pytest.skip("the scorer is sure of all of these views")
+    write_table(table, scene.table)
+    path = dataset.root / "adapted" / "scene-1.safetensors"
+    path.parent.mkdir()
+    path.write_text("of before")
+    assert run(dataset, "--scene", "scene-1") == 0
+    assert "does not make the weights better" in capsys.readouterr().out and not path.exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ((), "scene-0, scene-1"),
+        (("--scene", "house"), "house"),
+        (("--scene", "scene-1", "--minutes", "0"), "above 0 minutes"),
+        (("--scene", "scene-1", "--weights", "nowhere.safetensors"), "nowhere.safetensors"),
+    ],
+)
+def test_bad_input_is_named(
+    dataset: Dataset, options: tuple[str, ...], says: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(dataset, *options) == 2
+    assert says in capsys.readouterr().err
+
+
+def test_too_few_views_are_counted(dataset: Dataset, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = dataset.scenes[1]
+    write_table(scene.read_table().iloc[:60], scene.table)
+    assert run(dataset, "--scene", "scene-1") == 2
+    assert "60 views at 3 locations" in capsys.readouterr().err
+
+
+def test_gains_are_those_of_known_cases() -> None:
+    """Two locations of two views: the first chooses wrongly before and rightly after."""
+    good = np.array([True, False, True, False])
+    before, after = np.array([-1.0, 1.0, 1.0, -1.0]), np.array([2.0, -2.0, 2.0, -2.0])
+    centers = np.array([[0.0, 0, 0], [0, 0, 0], [9, 0, 0], [9, 0, 0]])
+    gain = compare_log_odds(before, after, good, np.array([4, 4, 7, 7]), centers)
+    assert gain.before["regret"] == 50 and gain.after["regret"] == 0
+    assert gain.before["auc"] == 0.5 and gain.after["auc"] == 1
+    expected = (np.log1p(np.exp(1)) + np.log1p(np.exp(-1))) / 2 - np.log1p(np.exp(-2))
+    assert gain.log_loss_less[0] == pytest.approx(expected) and gain.regret_less[0] == 50
+    assert pd.notna(gain.log_loss_less[1])

@@ -247,11 +247,11 @@ def main(arguments: list[str] | None = None) -> int:
     if arguments[0] == "--version":
         print(f"wheretolook {VERSION}")
         return 0
-    if not debug:
-        _quieten()
     interrupts: list[int] = []
     try:
         with _noting(interrupts):
+            if not debug:
+                _quieten()
             return _run(arguments[0], arguments[1:])
     except (Exception, KeyboardInterrupt) as error:
         if interrupts or isinstance(error, KeyboardInterrupt):

@@ -112,9 +112,10 @@ def test_a_name_that_is_no_dataset_leaves_no_folder(tmp_path: Path, capsys: pyte
 def test_what_killed_runs_left_is_removed_by_the_next_that_changes_the_dataset(dataset: Dataset) -> None:
     scene = dataset.scenes[0]
     left = [scene.folder / ".map.partial" / "points3D.bin", scene.table.with_name("viewpoints.parquet.partial"),
+            scene.folder / "photographs" / "tmpabc.partial" / "database.db",
             dataset.root / "weights" / "set.safetensors.partial", dataset.root / ".set-weights.lock"]  # fmt: skip
     for path in left:
-        path.parent.mkdir(exist_ok=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(b"half")
     elsewhere = dataset.root.parent / "elsewhere" / "half.partial"
     elsewhere.parent.mkdir()

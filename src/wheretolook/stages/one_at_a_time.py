@@ -54,7 +54,7 @@ _LOCK = ".lock"
 
 
 def _remove_leftovers(root: Path) -> None:
-    for pattern in (f".?*{_LOCK}", "*.partial", "*/*.partial", "*/map/*.partial"):
+    for pattern in (f".?*{_LOCK}", "*.partial", "*/*.partial", "*/*/*.partial"):
         for path in root.glob(pattern):
             if not path.parent.resolve().is_relative_to(root.resolve()):
                 continue  # a link leads there, which the stage will refuse

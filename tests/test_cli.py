@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 
 import pytest
 
+from wheretolook import cli
 from wheretolook.cli import main
 from wheretolook.methods.registry import describe_methods, scorers
 
@@ -61,3 +63,21 @@ def test_a_plan_with_numbers_that_are_not_finite_is_refused(
 ) -> None:
     assert main(["plan", option, value]) == 2
     assert message in capsys.readouterr().err
+
+
+def test_ctrl_c_stays_one_where_a_library_makes_another_error_of_it(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As safetensors does while it reads a tensor."""
+
+    def reads(*_: object) -> int:
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt as error:
+            raise ValueError("could not determine the shape") from error
+        return 0
+
+    monkeypatch.setattr(cli, "_run", reads)
+    assert main(["scenes"]) == 130
+    assert "wheretolook: interrupted" in capsys.readouterr().err
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

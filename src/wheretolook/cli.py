@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import logging
 import os
+import signal
 import sys
+import threading
 import time
 import traceback
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from wheretolook.utils.errors import (
@@ -256,19 +260,46 @@ def main(arguments: list[str] | None = None) -> int:
     if arguments[0] == "--version":
         print(f"wheretolook {VERSION}")
         return 0
-    if not debug:
-        _quieten()
+    interrupts: list[int] = []
     try:
-        return _run(arguments[0], arguments[1:])
-    except (WhereToLookError, OSError) as error:
+        with _noting(interrupts):
+            if not debug:
+                _quieten()
+            return _run(arguments[0], arguments[1:])
+    except (Exception, KeyboardInterrupt) as error:
+        if interrupts or isinstance(error, KeyboardInterrupt):
+            said = "interrupted; what is finished is kept, run the same command to go on"
+            print(f"\nwheretolook: {said}", file=sys.stderr)
+            return 130
+        if not isinstance(error, WhereToLookError | OSError):
+            raise
         if debug:
             traceback.print_exc()
         text = f"{error.filename or 'a file'}: {error.strerror or error}" if isinstance(error, OSError) else str(error)
         print(f"wheretolook: error: {text}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
-        print("\nwheretolook: interrupted; what is finished is kept, run the same command to go on", file=sys.stderr)
-        return 130
+
+
+@contextmanager
+def _noting(interrupts: list[int]) -> Iterator[None]:
+    """Note each Ctrl-C in this block: compiled libraries, such as the one that reads weights, make errors of it."""
+    if signal.getsignal(signal.SIGINT) is not signal.default_int_handler or not _in_main_thread():
+        yield
+        return
+
+    def note(number: int, frame: FrameType | None) -> None:
+        interrupts.append(number)
+        signal.default_int_handler(number, frame)
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _in_main_thread() -> bool:
+    return threading.current_thread() is threading.main_thread()
 
 
 def _run(command: str, arguments: list[str]) -> int:

@@ -22,6 +22,7 @@ import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 
 from matplotlib.figure import Figure
 
@@ -191,7 +192,7 @@ def at_file_events(folder: Path, do: Callable[[int], None]) -> Hook:
     """A hook that calls `do` with a number that counts up, before each change of a file or folder in a folder."""
 
     def hook() -> None:
-        mine, count, root = os.getpid(), 0, str(folder)
+        mine, count, root = os.getpid(), 0, f"{folder}/"
 
         def audit(event: str, arguments: tuple[object, ...]) -> None:
             nonlocal count
@@ -212,9 +213,12 @@ def at_file_events(folder: Path, do: Callable[[int], None]) -> Hook:
     return hook
 
 
-def _no_picture(figure: Figure, path: str | Path, **options: object) -> None:
+def _no_picture(figure: Figure, file: IO[bytes] | str | Path, **options: object) -> None:
     """Figures are built, but their files stay all but empty: drawing is a third of a small evaluation."""
-    Path(path).write_bytes(b"picture")
+    if isinstance(file, str | Path):
+        Path(file).write_bytes(b"picture")
+    else:
+        file.write(b"picture")
 
 
 def _remove(path: Path) -> None:

@@ -243,6 +243,18 @@ def test_the_old_map_outlives_a_save_that_ends_between_the_two_moves(
     assert content_of(old) == content_of(folder) == before
 
 
+def test_what_killed_saves_left_is_removed_by_the_next(viewpoint_map: ViewpointMap, folder: Path) -> None:
+    """A half-written new map always, the old one once there is a new one."""
+    unfinished, superseded = folder.with_name(".room.abcdefgh"), folder.with_name(".room.ijklmnop")
+    (unfinished / "new").mkdir(parents=True)
+    (superseded / "old").mkdir(parents=True)
+    for path in (unfinished / "new" / "scores.npy", superseded / "old" / "scores.npy"):
+        path.write_bytes(b"half")
+    (folder.with_name(".room.settings")).write_text("mine")
+    viewpoint_map.save(folder)
+    assert {path.name for path in folder.parent.iterdir()} == {"room", ".room.settings"}
+
+
 def test_rows_that_are_not_each_of_one_voxel_are_refused(viewpoint_map: ViewpointMap, folder: Path) -> None:
     rows = viewpoint_map.row_of_voxel.copy()
     first, second = viewpoint_map.voxel_of_row[:2]

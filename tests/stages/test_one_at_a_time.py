@@ -107,3 +107,23 @@ def test_a_name_that_is_no_dataset_leaves_no_folder(tmp_path: Path, capsys: pyte
     assert main(["sample", "--name", "typo", "--data", str(tmp_path / "data"), "--device", "cpu"]) == 2
     assert "this folder is no dataset" in capsys.readouterr().err
     assert not (tmp_path / "data" / "typo").exists()
+
+
+def test_what_killed_runs_left_is_removed_by_the_next_that_changes_the_dataset(dataset: Dataset) -> None:
+    scene = dataset.scenes[0]
+    left = [scene.folder / ".map.partial" / "points3D.bin", scene.table.with_name("viewpoints.parquet.partial"),
+            scene.folder / "photographs" / "tmpabc.partial" / "database.db",
+            dataset.root / "weights" / "set.safetensors.partial", dataset.root / ".set-weights.lock"]  # fmt: skip
+    for path in left:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(b"half")
+    elsewhere = dataset.root.parent / "elsewhere" / "half.partial"
+    elsewhere.parent.mkdir()
+    elsewhere.write_bytes(b"not ours")
+    (dataset.root / "link").symlink_to(elsewhere.parent)
+    before = {path for path in dataset.root.rglob("*") if path.is_file()}
+    with reading(dataset.root, "evaluate", "results"):
+        assert all(path.is_file() for path in left)
+    with changing(dataset.root, "map"):
+        assert before - {path for path in dataset.root.rglob("*") if path.is_file()} == {*left}
+    assert not left[0].parent.exists() and elsewhere.is_file()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import signal
+import tempfile
 import threading
 import time
 import warnings
@@ -66,6 +67,7 @@ def fit(classifier: ViewpointClassifier, data: LightningDataModule, record: Epoc
         where: dict[str, Any] = {"accelerator": config.accelerator, "devices": config.devices}
         if several:  # spawned processes run nothing but the fit; those that run the program anew would repeat all else
             where["strategy"] = _Spawned(start_method="spawn")
+            where["strategy"].temporary = folder
             where["accelerator"] = "cpu" if home_device(config) == "cpu" else config.accelerator
         quiet: dict[str, Any] = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False}
         how: dict[str, Any] = {"max_epochs": options.epochs, "callbacks": callbacks, "num_sanity_val_steps": 0}
@@ -176,9 +178,12 @@ class EpochRecord(Checkpoint):
 class _Spawned(DDPStrategy):
     """Lightning's DDP in spawned processes, which are as quiet as the one that starts them."""
 
+    temporary: str | None = None  # folder for temporary files, of which Lightning leaves some
+
     def setup_environment(self) -> None:
         """Silence this process, which does nothing but train, and join the others."""
         _silence()
+        tempfile.tempdir = self.temporary
         super().setup_environment()
 
 

@@ -159,7 +159,7 @@ def _run_match_job(job: MatchJob) -> list[NDArray[np.uint32]]:
 
     pairs, stored, parent = job
     matching = pycolmap.FeatureMatchingOptions(num_threads=1, skip_geometric_verification=True)
-    with TemporaryDirectory(dir=parent) as folder:
+    with TemporaryDirectory(".partial", dir=parent) as folder:
         database, listed = Path(folder) / "database.db", Path(folder) / "pairs.txt"
         # Any camera and poses do: only verification would use them.
         fill_database(database, _posed_model(PinholeCamera(), np.tile(np.eye(3, 4), (len(stored), 1, 1))), stored)

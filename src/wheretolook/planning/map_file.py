@@ -114,8 +114,9 @@ def write_map(
     _refuse_something_else(folder)
     with hold(folder.with_name(f".{folder.name}.lock"), "viewpoint map", wait_s=_WAIT_S):
         for left in folder.parent.glob(f".{glob.escape(folder.name)}.????????"):
-            if [path.name for path in left.glob("*")] in ([], [_NEW]):  # of a process that was killed while it wrote
-                shutil.rmtree(left, ignore_errors=True)
+            inside = {path.name for path in left.iterdir()} if left.is_dir() and not left.is_symlink() else {"a file"}
+            if inside <= {_NEW} or (inside <= {_NEW, _OLD} and (folder / DESCRIPTION).is_file()):
+                shutil.rmtree(left, ignore_errors=True)  # of a process that was killed while it wrote, or afterwards
         with storing(folder):
             work = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
         new, old = work / _NEW, work / _OLD
@@ -129,7 +130,11 @@ def write_map(
         finally:
             if old.exists() and not folder.exists():
                 old.rename(folder)
-            shutil.rmtree(work, ignore_errors=True)  # processes that have mapped the old files still read them
+            try:
+                shutil.rmtree(work, ignore_errors=True)  # processes that have mapped the old files still read them
+            except KeyboardInterrupt:
+                shutil.rmtree(work, ignore_errors=True)
+                raise
 
 
 def _refuse_something_else(folder: Path) -> None:

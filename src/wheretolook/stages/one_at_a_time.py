@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from functools import wraps
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
@@ -24,9 +25,15 @@ def reads_dataset(stage: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
     return _holding(stage, shared=True)
 
 
-def changing(root: Path, stage: str) -> AbstractContextManager[None]:
-    """Within this block no other stage runs on the dataset in this folder. Raises InUseError if one does."""
-    return hold(root / _LOCK, stage)
+@contextmanager
+def changing(root: Path, stage: str) -> Iterator[None]:
+    """Within this block no other stage runs on the dataset in this folder. Raises InUseError if one does.
+
+    What killed runs left half written is removed first: nobody writes it any more.
+    """
+    with hold(root / _LOCK, stage):
+        _remove_leftovers(root)
+        yield
 
 
 @contextmanager
@@ -46,13 +53,25 @@ def reading(root: Path, stage: str, makes: str = "") -> Iterator[None]:
 _LOCK = ".lock"
 
 
+def _remove_leftovers(root: Path) -> None:
+    for pattern in (f".?*{_LOCK}", "*.partial", "*/*.partial", "*/*/*.partial"):
+        for path in root.glob(pattern):
+            if not path.parent.resolve().is_relative_to(root.resolve()):
+                continue  # a link leads there, which the stage will refuse
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                with suppress(OSError):
+                    path.unlink()
+
+
 def _holding(stage: str, shared: bool) -> Callable[[Callable[P, R]], Callable[P, R]]:
     def of(function: Callable[P, R]) -> Callable[P, R]:
         @wraps(function)
         def alone(*args: P.args, **kwargs: P.kwargs) -> R:
             experiment: Any = args[0] if args else kwargs["experiment"]
             try:
-                with hold(experiment.root / _LOCK, stage, shared=shared):
+                with (reading if shared else changing)(experiment.root, stage):
                     return function(*args, **kwargs)
             finally:
                 with suppress(OSError):  # made for the lock of a stage that then found nothing to work on

@@ -75,8 +75,11 @@ def train_methods(
         dataset = with_also(dataset, config.also)
         for method in config.chosen():
             with reading(dataset.root, "train", f"{method.name}-weights"):
+                path = weights_path(dataset, method.name)
+                for left in path.parent.glob(f"{path.stem}.*.partial"):  # of a run that was killed
+                    left.unlink(missing_ok=True)
                 about = about_training(dataset, method.name, config, config.options_of(method))
-                known = None if force else trained_before(weights_path(dataset, method.name), about)
+                known = None if force else trained_before(path, about)
                 if known is None or not known.run_id:
                     check_store(tracking)
                 if known is None:

@@ -43,12 +43,22 @@ def test_the_correction_is_scikit_learns_gaussian_process() -> None:
     views = random_views()
     flat = LocalizedViews(np.zeros(len(views)), views.good, views.centers, views.axes, views.group)
     # without log-odds, offset and correction are one process, of both kernels; its reach covers the room
-    kernel = ConstantKernel(3.0) * RBF(2.0) + ConstantKernel(1 / PRIOR)
+    kernel = ConstantKernel(3.0) * RBF(2.0) + ConstantKernel(1 / PRIOR[1])
     theirs = GaussianProcessClassifier(kernel, optimizer=None, max_iter_predict=100).fit(views.centers, views.good)
     theirs = theirs.base_estimator_
     latent = theirs.kernel_(views.centers, theirs.X_train_) @ (theirs.y_train_ - theirs.pi_)
     ours = fit(flat, 2.0, 3.0, sharpness=0.0)
     np.testing.assert_allclose(ours.log_odds(flat), latent, atol=5e-3)
+
+
+def test_a_scorer_that_is_sure_and_wrong_is_corrected() -> None:
+    """Where log-odds are far off, full steps of Newton's method would run away."""
+    views = random_views(60, shift=-8.0)
+    sure = LocalizedViews(views.log_odds + 8, views.good, views.centers, views.axes, views.group)
+    for amplitude in (1.0, 3.0):
+        adapted = fit(sure, 2.0, amplitude)
+        assert log_losses(adapted.log_odds(sure), sure.good).mean() < log_losses(sure.log_odds, sure.good).mean() / 4
+        assert 0 < adapted.scale < 2
 
 
 def test_calibration_alone_is_platts() -> None:

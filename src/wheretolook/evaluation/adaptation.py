@@ -62,17 +62,15 @@ def compare_log_odds(
         np.logical_or.at(possible, row, good)
         return (possible & ~good[chosen]).astype(np.float64) * (times > 1)
 
-    choice, both = (times > 1).astype(np.float64), (before, after)
+    choice, both = np.asarray(times > 1, dtype=np.float64), (before, after)
     losses, misses = [log_losses(z, good) for z in both], [missed(z) for z in both]
     told = []
     for z, loss, miss in zip(both, losses, misses, strict=True):
         auc = float(roc_auc_score(good, z)) if 0 < good.sum() < len(good) else float("nan")
         regret, error = 100 * float(miss.sum() / max(1.0, choice.sum())), expected_calibration_error(expit(z), good)
         told.append({"log_loss": float(loss.mean()), "auc": auc, "regret": regret, "calibration_error": error})
-    loss_less = np.bincount(row, weights=losses[0] - losses[1])
-    return Gain(
-        told[0], told[1], less(loss_less, times.astype(np.float64)), less(100 * (misses[0] - misses[1]), choice)
-    )
+    loss_less = less(np.bincount(row, weights=losses[0] - losses[1]), np.asarray(times, dtype=np.float64))
+    return Gain(told[0], told[1], loss_less, less(100 * (misses[0] - misses[1]), choice))
 
 
 def gain_markdown(gain: Gain) -> str:

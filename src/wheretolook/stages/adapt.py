@@ -24,6 +24,7 @@ from wheretolook.utils.tracking_store import check_store, kept_if_not_logged
 
 if TYPE_CHECKING:
     from wheretolook.evaluation.adaptation import Gain
+    from wheretolook.inputs.localization_map import LocalizationMap
     from wheretolook.methods.adapted.fit import Adapted, LocalizedViews
     from wheretolook.methods.set.score import SetScorer
 
@@ -151,11 +152,11 @@ def labelled_views(files: SceneFolder, scene: Scene, table: pd.DataFrame, weight
     return LocalizedViews(log_odds, is_good(table), camera_centers(cam_from_world), axes, group)
 
 
-def _scorer(weights: Path, localization_map: object) -> SetScorer:
+def _scorer(weights: Path, localization_map: LocalizationMap) -> SetScorer:
     from wheretolook.methods.registry import load_scorer
     from wheretolook.methods.set.score import SetScorer
 
-    scorer = load_scorer(weights, localization_map)  # type: ignore[arg-type]
+    scorer = load_scorer(weights, localization_map)
     if not isinstance(scorer, SetScorer):
         fix = "Give weights of the method set, or leave them out for those that ship."
         raise WeightsError("only a set network is adapted", path=weights, value=scorer.name, fix=fix)

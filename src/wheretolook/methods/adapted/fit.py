@@ -22,11 +22,10 @@ from wheretolook.methods.adapted.kernel import nearness
 LENGTHS_M, AMPLITUDES, SHARPNESS = (0.5, 1.0, 2.0), (1.0, 3.0), 4.0
 """Kernels that are tried: lengths, and variances of g. Chosen on the val scenes of configs/cameras.yaml, as was the
 sharpness."""
-PRIOR = 5.0  # precision of scale (about 1) and offset (about 0)
+PRIOR = np.array([5.0, 0.1])  # precision of scale (about 1) and offset (about 0)
 MAX_SUPPORT, TRIED_SUPPORT = 2000, 800  # views that g stands on, finally and while kernels are tried; evenly spread
 FOLDS = 5
-STEPS = 20  # of Newton's method, at most
-JITTER = 1e-6
+STEPS, TOLERANCE = 30, 1e-4  # of Newton's method: steps at most, and what one gains in log-likelihood at least
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,19 +79,35 @@ def fit(
         return Adaptation(scale, offset, length_m, sharpness, np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
     poses = learnt.centers, learnt.axes
     kernel = amplitude * nearness(*poses, *poses, length_m, sharpness)
-    mean, covariance = fixed @ (1.0, 0.0), kernel + fixed @ fixed.T / PRIOR
-    z, residual = mean.copy(), np.zeros(len(y))
-    for _ in range(STEPS):
-        p = expit(z)
-        information = np.maximum(p * (1 - p), 1e-6)
-        target = z + (y - p) / information - mean
-        factor = cho_factor(covariance + np.diag(1 / information + JITTER), check_finite=False)
-        before, residual = residual, cho_solve(factor, target, check_finite=False)
-        z = mean + covariance @ residual
-        if np.abs(residual - before).max() < 1e-3:
-            break
+    residual = _most_likely(fixed @ (1.0, 0.0), kernel + (fixed / PRIOR) @ fixed.T, y)
     scale, offset = (1.0, 0.0) + fixed.T @ residual / PRIOR
     return Adaptation(float(scale), float(offset), length_m, sharpness, *poses, amplitude * residual)
+
+
+def _most_likely(mean: Float, covariance: Float, y: Float) -> Float:
+    """The residual a (N,) for which log-odds mean + covariance a are the most likely, of labels (N,).
+
+    Newton's method (Rasmussen and Williams, Algorithm 3.1), whose steps are halved until they gain.
+    """
+
+    def worth(a: Float, shift: Float) -> float:
+        return float(-a @ shift / 2 - np.logaddexp(0.0, np.where(y > 0, -1.0, 1.0) * (mean + shift)).sum())
+
+    a, shift = np.zeros(len(y)), np.zeros(len(y))
+    known = worth(a, shift)
+    for _ in range(STEPS):
+        p = expit(mean + shift)
+        root = np.sqrt(p * (1 - p))
+        target = root**2 * shift + y - p
+        factor = cho_factor(np.eye(len(y)) + root[:, None] * covariance * root, check_finite=False)
+        full = target - root * cho_solve(factor, root * (covariance @ target), check_finite=False)
+        step, full_shift = 1.0, covariance @ full
+        while (gained := worth(a + step * (full - a), shift + step * (full_shift - shift)) - known) < 0 and step > 1e-4:
+            step /= 2
+        a, shift, known = a + step * (full - a), shift + step * (full_shift - shift), known + gained
+        if gained < TOLERANCE:
+            break
+    return a
 
 
 def _calibration(fixed: Float, y: Float) -> tuple[float, float]:
@@ -101,7 +116,7 @@ def _calibration(fixed: Float, y: Float) -> tuple[float, float]:
     for _ in range(STEPS):
         p = expit(fixed @ at)
         gradient = fixed.T @ (p - y) + PRIOR * (at - prior)
-        step = np.linalg.solve(fixed.T @ (fixed * (p * (1 - p))[:, None]) + PRIOR * np.eye(2), gradient)
+        step = np.linalg.solve(fixed.T @ (fixed * (p * (1 - p))[:, None]) + np.diag(PRIOR), gradient)
         at = at - step * min(1.0, 2.0 / max(1e-12, float(np.abs(step).max())))
         if np.abs(step).max() < 1e-8:
             break

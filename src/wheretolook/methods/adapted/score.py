@@ -47,9 +47,9 @@ class AdaptedScorer(Scorer):
             _check_place(network.place.numpy(), localization_map)
         of_base = network.network, trained.camera, network.base_scale, network.base_offset, trained.training_range
         self.base = SetScorer(localization_map, TrainedNetwork("set", *of_base))
-        support = network.support_centers, network.support_axes, network.support_weights
-        arrays = [part.cpu().numpy() for part in support]
-        self.correction = Correction(*arrays, network.length_m, network.sharpness)
+        centers, axes = network.support_centers.numpy(), network.support_axes.numpy()
+        kernel = network.length_m, network.sharpness
+        self.correction = Correction(centers, axes, network.support_weights.numpy(), *kernel)
 
     def score(self, cam_from_world: Float) -> Float:
         """(B,) probabilities in [0, 1]."""

@@ -17,6 +17,7 @@ from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS
 from wheretolook.inputs.landmarks_in_view import ATTRIBUTES, LandmarkDescriber, pool
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.learning.landmark_views import AttributeStatistics
+from wheretolook.methods.adapted.network import AdaptedNetwork
 from wheretolook.methods.base import Scorer
 from wheretolook.methods.bins import BinsScorer
 from wheretolook.methods.conv.network import ConvNetwork, ConvSpec
@@ -87,6 +88,7 @@ def weights_of(method: str, path: Path, localization_map: LocalizationMap) -> Pa
         "sphere": lambda: SphereNetwork(SphereConfig()),
         "set": lambda: SetNetwork(NO_STATISTICS, pooled=2),
         "matchability": lambda: MatchabilityNetwork(NO_STATISTICS),
+        "adapted": lambda: AdaptedNetwork(SetNetwork(NO_STATISTICS, pooled=2), 1.0, 0.0, 1.0, 4.0, 0, 0),
     }[method]()
     return save_network(path, method, network)
 

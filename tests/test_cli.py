@@ -1,7 +1,8 @@
 """What the command line says without a dataset."""
 
-from __future__ import gc
+from __future__ import annotations
 
+import gc
 import signal
 from pathlib import Path
 

@@ -215,6 +215,7 @@ OWN = {
 """Sub-commands with options of their own, which are no stages of an experiment: their module, and what they do."""
 
 _SHORT = {"--engine": "--label.engine", "--images": "--map.photographs.images"}  # flags of every stage
+_SIGNED = ("--up", "--scenes.rgbd.up", "--map.existing.mesh_up")  # flags whose value may begin with a minus sign
 _COMMON = "name data device"  # the options that matter to every stage
 
 USAGE = """\
@@ -347,6 +348,10 @@ def parse_experiment(command: str, arguments: list[str]) -> Experiment | None:
     from wheretolook.config import MOVED, Experiment
 
     options, short = all_options(Experiment), {**_SHORT, **STAGES[command].short}
+    arguments = list(arguments)
+    places = [place for place, name in enumerate(arguments) if name in _SIGNED and place + 1 < len(arguments)]
+    for place in reversed(places):  # a value such as -y looks like an option
+        arguments[place : place + 2] = [f"{arguments[place]}={arguments[place + 1]}"]
     given = [argument.partition("=") for argument in arguments]
     arguments = [short.get(name, name) + equals + value for name, equals, value in given]
     if {"-h", "--help", "--help-all"} & {*arguments}:

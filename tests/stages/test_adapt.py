@@ -84,6 +84,8 @@ def test_where_nothing_is_gained_nothing_is_kept(dataset: Dataset, capsys: pytes
         ((), "scene-0, scene-1"),
         (("--scene", "house"), "house"),
         (("--scene", "scene-1", "--minutes", "0"), "above 0 minutes"),
+        (("--scene", "scene-1", "--out", "."), "ends in .safetensors"),
+        (("--scene", "scene-1", "--weights", "x.safetensors", "--out", "x.safetensors"), "would replace"),
         (("--scene", "scene-1", "--weights", "nowhere.safetensors"), "nowhere.safetensors"),
     ],
 )
@@ -112,3 +114,9 @@ def test_gains_are_those_of_known_cases() -> None:
     expected = (np.log1p(np.exp(1)) + np.log1p(np.exp(-1))) / 2 - np.log1p(np.exp(-2))
     assert gain.log_loss_less[0] == pytest.approx(expected) and gain.regret_less[0] == 50
     assert pd.notna(gain.log_loss_less[1])
+
+
+def test_a_name_that_is_no_dataset_leaves_nothing(dataset: Dataset) -> None:
+    data = dataset.root.parent
+    assert main(["adapt", "--name", "nothere", "--data", str(data), "--tracking.folder", str(data / "mlruns")]) == 2
+    assert not (data / "nothere").exists() and not (data / "mlruns").exists()

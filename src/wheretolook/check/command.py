@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from wheretolook.utils.errors import ConfigError, MapError
+from wheretolook.utils.locks import hold
 from wheretolook.utils.options import CommandParser
 
 if TYPE_CHECKING:
@@ -87,10 +88,12 @@ def run(arguments: Sequence[str]) -> int:
     device, workers = usable_device(options.device), options.workers or len(os.sched_getaffinity(0))
     scoring = Scoring(options.method, options.weights, tuple(options.also))
     _ = scoring.chosen  # refused now if there is none, not after the work
-    source, occlusion, out = _open(options, device, workers)
-    report = check_map(source, out / "work", scoring, occlusion, options.views, workers, device)
-    report.save(out)
-    save_figure(check_figure(report), out / "check.png")
+    out = options.out or options.data / "checks" / _name(options)
+    with hold(out / ".lock", "check"):
+        source, occlusion = _open(options, out, device, workers)
+        report = check_map(source, out / "work", scoring, occlusion, options.views, workers, device)
+        report.save(out)
+        save_figure(check_figure(report), out / "check.png")
     print("\n".join(report.lines()))
     print(f"done in {time.monotonic() - start:.0f} s: {out}")
     return 0
@@ -112,8 +115,17 @@ def _refuse(options: argparse.Namespace) -> None:
         check_method(name)
 
 
-def _open(options: argparse.Namespace, device: str, workers: int) -> tuple[PhotographedMap, OcclusionModel, Path]:
-    """The map, what hides its landmarks, and the folder of results."""
+def _name(options: argparse.Namespace) -> str:
+    """What the folder of results is called: as the scene, behind its dataset's name if that is given."""
+    from wheretolook.mapping.config import ExistingModelConfig
+
+    if options.scene is None:
+        return ExistingModelConfig(model=options.map).scene_name
+    return "-".join(filter(None, (options.name, options.scene)))
+
+
+def _open(options: argparse.Namespace, out: Path, device: str, workers: int) -> tuple[PhotographedMap, OcclusionModel]:
+    """The map, and what hides its landmarks; results go to a folder."""
     from wheretolook.check import source
     from wheretolook.mapping.config import ExistingModelConfig
     from wheretolook.select.surroundings import surroundings
@@ -133,7 +145,6 @@ def _open(options: argparse.Namespace, device: str, workers: int) -> tuple[Photo
         fix = "Say --metres if it is, or leave --mesh out."
         raise ConfigError("a mesh is of use only for a map in metres", value=str(mesh), fix=fix)
     hides, _ = surroundings(mesh, None, 1000.0, options.occlusion, model, device)
-    out = options.out or Path("data") / "checks" / name
     images, features = options.images, options.database
     if images is None and features is None:
         features = source.features_beside(model)
@@ -146,4 +157,4 @@ def _open(options: argparse.Namespace, device: str, workers: int) -> tuple[Photo
         raise MapError("neither the features nor the photographs of this map are known", path=model, fix=fix)
     if features is None:
         model, features = source.extract_anew(model, images, out / "work", workers, device)
-    return source.open_map(model, features, metric, name, keep_frame=mesh is not None), hides, out
+    return source.open_map(model, features, metric, name, keep_frame=mesh is not None), hides

@@ -18,6 +18,7 @@ from wheretolook.check.source import PhotographedMap
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float
 from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.mapping.colmap_model import compact_poses
 from wheretolook.methods.base import Scorer
 from wheretolook.methods.registry import load_scorer, make_scorer
 from wheretolook.select.weights import weights_of
@@ -64,7 +65,7 @@ def score_views(
         for one in left_out:
             views = one.views.copy()
             kept = np.setdiff1d(np.arange(len(source.poses)), one.block.left_out)
-            poses = source.poses[kept].astype(np.float32)
+            poses = compact_poses(source.poses[kept])
             hides = occlusion if occlusion.name == "none" else RememberedOcclusion(occlusion)
             looking = [source.cameras[row] for row in views["row"]]
             around = LocalizationMap(one.landmarks, looking[0], hides, device, poses)

@@ -135,7 +135,7 @@ class Scene:
         from wheretolook.space.mapped_space import MappedSpace
 
         centers = camera_centers(colmap_poses(self.files.frames))
-        return MappedSpace(self.mesh.vertices, centers, self.config.mapped_space)
+        return MappedSpace(self.mesh.vertices + self.mesh.origin, centers, self.config.mapped_space)
 
     @property
     def sampled_space(self) -> FreeSpace | MappedSpace:

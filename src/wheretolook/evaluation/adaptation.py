@@ -69,7 +69,8 @@ def compare_log_odds(
         auc = float(roc_auc_score(good, z)) if 0 < good.sum() < len(good) else float("nan")
         regret, error = 100 * float(miss.sum() / max(1.0, choice.sum())), expected_calibration_error(expit(z), good)
         told.append({"log_loss": float(loss.mean()), "auc": auc, "regret": regret, "calibration_error": error})
-    loss_less = less(np.bincount(row, weights=losses[0] - losses[1]), np.asarray(times, dtype=np.float64))
+    changed = np.bincount(row, weights=losses[0] - losses[1]).astype(np.float64)
+    loss_less = less(changed, times.astype(np.float64))
     return Gain(told[0], told[1], loss_less, less(100 * (misses[0] - misses[1]), choice))
 
 
@@ -81,6 +82,11 @@ def gain_markdown(gain: Gain) -> str:
         digits = ".1f" if key == "regret" else ".3f"
         rows.append([text, format(gain.before[key], digits), format(gain.after[key], digits)])
     loss, regret = gain.log_loss_less, gain.regret_less
+    if np.isnan(regret[1]):
+        less = (
+            f"Log loss is less by {loss[0]:.3f} [{loss[1]:.3f}, {loss[2]:.3f}]; there is no choice to judge regret by."
+        )
+        return f"{markdown_table(('', 'before', 'adapted'), rows)}\n\n{less}\n"
     less = (
         f"Log loss is less by {loss[0]:.3f} [{loss[1]:.3f}, {loss[2]:.3f}], regret by {regret[0]:+.1f} points "
         f"[{regret[1]:+.1f}, {regret[2]:+.1f}]."

@@ -210,6 +210,8 @@ def partial_folder(out_dir: Path, replacing: Callable[[], None] = lambda: None) 
             os.replace(partial, out_dir)
         shutil.rmtree(old, ignore_errors=True)
     except BaseException:
+        if old.exists() and not out_dir.exists():
+            os.replace(old, out_dir)
         shutil.rmtree(partial, ignore_errors=True)
         raise
 

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from wheretolook.config import Experiment
-from wheretolook.dataset.folders import Dataset, SceneFolder
+from wheretolook.dataset.folders import Dataset, SceneFolder, views_by_camera
 from wheretolook.dataset.scene import Scene
 from wheretolook.dataset.stamps import read_stamp
 from wheretolook.stages.inputs import Say, Tick, extractor_of, open_scene, refuse_release
@@ -52,10 +52,12 @@ def adapt(experiment: Experiment, say: Say = print, tick: Tick = lambda work: No
     config = experiment.adapt
     refuse_release(experiment.root)
     with reading(experiment.root, "adapt", FOLDER):
-        check_store(experiment.tracking)
         dataset = Dataset.load(experiment.root)
         files = _scene(dataset, config.scene)
         weights = config.weights or shipped(WEIGHTS) / "set.safetensors"
+        path = config.out or dataset.root / FOLDER / f"{files.name}.safetensors"
+        _check_out(path, weights)
+        check_store(experiment.tracking)
         scene = open_scene(experiment, dataset, files)
         table = _labelled(experiment, files, scene, say)
         views = labelled_views(files, scene, table, weights)
@@ -63,15 +65,16 @@ def adapt(experiment: Experiment, say: Say = print, tick: Tick = lambda work: No
         say(f"{files.name}: learning from {len(views):,} views, {views.good.mean():.0%} of which localize")
         learnt = learn(views, config.seed)
         gain = compare_log_odds(views.log_odds, learnt.held_out, views.good, views.group, views.centers, config.seed)
-        path = config.out or dataset.root / FOLDER / f"{files.name}.safetensors"
         text = gain_markdown(gain)
         write_text(path.with_suffix(".md"), f"# {files.name}: adapted by {len(views):,} views\n\n{text}")
         if gain.is_better:
             _save(path, files, scene, weights, learnt, views, gain)
             say(f"{text}\n{files.name}: the adapted weights are better -> {path}")
         else:
-            path.unlink(missing_ok=True)
             say(f"{text}\n{files.name}: adapting does not make the weights better here: use {weights}")
+            if config.out is None and path.is_file():  # of an earlier run, by other labels
+                path.unlink()
+                say(f"{files.name}: removed {path}, which an earlier run had made")
         with kept_if_not_logged(f"what was gained, {path.with_suffix('.md')},"):
             _log(experiment, dataset, files, weights, path, learnt, views, gain)
         tick(1)
@@ -87,16 +90,24 @@ def _scene(dataset: Dataset, name: str) -> SceneFolder:
     return dataset.scenes[0]
 
 
+def _check_out(path: Path, weights: Path) -> None:
+    if path.suffix != ".safetensors" or path.is_dir():
+        raise ConfigError("weights are a file", path=path, fix="Give --out a name that ends in .safetensors.")
+    if path.resolve() == weights.resolve():
+        fix = "Give --out another name."
+        raise ConfigError("the adapted weights would replace those that they start from", path=path, fix=fix)
+
+
 def _labelled(experiment: Experiment, files: SceneFolder, scene: Scene, say: Say) -> pd.DataFrame:
     """The scene's labelled viewpoints: all if the label stage has been here, else those that the time allows."""
     if read_stamp(files, "label") is not None:
         return files.read_table()
-    if read_stamp(files, "sample") is None:
-        problem = "the sample stage has not been run for this scene since its input was made"
-        raise TableError(problem, path=files.folder, fix="Run `wheretolook sample`.")
     if not files.mesh.is_file():
         problem = "this scene has neither labels nor a mesh that views could be rendered from"
         raise SceneError(problem, path=files.folder, fix="Use the weights that ship, or give the map a mesh.")
+    if read_stamp(files, "sample") is None:
+        problem = "the sample stage has not been run for this scene since its input was made"
+        raise TableError(problem, path=files.folder, fix="Run `wheretolook sample`.")
     return _label_for(experiment, files, scene, say)
 
 
@@ -120,13 +131,16 @@ def _label_for(experiment: Experiment, files: SceneFolder, scene: Scene, say: Sa
         for begin in begins
     ]
     say(f"{files.name}: labelling up to {len(table):,} views, for {config.minutes:g} minutes at most")
-    end, done = time.monotonic() + 60 * config.minutes, list[pd.DataFrame]()
+    done: dict[str, pd.DataFrame] = {}
+    end = None  # counted from the first views that are labelled now: what lay there comes at once
     with closing(label_scenes(tasks, label)) as results:
         for labelled in results:
-            done.append(labelled.table)
-            if time.monotonic() >= end:
+            done[labelled.task.name] = labelled.table
+            if labelled.seconds and end is None:
+                end = time.monotonic() + 60 * config.minutes
+            if end is not None and time.monotonic() >= end:
                 break
-    found = pd.concat(done, ignore_index=True)
+    found = pd.concat([done[task.name] for task in tasks if task.name in done], ignore_index=True)
     if len(found) < len(table):
         say(f"{files.name}: {len(found):,} of {len(table):,} views labelled; run it again to go on with more")
     return found
@@ -137,17 +151,14 @@ def labelled_views(files: SceneFolder, scene: Scene, table: pd.DataFrame, weight
     from wheretolook.geometry.poses import camera_centers
     from wheretolook.methods.adapted.fit import LocalizedViews
     from wheretolook.methods.adapted.score import log_odds_of
-    from wheretolook.viewpoints.table import CAMERA_ID, is_good, poses
+    from wheretolook.viewpoints.table import is_good, poses
 
     cam_from_world, log_odds = poses(table), np.empty(len(table))
-    numbers = table[CAMERA_ID].to_numpy() if CAMERA_ID in table else None
-    for number, camera in (files.cameras() if numbers is not None else {0: scene.camera}).items():
-        rows = np.arange(len(table)) if numbers is None else np.flatnonzero(numbers == number)
-        if len(rows):
-            scorer = _scorer(weights, files.localization_map(camera, scene.device))
-            with warnings.catch_warnings():  # how far the weights hold here is what is measured
-                warnings.simplefilter("ignore", OutOfRangeWarning)
-                log_odds[rows] = log_odds_of(scorer.score(cam_from_world[rows]))
+    for camera, rows in views_by_camera(files, table):
+        scorer = _scorer(weights, files.localization_map(camera, scene.device))
+        with warnings.catch_warnings():  # how far the weights hold here is what is measured
+            warnings.simplefilter("ignore", OutOfRangeWarning)
+            log_odds[rows] = log_odds_of(scorer.score(cam_from_world[rows]))
     axes, group = cam_from_world[:, 2, :3], table["location_id"].to_numpy(np.int64)
     return LocalizedViews(log_odds, is_good(table), camera_centers(cam_from_world), axes, group)
 

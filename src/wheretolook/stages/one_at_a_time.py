@@ -43,7 +43,7 @@ def reading(root: Path, stage: str, makes: str = "") -> Iterator[None]:
     Raises InUseError if another stage changes the dataset, or makes the same: "weights", "results" or "paths".
     """
     with hold(root / _LOCK, stage, shared=True):
-        if not makes:
+        if not makes or not root.is_dir():  # without a dataset nothing is made
             yield
             return
         with hold(root / f".{makes}{_LOCK}", stage):
@@ -54,7 +54,7 @@ _LOCK = ".lock"
 
 
 def _remove_leftovers(root: Path) -> None:
-    for pattern in (f".?*{_LOCK}", "*.partial", "*/*.partial", "*/*/*.partial"):
+    for pattern in (f".?*{_LOCK}", "*.partial", "*/*.partial", "*/*/*.partial", "*/*/*/*.partial"):
         for path in root.glob(pattern):
             if not path.parent.resolve().is_relative_to(root.resolve()):
                 continue  # a link leads there, which the stage will refuse

@@ -55,7 +55,7 @@ def plan(experiment: Experiment, say: Say = print, tick: Tick = lambda work: Non
     views = {name: path_views(path, scene.localization_map) for name, path in paths.items() if name != method}
     renderer = None if scene.is_photographed else scene.renderer
     views[method] = path_views(path, scene.localization_map, renderer)
-    folder = config.out or files.folder / "path"
+    folder = (config.out or files.folder / "path").resolve()  # so that "." has a name too
     with hold(folder.with_name(f".{folder.name}.lock"), "plan", wait_s=WAIT_S):
         written = _draw(views, scene.landmarks.points, f"{scene.name}, {method}", folder, config.film)
         write_text(folder / "path.csv", _table(path).to_csv(index=False, lineterminator="\n"))

@@ -69,7 +69,10 @@ def make_scenes(experiment: Experiment, say: Say = print, tick: Tick = lambda wo
         tick(1)
     dataset = Dataset(root, tuple(sources))
     if (root / "dataset.json").is_file():
-        cameras = {scene.name: scene.camera for scene in Dataset.load(root).scenes}
+        before, made = Dataset.load(root).scenes, {scene.name for scene in sources}
+        scans = [scene for scene in before if scene.is_scanned and scene.name not in made]  # which no setting names
+        dataset = Dataset(root, (*sources, *scans))
+        cameras = {scene.name: scene.camera for scene in before}
         for scene in dataset.scenes:  # what was seen by another camera is no longer valid; maps know theirs
             if cameras.get(scene.name, camera) != camera:
                 forget_stamp(scene, "sample")

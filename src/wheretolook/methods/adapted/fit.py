@@ -17,7 +17,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.special import expit
 
 from wheretolook.geometry.poses import Float
-from wheretolook.methods.adapted.kernel import nearness
+from wheretolook.methods.adapted.kernel import Correction, nearness
 
 LENGTHS_M, AMPLITUDES, SHARPNESS = (0.5, 1.0, 2.0), (1.0, 3.0), 4.0
 """Kernels that are tried: lengths, and variances of g. Chosen on the val scenes of configs/cameras.yaml, as was the
@@ -63,8 +63,8 @@ class Adaptation:
         """Adapted log-odds (B,)."""
         found = self.scale * views.log_odds + self.offset
         if len(self.weights):
-            of_views, of_support = (views.centers, views.axes), (self.centers, self.axes)
-            found = found + nearness(*of_views, *of_support, self.length_m, self.sharpness) @ self.weights
+            correction = Correction(self.centers, self.axes, self.weights, self.length_m, self.sharpness)
+            found = found + correction.at(views.centers, views.axes)
         return found
 
 

@@ -47,7 +47,10 @@ class Correction:
 
     def grid(self, locations: Float, directions: Float) -> Float:
         """The correction (L, D) of views at locations (L, 3) along each of directions (D, 3)."""
-        return np.stack([self._around(location, directions) for location in locations])
+        found = np.empty((len(locations), len(directions)))
+        for row, location in enumerate(locations):
+            found[row] = self._around(location, directions)
+        return found
 
     def _around(self, location: Float, axes: Float) -> Float:
         near = self._near(location)

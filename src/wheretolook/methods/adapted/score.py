@@ -93,6 +93,9 @@ def _check_place(place: Float, localization_map: LocalizationMap) -> None:
     distance = cKDTree(points).query(place)[0] if len(points) else np.full(len(place), np.inf)
     same = float((distance <= SAME_M).mean())
     if same < LEAST_SAME:
-        fix = "Adapt to this map, or use weights that are for any place, such as those that ship."
+        fix = (
+            "Adapt to this map, or use weights that are for any place, such as those that ship; to insist, in Python "
+            "load_scorer(path, map, anywhere=True)."
+        )
         problem = f"these weights are adapted to another place: of its landmarks this map has {same:.0%}"
         raise WeightsError(problem, fix=fix)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import signal
+import time
 from pathlib import Path
 
 import pytest
@@ -66,10 +67,10 @@ def test_a_plan_with_numbers_that_are_not_finite_is_refused(
     assert message in capsys.readouterr().err
 
 
-def test_ctrl_c_stays_one_where_a_library_makes_another_error_of_it(
+def test_ctrl_c_stays_one_where_it_is_lost_or_made_another_error_of(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """As safetensors does while it reads a tensor."""
+    """As Python does while it removes an object, and safetensors while it reads a tensor."""
 
     def reads(*_: object) -> int:
         gc.collect()  # one in the next moment would swallow the interrupt, as hypothesis listens to collections
@@ -79,6 +80,18 @@ def test_ctrl_c_stays_one_where_a_library_makes_another_error_of_it(
             raise ValueError("could not determine the shape") from error
         return 0
 
+    class Removed:
+        def __del__(self) -> None:
+            signal.raise_signal(signal.SIGINT)
+
+    def goes_on(*_: object) -> int:
+        Removed()
+        time.sleep(60)
+        return 0
+
+    monkeypatch.setattr(cli, "_run", goes_on)
+    assert main(["scenes"]) == 130
+    assert "Traceback" not in capsys.readouterr().err
     monkeypatch.setattr(cli, "_run", reads)
     assert main(["scenes"]) == 130
     assert "wheretolook: interrupted" in capsys.readouterr().err

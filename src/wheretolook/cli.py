@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import _thread
 import logging
 import os
 import signal
@@ -250,6 +251,7 @@ of your own map, without a dataset:
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line. Returns the exit code: 0, 2 for bad input, 130 when interrupted."""
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # idle threads leave the core to other processes
+    os.environ.setdefault("GLOG_logtostderr", "1")  # COLMAP leaves no log files in the folder of temporary files
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in arguments
     arguments = [argument for argument in arguments if argument != "--debug"]
@@ -292,11 +294,23 @@ def _noting(interrupts: list[int]) -> Iterator[None]:
         interrupts.append(number)
         signal.default_int_handler(number, frame)
 
+    def interrupt_again(lost: sys.UnraisableHookArgs) -> None:
+        if lost.exc_type is KeyboardInterrupt:  # it came while an object was removed, where Python drops errors
+            later.append(threading.Timer(0.01, _thread.interrupt_main))
+            later[-1].start()
+        else:
+            usual(lost)
+
+    later: list[threading.Timer] = []
+    usual, sys.unraisablehook = sys.unraisablehook, interrupt_again
     signal.signal(signal.SIGINT, note)
     try:
         yield
     finally:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+        sys.unraisablehook = usual
+        for timer in later:
+            timer.cancel()
 
 
 def _in_main_thread() -> bool:

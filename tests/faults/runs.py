@@ -38,6 +38,7 @@ def import_everything() -> None:
     """So that a forked process has it all. Nothing is computed, for threads do not survive a fork."""
     import wheretolook
 
+    os.environ["GLOG_logtostderr"] = "1"  # as `wheretolook.cli.main` does before COLMAP is loaded
     for module in pkgutil.walk_packages(wheretolook.__path__, "wheretolook."):
         with contextlib.suppress(ImportError):  # what optional packages would be needed for
             importlib.import_module(module.name)
@@ -86,7 +87,7 @@ class Run:
         code = 1
         try:
             os.setsid()
-            signal.signal(signal.SIGINT, signal.default_int_handler)
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
             os.chdir(self.folder)
             for number, kind in ((1, "out"), (2, "err")):
                 file = os.open(self._beside(kind), os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
@@ -104,6 +105,7 @@ class Run:
             if hook is not None:
                 hook()
             Figure.savefig = _no_picture  # type: ignore[method-assign]
+            signal.signal(signal.SIGINT, signal.default_int_handler)
             code = importlib.import_module("wheretolook.cli").main(self.arguments)
             threading._shutdown()  # type: ignore[attr-defined]
             atexit._run_exitfuncs()
@@ -201,6 +203,8 @@ def at_file_events(folder: Path, do: Callable[[int], None]) -> Hook:
                     return
             elif event not in _EVENTS:
                 return
+            if event in ("os.remove", "os.rmdir") and arguments[1] != -1:
+                return  # a part of a folder that is being removed, elsewhere perhaps
             path = arguments[0]
             if not isinstance(path, (str, os.PathLike)) or os.getpid() != mine:
                 return

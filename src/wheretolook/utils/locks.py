@@ -151,11 +151,13 @@ def _is_at(lock: Path, file: int) -> bool:
 
 def _release(lock: Path, file: int) -> None:
     """Let go; the last one removes the file, which it alone holds then, so that nobody can lock what is removed."""
-    with suppress(OSError):
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        if _is_at(lock, file):
-            lock.unlink()
-    os.close(file)
+    try:
+        with suppress(OSError):
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if _is_at(lock, file):
+                lock.unlink()
+    finally:
+        os.close(file)
 
 
 def _forget() -> None:

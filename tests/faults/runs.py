@@ -38,7 +38,7 @@ def import_everything() -> None:
     """So that a forked process has it all. Nothing is computed, for threads do not survive a fork."""
     import wheretolook
 
-    os.environ["GLOG_logtostderr"] = "1"  # as `wheretolook.cli.main` does before COLMAP is loaded
+    os.environ["GLOG_logtostderr"] = "1"  # noqa: SIM112 - as `cli.main` does before COLMAP is loaded
     for module in pkgutil.walk_packages(wheretolook.__path__, "wheretolook."):
         with contextlib.suppress(ImportError):  # what optional packages would be needed for
             importlib.import_module(module.name)

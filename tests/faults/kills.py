@@ -31,10 +31,13 @@ class Outcome:
 
 
 def planned(cases: Sequence[Case], n: int, rng: random.Random) -> list[tuple[Case, str]]:
-    """Cases and kinds of kills, all equally often, but those with workers, which take longer, half as often."""
+    """Cases and kinds of kills, all equally often, but those with workers, which take longer, half as often.
+
+    But a worker is killed three times as often as that.
+    """
     pairs: list[tuple[Case, str]] = []
     for case in cases:
-        kinds = KINDS if case.workers else KINDS[:4] * 2
+        kinds = (*KINDS, *KINDS[4:] * 2) if case.workers else KINDS[:4] * 2
         pairs += [(case, kind) for kind in kinds]
     chosen: list[tuple[Case, str]] = []
     while len(chosen) < n:
@@ -154,7 +157,7 @@ def _kill_a_worker(run: Run, rng: random.Random) -> None:
 
 
 def _until(condition: Callable[[], bool], run: Run) -> None:
-    while not condition():
+    while run.code is None and not condition():
         pid, status = os.waitpid(run.pid, os.WNOHANG)
         if pid:
             run.code = os.waitstatus_to_exitcode(status)

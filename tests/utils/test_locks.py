@@ -140,3 +140,17 @@ def test_a_link_or_a_pipe_is_no_lock(tmp_path: Path) -> None:
 def test_a_reader_needs_no_folder_and_makes_none(tmp_path: Path) -> None:
     with hold(tmp_path / "missing" / "lock", "plan", shared=True):
         assert not (tmp_path / "missing").exists()
+
+
+def test_ctrl_c_at_the_very_end_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    unlink, interrupts = Path.unlink, iter([True])
+
+    def interrupted(path: Path, missing_ok: bool = False) -> None:
+        if next(interrupts, False):
+            raise KeyboardInterrupt
+        unlink(path, missing_ok)
+
+    monkeypatch.setattr(Path, "unlink", interrupted)
+    with pytest.raises(KeyboardInterrupt), hold(tmp_path / "lock", "label"):
+        pass
+    assert not list(tmp_path.iterdir())

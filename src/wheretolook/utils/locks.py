@@ -152,12 +152,19 @@ def _is_at(lock: Path, file: int) -> bool:
 def _release(lock: Path, file: int) -> None:
     """Let go; the last one removes the file, which it alone holds then, so that nobody can lock what is removed."""
     try:
-        with suppress(OSError):
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if _is_at(lock, file):
-                lock.unlink()
+        _remove(lock, file)
+    except KeyboardInterrupt:
+        _remove(lock, file)
+        raise
     finally:
         os.close(file)
+
+
+def _remove(lock: Path, file: int) -> None:
+    with suppress(OSError):
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if _is_at(lock, file):
+            lock.unlink()
 
 
 def _forget() -> None:

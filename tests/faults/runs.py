@@ -105,8 +105,9 @@ class Run:
             if hook is not None:
                 hook()
             Figure.savefig = _no_picture  # type: ignore[method-assign]
+            main_of = importlib.import_module("wheretolook.cli").main
             signal.signal(signal.SIGINT, signal.default_int_handler)
-            code = importlib.import_module("wheretolook.cli").main(self.arguments)
+            code = main_of(self.arguments)
             threading._shutdown()  # type: ignore[attr-defined]
             atexit._run_exitfuncs()
         except BaseException:

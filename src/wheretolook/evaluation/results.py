@@ -6,7 +6,6 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,7 @@ from wheretolook.evaluation.views import CandidateSet
 from wheretolook.geometry.poses import Float
 from wheretolook.methods.registry import methods_named, scorers
 from wheretolook.methods.styles import ORACLE
-from wheretolook.utils.files import fingerprint, replacing
+from wheretolook.utils.files import fingerprint, replacing, temporary_folder
 from wheretolook.utils.tracking import (
     FINGERPRINT_TAG,
     NestedRun,
@@ -212,12 +211,12 @@ def log_evaluation(
     metrics |= {"n_locations": views.n_locations, "n_views": len(views.good), "positives": positives}
     tags = {"dataset": dataset.name, FINGERPRINT_TAG: mark, **best}
     opened = start_run(tracking, ALL_METHODS, "evaluate", params, tags=tags)
-    with TemporaryDirectory() as folder, opened as (client, run):
+    with temporary_folder() as folder, opened as (client, run):
         log(client, run, metrics=metrics)
         for file in results.iterdir():
             if file.is_file() and file.suffix != ".partial":  # a killed process may have left one
                 client.log_artifact(run, str(file))
-        file = Path(folder) / LOCATIONS_PARQUET
+        file = folder / LOCATIONS_PARQUET
         log_nested(tracking, run, "evaluate", _runs_with_locations(evaluation.scored, params, scenes, config, file))
 
 

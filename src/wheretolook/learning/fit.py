@@ -12,7 +12,6 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import pandas as pd
@@ -26,6 +25,7 @@ from tqdm.auto import tqdm
 from wheretolook.learning.classifier import ViewpointClassifier
 from wheretolook.learning.config import FittingConfig, SharedConfig
 from wheretolook.utils.errors import ConfigError, TrackingError, WorkerError
+from wheretolook.utils.files import temporary_folder
 from wheretolook.utils.tracking import client
 from wheretolook.utils.tracking_config import TrackingConfig
 
@@ -61,13 +61,13 @@ def fit(classifier: ViewpointClassifier, data: LightningDataModule, record: Epoc
     if options.patience is not None:
         callbacks.append(EarlyStopping(MONITORED, mode="max", patience=options.patience))
     several = config.devices > 1
-    with _quiet(), TemporaryDirectory() as folder:
+    with _quiet(), temporary_folder() as folder:
         if several:
-            record.file = Path(folder) / "record.pt"
+            record.file = folder / "record.pt"
         where: dict[str, Any] = {"accelerator": config.accelerator, "devices": config.devices}
         if several:  # spawned processes run nothing but the fit; those that run the program anew would repeat all else
             where["strategy"] = _Spawned(start_method="spawn")
-            where["strategy"].temporary = folder
+            where["strategy"].temporary = str(folder)
             where["accelerator"] = "cpu" if home_device(config) == "cpu" else config.accelerator
         quiet: dict[str, Any] = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False}
         how: dict[str, Any] = {"max_epochs": options.epochs, "callbacks": callbacks, "num_sanity_val_steps": 0}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -28,7 +27,7 @@ from wheretolook.mapping.colmap_files import (
 )
 from wheretolook.utils.colmap import quiet_colmap
 from wheretolook.utils.errors import MapError, StorageError
-from wheretolook.utils.files import MAKE_ROOM, storing
+from wheretolook.utils.files import MAKE_ROOM, storing, temporary_folder
 from wheretolook.utils.npz_files import load_npz, save_npz
 
 CAMERAS_FILE = "cameras.npz"  # lies beside the landmarks, small enough to travel without the COLMAP model
@@ -90,9 +89,9 @@ def read_model(model_dir: str | Path) -> Any:
         found = (reconstruction.num_cameras(), reconstruction.num_images(), reconstruction.num_points3D())
         for name, number in zip(MODEL_FILES, found, strict=True):
             check_text_count(folder / f"{name}.txt", number)
-        with TemporaryDirectory() as copy:
+        with temporary_folder() as copy:
             reconstruction.write_binary(copy)
-            check_binary(Path(copy), folder, suffix)
+            check_binary(copy, folder, suffix)
     return reconstruction
 
 
@@ -222,12 +221,12 @@ class _StoredPoints:
 
 def _stored_points(reconstruction: Any) -> _StoredPoints:
     """Points and tracks of a reconstruction, by way of a file: asked for one by one, 500,000 take a quarter minute."""
-    with TemporaryDirectory() as folder:
+    with temporary_folder() as folder:
         reconstruction.write_binary(folder)
-        data = np.fromfile(Path(folder) / "points3D.bin", dtype=np.uint8)
+        data = np.fromfile(folder / "points3D.bin", dtype=np.uint8)
     starts = point_starts(data.tobytes())
     if starts[-1] < 0:  # pycolmap does not notice a full disk
-        path = Path(folder) / "points3D.bin"
+        path = folder / "points3D.bin"
         raise StorageError("cannot be written whole: is the disk full?", path=path, fix=MAKE_ROOM)
     heads, elements = point_heads(data, starts), track_elements(data, starts).astype(np.int64)
     lengths, order = heads["n"].astype(np.int64), np.argsort(heads["id"])

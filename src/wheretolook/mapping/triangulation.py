@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,6 +16,7 @@ from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.local_origin import local_origin
 from wheretolook.geometry.poses import camera_centers, transform
 from wheretolook.utils.colmap import quiet_colmap, storing_in_database
+from wheretolook.utils.files import temporary_folder
 from wheretolook.utils.processes import Processes
 
 if TYPE_CHECKING:
@@ -159,8 +159,8 @@ def _run_match_job(job: MatchJob) -> list[NDArray[np.uint32]]:
 
     pairs, stored, parent = job
     matching = pycolmap.FeatureMatchingOptions(num_threads=1, skip_geometric_verification=True)
-    with TemporaryDirectory(".partial", dir=parent) as folder:
-        database, listed = Path(folder) / "database.db", Path(folder) / "pairs.txt"
+    with temporary_folder(".partial", parent=parent) as folder:
+        database, listed = folder / "database.db", Path(folder) / "pairs.txt"
         # Any camera and poses do: only verification would use them.
         fill_database(database, _posed_model(PinholeCamera(), np.tile(np.eye(3, 4), (len(stored), 1, 1))), stored)
         listed.write_text("".join(f"{image_name(i)} {image_name(j)}\n" for i, j in pairs))

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import pandas as pd
 
 from wheretolook.figures.runtimes import runtime_figure, scaling_figure
 from wheretolook.figures.style import save_figure
-from wheretolook.utils.files import copy_file
+from wheretolook.utils.files import copy_file, temporary_folder
 from wheretolook.utils.tracking import Tags, log, start_run
 from wheretolook.utils.tracking_config import TrackingConfig
 
@@ -31,17 +30,17 @@ def log_runtimes(
         metrics["".join(letter for letter in name if letter.isalnum() or letter == " ")] = float(row["median_s"])
     machines = " + ".join(dict.fromkeys(map(str, sizes["name"])))
     with (
-        TemporaryDirectory() as folder,
+        temporary_folder() as folder,
         start_run(tracking, "visibility check", "benchmark", {"machines": machines}, tags=tags) as (client, run),
     ):
         log(client, run, metrics=metrics)
         if file is None:
-            sizes.to_csv(Path(folder) / RUNTIMES_CSV, index=False)
+            sizes.to_csv(folder / RUNTIMES_CSV, index=False)
         else:
-            copy_file(file, Path(folder) / RUNTIMES_CSV)
-        save_figure(runtime_figure(sizes), Path(folder) / "runtimes.png")
+            copy_file(file, folder / RUNTIMES_CSV)
+        save_figure(runtime_figure(sizes), folder / "runtimes.png")
         if len(growth):
-            growth.to_csv(Path(folder) / SCALING_CSV, index=False)
-            save_figure(scaling_figure(growth), Path(folder) / "visibility-scaling.png")
+            growth.to_csv(folder / SCALING_CSV, index=False)
+            save_figure(scaling_figure(growth), folder / "visibility-scaling.png")
         client.log_artifacts(run, folder)
     return run

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import pandas as pd
@@ -31,7 +30,7 @@ from wheretolook.methods.registry import learned
 from wheretolook.planning.path_report import PATHS_CSV, log_paths
 from wheretolook.release.benchmark_runs import RUNTIMES_CSV, SCALING_CSV, log_runtimes
 from wheretolook.release.card import GENERALIZATION_CSV
-from wheretolook.utils.files import write_text
+from wheretolook.utils.files import temporary_folder, write_text
 from wheretolook.utils.locks import hold
 from wheretolook.utils.tracking import NestedRun, artifact, experiment_ids, finished_runs, log, log_nested, start_run
 from wheretolook.utils.tracking import client as client_of
@@ -155,8 +154,8 @@ def _log_others(name: str, table: pd.DataFrame, dataset: Dataset, tracking: Trac
     """An evaluation on another dataset, which does not ship."""
     scenes = " ".join(scene for scene in table["scene"].unique() if scene != ALL)
     params = {"dataset": name, "scenes": scenes, "weights": f"of {dataset.name}", **_choices(table)}
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / SCORES_CSV
+    with temporary_folder() as folder:
+        path = folder / SCORES_CSV
         path.write_bytes(table.to_csv(index=False).encode())
         return _log_evaluation(name, table, params, {}, [path], tracking)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 from wheretolook.config import Experiment
 from wheretolook.dataset.folders import Dataset
@@ -11,6 +10,7 @@ from wheretolook.figures.config import FiguresConfig
 from wheretolook.stages.inputs import Say
 from wheretolook.stages.one_at_a_time import reads_dataset
 from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.files import temporary_folder
 from wheretolook.utils.tracking import ui_command
 from wheretolook.utils.tracking_store import check_store
 
@@ -37,7 +37,7 @@ def log_release(experiment: Experiment, say: Say = print, attach: bool = True) -
     runs = log_runs(dataset, experiment.tracking, say)
     if runs.new and attach:
         say("attaching figures and tables")
-        with TemporaryDirectory() as folder:
+        with temporary_folder() as folder:
             config = FiguresConfig(Path(folder), QUICK, ("png",))
             write_items(dataset, experiment.tracking, config, lambda text: None)
     say(f"{runs.new} runs are new; all runs: {ui_command(experiment.tracking)}")

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from wheretolook.config import Experiment
@@ -17,7 +16,7 @@ from wheretolook.stages.inputs import Say, Tick, dataset_after
 from wheretolook.stages.one_at_a_time import reading, reads_dataset
 from wheretolook.utils.confine import entry_of
 from wheretolook.utils.errors import TrackingError
-from wheretolook.utils.files import sha256, write_json, write_text
+from wheretolook.utils.files import sha256, temporary_folder, write_json, write_text
 from wheretolook.utils.tracking import log, start_run
 from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.utils.tracking_store import check_store, kept_if_not_logged, warn_not_logged
@@ -156,8 +155,8 @@ def _log_artifacts(client: MlflowClient, run_id: str, weights: Path, history: pd
     client.log_artifact(run_id, str(weights))
     if history is None:
         return
-    with TemporaryDirectory() as folder:
-        table, curves = Path(folder) / HISTORY_CSV, Path(folder) / "curves.png"
+    with temporary_folder() as folder:
+        table, curves = folder / HISTORY_CSV, Path(folder) / "curves.png"
         write_text(table, history.to_csv(index=False))
         save_figure(training_figure({method: history}), curves)
         for file in (table, curves):

@@ -5,7 +5,9 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import secrets
 import shutil
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -81,6 +83,24 @@ def moved_later(folder: Path, place: Path) -> Iterator[None]:
             raise
         path = place / Path(error.path).relative_to(folder)
         raise StorageError(error.problem, path=path, value=error.value, fix=error.fix) from error
+
+
+@contextmanager
+def temporary_folder(suffix: str = "", prefix: str = "wheretolook-", parent: Path | None = None) -> Iterator[Path]:
+    """A folder, that of temporary files as a parent or another one, that is removed at the end.
+
+    Unlike one of `tempfile.TemporaryDirectory`, Ctrl-C leaves none behind when it comes while it is made or removed.
+    """
+    folder = Path(tempfile.gettempdir() if parent is None else parent) / f"{prefix}{secrets.token_hex(8)}{suffix}"
+    try:
+        folder.mkdir(mode=0o700)
+        yield folder
+    finally:
+        try:
+            shutil.rmtree(folder, ignore_errors=True)
+        except KeyboardInterrupt:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
 
 
 def sha256(path: Path) -> str:

@@ -18,11 +18,11 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from functools import cache
 from pathlib import Path
-from tempfile import TemporaryDirectory, TemporaryFile
+from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Any, cast
 
 from wheretolook.utils.errors import StorageError, TrackingError, TrackingWarning
-from wheretolook.utils.files import copy_file, storing, write_json
+from wheretolook.utils.files import copy_file, storing, temporary_folder, write_json
 from wheretolook.utils.locks import hold
 from wheretolook.utils.tracking_config import TrackingConfig
 
@@ -120,8 +120,8 @@ def _make(root: Path, database: Path) -> None:
             shutil.rmtree(leftover, ignore_errors=True)
         with storing(root), TemporaryFile(dir=root) as file:
             file.write(bytes(2 * ROOM_BYTES))
-        with TemporaryDirectory(prefix=".making-", dir=root) as folder:
-            new = Path(folder) / "mlflow.db"
+        with temporary_folder(prefix=".making-", parent=root) as folder:
+            new = folder / "mlflow.db"
             mlflow_package().MlflowClient(tracking_uri=f"sqlite:///{new}").search_experiments(max_results=1)
             copy_file(new, database)
 

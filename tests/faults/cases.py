@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import json
 import os
 import shutil
 import subprocess
@@ -12,6 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatch
 from pathlib import Path
+from typing import Any
 
 from faults.runs import at_file_events, contents, run
 
@@ -40,6 +42,7 @@ PATHS = ["--paths.pairs", "1", "--paths.methods", "[forward,visible]", "--paths.
 SPACE = ["--scene", "two", "--method", "visible", "--viewpoint_map.grid", "[4,4,2]", "--viewpoint_map.directions", "20"]
 VARYING = (
     "*/map/report.json",
+    "*/photos/room/map/*",
     "*/weights/*.json",
     "*/path/*",
     "*/room/photographs/*",
@@ -48,7 +51,8 @@ VARYING = (
     "*/scores.md",
     "*/compared.json",
 )
-"""Files that hold run ids or the seconds that steps took, or paths that are planned against the clock."""
+"""Files that hold run ids or the seconds that steps took, or paths that are planned against the clock, or a map of
+photographs, whose last digits depend on how COLMAP's threads share the work: of it, `_counts` are compared."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,6 +249,14 @@ class Workshop:
         missing = [f"missing: {path}" for path in sorted({*expected} - {*found})]
         left = [f"left over: {path}" for path in sorted({*found} - {*expected})]
         fixed = [path for path in expected if not any(fnmatch(f"/{path}", pattern) for pattern in VARYING)]
-        return (
-            missing + left + [f"other: {path}" for path in fixed if found.get(path, expected[path]) != expected[path]]
-        )
+        other = [f"other: {path}" for path in fixed if found.get(path, expected[path]) != expected[path]]
+        counts = [_counts(folder) for folder in (self.folder, self.state(case.after or case.name))]
+        return missing + left + other + [f"other counts: {counts}"] * (counts[0] != counts[1])
+
+
+def _counts(folder: Path) -> dict[str, Any]:
+    """What the report of a map of photographs counts; nothing if there is no such map."""
+    report = folder / "data" / "photos" / "room" / "map" / "report.json"
+    content = json.loads(report.read_text()) if report.exists() else {}
+    counted = ("n_images", "n_registered", "model_sizes", "n_keypoints", "n_landmarks")
+    return {name: content[name] for name in counted if name in content}

@@ -190,21 +190,23 @@ def scores() -> pd.DataFrame:
 def test_occlusion_figure_draws_every_method_by_model(scores: pd.DataFrame, tmp_path: Path) -> None:
     figure = occlusion_figure(scores)
     left, right = figure.axes
-    assert [label.get_text() for label in left.get_yticklabels()] == ["MLP, 2d", "reprojections with bins"]
+    first = scores[(scores["scene"] == "all") & (scores["top_n"] == 1)]
+    mesh = first[(first["occlusion"] == "mesh") & first["method"].isin(["bins", "mlp-2d"])]
+    best_first = list(mesh.sort_values("normalized_0.05m_0.4deg", ascending=False)["method"])
+    assert [label.get_text() for label in left.get_yticklabels()] == [method_style(one).label for one in best_first]
     (legend,) = figure.legends
     names = [text.get_text() for text in legend.get_texts()]
     assert names == ["mesh rays", "hidden-point removal", "none", "random", "oracle"]
-    first = scores[(scores["scene"] == "all") & (scores["top_n"] == 1)]
     for method in METHODS[1:3]:
         rows = first[first["method"] == method]
         style = method_style(method)
         np.testing.assert_allclose(_line(left, style.label).get_xdata(), rows["average_precision"])
         drawn = _line(right, style.label)
         np.testing.assert_allclose(drawn.get_xdata(), 100 * rows["normalized_0.05m_0.4deg"])
-        row = {"mlp-2d": 0, "bins": 1.6}[method]
+        row = best_first.index(method)
         assert np.abs(np.asarray(drawn.get_ydata()) - row).max() < 0.5 and drawn.get_color() == style.color
     ends = [segment[:, 0] for collection in right.collections for segment in collection.get_segments()]  # type: ignore[attr-defined]
-    shown = first[first["method"].isin(["bins", "mlp-2d"])].sort_values("method", kind="stable", ascending=False)
+    shown = pd.concat([first[first["method"] == method] for method in best_first])
     columns = ["normalized_low_0.05m_0.4deg", "normalized_high_0.05m_0.4deg"]
     np.testing.assert_allclose(ends, 100 * shown[columns].to_numpy())
     assert set(_line(left, "random").get_xdata()) == {0.25}

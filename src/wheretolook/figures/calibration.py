@@ -9,7 +9,7 @@ from matplotlib.style import context
 
 from wheretolook.evaluation.score_table import main_rows, methods_of
 from wheretolook.figures.config import Look
-from wheretolook.figures.style import INK, RC, new_figure
+from wheretolook.figures.style import GREY, INK, RC, new_figure
 from wheretolook.methods.method import MethodStyle
 from wheretolook.methods.styles import method_style
 
@@ -20,8 +20,9 @@ def calibration_figure(table: pd.DataFrame) -> Figure:
     """Reliability diagram of each learned method before (open marks) and after temperature scaling (filled).
 
     One column for each method: above, the share of good views over the mean prediction of each bin; below, the number
-    of views in each bin. `table` is `calibration.csv` of the evaluate stage: a row for each method, `when` ("before",
-    "after") and bin. Of several occlusion models or sets of candidates the first is drawn.
+    of views in each bin. Above the diagonal a method is too careful, below it too sure. `table` is `calibration.csv` of
+    the evaluate stage: a row for each method, `when` ("before", "after") and bin. Of several occlusion models or sets
+    of candidates the first is drawn.
     """
     table = main_rows(table)
     methods = methods_of(table)
@@ -37,6 +38,8 @@ def calibration_figure(table: pd.DataFrame) -> Figure:
                 if len(part):
                     _draw(curve, counts, part, style, when)
             curve.set(title=style.label, xlim=(0, 1), ylim=(0, 1))
+            for x, y, text in ((0.3, 0.7, "too careful"), (0.7, 0.3, "too sure")):
+                curve.text(x, y, text, color=GREY, fontsize=9, ha="center", rotation=45, rotation_mode="anchor")
             curve.legend(handlelength=1.6, borderaxespad=0.2)
             counts.set_xlabel("predicted probability")
             counts.yaxis.set_major_formatter("{x:,.0f}")

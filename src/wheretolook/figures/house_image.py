@@ -35,13 +35,16 @@ class Dollhouse:
         return self.camera.project(transform(self.cam_from_world, world.reshape(-1, 3))).reshape(*world.shape[:-1], 2)
 
     def shows(self, points: ArrayLike, margin_m: float = 0.1) -> NDArray[np.bool_]:
-        """Which world points (N, 3) in metres lie in the picture, and at most the margin behind a surface; (N,)."""
+        """Which world points (N, 3) in metres lie on a surface in the picture, to the margin; (N,).
+
+        Not, then, points of what is hidden, and of walls that are cut off or left out: they would float.
+        """
         in_camera = transform(self.cam_from_world, points)
         pixels = self.camera.project(in_camera)
         inside = self.camera.in_image(pixels)
         column, row = np.where(inside[:, None], pixels, 0).astype(int).T
         depth = self.depth_m[row, column]
-        return inside & ((depth == 0) | (in_camera[:, 2] <= depth + margin_m))
+        return inside & (np.abs(in_camera[:, 2] - depth) <= margin_m)
 
 
 def dollhouse(

@@ -13,8 +13,9 @@ from matplotlib.style import context
 
 from wheretolook.evaluation.score_table import main_rows, methods_of, threshold_keys
 from wheretolook.evaluation.scores import by_chance
+from wheretolook.figures.scores import methods_to_show
 from wheretolook.figures.style import INK, RC, new_figure
-from wheretolook.methods.styles import ORACLE, method_style, rows_by_group
+from wheretolook.methods.styles import ORACLE, method_style
 from wheretolook.viewpoints.thresholds import ALL, threshold_label
 
 _LABELS = {"mesh": "mesh rays", "tsdf": "TSDF", "hidden-points": "hidden-point removal", "none": "none"}
@@ -25,7 +26,8 @@ def occlusion_figure(scores: pd.DataFrame) -> Figure:
     """Average precision and share of good best views of each method, by occlusion model.
 
     The share is that at the finest threshold, in % of the oracle's, with bootstrap intervals. A row for each method, a
-    mark for each occlusion model; the random choice and the oracle are lines. `scores` are tables of
+    mark for each occlusion model; the random choice and the oracle are lines. Shown are the methods that
+    `figures.scores.methods_to_show` chooses, on axes that begin where the marks do. `scores` are tables of
     `wheretolook.evaluation.scores.score_table`, one below the other, with a column `occlusion`; the rows over all
     scenes, of the first N and the first set of candidates, are drawn.
     """
@@ -34,16 +36,19 @@ def occlusion_figure(scores: pd.DataFrame) -> Figure:
     pooled = scores[(scores["scene"] == ALL) & (scores["top_n"] == n) & (scores["method"] != ORACLE)]
     models = list(pooled["occlusion"].unique())
     chosen = "best view" if n == 1 else f"best {n} views"
-    methods = [method for method in methods_of(pooled) if not by_chance(method)]
-    y = rows_by_group(methods)
+    first = pooled[pooled["occlusion"] == models[0]]
+    methods = [method for method in methods_to_show(first, key) if not by_chance(method)]
+    y = {method: float(row) for row, method in enumerate(methods)}
     with context(RC):
         figure = new_figure(8.0, 1.5 + 0.3 * (max(y.values(), default=0) + 1))
         left, right = figure.subplots(1, 2, sharey=True)
         _draw(left, pooled, models, y, "average_precision", 1.0)
         columns = (f"normalized_{end}{key}" for end in ("", "low_", "high_"))
         _draw(right, pooled, models, y, next(columns), 100.0, *columns)
-        left.set(xlabel=f"average precision\n{threshold_label(key)}", xlim=(0, 1.02))
-        right.set(xlabel=f"{chosen} within {threshold_label(key)}\n% of the oracle's share", xlim=(0, 104))
+        left.set(xlabel=f"average precision\n{threshold_label(key)}", xlim=(_begin(left, 0.1), 1.02))
+        right.set(
+            xlabel=f"{chosen} within {threshold_label(key)}\n% of the oracle's share", xlim=(_begin(right, 10), 104)
+        )
         figure.supxlabel("whiskers: 95 % bootstrap interval over locations", fontsize=8)
         right.axvline(100, color=INK, linewidth=1, linestyle="--", label=method_style(ORACLE).label)
         left.set_yticks(list(y.values()), [method_style(method).label for method in y], fontsize=9)
@@ -58,6 +63,11 @@ def occlusion_figure(scores: pd.DataFrame) -> Figure:
         return figure
 
 
+def _begin(axes: Axes, step: float) -> float:
+    """Where an axis begins: at the whole step below all that is drawn, and not below 0."""
+    return max(0.0, float(step * np.floor(axes.dataLim.x0 / step)))
+
+
 def _mark(number: int, color: str) -> dict[str, Any]:
     """Look of the mark of an occlusion model, by its number; the first is filled."""
     fill = color if number == 0 else "white"
@@ -67,13 +77,16 @@ def _mark(number: int, color: str) -> dict[str, Any]:
 def _draw(
     axes: Axes, pooled: pd.DataFrame, models: list[str], y: dict[str, float], column: str, scale: float, *ends: str
 ) -> None:
-    """A line from model to model for each method, and their marks; `ends` names the columns of whiskers."""
+    """A method's marks, joined by a line, or with whiskers, one below the other, if `ends` names their columns."""
     for method, place in y.items():
         style = method_style(method)
         rows = pooled[pooled["method"] == method]
         by_model = scale * rows.set_index("occlusion").reindex(models)[[column, *ends]]
-        shift = 0.16 * (np.arange(len(models)) - (len(models) - 1) / 2) if ends else np.zeros(len(models))
-        axes.plot(by_model[column], place + shift, color=style.color, linewidth=1, label=style.label)
+        shift = 0.2 * (np.arange(len(models)) - (len(models) - 1) / 2) if ends else np.zeros(len(models))
+        joined = "none" if ends else "-"
+        axes.plot(
+            by_model[column], place + shift, color=style.color, linewidth=0.8, linestyle=joined, label=style.label
+        )
         for number, value in enumerate(by_model[column]):
             if ends:
                 low, high = (by_model[end].iloc[number] for end in ends)

@@ -25,7 +25,7 @@ Pixels = NDArray[np.uint8]
 
 PATH, SEEN = "#CC3311", "#EE9900"
 FRAMES_PER_SECOND = 8
-STILLS = 5
+STILLS, ARROWS = 5, 12
 
 
 def film_frames(views: Sequence[PathView], landmarks: Float) -> Iterator[Pixels]:
@@ -149,13 +149,15 @@ def _draw_map(
     low, high = np.percentile(landmarks[:, :2], (1, 99), axis=0)
     low, high = np.minimum(low, positions[:, :2].min(0)), np.maximum(high, positions[:, :2].max(0))
     axes.scatter(landmarks[:, 0], landmarks[:, 1], s=0.5, color="#9a9a9a", linewidths=0, rasterized=True)
-    axes.plot(*positions[:, :2].T, color=PATH, linewidth=1.6)
+    axes.plot(*positions[:, :2].T, color=PATH, linewidth=2.2, zorder=3)
     xy = [(float(x), float(y)) for x, y in positions[:, :2]]
     reach = 0.07 * float(np.max(high - low))
-    arrow: Look = {"arrowstyle": "-|>", "color": INK, "linewidth": 1.0, "shrinkA": 0, "shrinkB": 0}
-    for at in [number] if number is not None else range(0, len(views), max(1, len(views) // 25)):
+    arrow: Look = {"arrowstyle": "-|>", "color": INK, "linewidth": 0.9, "shrinkA": 0, "shrinkB": 0, "mutation_scale": 8}
+    along = lengths_along(positions)
+    apart = np.linspace(0, along[-1], ARROWS)  # evenly, and so few that they do not hide the path
+    for at in [number] if number is not None else np.unique(np.searchsorted(along, apart - 1e-9)):
         x, y = positions[at, :2] + views[at].axis[:2] * (2 if number is not None else 1) * reach
-        axes.annotate("", (float(x), float(y)), xy[at], arrowprops=arrow)
+        axes.annotate("", (float(x), float(y)), xy[at], arrowprops=arrow, zorder=2)
     disc: Look = {"boxstyle": "circle,pad=0.15", "facecolor": PATH, "edgecolor": "white"}
     for column, at in enumerate(() if shown is None else shown, 1):
         axes.annotate(str(column), xy[at], fontsize=9, color="white", ha="center", va="center", bbox=disc)
@@ -175,6 +177,8 @@ def _draw_scores(
     for column, at in enumerate(() if shown is None else shown, 1):
         side = "left" if at == 0 else "right" if at == len(views) - 1 else "center"
         axes.annotate(str(column), (along[at], scores[at]), (0, 6), textcoords="offset points", ha=side)
-    lowest, highest = min(0.0, *scores), max(1.0, *scores)  # NaN, for unknown, is never less nor more
-    axes.set(xlim=(0, max(along[-1], 1e-6)), ylim=(1.12 * lowest, 1.12 * highest))
+    known = scores[np.isfinite(scores)]
+    lowest, highest = (float(known.min()), float(known.max())) if len(known) else (0.0, 1.0)
+    room = max(0.25 * (highest - lowest), 0.02 * max(1.0, abs(highest)))  # a flat score stays in the middle
+    axes.set(xlim=(0, max(along[-1], 1e-6)), ylim=(lowest - room, highest + room))
     axes.set(xlabel="along the path (m)", ylabel="score")

@@ -10,8 +10,9 @@ from matplotlib.figure import Figure
 from matplotlib.style import context
 
 from wheretolook.figures.config import Look
-from wheretolook.figures.style import INK, RC, new_figure
+from wheretolook.figures.style import INK, RC, new_figure, scene_label
 from wheretolook.methods.styles import method_style
+from wheretolook.viewpoints.thresholds import ALL
 
 TITLES = {"planned": "places and views planned", "given": "views along a given path"}
 
@@ -19,32 +20,35 @@ TITLES = {"planned": "places and views planned", "given": "views along a given p
 def paths_figure(summary: pd.DataFrame) -> Figure:
     """Share of the views along paths that localize, from `wheretolook.planning.path_report.summarize_paths`.
 
-    A panel for each task, in it a bar for each scene (and all of them) and method, with 95 % intervals; hatched where
-    views were chosen by ActLoc's rule.
+    A panel for each task, in it a row for each scene, all of them together on top, and in each a mark for each method,
+    with 95 % intervals; open where views were chosen by ActLoc's rule.
     """
     with context(RC):
         tasks = list(dict.fromkeys(summary["task"]))
-        scenes = list(dict.fromkeys(summary["scene"]))
-        figure = new_figure(max(7.0, 1.5 + 1.1 * len(scenes)), 3.1 * len(tasks))
-        panels = figure.subplots(len(tasks), 1, sharex=True, squeeze=False)[:, 0]
+        scenes = sorted(dict.fromkeys(summary["scene"]), key=lambda name: name != ALL)
+        figure = new_figure(2.0 + 4.0 * len(tasks), 1.3 + 0.55 * len(scenes))
+        panels = figure.subplots(1, len(tasks), sharex=True, sharey=True, squeeze=False)[0]
         for axes, task in zip(panels, tasks, strict=True):
             rows = summary[summary["task"] == task]
             methods = list(dict.fromkeys(rows["method"]))
-            width = 0.8 / len(methods)
             for number, method in enumerate(methods):
                 of_method = rows[rows["method"] == method].set_index("scene").reindex(scenes)
-                at = np.arange(len(scenes)) + (number - (len(methods) - 1) / 2) * width
+                at = np.arange(len(scenes)) + 0.7 * ((number + 0.5) / len(methods) - 0.5)
                 name, _, rule = method.partition(" ")
                 style = method_style(name)
                 value, low, high = (100 * of_method[f"localized{end}"].to_numpy() for end in ("", "_low", "_high"))
-                label, hatch = (f"{style.label}, greedy", "////") if rule else (style.label, "")
-                look: Look = {"color": style.color, "hatch": hatch, "edgecolor": "white", "linewidth": 0.4}
-                axes.bar(at, value, 0.92 * width, label=label, **look)
-                whiskers = np.maximum(0, [value - low, high - value])  # few resamples may not enclose the share
-                axes.errorbar(at, value, whiskers, fmt="none", ecolor=INK, elinewidth=0.9)
-            axes.set(title=TITLES.get(task, task), ylabel="views that localize (%)", ylim=(0, 100))
-            axes.set_xticks(np.arange(len(scenes)), [name.replace("_", "\n", 1) for name in scenes])
-            axes.grid(axis="x", visible=False)
+                axes.hlines(at, low, high, color=style.color, linewidth=1.2)
+                look: Look = {"markersize": 6, "markerfacecolor": "white" if rule else style.color}
+                label = f"{style.label}, greedy" if rule else style.label
+                axes.plot(value, at, style.marker, color=style.color, label=label, **look)
+            axes.set_title(TITLES.get(task, task))
+            axes.set_xlabel("views along the paths that localize (%)")
+            axes.axhline(0.5, color=INK, linewidth=0.8)
+            axes.grid(axis="y", visible=False)
+            axes.tick_params(axis="y", length=0)
+        names = ["all scenes" if name == ALL else scene_label(name) for name in scenes]
+        panels[0].set_yticks(np.arange(len(scenes)), names)
+        panels[0].set(ylim=(len(scenes) - 0.5, -0.5), xlim=(None, 101))
         named: dict[str, Any] = {}
         for axes in panels:
             handles, labels = axes.get_legend_handles_labels()

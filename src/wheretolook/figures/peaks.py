@@ -63,9 +63,9 @@ def peaks_figure(
                 axes.set_title(f"{mark}  predicted {view.score:.2f}", loc="left")
                 axes.set_xlabel("\n".join(textwrap.wrap(view.outcome, _WIDE)), labelpad=2)
                 azimuth, elevation = map(float, pan_tilt_angles(view.direction))
-                look: Look = {"color": color, "fontsize": 9, "fontweight": "bold", "ha": "center", "va": "center"}
-                text = sphere.text(azimuth, elevation, mark, zorder=5, **look)
-                text.set_path_effects([withStroke(linewidth=2.5, foreground="white")])
+                look: Look = {"color": color, "fontsize": 8, "fontweight": "bold", "ha": "center", "va": "center"}
+                disc = {"boxstyle": "circle,pad=0.18", "facecolor": "white", "edgecolor": color}
+                sphere.text(azimuth, elevation, mark, zorder=5, bbox=disc, **look)
         return figure
 
 

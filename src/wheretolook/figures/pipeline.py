@@ -53,14 +53,14 @@ class Pipeline:
 def pipeline_figure(pipeline: Pipeline) -> Figure:
     """Map, sampled viewpoints, ranked viewpoints and the chosen camera, all drawn on the same picture of the scene.
 
-    The map's panel leaves out landmarks that are occluded in the picture.
+    Landmarks that lie on nothing in the picture, such as those of walls that are cut off, are left out.
     """
     with context(PRINT):
         top, bottom = _rows_drawn(pipeline.house)
         width = pipeline.house.rgb.shape[1]
         figure = new_figure(TWO_COLUMNS_IN, TWO_COLUMNS_IN * (bottom - top) / width + 0.6)
         panels = figure.subplots(2, 2).ravel()
-        for panel, fade in zip(panels, (0.45, 0.6, 0.6, 0.35), strict=True):
+        for panel, fade in zip(panels, (0.25, 0.45, 0.5, 0.15), strict=True):
             draw_house(panel, pipeline.house, fade)
             panel.set_ylim(bottom, top)
         _draw_map(panels[0], pipeline)
@@ -118,6 +118,7 @@ def _draw_ranks(
 
 def _draw_choice(axes: Axes, pipeline: Pipeline) -> None:
     seen = pipeline.landmarks[pipeline.seen]
+    seen = seen[pipeline.house.shows(seen)]
     draw_points(axes, pipeline.house, seen, s=1.2, color=ORANGE, rasterized=True)
     (corners,) = frustum_corners(pipeline.camera, pipeline.chosen, 0.7)
     pixels = pipeline.house.pixels(corners)

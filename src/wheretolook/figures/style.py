@@ -19,7 +19,7 @@ ONE_COLUMN_IN, TWO_COLUMNS_IN = 3.5, 7.2
 """Widths of figures for one and for two columns of a paper, inches. Their letters are as large as they will be in
 print: `PRINT`. Figures for the screen are wider, with the letters of `RC`."""
 
-INK, GRID = "#333333", "#d9d9d9"
+INK, GREY, GRID = "#333333", "#7a7a7a", "#d9d9d9"
 
 BLUE, SKY, GREEN, ORANGE, VERMILION, PURPLE = "#0072B2", "#56B4E9", "#009E73", "#E69F00", "#D55E00", "#CC79A7"
 """The colours of Okabe and Ito (2008), which colour-blind people can tell apart."""
@@ -43,6 +43,11 @@ def new_figure(width_in: float, height_in: float) -> Figure:
     """An empty figure in this style, independent of pyplot and its global state. Draw in `with context(RC):`."""
     with context(RC):
         return Figure(figsize=(width_in, height_in), layout="constrained")
+
+
+def scene_label(name: str) -> str:
+    """The name of a scene for people: "apartment 210" of "apartment-210"."""
+    return name.replace("_", " ").replace("-", " ")
 
 
 _NOTE = {"png": "Description", "pdf": "Subject", "svg": "Description"}

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import replace
-from typing import get_args
 
 from wheretolook.methods.method import Group, MethodStyle
 from wheretolook.methods.registry import find
 
 ORACLE = "oracle"  # name of what knows the labels and chooses the best there is, in tables and figures
-GROUPS: tuple[Group, ...] = get_args(Group)  # in the order of figures
 
 _ORACLE_STYLE = MethodStyle("oracle", "#000000", "*", "-")
 
@@ -30,14 +27,6 @@ def method_style(name: str) -> MethodStyle:
 
 
 def method_group(name: str) -> Group:
-    """Which of `GROUPS` a method belongs to; one that is not known is a rule."""
+    """Which group a method belongs to; one that is not known is a rule."""
     method = find(name)
     return "rules" if method is None else method.group
-
-
-def rows_by_group(methods: Iterable[str], gap: float = 0.6) -> dict[str, float]:
-    """Where rows of methods are drawn, from the top down, a gap (in rows) between groups, in the order of `GROUPS`."""
-    ordered = sorted(methods, key=lambda method: GROUPS.index(method_group(method)))
-    groups = [method_group(name) for name in ordered]
-    new = [0.0] + [gap * (one != other) for one, other in zip(groups[1:], groups, strict=False)]
-    return {method: float(row + sum(new[: row + 1])) for row, method in enumerate(ordered)}

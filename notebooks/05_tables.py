@@ -5,6 +5,8 @@
 #     text_representation:
 #       extension: .py
 #       format_name: percent
+#       format_version: '1.3'
+#       jupytext_version: 1.19.6
 #   kernelspec:
 #     display_name: Python 3
 #     language: python
@@ -52,8 +54,9 @@ paper_styler(latest_paper_table(tracking, "input_variants", release.name))
 # %% [markdown]
 # ## All methods
 #
-# Filled marks are the best view of each location, open ones the best 5 and 10; random is far to the left, beyond the
-# axis. The methods that know what landmarks are like lead at the finest limit; at coarser ones most are alike.
+# The best view of each location at the finest and at the coarsest limit, the best method on top; arrows point to
+# methods beyond the axis. Those that know what landmarks are like lead at the finest limit; at the coarsest most are
+# alike. Of the rows of Fisher information the best three are shown; all numbers stand in the table at the end.
 
 # %%
 from wheretolook.evaluation.results import latest_scores
@@ -81,7 +84,7 @@ display(regret_figure(latest_scores(tracking, "interiors")))
 # %% [markdown]
 # ## Seeing through walls
 #
-# Filled marks with true occlusion, open ones as if every method saw through walls, as the paper's released code does.
+# Discs with true occlusion, squares as if every method saw through walls, as the paper's released code does.
 # With the walls gone bins and the networks are above all rows of Fisher information, as in the paper, but bins above
 # the paper's network. What suffers most is what counts landmarks or sums up their information.
 

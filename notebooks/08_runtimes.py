@@ -5,6 +5,8 @@
 #     text_representation:
 #       extension: .py
 #       format_name: percent
+#       format_version: '1.3'
+#       jupytext_version: 1.19.6
 #   kernelspec:
 #     display_name: Python 3
 #     language: python
@@ -22,7 +24,7 @@
 # %matplotlib inline
 # %config InlineBackend.figure_formats = ["retina"]
 import pandas as pd
-from IPython.display import display
+from IPython.display import Image, Markdown, display
 
 from wheretolook.release.notebook import open_release, open_store
 from wheretolook.utils.tracking import newest_artifact
@@ -66,4 +68,6 @@ from wheretolook.utils.errors import MissingRunError
 try:
     display(scaling_figure(pd.read_csv(newest_artifact(tracking, "benchmark", "scaling.csv"))))
 except MissingRunError:
-    print("not measured yet")
+    display(
+        Markdown("Not measured on this machine; on an H200 and on two cores:"), Image("images/visibility-scaling.webp")
+    )

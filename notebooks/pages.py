@@ -1,4 +1,4 @@
-"""Run notebooks and write each as one small HTML file with its pictures in it.
+"""Run notebooks and write each as one small HTML file with its pictures in it, and a first page that leads to them.
 
     python notebooks/pages.py notebooks notebooks/html
 
@@ -23,11 +23,16 @@ _STYLE = """\
 body { max-width: 75rem; margin: 2rem auto; padding: 0 1rem; color: #333; font: 16px/1.5 system-ui, sans-serif }
 pre { padding: .5rem .8rem; overflow-x: auto; font-size: 13px; line-height: 1.4; background: #f6f8fa }
 pre.output { background: none; border-left: 3px solid #ddd }
-img { max-width: 100% }
-div.output { overflow-x: auto; font-size: 13px }
+img { max-width: 100%; height: auto }
+div.output { overflow: auto; max-height: 36rem; font-size: 13px }
+div.output th { position: sticky; top: 0; background: #fff }
+ol.pages { padding: 0; list-style: none; display: grid; gap: 1.5rem; \
+grid-template-columns: repeat(auto-fill, minmax(min(20rem, 100%), 1fr)) }
+ol.pages img { max-height: 12rem; object-fit: contain; object-position: left }
 table { border-collapse: collapse; margin: .5rem 0 }
 td, th { padding: 2px 8px; border-bottom: 1px solid #ddd; text-align: left }
-nav a { margin-right: 1em }
+nav a { margin-right: 1em; display: inline-block }
+@media (max-width: 40rem) { body { margin: 1rem auto; font-size: 15px } pre { font-size: 12px } }
 """
 
 LARGE, QUALITY, WIDEST_PX = 25_000, 55, 960
@@ -53,13 +58,12 @@ def run_notebook(path: Path, timeout_s: float = 600) -> Any:
     return notebook
 
 
-def notebook_page(notebook: Any, title: str, others: list[str] | None = None) -> str:
-    """A notebook with outputs as an HTML page.
+def notebook_page(notebook: Any, others: dict[str, str] | None = None) -> str:
+    """A notebook with outputs as an HTML page; the text of a picture is the first sentence of the cell before it.
 
     Args:
         notebook: as nbformat holds it.
-        title: of the page.
-        others: names of pages beside this one to link to.
+        others: titles of pages beside this one to link to, by their names.
     """
     from markdown_it import MarkdownIt
     from pygments import highlight
@@ -67,18 +71,60 @@ def notebook_page(notebook: Any, title: str, others: list[str] | None = None) ->
     from pygments.lexers import PythonLexer
 
     markdown, formatter = MarkdownIt("commonmark").enable("table"), HtmlFormatter(nobackground=True)
-    body = []
+    body, about = [], ""
     for cell in notebook.cells:
         if cell.cell_type == "markdown":
             body.append(_from_above(markdown.render(cell.source)))
+            about = _first_sentence(cell.source)
         elif cell.cell_type == "code":
             body.append(highlight(cell.source, PythonLexer(), formatter))
-            body += [_output(output, markdown) for output in cell.outputs]
-    links = "".join(f'<a href="{name}.html">{name}</a>' for name in others or [])
+            body += [_output(output, markdown, about) for output in cell.outputs]
+    pages = {"index": "All notebooks", **(others or {})}
+    links = "".join(f'<a href="{name}.html">{html.escape(text)}</a>' for name, text in pages.items())
+    return _page(title_of(notebook), formatter.get_style_defs(".highlight"), [f"<nav>{links}</nav>", *body])
+
+
+def index_page(pages: dict[str, tuple[str, str, str]]) -> str:
+    """The page that leads to the others: for each, by its name, its title, what it is about, and its first picture."""
+    items = []
+    for name, (title, about, picture) in pages.items():
+        image = f'<a href="{name}.html"><img src="{picture}" alt="{html.escape(about)}"></a>' if picture else ""
+        link = f'<a href="{name}.html">{html.escape(title)}</a>'
+        items.append(f"<li>{image}<h2>{link}</h2><p>{html.escape(about)}</p></li>")
+    lead = "What was measured, with the code that draws it: each page is a notebook of this folder with its outputs."
+    return _page(
+        "wheretolook: notebooks", "", ["<h1>Notebooks</h1>", f"<p>{lead}</p>", '<ol class="pages">', *items, "</ol>"]
+    )
+
+
+def title_of(notebook: Any) -> str:
+    """The first heading of a notebook."""
+    found = re.search(r"^# +(.+)$", "\n".join(_texts(notebook)), re.MULTILINE)
+    return found[1].strip() if found else ""
+
+
+def about_of(notebook: Any) -> str:
+    """The first sentence below the first heading of a notebook."""
+    return _first_sentence(next(iter(_texts(notebook)), ""))
+
+
+def _texts(notebook: Any) -> list[str]:
+    return [cell.source for cell in notebook.cells if cell.cell_type == "markdown"]
+
+
+def _first_sentence(source: str) -> str:
+    """Of Markdown, without its heading and its marks."""
+    text = " ".join(line for line in source.splitlines() if not line.startswith("#"))
+    text = re.sub(r"!?\[([^\]]*)\]\([^)]*\)|[*`_]", lambda found: found[1] or "", text).strip()
+    return re.split(r"(?<=[.?!:]) ", text)[0].rstrip(":")
+
+
+def _page(title: str, style: str, body: list[str]) -> str:
     return "\n".join([
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)}</title>',
-        f"<style>{_STYLE}{formatter.get_style_defs('.highlight')}</style></head>",
-        f"<body><nav>{links}</nav>",
+        '<meta name="viewport" content="width=device-width, initial-scale=1">',
+        f"<style>{_STYLE}{style}</style></head>",
+        "<body>",
         *body,
         "</body></html>\n",
     ])  # fmt: skip
@@ -89,14 +135,16 @@ def _from_above(text: str) -> str:
     return re.sub(r'(src|href)="(?!https?:|#|/|data:)', r'\1="../', text)
 
 
-def _output(output: Any, markdown: Any) -> str:
+def _output(output: Any, markdown: Any, about: str) -> str:
     if output.output_type == "stream":
         return f'<pre class="output">{html.escape(output.text)}</pre>' if output.name == "stdout" else ""
     data = output.get("data", {})
     if "application/vnd.jupyter.widget-view+json" in data:  # a progress bar, long done
         return ""
     if "image/png" in data:
-        return f'<p><img src="{small_picture(data["image/png"])}" alt=""></p>'
+        return f'<p><img src="{small_picture(data["image/png"])}" alt="{html.escape(about)}"></p>'
+    if "image/webp" in data:
+        return f'<p><img src="data:image/webp;base64,{data["image/webp"]}" alt="{html.escape(about)}"></p>'
     if "text/html" in data:
         return f'<div class="output">{small_table(data["text/html"])}</div>'
     if "text/markdown" in data:
@@ -140,18 +188,19 @@ def _webp(image: Image.Image, **options: Any) -> bytes:
 
 def main(arguments: list[str]) -> int:
     """Write the page of every notebook in a folder; those that fail are named. Returns the exit code."""
+    import jupytext
     from nbclient.exceptions import CellExecutionError, CellTimeoutError, DeadKernelError
 
     folder, out = Path(arguments[0]), Path(arguments[1])
     notebooks = sorted(folder.glob("[0-9]*.py"))  # not this file
-    names = [path.stem for path in notebooks]
+    titles = {path.stem: title_of(jupytext.read(path)) for path in notebooks}
     paths = [path for path in notebooks if len(arguments) < 3 or path.stem in arguments[2:]]
     failed = []
     out.mkdir(parents=True, exist_ok=True)
     for path in paths:
         start = time.monotonic()
         try:
-            page = notebook_page(run_notebook(path), path.stem, names)
+            page = notebook_page(run_notebook(path), titles)
         except (CellExecutionError, CellTimeoutError, DeadKernelError) as error:
             failed.append(path.stem)
             what = f"{error.ename}: {error.evalue}" if isinstance(error, CellExecutionError) else str(error)
@@ -159,6 +208,13 @@ def main(arguments: list[str]) -> int:
             continue
         (out / f"{path.stem}.html").write_text(page, encoding="utf-8")
         print(f"{path.stem}: {len(page) / 1e3:.0f} kB in {time.monotonic() - start:.0f} s -> {out / path.stem}.html")
+    pages = {}
+    for path in notebooks:
+        written = out / f"{path.stem}.html"
+        if written.exists():
+            found = re.search(r'<img src="(data:[^"]+)"', written.read_text(encoding="utf-8"))
+            pages[path.stem] = (titles[path.stem], about_of(jupytext.read(path)), found[1] if found else "")
+    (out / "index.html").write_text(index_page(pages), encoding="utf-8")
     return 1 if failed else 0
 
 

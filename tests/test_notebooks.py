@@ -128,12 +128,17 @@ def test_pages_are_small_and_whole(
     (folder / "02_broken.py").write_text("# %%\nraise ValueError('no such thing')\n")
     assert main([str(folder), str(tmp_path / "html")]) == 1
     assert "02_broken: ValueError: no such thing" in capsys.readouterr().err
-    (page,) = (tmp_path / "html").iterdir()
+    first, page = sorted((tmp_path / "html").iterdir(), reverse=True)
+    assert first.name == "index.html" and page.name == "01_one.html"
     text = page.read_text()
     assert "<h1>One &amp; all</h1>" in text and "1 &lt; 2" in text and "stderror" not in text
     assert 'src="../images/one.webp"' in text and 'href="https://example.org"' in text
     assert text.count("data:image/webp;base64,") == 1 and len(text) < 40_000
-    assert 'href="02_broken.html"' in text
+    assert 'href="02_broken.html"' in text and 'href="index.html">All notebooks' in text
+    assert '<meta name="viewport"' in text and 'alt="a picture, elsewhere"' in text
+    text = first.read_text()
+    assert '<a href="01_one.html">One &amp; all</a>' in text and "02_broken" not in text
+    assert text.count("data:image/webp;base64,") == 1
 
 
 def test_pictures_keep_their_colours_in_less_space() -> None:
@@ -184,6 +189,6 @@ def test_a_page_shows_tables_once() -> None:
     widget = {"application/vnd.jupyter.widget-view+json": {}, "text/plain": "plan: 0%"}
     bar = nbformat.v4.new_output("display_data", widget)
     cells = [nbformat.v4.new_code_cell("x", outputs=[bar, table])]
-    page = notebook_page(nbformat.v4.new_notebook(cells=cells), "a page")
+    page = notebook_page(nbformat.v4.new_notebook(cells=[nbformat.v4.new_markdown_cell("# a page"), *cells]))
     assert "plan: 0%" not in page
     assert page.count("<b>told</b>") == page.count("told") == 1 and "<title>a page</title>" in page

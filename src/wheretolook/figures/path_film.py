@@ -157,7 +157,7 @@ def _draw_map(
     apart = np.linspace(0, along[-1], ARROWS)  # evenly, and so few that they do not hide the path
     for at in [number] if number is not None else np.unique(np.searchsorted(along, apart - 1e-9)):
         x, y = positions[at, :2] + views[at].axis[:2] * (2 if number is not None else 1) * reach
-        axes.annotate("", (float(x), float(y)), xy[at], arrowprops=arrow, zorder=2)
+        axes.annotate("", (float(x), float(y)), xy[at], arrowprops=arrow, zorder=4)
     disc: Look = {"boxstyle": "circle,pad=0.15", "facecolor": PATH, "edgecolor": "white"}
     for column, at in enumerate(() if shown is None else shown, 1):
         axes.annotate(str(column), xy[at], fontsize=9, color="white", ha="center", va="center", bbox=disc)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 from pathlib import Path
@@ -118,6 +119,15 @@ def test_each_dataset_and_purpose_has_an_experiment_that_says_what_to_look_at(
         assert (named and named <= metrics) or experiment.name == "benchmarks", (experiment.name, named - metrics)
         for query in re.findall(r"`(params\.[^`]*)`", note):
             assert client(tracking).search_runs(ids, query), query
+        for address in re.findall(r"\]\((#[^)]*)\)", note):
+            assert address.startswith(f"#/experiments/{experiment.experiment_id}/runs?viewStateShareKey=")
+            view = json.loads(experiment.tags[f"mlflow.sharedViewState.{address.rpartition('=')[2]}"])
+            order = f"{view['orderByKey']} {'ASC' if view['orderByAsc'] else 'DESC'}"
+            shown = client(tracking).search_runs(ids, view["searchFilter"], order_by=[order], max_results=1000)
+            for column in view["selectedColumns"]:
+                kind, _, name = column.replace("`", "").partition(".")
+                values = [(run.data.params if kind == "params" else run.data.metrics).get(name) for run in shown]
+                assert any(value is not None for value in values), (experiment.name, column)
 
 
 def test_parents_carry_the_numbers_of_the_best(logged: tuple[Dataset, TrackingConfig, ReleaseRuns]) -> None:

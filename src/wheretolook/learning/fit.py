@@ -72,12 +72,17 @@ def fit(classifier: ViewpointClassifier, data: LightningDataModule, record: Epoc
         quiet: dict[str, Any] = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False}
         how: dict[str, Any] = {"max_epochs": options.epochs, "callbacks": callbacks, "num_sanity_val_steps": 0}
         trainer = Trainer(**where, **how, **quiet, default_root_dir=folder)
+        usual = tempfile.tempdir
+        if several:  # a process that outlives this one writes down its error as a temporary file
+            tempfile.tempdir = str(folder)
         try:
             trainer.fit(classifier, datamodule=data)
         except ProcessException as error:
             problem = f"a training process ended before its work was done: {error}"
             fix = "There may be too little memory: lower train.devices."
             raise WorkerError(problem, value=f"train.devices {config.devices}", fix=fix) from error
+        finally:
+            tempfile.tempdir = usual
         record.collect()
     data.trainer = None  # who asks for batches from now on gets whole ones, not one process's share
 

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any
 
 from wheretolook.utils.errors import MissingRunError, TrackingError
 from wheretolook.utils.tracking_config import TrackingConfig
-from wheretolook.utils.tracking_layout import experiment_name, note_of, run_name
+from wheretolook.utils.tracking_layout import experiment_name, note_of, run_name, views_of
 from wheretolook.utils.tracking_store import opened_client
 from wheretolook.utils.version import VERSION
 
@@ -79,15 +79,18 @@ def experiment_id(mlflow_client: MlflowClient, tracking: TrackingConfig, stage: 
     An experiment keeps the absolute path that its artifacts go to. In a store that was moved, new runs therefore go to
     another experiment, named after the new place; likewise where the experiment was deleted, as MLflow keeps its name.
     """
-    layout, note = experiment_name(stage, dataset), note_of(stage)
-    tags = {KIND_TAG: KIND} | ({} if tracking.experiment else {LAYOUT_TAG: LAYOUT, "mlflow.note.content": note})
+    layout = experiment_name(stage, dataset)
+    tags = {KIND_TAG: KIND} | ({} if tracking.experiment else {LAYOUT_TAG: LAYOUT, **views_of(stage)})
     name = tracking.experiment or layout
     elsewhere = f"{name} at {tracking.root}"
     for candidate in chain((name, elsewhere), (f"{elsewhere} {number}" for number in count(2))):
         known = mlflow_client.get_experiment_by_name(candidate)  # also a deleted one
         if known is None:
             location = tracking.artifacts
-            return str(mlflow_client.create_experiment(candidate, artifact_location=location, tags=tags))
+            made = str(mlflow_client.create_experiment(candidate, artifact_location=location, tags=tags))
+            if not tracking.experiment:
+                mlflow_client.set_experiment_tag(made, "mlflow.note.content", note_of(stage, made))
+            return made
         if known.lifecycle_stage == "active" and known.artifact_location == tracking.artifacts:
             return str(known.experiment_id)
     raise AssertionError  # there is always another name

@@ -10,7 +10,9 @@ runs apart comes first, since MLflow cuts long names.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 REGRET, SHARE, AUC = "1_regret", "1_share", "1_auc"
 """Metrics to sort runs by: the first view chosen (N = 1), at the strictest threshold. MLflow orders columns by name,
@@ -23,11 +25,43 @@ ALL_METHODS = "all methods"  # what was run in a comparison of methods
 
 
 @dataclass(frozen=True)
+class View:
+    """A table of runs that an experiment's description leads to: what it is about, its columns, and which runs."""
+
+    about: str
+    sort: str  # the metric that runs are sorted by
+    columns: tuple[str, ...]  # parameters and further metrics, as MLflow's interface names them
+    only: str = ""  # MLflow's filter of runs
+    ascending: bool = True
+
+    def state(self) -> str:
+        """As MLflow's interface shares a view, in a tag of the experiment."""
+        columns = [_column(name) for name in (*self.columns, f"metrics.{self.sort}")]
+        sort = {"orderByKey": _column(f"metrics.{self.sort}"), "orderByAsc": self.ascending}
+        facets = {"searchFilter": self.only, "startTime": "ALL", "lifecycleFilter": "Active"}
+        return json.dumps({**sort, **facets, "selectedColumns": columns})
+
+
+def _column(name: str) -> str:
+    kind, _, key = name.partition(".")
+    return f"{kind}.`{key}`"
+
+
+@dataclass(frozen=True)
 class Purpose:
     """What the runs of a stage are for: the end of their experiment's name, and what to look at there."""
 
     name: str
     note: str  # MLflow shows it as Markdown
+    views: Mapping[str, View] = field(default_factory=dict)  # by their names, which are parts of links
+
+
+_ALL = "params.method LIKE '%' AND params.candidates = 'all'"  # without the run that holds the others
+_CHOICES = ("params.method", "params.occlusion", f"metrics.{SHARE}", f"metrics.{AUC}")
+_TOP_N = tuple(f"metrics.top-{n}/normalized_0.05m_0.4deg" for n in (1, 5, 10))
+_KEPT = "kept_val_average_precision"
+_LEARNERS = ("params.learner", "params.learnt_from", "params.seed", f"metrics.{AUC}", "metrics.regret_others")
+_PATHS = ("params.method", "params.task", "metrics.times_forward", "metrics.times_forward_length")
 
 
 _FIRST = f"""\
@@ -49,6 +83,11 @@ to choose (tag `best`). Open it (+) to compare: in it is a run for each `method`
 Keep two of the three parameters fixed to see what the third changes. All methods alike:
 `params.occlusion = "mesh" and params.candidates = "all"`; inputs of the paper's network: `params.method LIKE "mlp-%"`.
 All other numbers lie in the artifact `scores.csv`.""",
+        {
+            "methods": View("all methods, the best first", REGRET, _CHOICES, _ALL),
+            "inputs": View("inputs of the paper's network", REGRET, _CHOICES, f"{_ALL} AND params.method LIKE 'mlp-%'"),
+            "top-n": View("the best 1, 5 and 10 views", REGRET, (*_CHOICES[:2], *_TOP_N), _ALL),
+        },
     ),
     "train": Purpose(
         "training",
@@ -56,6 +95,7 @@ All other numbers lie in the artifact `scores.csv`.""",
 What was trained, a run for each time. Compare the last epoch kept by `kept_val_average_precision`, highest first, with
 `method` beside it; the charts of `val_bce` and `train_bce` by step tell whether a network has learnt too long. Weights
 and `history.csv` are artifacts.""",
+        {"trained": View("what was trained, the best first", _KEPT, ("params.method", f"metrics.{AUC}"), "", False)},
     ),
     "learners": Purpose(
         "learners",
@@ -67,6 +107,7 @@ the lowest mean regret (tag `best`). Open it (+) to compare: in it is a run for 
 - `regret_others`, `average_precision_others`: on scenes by others; `…_validation`: what one may choose a learner by
 
 Runs that differ by `seed` alone tell how much of a difference is luck.""",
+        {"learners": View("all learners, the best first", REGRET, _LEARNERS, "params.learner LIKE '%'")},
     ),
     "adapt": Purpose(
         "adapting",
@@ -82,6 +123,7 @@ Planned paths whose views were rendered and localized. Open the run (+) to compa
 
 - `localized`: share of the views along the paths that localize; **sort by it, highest first**
 - `times_forward`: this share divided by that of looking forward; `times_forward_length`: the path's length likewise""",
+        {"methods": View("all methods, the best first", "localized", _PATHS, "params.method LIKE '%'", False)},
     ),
     "plan": Purpose(
         "plans",
@@ -106,9 +148,22 @@ def experiment_name(stage: str, dataset: str) -> str:
     return ": ".join(filter(None, (dataset, purpose)))
 
 
-def note_of(stage: str) -> str:
-    """What the description of that experiment says."""
-    return PURPOSES[stage].note if stage in PURPOSES else ""
+def note_of(stage: str, experiment_id: str = "") -> str:
+    """What the description of that experiment says; with its id, it begins with links to the experiment's views."""
+    if stage not in PURPOSES:
+        return ""
+    address = f"#/experiments/{experiment_id}/runs?{_SHARED_BY}"
+    links = [f"[{view.about}]({address}={name})" for name, view in PURPOSES[stage].views.items() if experiment_id]
+    return "\n\n".join(filter(None, (" · ".join(links), PURPOSES[stage].note)))
+
+
+def views_of(stage: str) -> dict[str, str]:
+    """Tags of that experiment in which MLflow keeps its views."""
+    views = PURPOSES[stage].views if stage in PURPOSES else {}
+    return {f"{_SHARED}{name}": view.state() for name, view in views.items()}
+
+
+_SHARED, _SHARED_BY = "mlflow.sharedViewState.", "viewStateShareKey"  # as of MLflow 3
 
 
 def run_name(what: str, stage: str, dataset: str) -> str:

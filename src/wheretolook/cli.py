@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import _thread
 import logging
 import os
 import signal
@@ -296,7 +295,8 @@ def _noting(interrupts: list[int]) -> Iterator[None]:
 
     def interrupt_again(lost: sys.UnraisableHookArgs) -> None:
         if lost.exc_type is KeyboardInterrupt:  # it came while an object was removed, where Python drops errors
-            later.append(threading.Timer(0.01, _thread.interrupt_main))
+            main_thread = threading.main_thread().ident or 0  # a real signal, which also ends what waits
+            later.append(threading.Timer(0.01, signal.pthread_kill, (main_thread, signal.SIGINT)))
             later[-1].start()
         else:
             usual(lost)

@@ -34,6 +34,7 @@ def hold_the_interpreter(seconds: int) -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the kernel ends them on Linux")
+@pytest.mark.slow
 def test_a_process_ends_with_the_killed_one_that_started_it_whatever_it_does(tmp_path: Path) -> None:
     script = tmp_path / "parent.py"
     script.write_text(

@@ -222,6 +222,7 @@ def begun() -> Iterator[list[subprocess.Popen[str]]]:
         process.communicate()
 
 
+@pytest.mark.slow
 def test_two_first_runs_at_once_make_one_store(tmp_path: Path, begun: list[subprocess.Popen[str]]) -> None:
     begun += [_starting(tmp_path / "mlruns") for _ in range(3)]
     for process in begun:

@@ -140,8 +140,9 @@ def match_pairs(
     same buffer, and the nearest neighbours come out wrong. Small databases are made in `folder` meanwhile.
     """
     chunks = [pairs[start : start + _PAIRS_AT_A_TIME] for start in range(0, len(pairs), _PAIRS_AT_A_TIME)]
-    jobs = (_match_job(chunk, stored, folder) for chunk in chunks)
-    with tqdm(total=len(pairs), desc="map: match", disable=not progress, unit="pair") as bar:
+    bar = tqdm(total=len(pairs), desc="map: match", disable=not progress, unit="pair")
+    with bar, temporary_folder(".partial", parent=folder) as work:  # goes with what a killed process leaves in it
+        jobs = (_match_job(chunk, stored, work) for chunk in chunks)
         for matches in processes.map(_run_match_job, jobs):
             yield from matches
             bar.update(len(matches))
@@ -159,7 +160,7 @@ def _run_match_job(job: MatchJob) -> list[NDArray[np.uint32]]:
 
     pairs, stored, parent = job
     matching = pycolmap.FeatureMatchingOptions(num_threads=1, skip_geometric_verification=True)
-    with temporary_folder(".partial", parent=parent) as folder:
+    with temporary_folder(parent=parent) as folder:
         database, listed = folder / "database.db", Path(folder) / "pairs.txt"
         # Any camera and poses do: only verification would use them.
         fill_database(database, _posed_model(PinholeCamera(), np.tile(np.eye(3, 4), (len(stored), 1, 1))), stored)

@@ -64,6 +64,7 @@ def parser() -> argparse.ArgumentParser:
     add = score.add_argument
     add("--weights", type=Path, metavar="FILE", help="weights, or a folder of them (those that ship)")
     add("--method", default="", metavar="NAME", help="`wheretolook evaluate --list-methods` (that of the weights)")
+    add("--anywhere", action="store_true", help="let weights that are adapted to another place score here, too")
     add("--also", nargs="+", default=[], metavar="NAME", help="further methods, by the weights that ship")
     add("--mesh", type=Path, metavar="FILE", help="a mesh of the scene in the map's frame, in metres, for occlusion")
     add("--occlusion", metavar="NAME", help="mesh, hidden-points (from the landmarks alone) or none")
@@ -86,8 +87,8 @@ def run(arguments: Sequence[str]) -> int:
     from wheretolook.utils.devices import usable_device
 
     device, workers = usable_device(options.device), options.workers or len(os.sched_getaffinity(0))
-    scoring = Scoring(options.method, options.weights, tuple(options.also))
-    _ = scoring.chosen  # refused now if there is none, not after the work
+    scoring = Scoring(options.method, options.weights, tuple(options.also), options.anywhere)
+    scoring.check()  # now, not after the work
     out = options.out or options.data / "checks" / _name(options)
     with hold(out / ".lock", "check"):
         source, occlusion = _open(options, out, device, workers)
@@ -130,7 +131,7 @@ def _open(options: argparse.Namespace, out: Path, device: str, workers: int) -> 
     from wheretolook.mapping.config import ExistingModelConfig
     from wheretolook.select.surroundings import surroundings
 
-    mesh, metric, name = options.mesh, options.metres, options.scene
+    mesh, metric, name, scene = options.mesh, options.metres, options.scene, None
     if options.scene is not None:
         scene = source.find_scene(options.data, options.scene, options.name)
         model = scene.map
@@ -154,6 +155,8 @@ def _open(options: argparse.Namespace, out: Path, device: str, workers: int) -> 
 
         read_model(model)  # if there is no model at all, that is said
         fix = "Give --database, the database.db that it was built from, or --images, the folder of its photographs."
+        if scene is not None and scene.mesh.is_file():  # its images were rendered, and are gone
+            fix = "Map the scene again with `wheretolook map --map.keep_database true`, which keeps the features."
         raise MapError("neither the features nor the photographs of this map are known", path=model, fix=fix)
     if features is None:
         model, features = source.extract_anew(model, images, out / "work", workers, device)

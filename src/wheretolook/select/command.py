@@ -87,6 +87,7 @@ def parser() -> argparse.ArgumentParser:
     add = score.add_argument
     add("--weights", type=Path, metavar="FILE", help="weights, or a folder of them (those that ship)")
     add("--method", default="", metavar="NAME", help="`wheretolook evaluate --list-methods` (that of the weights)")
+    add("--anywhere", action="store_true", help="let weights that are adapted to another place score here, too")
     add("--database", type=Path, metavar="FILE", help="the map's database: descriptors tell which landmarks look alike")
     add("--directions", type=int, default=500, metavar="N", help="directions looked along at each waypoint (500)")
     add("--lattice", default="fibonacci", metavar="NAME", help="fibonacci (even), or yaw-pitch (ActLoc's 6 x 18)")
@@ -118,6 +119,7 @@ def run(arguments: Sequence[str]) -> int:
         lattice=options.lattice,
         max_reprojection_error_px=options.max_error,
         device=options.device,
+        anywhere=options.anywhere,
     )
     if waypoints is None:
         waypoints = look.grid(options.grid)

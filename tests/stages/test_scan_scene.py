@@ -76,7 +76,7 @@ def test_it_joins_scenes_with_meshes_and_a_named_camera_looks(experiment, tmp_pa
 
 def test_up_is_an_option_that_may_have_a_minus_sign(tmp_path, capsys):
     y_down = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-    write_seven_scenes(tmp_path / "room", room(), walk(20), y_down)
+    write_seven_scenes(tmp_path / "room", room(), walk(), y_down)
     where = ["--data", str(tmp_path / "data"), "--name", "scan", "--device", "cpu"]
     how = ["--scenes.rgbd.voxel_m", "0.06", "--scenes.rgbd.appearance", "colors"]
     assert main(["scenes", "--rgbd", str(tmp_path / "room"), "--up", "-y", *where, *how]) == 0

@@ -110,10 +110,15 @@ def _refuse(options: argparse.Namespace) -> None:
     if options.views < 1 or options.workers < 0:
         fix = "Give --views of at least 1, --workers of at least 0."
         raise ConfigError("not such numbers", value=(options.views, options.workers), fix=fix)
+    from wheretolook.mapping.colmap_model import model_suffix
     from wheretolook.methods.registry import check_method
+    from wheretolook.select.weights import check_there
 
     for name in (*([options.method] if options.method else []), *options.also):
         check_method(name)
+    check_there(options.weights)
+    if options.map is not None and options.mesh is None:  # a mesh is refused first, if the map has no metres
+        model_suffix(options.map)
 
 
 def _name(options: argparse.Namespace) -> str:

@@ -134,15 +134,19 @@ def run(arguments: Sequence[str]) -> int:
 
 def _check(options: argparse.Namespace) -> Waypoints | None:
     """The waypoints, None for a grid; whatever can be refused before the map is read is refused here."""
+    from wheretolook.mapping.colmap_model import model_suffix
     from wheretolook.select.formats import check_format
     from wheretolook.select.limits import check_limits
     from wheretolook.select.waypoints import parse_points, read_waypoints
+    from wheretolook.select.weights import check_there
 
     check_format(options.out, options.format, options.n)
     check_limits(options.n, options.pitch, options.max_turn)
     if (options.at is None) == (options.grid is None):
         raise ConfigError("waypoints are given by --at or by --grid", fix="Give one of them.")
     _camera(options)
+    check_there(options.weights)
+    model_suffix(options.map)
     if options.at is None:
         return None
     texts = [text.strip() for text in options.at]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import warnings
 from pathlib import Path
@@ -12,21 +13,30 @@ import numpy as np
 import pandas as pd
 import pycolmap
 import pytest
+import torch
 from scipy.spatial.transform import Rotation
 
 from box_scenes import furnished_room
 from check.corridor import ALONE, N, corridor_poses, write_corridor
+from selection.room import WEIGHTS
+from wheretolook.check import leave_out
 from wheretolook.check.blocks import KEPT, LEAST_REST, choose_blocks, landmarks_kept, observation_matrix
 from wheretolook.check.command import run
 from wheretolook.check.leave_out import without
 from wheretolook.check.source import open_map
 from wheretolook.cli import main
+from wheretolook.dataset.folders import Dataset, SceneFolder
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import camera_centers, poses_looking_along
+from wheretolook.learning.trained_network import TrainedNetwork
 from wheretolook.mapping.colmap_model import model_arrays, read_model
 from wheretolook.mapping.descriptors import read_features
+from wheretolook.methods.adapted.network import AdaptedNetwork
+from wheretolook.methods.set.network import SetNetwork
 from wheretolook.rendering.warp_renderer import WarpRenderer
-from wheretolook.utils.errors import ConfigError, MapError, WeightsError
+from wheretolook.scenes.loading import save_glb
+from wheretolook.utils.errors import ConfigError, InUseError, MapError, WeightsError
+from wheretolook.utils.locks import hold
 
 
 @pytest.fixture(scope="module")
@@ -176,6 +186,56 @@ def test_an_interrupted_check_goes_on(checked: Path, corridor: tuple[Path, Path]
     assert (work / "01" / "views.csv").stat().st_mtime_ns == kept
 
 
+def test_blocks_of_other_limits_or_versions_are_not_taken(
+    checked: Path, corridor: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(checked, tmp_path / "out")
+    (before,) = (tmp_path / "out" / "work").glob("blocks-*")
+    names = set[str]()
+    for what, value in (("versions", lambda: {"wheretolook": "0.0.1"}), ("MAX_ERROR_DEG", 1e-9)):
+        monkeypatch.setattr(leave_out, what, value)
+        run(_arguments(*corridor, tmp_path / "out", "--metres", "--views", "1"))
+        (now,) = (tmp_path / "out" / "work").glob("blocks-*")
+        assert now.name not in {before.name, *names}
+        names.add(now.name)
+    assert not pd.read_csv(tmp_path / "out" / "views.csv")["good"].any()  # by a limit that nothing stays under
+
+
+def test_two_checks_do_not_write_the_same_results(corridor: tuple[Path, Path], tmp_path: Path) -> None:
+    with hold(tmp_path / "out" / ".lock", "check"), pytest.raises(InUseError, match=rf"process {os.getpid()}"):
+        run(_arguments(*corridor, tmp_path / "out"))
+    assert [path.name for path in (tmp_path / "out").iterdir()] == []
+
+
+def _adapted(folder: Path, place: np.ndarray) -> Path:
+    """Weights that are adapted to a place with these landmarks, and change nothing."""
+    base = TrainedNetwork.load(WEIGHTS / "set.safetensors", SetNetwork, "set")
+    network = AdaptedNetwork(base.network, base.scale, base.offset, 1.0, 4.0, 0, len(place))
+    network.place = torch.from_numpy(np.array(place))
+    path = folder / "adapted.safetensors"
+    TrainedNetwork("adapted", network, base.camera, 1.0, 0.0, base.training_range).save(path, {"scene": "corridor"})
+    return path
+
+
+def test_adapted_weights_are_checked_on_their_map_without_most_of_its_landmarks(
+    checked: Path, corridor: tuple[Path, Path], tmp_path: Path
+) -> None:
+    shutil.copytree(checked, tmp_path / "out")
+    points = np.array([point.xyz for _, point in sorted(read_model(corridor[0]).points3D.items())])
+    place = points[:: len(points) // 256][:256]
+    arguments = _arguments(*corridor, tmp_path / "out", "--metres", "--weights")
+    run([*arguments, str(_adapted(tmp_path, place))])
+    few = pd.read_csv(tmp_path / "out" / "views.csv")["n_landmarks"].min()
+    assert few < len(points) / 2  # a map without that many would be taken for another place
+    same, before = (pd.read_csv(folder / "views.csv")["score"] for folder in (tmp_path / "out", checked))
+    assert np.abs(same - before).max() < 1e-6
+    elsewhere = str(_adapted(tmp_path, place + 0.5))
+    with pytest.raises(WeightsError, match=r"adapted to another place.*--anywhere"):
+        run([*_arguments(*corridor, tmp_path / "new", "--metres", "--weights"), elsewhere])
+    assert not [*(tmp_path / "new").glob("work/*")]  # before the work
+    run([*arguments, elsewhere, "--anywhere"])
+
+
 def test_a_map_of_any_scale_and_frame_gives_the_same(
     corridor: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -286,6 +346,23 @@ def test_features_are_read_by_names(corridor: tuple[Path, Path]) -> None:
 def test_a_scene_that_is_not_there_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["check", "--scene", "hall", "--data", str(tmp_path)]) == 2
     assert "there is no such scene" in capsys.readouterr().err
+
+
+def test_another_dataset_that_is_damaged_is_not_in_the_way(
+    corridor: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = SceneFolder(tmp_path / "mine" / "hall", "test")
+    shutil.copytree(corridor[0], scene.map)
+    save_glb(furnished_room(), scene.mesh)
+    Dataset(tmp_path / "mine", (scene,)).save()
+    (tmp_path / "broken").mkdir()
+    (tmp_path / "broken" / "dataset.json").write_text("{")
+    options = ["--data", str(tmp_path), "--metres", "--occlusion", "none"]
+    assert main(["check", "--scene", "hall", *options]) == 2
+    said = capsys.readouterr().err
+    assert "neither the features" in said and "wheretolook map --map.keep_database true" in said
+    assert main(["check", "--scene", "cellar", *options]) == 2
+    assert "There are hall" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -82,6 +82,27 @@ def test_a_recording_of_7_scenes_is_the_room_within_a_voxel(seven_scenes, mesh):
     assert np.quantile(back, 0.9) < VOXEL_M
 
 
+@pytest.mark.parametrize(("offset", "appearance"), [((300.0, -300, 100), "colors"), ((5e6, 5e6, 300), "texture")])
+def test_a_recording_far_from_the_origin_is_the_same_room(seven_scenes, mesh, tmp_path, offset, appearance):
+    folder = copied(seven_scenes, tmp_path / "far")
+    for path in folder.glob("*.pose.txt"):
+        pose = np.loadtxt(path)
+        pose[:3, 3] += offset
+        np.savetxt(path, pose)
+    found = scan(folder, appearance=appearance)
+    # from the recording's world to the room's: its offset undone, and the upright rotation
+    from_room = found.rotation @ Y_DOWN.T
+    place = found.mesh.origin - found.rotation @ offset
+    vertices = (found.mesh.vertices + place) @ from_room
+    moved = replace(found.mesh, vertices=vertices.astype(np.float32), origin=np.zeros(3))
+    there, back = off_m(moved, mesh)
+    assert np.quantile(there, 0.99) < VOXEL_M and np.median(there) < VOXEL_M / 4
+    assert np.quantile(back, 0.9) < VOXEL_M
+    truth, rendered = (WarpRenderer(one).render(COLOR, walk()[[10]]).rgb.astype(float) for one in (mesh, moved))
+    seen = rendered.any(-1)
+    assert seen.mean() > 0.55 and np.abs(truth - rendered)[seen].mean() < 28
+
+
 def test_a_recording_of_tum_is_the_room_within_a_voxel_and_stays_in_its_world(tum, mesh):
     found = scan(tum, up="auto")
     assert len(found.frames) == 60 and found.frames.depth_scale == 5000

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -26,6 +27,21 @@ def die(item: int) -> int:
 def test_a_killed_process_is_a_typed_error() -> None:
     with Processes(2) as processes, pytest.raises(WorkerError, match="killed"):
         list(processes.map(die, range(6)))
+
+
+def pid_after(seconds: float) -> int:
+    time.sleep(seconds)
+    return os.getpid()
+
+
+def test_processes_outlive_the_thread_that_started_them() -> None:
+    first: list[int] = []
+    with Processes(2) as processes:
+        pids = processes.map(pid_after, [0.1] * 10)
+        thread = threading.Thread(target=lambda: first.append(next(pids)))
+        thread.start()
+        thread.join()
+        assert len([*first, *pids]) == 10
 
 
 def hold_the_interpreter(seconds: int) -> None:

@@ -13,7 +13,8 @@ from mask_agreement import MaskAgreement
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.utils.errors import ConfigError, MapError, SceneError
-from wheretolook.visibility.hidden_points import HiddenPointRemoval, hull_length
+from wheretolook.visibility.hidden_points import HiddenPointRemoval, on_hull, on_hull_plain
+from wheretolook.visibility.hull import LEAST_POINTS, hull_length, may_be_near_hull
 from wheretolook.visibility.occlusion import MeshOcclusion
 
 ORIGIN = np.zeros((1, 3))
@@ -199,3 +200,43 @@ def test_what_cannot_be_answered_is_refused_by_name() -> None:
 def test_bad_settings_are_refused_by_value(arguments: dict[str, float]) -> None:
     with pytest.raises(ConfigError, match=f"got {next(iter(arguments.values()))}"):
         HiddenPointRemoval(**arguments)  # type: ignore[arg-type]
+
+
+def seen_from(points: np.ndarray, at: np.ndarray, radius: float = 50.0) -> tuple[np.ndarray, np.ndarray, float]:
+    """Directions and lengths of the hull's points, and 5 cm, as the model has them."""
+    lines = points - at
+    distance = np.linalg.norm(lines, axis=1)
+    unit = 2 * radius * distance.max()
+    return lines / distance[:, None], 1 - distance / unit, 0.05 / unit
+
+
+@pytest.mark.parametrize("radius", [1.0, 50.0])
+def test_a_building_of_many_landmarks_has_the_hull_of_all(radius: float) -> None:
+    rng = np.random.default_rng(0)
+    size, room, n = np.array([30.0, 20.0, 6.0]), np.array([6.0, 5.0, 3.0]), 2 * LEAST_POINTS
+    points, axis = rng.uniform((0, 0, 0), size, (n, 3)), rng.integers(0, 3, n)
+    points[np.arange(n), axis] = rng.integers(0, (size / room)[axis].astype(int) + 1) * room[axis]  # on walls
+    for at in ((8.0, 7, 1.5), (-5.0, -4, 1)):  # in a room, and outside of all, where the location is a corner
+        directions, lengths, margin = seen_from(points, np.array(at), radius)
+        near = may_be_near_hull(directions, lengths, margin)
+        assert near.mean() < 0.6  # most need not be looked at
+        for asked in (0.0, margin):
+            expected = on_hull_plain(directions, lengths, asked)
+            assert np.array_equal(on_hull(directions, lengths, asked), expected)
+            assert 0.01 < expected.mean() < 0.5
+
+
+def test_many_landmarks_in_a_plane_have_the_hull_of_all() -> None:
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-5, 5, (LEAST_POINTS + 1, 2)), np.full(LEAST_POINTS + 1, 1.0)])
+    for at in ((0.0, 0, 1), (0.0, 0, 0)):  # in the plane, and beside it
+        given = seen_from(points, np.array(at))
+        assert np.array_equal(on_hull(*given), on_hull_plain(*given))
+
+
+def test_landmarks_that_change_are_looked_at_anew() -> None:
+    model, points = HiddenPointRemoval(margin_m=0.0), np.array([(1.0, 0, 0), (2.0, 0, 0), (0, 1, 0), (0, 0, 1)])
+    assert model.unoccluded(ORIGIN, points).tolist() == [[True, False, True, True]]
+    points[0], points[1] = (3.0, 0, 0), (2.0, 0, 0)
+    assert model.unoccluded(ORIGIN, points).tolist() == [[False, True, True, True]]
+    assert model.unoccluded(ORIGIN, points[1:]).tolist() == [[True, True, True]]

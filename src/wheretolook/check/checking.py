@@ -9,7 +9,7 @@ from tqdm.auto import tqdm
 from wheretolook.check.blocks import VIEWS, choose_blocks
 from wheretolook.check.leave_out import leave_out
 from wheretolook.check.report import CheckReport, make_report
-from wheretolook.check.scores import Scoring, score_views
+from wheretolook.check.scores import Scoring, check_place, score_views
 from wheretolook.check.source import PhotographedMap
 from wheretolook.visibility.hidden_points import HiddenPointRemoval
 from wheretolook.visibility.occlusion import OcclusionModel
@@ -29,6 +29,7 @@ def check_map(
     Finished blocks are kept in `work`. What hides landmarks is by default told by hidden-point removal; at most so many
     `views` of a block are localized. Raises MapError if blocks leave no map; WeightsError if weights cannot be used.
     """
+    check_place(source, scoring, device)
     blocks = choose_blocks(source, views)
     left_out = []
     total = sum(len(block.looked_at) for block in blocks)

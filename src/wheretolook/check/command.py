@@ -64,6 +64,7 @@ def parser() -> argparse.ArgumentParser:
     add = score.add_argument
     add("--weights", type=Path, metavar="FILE", help="weights, or a folder of them (those that ship)")
     add("--method", default="", metavar="NAME", help="`wheretolook evaluate --list-methods` (that of the weights)")
+    add("--anywhere", action="store_true", help="let weights that are adapted to another place score here, too")
     add("--also", nargs="+", default=[], metavar="NAME", help="further methods, by the weights that ship")
     add("--mesh", type=Path, metavar="FILE", help="a mesh of the scene in the map's frame, in metres, for occlusion")
     add("--occlusion", metavar="NAME", help="mesh, hidden-points (from the landmarks alone) or none")
@@ -86,8 +87,8 @@ def run(arguments: Sequence[str]) -> int:
     from wheretolook.utils.devices import usable_device
 
     device, workers = usable_device(options.device), options.workers or len(os.sched_getaffinity(0))
-    scoring = Scoring(options.method, options.weights, tuple(options.also))
-    _ = scoring.chosen  # refused now if there is none, not after the work
+    scoring = Scoring(options.method, options.weights, tuple(options.also), options.anywhere)
+    scoring.check()  # now, not after the work
     out = options.out or options.data / "checks" / _name(options)
     with hold(out / ".lock", "check"):
         source, occlusion = _open(options, out, device, workers)
@@ -109,10 +110,15 @@ def _refuse(options: argparse.Namespace) -> None:
     if options.views < 1 or options.workers < 0:
         fix = "Give --views of at least 1, --workers of at least 0."
         raise ConfigError("not such numbers", value=(options.views, options.workers), fix=fix)
+    from wheretolook.mapping.colmap_model import model_suffix
     from wheretolook.methods.registry import check_method
+    from wheretolook.select.weights import check_there
 
     for name in (*([options.method] if options.method else []), *options.also):
         check_method(name)
+    check_there(options.weights)
+    if options.map is not None and options.mesh is None:  # a mesh is refused first, if the map has no metres
+        model_suffix(options.map)
 
 
 def _name(options: argparse.Namespace) -> str:
@@ -130,7 +136,7 @@ def _open(options: argparse.Namespace, out: Path, device: str, workers: int) -> 
     from wheretolook.mapping.config import ExistingModelConfig
     from wheretolook.select.surroundings import surroundings
 
-    mesh, metric, name = options.mesh, options.metres, options.scene
+    mesh, metric, name, scene = options.mesh, options.metres, options.scene, None
     if options.scene is not None:
         scene = source.find_scene(options.data, options.scene, options.name)
         model = scene.map
@@ -154,6 +160,8 @@ def _open(options: argparse.Namespace, out: Path, device: str, workers: int) -> 
 
         read_model(model)  # if there is no model at all, that is said
         fix = "Give --database, the database.db that it was built from, or --images, the folder of its photographs."
+        if scene is not None and scene.mesh.is_file():  # its images were rendered, and are gone
+            fix = "Map the scene again with `wheretolook map --map.keep_database true`, which keeps the features."
         raise MapError("neither the features nor the photographs of this map are known", path=model, fix=fix)
     if features is None:
         model, features = source.extract_anew(model, images, out / "work", workers, device)

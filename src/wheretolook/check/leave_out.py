@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -15,10 +15,12 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from wheretolook.check.blocks import Block
-from wheretolook.check.source import MAX_ERROR_DEG, PhotographedMap
+from wheretolook.check.source import MAX_ERROR_DEG, PhotographedMap, digest_of
 from wheretolook.features.keypoints import Keypoints
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float, pose_error
+from wheretolook.labelling.config import LocalizerConfig
+from wheretolook.labelling.labeller import versions
 from wheretolook.labelling.localizer import Localizer
 from wheretolook.mapping.colmap_model import read_model
 from wheretolook.mapping.descriptors import read_features
@@ -30,6 +32,7 @@ from wheretolook.utils.processes import Processes
 from wheretolook.viewpoints.table import LOCALIZED
 
 MIN_ANGLE_DEG = 1.5  # COLMAP's own least angle between the rays of a landmark
+_FORMAT = 1  # raise it if what is stored of a block changes, or means something else
 _FILES = ("landmarks.npz", "matches.npz", "views.csv")
 
 
@@ -78,10 +81,10 @@ def leave_out(
     remains alone; poses and intrinsics are the whole map's. Finished blocks are kept in `work`, and not done again.
     """
     work.mkdir(parents=True, exist_ok=True)
+    folder = work / f"blocks-{_key(source)}"
     for old in work.iterdir():
-        if old.is_dir() and old.name.startswith("blocks-") and old.name != f"blocks-{source.key}":
+        if old.is_dir() and old.name.startswith("blocks-") and old != folder:
             shutil.rmtree(old)
-    folder = work / f"blocks-{source.key}"
     model = folder / "model"
     jobs, open_blocks = list[_Job](), set[int]()
     for block in blocks:
@@ -135,6 +138,12 @@ def without(model: Any, image_ids: Sequence[int]) -> Any:
             if not (point.error <= worst_px and np.isfinite(point.xyz).all()):
                 rest.delete_point3D(number)
     return rest
+
+
+def _key(source: PhotographedMap) -> str:
+    """Changes with all that decides what is stored of a block but the block itself, which is stored with it."""
+    limits = [source.limit_m.tolist(), MAX_ERROR_DEG, MIN_ANGLE_DEG, asdict(LocalizerConfig())]
+    return digest_of([_FORMAT, versions(), source.key, limits])
 
 
 @lru_cache(maxsize=1)

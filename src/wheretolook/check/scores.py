@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +18,13 @@ from wheretolook.check.source import PhotographedMap
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float
 from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.learning.weights import method_of_weights
 from wheretolook.mapping.colmap_model import compact_poses
+from wheretolook.mapping.landmarks import load_colmap_landmarks
 from wheretolook.methods.base import Scorer
-from wheretolook.methods.registry import load_scorer, make_scorer
+from wheretolook.methods.registry import find, load_scorer, make_scorer
 from wheretolook.select.weights import weights_of
-from wheretolook.utils.errors import OutOfRangeWarning
+from wheretolook.utils.errors import MapWarning, OutOfRangeWarning
 from wheretolook.visibility.occlusion import OcclusionModel
 from wheretolook.visibility.remembered import RememberedOcclusion
 
@@ -37,6 +39,13 @@ class Scoring:
     method: str = ""  # "" for that of the weights
     weights: Path | None = None  # file or folder; None for those that ship
     also: tuple[str, ...] = ()
+    anywhere: bool = False  # whether weights that are adapted to another place may score
+
+    def check(self) -> None:
+        """Raise a WeightsError if weights are missing or damaged, of any of the methods."""
+        for weights in (self.chosen, *(weights_of(name, None) for name in self.also)):
+            if weights is not None:
+                method_of_weights(weights)
 
     @property
     def chosen(self) -> Path | None:
@@ -47,8 +56,22 @@ class Scoring:
         """The scorer that is checked."""
         chosen = self.chosen
         if self.method:
-            return make_scorer(self.method, localization_map, weights=chosen)
-        return load_scorer(str(chosen), localization_map)
+            return make_scorer(self.method, localization_map, weights=chosen, anywhere=self.anywhere)
+        return load_scorer(str(chosen), localization_map, anywhere=self.anywhere)
+
+
+def check_place(source: PhotographedMap, scoring: Scoring, device: str) -> None:
+    """Raise a WeightsError if the weights are adapted to another place than the whole map, unless that may be.
+
+    Without a block a map may lack most of the landmarks by which they would know it.
+    """
+    chosen = scoring.chosen
+    method = find(method_of_weights(chosen)) if chosen is not None else None
+    if method is not None and method.one_place and not scoring.anywhere:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", MapWarning)
+            landmarks = load_colmap_landmarks(source.path, reconstruction=source.model, progress=False)
+        scoring.scorer(LocalizationMap(landmarks, source.cameras[0], device=device))
 
 
 def score_views(
@@ -92,7 +115,7 @@ def _by_camera(cameras: Sequence[Camera]) -> list[tuple[Camera, NDArray[np.int64
 def _score(around: LocalizationMap, poses: Float, scoring: Scoring) -> dict[str, Any]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", OutOfRangeWarning)  # the results tell how many are in range
-        scorer = scoring.scorer(around)
+        scorer = replace(scoring, anywhere=True).scorer(around)  # `check_place` has seen to it
         told = scorer.report(poses)
         found: dict[str, Any] = {"name": scorer.name, "score": told.score * _number(scorer.name, around)}
         found |= {"expected_inliers": told.expected_inliers, "n_visible": told.n_visible, "in_range": told.in_range}

@@ -6,6 +6,7 @@ import hashlib
 import json
 import shutil
 import warnings
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,14 +17,15 @@ from numpy.typing import NDArray
 from wheretolook.dataset.folders import Dataset, SceneFolder
 from wheretolook.geometry.camera import Camera, cameras_by_id
 from wheretolook.geometry.poses import Float, camera_centers, transform
+from wheretolook.labelling.labeller import versions
 from wheretolook.mapping.building import DATABASE_FILE
-from wheretolook.mapping.colmap_model import ModelArrays, colmap_poses, model_arrays, read_model
+from wheretolook.mapping.colmap_model import ModelArrays, colmap_poses, model_arrays, read_model, registered_names
 from wheretolook.mapping.config import ExistingModelConfig, MapConfig, PhotographsConfig
 from wheretolook.mapping.descriptors import HDF5_SUFFIXES, read_descriptors
 from wheretolook.mapping.gravity import estimate_gravity
 from wheretolook.mapping.plausibility import axes_doubt
 from wheretolook.mapping.scale import REPORT_FILE, Similarity, read_scale
-from wheretolook.utils.errors import ConfigError, MapError, MapWarning
+from wheretolook.utils.errors import ConfigError, MapError, MapWarning, WhereToLookError
 from wheretolook.utils.files import fingerprint, write_text
 from wheretolook.utils.reading import read_json_object
 from wheretolook.viewpoints.thresholds import THRESHOLDS
@@ -142,7 +144,7 @@ def open_map(
         poses=poses,
         own_centers=own_centers,
         depth_m=_median_depths(arrays, poses),
-        key=hashlib.sha256(" ".join(parts).encode()).hexdigest()[:16],
+        key=digest_of(parts),
     )
 
 
@@ -153,13 +155,19 @@ def find_scene(data: Path, name: str, dataset: str = "") -> SceneFolder:
     """
     if dataset:
         return Dataset.load(data / dataset).scene(name)
-    found = {path.parent.name: Dataset.load(path.parent) for path in sorted(data.glob("*/dataset.json"))}
-    having = {key: one for key, one in found.items() if name in {scene.name for scene in one.scenes}}
+    roots = [path.parent for path in sorted(data.glob("*/dataset.json"))]
+    # a dataset without such a folder is not read, so that a damaged one is not in the way
+    found = [Dataset.load(root) for root in roots if (root / name).is_dir()]
+    having = [one for one in found if name in {scene.name for scene in one.scenes}]
     if len(having) == 1:
-        return next(iter(having.values())).scene(name)
+        return having[0].scene(name)
     if having:
-        raise ConfigError("several datasets have such a scene", value=name, fix=f"Give --name: {', '.join(having)}.")
-    scenes = [scene.name for one in found.values() for scene in one.scenes]
+        names = ", ".join(one.name for one in having)
+        raise ConfigError("several datasets have such a scene", value=name, fix=f"Give --name: {names}.")
+    scenes = list[str]()
+    for root in roots:
+        with suppress(WhereToLookError):  # what is wrong there is not what was asked
+            scenes += [scene.name for scene in Dataset.load(root).scenes]
     fix = f"There are {', '.join(scenes)}." if scenes else "Make one with `wheretolook map --name NAME --model SPARSE`."
     raise ConfigError("there is no such scene", path=data, value=name, fix=fix)
 
@@ -200,14 +208,15 @@ def extract_anew(model_dir: Path, images: Path, work: Path, workers: int, device
     from wheretolook.mapping.existing_map import map_existing
 
     out, note = work / "map", work / "map.json"
+    model = read_model(model_dir)
     parts = [fingerprint(path) for path in sorted(model_dir.glob("*.bin")) + sorted(model_dir.glob("*.txt"))]
-    key = {"model": parts, "images": str(images.resolve())}
+    files = [[name, *_size_and_time(images / name)] for name in registered_names(model).values()]
+    key = {"versions": versions(), "model": parts, "images": str(images.resolve()), "photographs": digest_of(files)}
     try:
         if read_json_object(note) == key and (out / DATABASE_FILE).is_file():
             return out, out / DATABASE_FILE
     except (OSError, ValueError):
         pass
-    model = read_model(model_dir)
     n_posed = sum(image.has_pose for image in model.images.values())
     if n_posed < LEAST_PHOTOGRAPHS:
         fix = "Take more photographs of the place, and map them all."
@@ -225,6 +234,19 @@ def extract_anew(model_dir: Path, images: Path, work: Path, workers: int, device
         map_existing(config, out, work / "photographs", workers=workers, device=device, reconstruction=model)
     write_text(note, json.dumps(key) + "\n")
     return out, out / DATABASE_FILE
+
+
+def _size_and_time(path: Path) -> tuple[int, int]:
+    """Bytes of a file, and when it was changed; zeros if it is missing, which is told where it is read."""
+    try:
+        return path.stat().st_size, path.stat().st_mtime_ns
+    except OSError:
+        return 0, 0
+
+
+def digest_of(values: Any) -> str:
+    """16 hexadecimal digits that change with values of JSON."""
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def _median_depths(arrays: ModelArrays, poses: Float) -> Float:

@@ -92,6 +92,11 @@ class SceneFolder:
         return self.folder / "labels.json"
 
     @property
+    def adapt_shards(self) -> Path:
+        """Views that the adapt stage has labelled, while the label stage has not."""
+        return self.folder / "adapt-shards"
+
+    @property
     def occlusion(self) -> Path:
         """Which landmark each sampled location has a free line of sight to."""
         return self.folder / "occlusion.npz"

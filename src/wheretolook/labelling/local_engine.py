@@ -12,7 +12,7 @@ from multiprocessing.process import BaseProcess
 
 from wheretolook.labelling.shard import LabelledShard, Shard, ShardWorker
 from wheretolook.utils.errors import WorkerError
-from wheretolook.utils.workers import end_with_parent, spawning
+from wheretolook.utils.workers import end_with_parent, in_main_thread, spawning
 
 MAX_DEATHS = 3
 """Labelling ends with an error when a shard's worker was killed this many times."""
@@ -83,7 +83,7 @@ def run_local(
 def _start(number: int) -> _Worker:
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
-    process = context.Process(target=_work, args=(theirs, number), daemon=True)
+    process = context.Process(target=_work, args=(theirs, number, in_main_thread()), daemon=True)
     process.start()
     theirs.close()  # the child holds the only copy then, so its death closes the pipe
     return _Worker(process, ours)
@@ -97,8 +97,8 @@ def _give(worker: _Worker, waiting: deque[Shard]) -> None:
             worker.pipe.send((worker.shard.job, worker.shard.rows))
 
 
-def _work(pipe: Connection, number: int) -> None:
-    end_with_parent()
+def _work(pipe: Connection, number: int, of_main_thread: bool) -> None:
+    end_with_parent(of_main_thread)
     worker: ShardWorker | None = None
     while True:
         try:

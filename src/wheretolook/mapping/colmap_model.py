@@ -51,14 +51,8 @@ class ModelArrays:
     observation_keypoint: NDArray[np.int64]  # (O,) index of the keypoint in its image
 
 
-def read_model(model_dir: str | Path) -> Any:
-    """Read a COLMAP model as a `pycolmap.Reconstruction`, binary or text, with or without rigs and frames (3.12).
-
-    Raises MapError if the folder or a file is missing, truncated or corrupt, or holds a camera, pose or point that is
-    not finite or that no model can have; it names the file.
-    """
-    import pycolmap
-
+def model_suffix(model_dir: str | Path) -> str:
+    """Whether a folder holds a binary model, ".bin", or one of text, ".txt". MapError if it holds none, or not all."""
     folder = Path(model_dir)
     if not folder.is_dir():
         fix = "Give the folder that holds cameras.bin, images.bin and points3D.bin."
@@ -71,6 +65,18 @@ def read_model(model_dir: str | Path) -> Any:
     for name in MODEL_FILES:
         if not (folder / (name + suffix)).is_file():
             raise MapError("a file of the COLMAP model is missing", path=folder / (name + suffix), fix=REBUILD)
+    return suffix
+
+
+def read_model(model_dir: str | Path) -> Any:
+    """Read a COLMAP model as a `pycolmap.Reconstruction`, binary or text, with or without rigs and frames (3.12).
+
+    Raises MapError if the folder or a file is missing, truncated or corrupt, or holds a camera, pose or point that is
+    not finite or that no model can have; it names the file.
+    """
+    folder, suffix = Path(model_dir), model_suffix(model_dir)
+    import pycolmap
+
     n_bytes = sum((folder / (name + suffix)).stat().st_size for name in MODEL_FILES)
     bar = tqdm(total=2, desc=f"model of {n_bytes / 1e9:.1f} GB: read", unit="step", disable=n_bytes < _LARGE_BYTES)
     reconstruction = pycolmap.Reconstruction()

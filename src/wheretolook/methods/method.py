@@ -78,6 +78,7 @@ class Method:
     folder: str = ""  # name of these options' group in `train`; methods with the same folder share them
     settings: Mapping[str, Any] = field(default_factory=dict)  # options that it has whatever its group says
     trained_unasked: bool = False  # whether the train stage learns it unless told what to learn
+    one_place: bool = False  # whether its weights serve only the map that they were adapted to
     one_camera: bool = False  # whether its weights serve only cameras with the field of view of their training views
     # whether a release may ship it: as the best of all; as the paper's network, of which the best one ships in half
     # precision; or not at all, as it is trained to compare with only

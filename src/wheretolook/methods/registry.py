@@ -130,10 +130,12 @@ def make_scorer(
     seed: int = 0,
     weights: str | Path | None = None,
     heading: tuple[tuple[float, float, float], ...] = (),
+    anywhere: bool = False,
 ) -> Scorer:
     """Build a method by its name, or by that of its family, for which the weights tell which one it is.
 
     The heading is for "forward": one direction, or the waypoints of a path; empty for one drawn for each location.
+    With `anywhere`, weights that are adapted to one place score in another, too.
 
     Raises a ConfigError if there is no such method, or it needs weights; a WeightsError if these cannot be used; a
     MapError if the map lacks what the method needs.
@@ -150,7 +152,7 @@ def make_scorer(
     if path is None:
         raise ConfigError("the method needs weights", value=name, fix="Give a file that the train stage wrote.")
     _of_weights(name, [method], path)
-    return _build(method, localization_map, ScorerOptions(seed, path, heading))
+    return _build(method, localization_map, ScorerOptions(seed, path, heading, anywhere))
 
 
 @overload

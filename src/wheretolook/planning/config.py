@@ -40,12 +40,14 @@ class ViewpointMapConfig(MappedLattice):
         weights: file of weights that the train stage wrote, for a method that has learnt. Unless a method is named,
             the best of the dataset, or else of those that ship, for cameras with their field of view.
         out: folder to write; empty for `<data>/<name>/<scene>/viewpoint-map`. Only with a scene.
+        anywhere: let weights that are adapted to another place score here, too.
     """
 
     scene: str = ""
     method: str = ""
     weights: Path | None = None
     out: Path | None = None
+    anywhere: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -28,16 +28,18 @@ INSIDE = np.stack(np.meshgrid(*[(-1 / 3, 0.0, 1 / 3)] * 3, indexing="ij"), -1).r
 """Points of a voxel that are tested for free space (27, 3), relative to its centre in units of its size."""
 
 
-def scene_scorer(scene: Scene, method: str = "", weights: Path | None = None) -> Scorer:
+def scene_scorer(scene: Scene, method: str = "", weights: Path | None = None, anywhere: bool = False) -> Scorer:
     """What scores views of a scene by a method (empty for that of the weights, or bins).
+
+    With `anywhere`, weights that are adapted to one place score in another, too.
 
     Raises:
         ConfigError: no such method, or it needs weights. WeightsError: the weights cannot be used.
         MapError: the map lacks what the method needs.
     """
     if weights is not None and not method:
-        return load_scorer(weights, scene.localization_map)
-    return make_scorer(method or fallback().name, scene.localization_map, weights=weights)
+        return load_scorer(weights, scene.localization_map, anywhere=anywhere)
+    return make_scorer(method or fallback().name, scene.localization_map, weights=weights, anywhere=anywhere)
 
 
 def scene_viewpoint_map(scene: Scene, views: ViewLattice, scorer: Scorer) -> ViewpointMap:

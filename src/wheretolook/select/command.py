@@ -87,6 +87,7 @@ def parser() -> argparse.ArgumentParser:
     add = score.add_argument
     add("--weights", type=Path, metavar="FILE", help="weights, or a folder of them (those that ship)")
     add("--method", default="", metavar="NAME", help="`wheretolook evaluate --list-methods` (that of the weights)")
+    add("--anywhere", action="store_true", help="let weights that are adapted to another place score here, too")
     add("--database", type=Path, metavar="FILE", help="the map's database: descriptors tell which landmarks look alike")
     add("--directions", type=int, default=500, metavar="N", help="directions looked along at each waypoint (500)")
     add("--lattice", default="fibonacci", metavar="NAME", help="fibonacci (even), or yaw-pitch (ActLoc's 6 x 18)")
@@ -118,6 +119,7 @@ def run(arguments: Sequence[str]) -> int:
         lattice=options.lattice,
         max_reprojection_error_px=options.max_error,
         device=options.device,
+        anywhere=options.anywhere,
     )
     if waypoints is None:
         waypoints = look.grid(options.grid)
@@ -132,15 +134,19 @@ def run(arguments: Sequence[str]) -> int:
 
 def _check(options: argparse.Namespace) -> Waypoints | None:
     """The waypoints, None for a grid; whatever can be refused before the map is read is refused here."""
+    from wheretolook.mapping.colmap_model import model_suffix
     from wheretolook.select.formats import check_format
     from wheretolook.select.limits import check_limits
     from wheretolook.select.waypoints import parse_points, read_waypoints
+    from wheretolook.select.weights import check_there
 
     check_format(options.out, options.format, options.n)
     check_limits(options.n, options.pitch, options.max_turn)
     if (options.at is None) == (options.grid is None):
         raise ConfigError("waypoints are given by --at or by --grid", fix="Give one of them.")
     _camera(options)
+    check_there(options.weights)
+    model_suffix(options.map)
     if options.at is None:
         return None
     texts = [text.strip() for text in options.at]

@@ -8,6 +8,12 @@ from wheretolook.utils.errors import WeightsError
 from wheretolook.utils.shipped import WEIGHTS, or_shipped, shipped
 
 
+def check_there(given: str | Path | None) -> None:
+    """Raise a WeightsError if there is no such file or folder of weights: at once, without reading any."""
+    if given is not None and not or_shipped(given).exists():
+        raise WeightsError("there are no weights", path=or_shipped(given), fix="Correct the path.")
+
+
 def weights_of(method: str, given: str | Path | None) -> Path | None:
     """The file of weights that a method scores with, of the file or folder given or of those that ship.
 

@@ -76,6 +76,7 @@ class WhereToLook:
         lattice: Lattice = "fibonacci",
         max_reprojection_error_px: float | None = None,
         device: str = "auto",
+        anywhere: bool = False,
     ) -> WhereToLook:
         """From any COLMAP model (binary or text) in metres, z up.
 
@@ -97,6 +98,7 @@ class WhereToLook:
             lattice: how they are spread: "fibonacci" evenly; "yaw-pitch" 6 pitches x 18 yaws as in ActLoc.
             max_reprojection_error_px: landmarks with a larger mean error are left out; None for the map's own default.
             device: "auto" for a GPU if there is one, "cpu", or "cuda:0".
+            anywhere: whether weights that are adapted to another place may score here.
 
         Raises:
             MapError: no usable model in the folder, or database.
@@ -128,7 +130,10 @@ class WhereToLook:
         if hides.name != "none":
             hides = RememberedOcclusion(hides)
         around = LocalizationMap.from_colmap(model, camera, occlusion=hides, device=device, **options)
-        scorer = make_scorer(method, around, weights=weights) if method else load_scorer(str(weights), around)
+        if method:
+            scorer = make_scorer(method, around, weights=weights, anywhere=anywhere)
+        else:
+            scorer = load_scorer(str(weights), around, anywhere=anywhere)
         return cls(scorer, axes, space)
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import time
 import warnings
 from contextlib import closing
@@ -19,12 +20,14 @@ from wheretolook.stages.inputs import Say, Tick, extractor_of, open_scene, refus
 from wheretolook.stages.one_at_a_time import reading
 from wheretolook.utils.errors import ConfigError, OutOfRangeWarning, SceneError, TableError, WeightsError
 from wheretolook.utils.files import fingerprint, write_text
+from wheretolook.utils.reading import read_json_object
 from wheretolook.utils.shipped import WEIGHTS, shipped
 from wheretolook.utils.tracking_store import check_store, kept_if_not_logged
 
 if TYPE_CHECKING:
     from wheretolook.evaluation.adaptation import Gain
     from wheretolook.inputs.localization_map import LocalizationMap
+    from wheretolook.labelling.labeller import LabelTask
     from wheretolook.methods.adapted.fit import Adapted, LocalizedViews
     from wheretolook.methods.set.score import SetScorer
 
@@ -101,6 +104,7 @@ def _check_out(path: Path, weights: Path) -> None:
 def _labelled(experiment: Experiment, files: SceneFolder, scene: Scene, say: Say) -> pd.DataFrame:
     """The scene's labelled viewpoints: all if the label stage has been here, else those that the time allows."""
     if read_stamp(files, "label") is not None:
+        shutil.rmtree(files.adapt_shards, ignore_errors=True)  # of views that have labels now
         return files.read_table()
     if not files.mesh.is_file():
         problem = "this scene has neither labels nor a mesh that views could be rendered from"
@@ -118,17 +122,19 @@ def _label_for(experiment: Experiment, files: SceneFolder, scene: Scene, say: Sa
 
     config, label = experiment.adapt, experiment.label
     table = files.read_table()
+    if table.empty:
+        return table
     ids, row = np.unique(table["location_id"].to_numpy(), return_inverse=True)
     order = np.random.default_rng(config.seed).permutation(len(ids))[row.reshape(-1)]
     table = table.iloc[np.argsort(order, kind="stable")].reset_index(drop=True)
     cameras = tuple(files.cameras().items()) if files.cameras_file.is_file() else ()
     options = (label.localizer, extractor_of(files), scene.device, False)
     job = SceneJob(files.mesh, files.landmarks, scene.camera, *options, cameras)
-    folder = files.folder / "adapt-shards"
     begins = range(0, len(table), _AT_ONCE)
+    parts = {begin: table.iloc[begin : begin + _AT_ONCE] for begin in begins}
     tasks = [
-        LabelTask(f"{files.name} {begin}", job, table.iloc[begin : begin + _AT_ONCE], folder / f"{begin:06}")
-        for begin in begins
+        LabelTask(f"{files.name} {begin}", job, part, files.adapt_shards / f"{begin:06}")
+        for begin, part in parts.items()
     ]
     say(f"{files.name}: labelling up to {len(table):,} views, for {config.minutes:g} minutes at most")
     done: dict[str, pd.DataFrame] = {}
@@ -140,10 +146,25 @@ def _label_for(experiment: Experiment, files: SceneFolder, scene: Scene, say: Sa
                 end = time.monotonic() + 60 * config.minutes
             if end is not None and time.monotonic() >= end:
                 break
+    _remove_stale(files.adapt_shards, tasks)
     found = pd.concat([done[task.name] for task in tasks if task.name in done], ignore_index=True)
     if len(found) < len(table):
         say(f"{files.name}: {len(found):,} of {len(table):,} views labelled; run it again to go on with more")
     return found
+
+
+def _remove_stale(folder: Path, tasks: list[LabelTask]) -> None:
+    """Remove shards of other viewpoints, maps or settings; the others wait for a run that goes on."""
+    from wheretolook.labelling.labeller import MANIFEST
+
+    for path in folder.iterdir():
+        if path not in {task.shards for task in tasks}:
+            shutil.rmtree(path, ignore_errors=True)
+    for task in tasks:
+        current = read_json_object(task.shards / MANIFEST)["shards"]
+        for path in task.shards.glob("*.parquet"):
+            if path.name not in current:
+                path.unlink()
 
 
 def labelled_views(files: SceneFolder, scene: Scene, table: pd.DataFrame, weights: Path) -> LocalizedViews:

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 def evaluate(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> pd.DataFrame:
     """Stage 6: the score table of all methods on the test scenes, `<dataset>/results/`, and nested MLflow runs."""
     dataset = dataset_after(experiment, "label")
+    check_store(experiment.tracking)  # before the imports of what scores, which take seconds
     device, occlusion = experiment.warp_device, experiment.occlusion
     scores = evaluate_methods(dataset, experiment.evaluate, experiment.tracking, device=device, occlusion=occlusion)
     tick(1)

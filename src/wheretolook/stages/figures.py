@@ -19,11 +19,11 @@ def figures(experiment: Experiment, say: Say = print) -> Dataset:
             were drawn.
         ConfigError: there is no figure of that name. TableError: there is no dataset.
     """
-    from wheretolook.release.catalog import ITEMS, check_names, write_items
+    dataset = Dataset.load(experiment.root)
+    from wheretolook.release.catalog import ITEMS, check_names, write_items  # takes seconds
     from wheretolook.release.copy import is_release
 
     check_names(experiment.figures)
-    dataset = Dataset.load(experiment.root)
     if is_release(dataset):
         log_release(experiment, say, attach=False)
     missing = write_items(dataset, experiment.tracking, experiment.figures, say)

@@ -94,6 +94,7 @@ def _label(
             write_json(files.label_manifest, labelled.manifest)
             write_stamp(files, "label", key)
             shutil.rmtree(labelled.task.shards, ignore_errors=True)
+            shutil.rmtree(files.adapt_shards, ignore_errors=True)  # a part of the same views
             for step, spent in labelled.seconds.items():
                 seconds[step] = seconds.get(step, 0.0) + spent
             _report(files, labelled.table, say)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from wheretolook.config import Experiment
-from wheretolook.dataset.folders import Dataset
+from wheretolook.dataset.folders import RELEASE_FILE, Dataset
 from wheretolook.figures.config import FiguresConfig
 from wheretolook.stages.inputs import Say
 from wheretolook.stages.one_at_a_time import reads_dataset
@@ -25,15 +25,14 @@ def log_release(experiment: Experiment, say: Say = print, attach: bool = True) -
 
     Raises ConfigError if the dataset is no release, TableError if there is none.
     """
-    from wheretolook.release.catalog import write_items
-    from wheretolook.release.copy import is_release
-    from wheretolook.release.runs import log_release as log_runs
-
     dataset = Dataset.load(experiment.root)
-    if not is_release(dataset):
+    if not (dataset.root / RELEASE_FILE).is_file():
         fix = "Its runs are logged by the stages themselves; a release is made by `wheretolook release`."
         raise ConfigError("this dataset is no release", path=experiment.root, fix=fix)
     check_store(experiment.tracking)
+    from wheretolook.release.catalog import write_items  # these take seconds, and what can be refused has been
+    from wheretolook.release.runs import log_release as log_runs
+
     runs = log_runs(dataset, experiment.tracking, say)
     if runs.new and attach:
         say("attaching figures and tables")

@@ -33,7 +33,8 @@ def viewpoint_map(experiment: Experiment, say: Say = print, tick: Tick = lambda 
     for files in [dataset.scene(config.scene)] if config.scene else dataset.scenes:
         scene = open_scene(experiment, dataset, files)
         with naming_scene(scene.source):
-            views = scene_viewpoint_map(scene, config, scene_scorer(scene, config.method, config.weights))
+            scorer = scene_scorer(scene, config.method, config.weights, config.anywhere)
+            views = scene_viewpoint_map(scene, config, scorer)
         folder = config.out or files.folder / "viewpoint-map"
         views.save(folder)
         built[scene.name] = views

@@ -12,7 +12,7 @@ from types import TracebackType
 from typing import TypeVar
 
 from wheretolook.utils.errors import WorkerError
-from wheretolook.utils.workers import end_with_parent, spawning, use_one_core
+from wheretolook.utils.workers import end_with_parent, in_main_thread, spawning, use_one_core
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -23,8 +23,7 @@ class Processes:
 
     def __init__(self, workers: int) -> None:
         self.workers = workers
-        context = multiprocessing.get_context("spawn")
-        self._pool = ProcessPoolExecutor(workers, context, initializer=_start_worker) if workers > 1 else None
+        self._pool: ProcessPoolExecutor | None = None
 
     def __enter__(self) -> Processes:
         return self
@@ -40,9 +39,12 @@ class Processes:
 
         Raises WorkerError if a process was killed.
         """
-        if self._pool is None:
+        if self.workers <= 1:
             yield from map(function, items)
             return
+        if self._pool is None:  # here, since the thread that begins to use it starts the processes
+            context = multiprocessing.get_context("spawn")
+            self._pool = ProcessPoolExecutor(self.workers, context, _start_worker, (in_main_thread(),))
         source, pending = iter(items), deque[Future[Result]]()
         try:
             while True:
@@ -60,6 +62,6 @@ class Processes:
                 future.cancel()
 
 
-def _start_worker() -> None:
-    end_with_parent()
+def _start_worker(of_main_thread: bool) -> None:
+    end_with_parent(of_main_thread)
     use_one_core()

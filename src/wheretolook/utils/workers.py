@@ -18,7 +18,7 @@ def spawning() -> Iterator[None]:
 
     If workers set this themselves, a Ctrl-C during their imports, which take seconds, would still reach them.
     """
-    if threading.current_thread() is not threading.main_thread():
+    if not in_main_thread():
         yield
         return
     handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -28,14 +28,21 @@ def spawning() -> Iterator[None]:
         signal.signal(signal.SIGINT, handler)
 
 
-def end_with_parent() -> None:
+def in_main_thread() -> bool:
+    """Whether this is the main thread, which lives as long as its process."""
+    return threading.current_thread() is threading.main_thread()
+
+
+def end_with_parent(of_main_thread: bool) -> None:
     """Called in a worker: end it when its parent ends, even if the parent is killed.
 
     On Linux the kernel ends it at once, even in the middle of a compiled function that lets no other thread run: what a
-    killed run has begun must write nothing beside the next run. Elsewhere a thread does.
+    killed run has begun must write nothing beside the next run. Elsewhere a thread does. So it is, too, if the worker
+    was not started by its parent's main thread: the kernel ends it with the thread that started it (prctl(2)).
     """
-    with suppress(OSError, AttributeError):
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if of_main_thread:
+        with suppress(OSError, AttributeError):
+            ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=_wait_and_exit, args=(parent,), daemon=True).start()

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from threading import Lock
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,11 +14,29 @@ from scipy.spatial import ConvexHull, cKDTree
 from wheretolook.geometry.poses import Float
 from wheretolook.utils.errors import ConfigError, MapError, SceneError
 from wheretolook.visibility.config import DEFAULT_RADIUS
+from wheretolook.visibility.hull import hull_length, may_be_near_hull
 from wheretolook.visibility.occlusion import OcclusionModel
 
 TOUCHING_M = 1e-6  # a landmark this close to a location is in the same place, and has no direction as seen from it
 _FLAT = 1e-12  # least mean square of the directions along an axis; below it, all lie in the plane across that axis
-_NO_LENGTH = 1e-12  # keeps facets through the origin, which no direction leaves by, from dividing by zero
+
+
+_LOCK = Lock()
+
+
+@dataclass(frozen=True, eq=False)
+class _Places:
+    """Where the landmarks of a map are. Of two millions it takes seconds to find out, and a map is asked often."""
+
+    points: Float  # (N, 3)
+    distinct: Float  # (P, 3) the places that differ
+    place: NDArray[np.int64]  # (N,) rows of these
+    tree: cKDTree  # of the distinct ones
+
+    @classmethod
+    def of(cls, points: Float) -> _Places:
+        distinct, place = np.unique(points, axis=0, return_inverse=True)
+        return cls(points.copy(), distinct, place.reshape(-1), cKDTree(distinct))
 
 
 class HiddenPointRemoval(OcclusionModel):
@@ -51,12 +71,14 @@ class HiddenPointRemoval(OcclusionModel):
         if threads < 0:
             raise ConfigError("threads must be >= 0", value=threads)
         self.radius, self.margin_m, self.threads = float(radius), float(margin_m), threads
+        self._places: _Places | None = None  # of the landmarks that were asked about last
 
     def unoccluded(self, locations: Float, points: Float) -> NDArray[np.bool_]:
         """(L, N), True where no surface that the landmarks suggest stands between; raises what `check` raises."""
         at, landmarks = np.asarray(locations, dtype=np.float64), np.asarray(points, dtype=np.float64)
         self.check(at, landmarks)
-        places, place = np.unique(landmarks, axis=0, return_inverse=True)
+        known = self._places_of(landmarks)
+        places, place = known.distinct, known.place
         free = np.empty((len(at), len(landmarks)), dtype=bool)
 
         def fill(row: int) -> None:
@@ -78,12 +100,19 @@ class HiddenPointRemoval(OcclusionModel):
         if len(bad):
             problem = f"{len(bad)} of {len(points)} landmarks are not finite, the first in row {bad[0]}"
             raise MapError(problem, value=tuple(points[bad[0]].tolist()), fix="Triangulate the model again.")
-        distance, _ = cKDTree(points).query(locations, distance_upper_bound=2 * TOUCHING_M)
+        tree = self._places_of(np.asarray(points, dtype=np.float64)).tree
+        distance, _ = tree.query(locations, distance_upper_bound=2 * TOUCHING_M)
         touching = distance <= TOUCHING_M
         if touching.any():
             problem = "a landmark lies at the location: it is on a surface, or inside geometry"
             at = tuple(np.asarray(locations)[touching][0].tolist())
             raise SceneError(problem, value=at, fix="Choose locations in free space.")
+
+    def _places_of(self, points: Float) -> _Places:
+        with _LOCK:  # so that threads that ask about the same landmarks do not all sort them
+            if self._places is None or not np.array_equal(self._places.points, points):
+                self._places = _Places.of(points)
+            return self._places
 
     def _free_from(self, location: Float, places: Float) -> NDArray[np.bool_]:
         """Which of the distinct places (N, 3) are free from a location (3,); (N,)."""
@@ -97,8 +126,16 @@ class HiddenPointRemoval(OcclusionModel):
 def on_hull(directions: Float, lengths: Float, margin: float = 0.0) -> NDArray[np.bool_]:
     """Which points (N,) lie on the convex hull of all and the origin, or less than a margin below it.
 
-    They are given by unit vectors (N, 3) from the origin and positive lengths (N,).
+    They are given by unit vectors (N, 3) from the origin and positive lengths (N,). What `on_hull_plain` tells, of the
+    points that may be there.
     """
+    on = may_be_near_hull(directions, lengths, margin)
+    on[on] = on_hull_plain(directions[on], lengths[on], margin)
+    return on
+
+
+def on_hull_plain(directions: Float, lengths: Float, margin: float = 0.0) -> NDArray[np.bool_]:
+    """As `on_hull`, by the hull of all points."""
     points = directions * lengths[:, None]
     hull = ConvexHull(np.concatenate([points, np.zeros((1, 3)), _missing_axes(directions)]))
     on = np.isin(np.arange(len(points)), hull.vertices)
@@ -106,31 +143,6 @@ def on_hull(directions: Float, lengths: Float, margin: float = 0.0) -> NDArray[n
         inner = np.flatnonzero(~on)
         on[inner] = hull_length(hull, directions[inner]) - lengths[inner] <= margin
     return on
-
-
-def hull_length(hull: ConvexHull, directions: Float) -> Float:
-    """Distance (N,) from the origin to where each of directions (N, 3) leaves a 3D convex hull that holds the origin.
-
-    Along u, a facet's plane n x = d is met at d / (n u), and the hull's boundary at the least of these, that is, at the
-    facet with the greatest u (n / d). The n / d are the corners of a convex polyhedron, the hull's dual. So moving from
-    facet to better neighbouring facet ends at the best one, as in the simplex method. Directions are unit vectors that
-    point into the hull.
-    """
-    dual = hull.equations[:, :3] / np.maximum(-hull.equations[:, 3:], _NO_LENGTH)
-    centers = hull.points[hull.simplices].mean(axis=1)
-    centers /= np.maximum(np.linalg.norm(centers, axis=1, keepdims=True), _NO_LENGTH)
-    facet = cKDTree(centers).query(directions)[1]  # near the one looked for
-    value = np.sum(dual[facet] * directions, axis=1)
-    climbing = np.arange(len(directions))
-    while len(climbing):
-        neighbours = hull.neighbors[facet[climbing]]
-        values = np.einsum("ijk,ik->ij", dual[neighbours], directions[climbing])
-        best = values.argmax(axis=1)
-        better = values.max(axis=1) > value[climbing]
-        climbing, best = climbing[better], best[better]
-        facet[climbing] = neighbours[better, best]
-        value[climbing] = values[better, best]
-    return 1 / np.maximum(value, _NO_LENGTH)
 
 
 def _missing_axes(directions: Float) -> Float:

@@ -14,5 +14,6 @@ METHODS = (
         weights="adapted",
         probability=True,
         only_if_named=True,
+        one_place=True,
     ),
 )

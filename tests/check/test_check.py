@@ -335,7 +335,7 @@ def test_blocks_that_leave_no_map_are_refused(tmp_path: Path) -> None:
 
 
 def test_features_are_read_by_names(corridor: tuple[Path, Path]) -> None:
-    ((pixels, descriptors),) = read_features(corridor[1], ["004.jpg"])
+    _, ((pixels, descriptors),) = read_features(corridor[1], ["004.jpg"])
     image = read_model(corridor[0]).images[5]
     assert np.abs(pixels - [point.xy for point in image.points2D]).max() < 1e-4
     assert descriptors.shape == (len(pixels), 128) and descriptors.dtype == np.uint8

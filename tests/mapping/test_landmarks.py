@@ -232,8 +232,9 @@ def test_compact_landmarks_keep_all_but_descriptors(tmp_path, model_dir, with_de
     again = Landmarks.load(tmp_path / "a.npz")
     assert again.descriptors is None
     assert np.isnan(again.ambiguity).all() == (not with_descriptors)
+    assert again.features == landmarks.features == ("sift" if with_descriptors else "")
     for name, value in vars(landmarks).items():
-        if name != "descriptors":
+        if name not in ("descriptors", "described_by"):
             other = getattr(again, name)
             assert other.dtype == value.dtype
             rtol = 0 if value.dtype.kind == "i" else 1e-7 if name == "points" else 5e-4

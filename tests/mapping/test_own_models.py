@@ -271,7 +271,7 @@ def test_features_in_hdf5_of_hloc(tmp_path):
     with h5py.File(tmp_path / "feats.h5", "a") as file:
         for i in range(3):
             del file[f"{i}.png/descriptors"]
-            file[f"{i}.png"]["descriptors"] = np.zeros((256, len(keypoints[i])))  # SuperPoint's
+            file[f"{i}.png"]["descriptors"] = np.zeros((512, len(keypoints[i])))  # D2-Net's
     with pytest.warns(MapWarning, match="ambiguity"):
         assert np.isnan(load_colmap_landmarks(folder, tmp_path / "feats.h5").ambiguity).all()
     (tmp_path / "feats.h5").write_bytes(b"not HDF5")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -182,7 +182,7 @@ class SceneRound:
         from wheretolook.benchmark.query_map import read_image
 
         errors, estimates = folder / ERRORS, folder / ESTIMATES
-        key = stage_key("localize", [self._map_key, asdict(LOCALIZER)])
+        key = stage_key("localize", [self._map_key, LOCALIZER.record()])
         noted, done = _key(folder, "localize"), {}
         if errors.is_file() and noted is None:
             self.told.append(f"{folder.name}: errors of another localizer are kept, {errors}")

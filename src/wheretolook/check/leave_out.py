@@ -164,9 +164,9 @@ def _run(job: _Job) -> int:
         landmarks = load_colmap_landmarks(job.model, job.features, None, job.device, rest, progress=False)
     localizer = Localizer(landmarks, job.cameras[0], device=job.device)
     rows, matched, inliers, kept = [], list[NDArray[np.int64]](), list[NDArray[np.int64]](), list[NDArray[np.int64]]()
-    stored = read_features(job.features, job.names)
+    kind, stored = read_features(job.features, job.names)
     for place, (pixels, descriptors) in enumerate(stored):
-        keypoints = Keypoints(pixels, (descriptors / 512).astype(np.float32), np.ones(len(pixels), np.float32))
+        keypoints = Keypoints(pixels, kind.restore(descriptors), np.ones(len(pixels), np.float32))
         found = localizer.estimate(keypoints, *localizer.match([keypoints])[0], camera=job.cameras[place])
         pose = np.full((3, 4), np.nan) if found.cam_from_world is None else found.cam_from_world
         error_m, error_deg = (float(error) for error in pose_error(pose, job.poses[place]))

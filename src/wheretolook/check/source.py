@@ -93,8 +93,8 @@ def open_map(
     `metric` says whether the model is in metres; `keep_frame` that it has z up, whatever it looks like. A
     `reconstruction` is the model if it has been read already; it is turned and scaled in place.
 
-    Raises MapError if the model or the features cannot be used or do not belong together, the features are not SIFT, or
-    the model has fewer than `LEAST_PHOTOGRAPHS` photographs.
+    Raises MapError if the model or the features cannot be used or do not belong together, the features are of no known
+    kind, or the model has fewer than `LEAST_PHOTOGRAPHS` photographs.
     """
     model = reconstruction or read_model(model_dir)
     n_posed = sum(image.has_pose for image in model.images.values())
@@ -123,7 +123,8 @@ def open_map(
         warnings.simplefilter("ignore", MapWarning)  # the error below tells the same
         if read_descriptors(features, model_dir, model, arrays) is None:
             fix = "Give the folder of its photographs instead, --images: then SIFT is extracted from them."
-            raise MapError("these features are not SIFT, so nothing can be localized by them", path=features, fix=fix)
+            problem = "these features are of no kind that is known, so nothing can be localized by them"
+            raise MapError(problem, path=features, fix=fix)
     known = cameras_by_id(model.cameras, model_dir)
     images = [model.images[int(number)] for number in arrays.image_ids]
     parts = [fingerprint(path) for path in sorted(model_dir.glob("*.bin")) + sorted(model_dir.glob("*.txt"))]

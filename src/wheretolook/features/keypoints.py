@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from wheretolook.features.descriptors import quantize_descriptors, unit_descriptors
+from wheretolook.features.registry import all_extractors, that_extract
 from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.files import sha256
+
+__all__ = ["ExtractorConfig", "Keypoints", "quantize_descriptors", "unit_descriptors"]
 
 
 @dataclass(frozen=True)
@@ -16,28 +22,35 @@ class ExtractorConfig:
     """Settings of the keypoint extractor.
 
     Args:
-        method: whose SIFT finds keypoints, opencv or colmap. `opencv` finds nearly the same keypoints as `colmap`,
-            COLMAP's own extraction on the CPU, in 40 % of the time; on a GPU, Warp kernels find OpenCV's up to
-            rounding.
-        first_octave: -1 doubles the image first, which gives about three times as many (and smaller) keypoints, for
-            `colmap` at four times the cost; 0 starts at the image's own size. COLMAP's default is -1.
+        method: what finds keypoints: SIFT by opencv or colmap, or one of the learned aliked, disk and xfeat, which need
+            `pip install 'wheretolook[learned]'`. `opencv` finds nearly the same keypoints as `colmap`, COLMAP's own
+            extraction on the CPU, in 40 % of the time; on a GPU, Warp kernels find OpenCV's up to rounding.
+        first_octave: of SIFT: -1 doubles the image first, which gives about three times as many (and smaller)
+            keypoints, for `colmap` at four times the cost; 0 starts at the image's own size. COLMAP's default is -1.
         max_keypoints: largest number of keypoints for each image. `colmap` prefers large scales, `opencv` strong
-            contrast.
-        peak_threshold: least contrast (difference of Gaussians, grey values in [0, 1]). COLMAP's default is 0.02 / 3.
+            contrast, learned ones high scores.
+        peak_threshold: of SIFT: least contrast (difference of Gaussians, grey values in [0, 1]). COLMAP's default is
+            0.02 / 3.
+        weights: file of a learned extractor's network as its authors give it (aliked-n16rot.pth, depth-save.pth of
+            DISK, xfeat.pt). Without one, kornia's copy: from its cache, or else downloaded, which is said.
 
     Attributes:
         edge_threshold: largest ratio of principal curvatures: the value of Lowe 2004 (section 4.1), COLMAP and OpenCV.
     """
 
-    method: Literal["opencv", "colmap"] = "opencv"
+    method: str = "opencv"
     first_octave: int = -1
     max_keypoints: int = 2048
     peak_threshold: float = 0.02 / 3
+    weights: str = ""
     edge_threshold: float = field(default=10.0, init=False)
 
     def __post_init__(self) -> None:
-        if self.method not in ("colmap", "opencv"):
-            raise ConfigError("unknown extractor method", value=self.method, fix="Choose colmap or opencv")
+        if self.method not in that_extract():
+            fix = f"Choose one of {', '.join(that_extract())}."
+            raise ConfigError("unknown extractor method", value=self.method, fix=fix)
+        if self.weights and not all_extractors()[self.method].weights:
+            raise ConfigError("this extractor has no weights", value=self.weights, fix="Leave extractor.weights out.")
         if self.first_octave not in (-1, 0):
             raise ConfigError("first_octave must be -1 or 0", value=self.first_octave)
         if self.max_keypoints < 1:
@@ -45,32 +58,29 @@ class ExtractorConfig:
         if not self.peak_threshold > 0:
             raise ConfigError("peak_threshold must be positive", value=self.peak_threshold)
 
+    def record(self) -> dict[str, Any]:
+        """What decides which keypoints come out, as JSON values: of weights what is in them, not where they lie."""
+        record = asdict(self)
+        path = record.pop("weights")
+        if path:
+            record["weights_sha256"] = sha256(Path(path)) if Path(path).is_file() else None
+        return record
+
 
 @dataclass(frozen=True, eq=False)
 class Keypoints:
     """Keypoints of one image."""
 
     pixels: NDArray[np.float32]  # (N, 2) (x, y) in pixels; (0.5, 0.5) is the centre of the top-left pixel
-    descriptors: NDArray[np.float32]  # (N, 128) RootSIFT (Arandjelovic and Zisserman, CVPR 2012) of unit length
-    scales_px: NDArray[np.float32]  # (N,) standard deviation of the Gaussian at which the keypoint was found
+    # (N, D) of unit length; of SIFT (N, 128) RootSIFT (Arandjelovic and Zisserman, CVPR 2012)
+    descriptors: NDArray[np.float32]
+    # (N,) standard deviation of the Gaussian at which the keypoint was found; 1 where the extractor knows no scales
+    scales_px: NDArray[np.float32]
 
     def __len__(self) -> int:
         return len(self.pixels)
 
     @classmethod
-    def none(cls) -> Keypoints:
-        """No keypoints."""
-        return cls(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32), np.zeros(0, np.float32))
-
-
-def quantize_descriptors(descriptors: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
-    """Unit descriptors (N, D) as COLMAP stores them, (N, D) uint8: 512 times the value, rounded, at most 255."""
-    return np.clip(np.rint(512 * descriptors), 0, 255).astype(np.uint8)
-
-
-def unit_descriptors(descriptors: NDArray[Any]) -> NDArray[np.float32]:
-    """Stored descriptors (N, D), e.g. uint8, as float32 of unit length (rows of zeros stay zero)."""
-    values = descriptors.astype(np.float32)
-    length = np.linalg.norm(values, axis=1, keepdims=True)
-    values /= np.where(length > 0, length, 1)
-    return values
+    def none(cls, dimension: int = 128) -> Keypoints:
+        """No keypoints, with descriptors of so many numbers."""
+        return cls(np.zeros((0, 2), np.float32), np.zeros((0, dimension), np.float32), np.zeros(0, np.float32))

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
 
 from wheretolook.utils.errors import ConfigError
 
@@ -13,8 +13,10 @@ class LocalizerConfig:
     """Settings of matching and pose estimation.
 
     Args:
-        max_ratio: Lowe's ratio: below it, a match counts. The nearest landmark's descriptor distance over the second
-            nearest's.
+        max_ratio: Lowe's ratio, for SIFT: below it, a match counts. The nearest landmark's descriptor distance over the
+            second nearest's.
+        min_similarity: of learned features: a keypoint and a landmark that are each other's nearest match if the cosine
+            between their descriptors is at least this; the extractor's own limit if none is given.
         max_error_px: reprojection error under which RANSAC counts a match as an inlier.
         min_inliers: inliers that a pose needs. With fewer it is taken for an accident: RANSAC finds some pose for
             almost any image.
@@ -30,6 +32,7 @@ class LocalizerConfig:
     """
 
     max_ratio: float = 0.85
+    min_similarity: float | None = None
     min_matches: int = field(default=4, init=False)
     max_error_px: float = 8.0
     min_inliers: int = 10
@@ -41,10 +44,17 @@ class LocalizerConfig:
     def __post_init__(self) -> None:
         if not 0 < self.max_ratio <= 1:
             raise ConfigError("max_ratio must be in (0, 1]", value=self.max_ratio)
+        if self.min_similarity is not None and not -1 <= self.min_similarity <= 1:
+            raise ConfigError("min_similarity is a cosine, -1 to 1", value=self.min_similarity)
         if self.min_inliers < 4 or self.max_error_px <= 0:
             raise ConfigError(
                 "the localizer needs min_inliers >= 4 and max_error_px > 0", value=(self.min_inliers, self.max_error_px)
             )
+
+    def record(self) -> dict[str, Any]:
+        """What decides which labels come out, as JSON values."""
+        later = {"min_similarity": None}  # options that older labels do not know, and what leaves everything as it was
+        return {name: value for name, value in asdict(self).items() if name not in later or value != later[name]}
 
 
 @dataclass(frozen=True)

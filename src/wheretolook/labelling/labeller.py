@@ -7,7 +7,7 @@ import json
 import os
 from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -128,7 +128,7 @@ class _SceneInProgress:
             fix = "Build the map again."
             raise MapError("landmarks without descriptors cannot be matched", path=job.landmarks, fix=fix)
         settings: dict[str, Any] = {"versions": versions()}
-        settings |= {name: asdict(getattr(job, name)) for name in ("localizer", "extractor")}
+        settings |= {"localizer": job.localizer.record(), "extractor": job.extractor.record()}
         settings["camera"] = job.camera.record()
         settings |= {"renderer": _renderer_name(job.device)}
         settings |= {"mesh": fingerprint(job.mesh), "landmarks": fingerprint(job.landmarks)}

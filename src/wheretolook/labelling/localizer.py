@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -11,8 +12,10 @@ import poselib
 from numpy.typing import NDArray
 
 from wheretolook.features.extraction import KeypointExtractor
-from wheretolook.features.keypoints import ExtractorConfig, Keypoints, quantize_descriptors
+from wheretolook.features.keypoints import ExtractorConfig, Keypoints
 from wheretolook.features.matching import DescriptorMatcher, Matches, match
+from wheretolook.features.registry import all_kinds, kind_of
+from wheretolook.features.similarity import SimilarityMatcher
 from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.geometry.local_origin import local_origin, poses_from
 from wheretolook.geometry.poses import Float
@@ -45,9 +48,11 @@ class Localization:
 class Localizer:
     """Localizes images against landmarks (paper, Sec. 3.3 "Self-supervision").
 
-    Keypoints are extracted and matched to the landmarks' mean descriptors with Lowe's ratio test; PoseLib estimates the
-    pose by P3P in LO-RANSAC and refines it on the inliers. The extractor must be what the map was made with; it and
-    matching run on the device, "cpu" or a CUDA device. Raises MapError if the landmarks have no descriptors.
+    Keypoints are extracted and matched to the landmarks' mean descriptors, SIFT's with Lowe's ratio test, learned ones
+    where both are each other's nearest; PoseLib estimates the pose by P3P in LO-RANSAC and refines it on the inliers.
+    The extractor must be what the map was made with, and may be left out where nothing is extracted; it and matching
+    run on the device, "cpu" or a CUDA device. Raises MapError if the landmarks have no descriptors, or others than the
+    extractor's.
     """
 
     def __init__(
@@ -61,8 +66,12 @@ class Localizer:
         if landmarks.descriptors is None:
             raise MapError("landmarks without descriptors cannot be matched", fix="Build the map with its database.")
         self.landmarks, self.config = landmarks, config or LocalizerConfig()
-        self.extractor = KeypointExtractor(extractor, device)
-        self._matcher = DescriptorMatcher(landmarks.descriptors, device)
+        self.kind = all_kinds()[landmarks.features]
+        if extractor is not None:
+            self._refuse_other(extractor)
+        self._extract_with, self._device = extractor, device
+        by_ratio = self.kind.in_bytes
+        self._matcher = (DescriptorMatcher if by_ratio else SimilarityMatcher)(landmarks.descriptors, device)
         self._camera, self._origin = camera, local_origin(landmarks.points)
         self._ransac = {
             "max_reproj_error": self.config.max_error_px,
@@ -76,6 +85,19 @@ class Localizer:
         # just within the limit were accurate, too: poses are then worse.
         self._refinement = {"loss_type": "CAUCHY", "loss_scale": 1.0}
 
+    @cached_property
+    def extractor(self) -> KeypointExtractor:
+        """What finds keypoints in queries. Made when first asked for: keypoints may also be given."""
+        config = self._extract_with or ExtractorConfig()
+        self._refuse_other(config)
+        return KeypointExtractor(config, self._device)
+
+    def _refuse_other(self, extractor: ExtractorConfig) -> None:
+        if kind_of(extractor.method) != self.kind:
+            problem = f"the map's landmarks are described by {self.kind.name}: other keypoints match none of them"
+            fix = "Map again with what queries are to have, --map.extractor.method."
+            raise MapError(problem, value=extractor.method, fix=fix)
+
     def localize(self, rgb: NDArray[np.uint8]) -> Localization:
         """Localize one image (H, W, 3) uint8."""
         keypoints = self.extractor.extract(rgb)
@@ -87,7 +109,10 @@ class Localizer:
 
     def match(self, keypoints: Sequence[Keypoints]) -> list[Matches]:
         """Step 2: 2D-3D matches of several images at once; those of one image do not depend on the others."""
-        descriptors = [quantize_descriptors(of_image.descriptors) for of_image in keypoints]
+        descriptors = [self.kind.store(of_image.descriptors) for of_image in keypoints]
+        if isinstance(self._matcher, SimilarityMatcher):
+            least = self.config.min_similarity
+            return self._matcher.match(descriptors, self.kind.min_similarity if least is None else least)
         return match(self._matcher, descriptors, self.config.max_ratio)
 
     def estimate(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sqlite3
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -12,29 +13,33 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.features.keypoints import quantize_descriptors, unit_descriptors
+from wheretolook.features.descriptors import DescriptorKind, Stored, unit_descriptors
+from wheretolook.features.registry import all_kinds, kind_of, that_extract
+from wheretolook.features.sift import SIFT
 from wheretolook.mapping.colmap_model import ModelArrays
+from wheretolook.mapping.scale import REPORT_FILE
 from wheretolook.utils.errors import MapError, MapWarning
+from wheretolook.utils.reading import read_json_object
 
 HDF5_SUFFIXES = (".h5", ".hdf5")
-_SIFT = 128  # numbers in a descriptor
-_SIFT_TYPES = (-1, 0)  # in a database of COLMAP 4: not said, or SIFT
-# An image's keypoints (K, 2) in pixels, and its descriptors (K, 128) uint8; None where it has none that are SIFT.
-_Features = tuple[NDArray[np.float64], NDArray[np.uint8] | None]
-
-Stored = tuple[NDArray[np.float32], NDArray[np.uint8]]  # pixels (K, 2) and descriptors (K, 128) of an image
+# An image's keypoints (K, 2) in pixels, its descriptors (K, D) as `DescriptorKind.store` gives them, and their kind;
+# None where it has none, or of a kind that is not known.
+_Features = tuple[NDArray[np.float64], NDArray[Any] | None, DescriptorKind | None]
 
 
 def read_descriptors(
     features: str | Path, model_dir: str | Path, reconstruction: Any, model: ModelArrays
-) -> NDArray[np.uint8] | None:
-    """Descriptors (O, 128) uint8 of the observations of a model, from the file of features that it was built from.
+) -> tuple[DescriptorKind, NDArray[Any]] | None:
+    """Descriptors (O, D) of the observations of a model, stored as their kind says, and that kind.
 
-    That is a COLMAP database (`database.db` of version 3 or 4; it is not written to), or hloc's features in HDF5
-    (`feats-*.h5`). Images are found by their names. None, with a `MapWarning`, if the file holds no SIFT descriptors:
-    other kinds tell nothing that scorers have learnt from.
+    They come from the file of features that the model was built from: a COLMAP database (`database.db` of version 3 or
+    4; it is not written to), or hloc's features in HDF5 (`feats-*.h5`). Images are found by their names. What kind they
+    are the database says, or the report beside it; of HDF5 the file's name (`feats-disk.h5`), or where that says
+    nothing how many numbers there are: 64 for XFeat, 256 for SuperPoint, 128 without negatives for SIFT. None, with a
+    `MapWarning`, if the file holds no descriptors, or none of a kind in `wheretolook.features.registry`.
 
-    Raises MapError if the file is missing, unreadable, or not the one the model was built from, or h5py is missing.
+    Raises MapError if the file is missing, unreadable, or not the one the model was built from, its descriptors are not
+    all of one kind, or h5py is missing.
     """
     path = Path(features)
     if not path.is_file():
@@ -43,10 +48,11 @@ def read_descriptors(
     mismatch = f"Give the database that {model_dir} was built from, or none."
     order = np.argsort(model.observation_image, kind="stable")
     ends = np.searchsorted(model.observation_image[order], np.arange(len(model.image_ids) + 1))
-    found, without = np.empty((len(order), _SIFT), dtype=np.uint8), []
-    with (_hdf5 if path.suffix.lower() in HDF5_SUFFIXES else _database)(path, mismatch) as read:
+    found: NDArray[Any] | None = None
+    kind, without = None, []
+    with _reader(path, mismatch) as read:
         for row, (image_id, name) in enumerate(zip(model.image_ids, model.image_names, strict=True)):
-            keypoints, descriptors = read(name)
+            keypoints, descriptors, its_kind = read(name)
             image = reconstruction.images[int(image_id)]
             number = image.num_points2D()
             if len(keypoints) != number or (descriptors is not None and len(descriptors) != number):
@@ -57,42 +63,89 @@ def read_descriptors(
                 problem = "the database holds other keypoints than the model"
                 raise MapError(problem, path=path, value=name, fix=mismatch)
             rows = order[ends[row] : ends[row + 1]]
-            if descriptors is not None:
+            if descriptors is not None and its_kind is not None and len(rows):
+                kind = _same(kind, its_kind, path, name)
+                if found is None:
+                    found = np.empty((len(order), kind.dimension), dtype=kind.stored_as)
                 found[rows] = descriptors[model.observation_keypoint[rows]]
             elif len(rows):
                 without.append(name)
     n_observing = int((np.diff(ends) > 0).sum())
     if without and len(without) < n_observing:
-        problem = f"{len(without)} of {n_observing} images have no SIFT descriptors in the database"
+        what = "SIFT" if kind in (None, SIFT) else f"{kind.name}"
+        problem = f"{len(without)} of {n_observing} images have no {what} descriptors in the database"
         raise MapError(problem, path=path, value=without[0], fix=mismatch)
-    if without:
+    if kind is None or found is None:
         text = (
-            f"{path} holds no SIFT descriptors, so how easily landmarks are mistaken for one another (their ambiguity) "
+            f"{path} holds no descriptors of a kind that is known ({', '.join(all_kinds())}), so how easily landmarks "
+            "are mistaken for one another (their ambiguity) is unknown; scores do without it"
         )
-        text += "is unknown; scores do without it"
         warnings.warn(text, MapWarning, stacklevel=2)
         return None
-    return found
+    return kind, found
 
 
-def read_features(features: str | Path, names: Sequence[str]) -> list[Stored]:
+def read_features(features: str | Path, names: Sequence[str]) -> tuple[DescriptorKind, list[Stored]]:
     """Keypoints and descriptors of images by their names, from a file of features as `read_descriptors` reads.
 
-    Raises MapError if the file is missing or unreadable, lacks an image, or one of them has no SIFT descriptors.
+    Raises MapError if the file is missing or unreadable, lacks an image, or one of them has no descriptors of a kind
+    that is known.
     """
     path, found = Path(features), []
     if not path.is_file():
         raise MapError("there is no such database", path=path, fix="Give the database.db the model was built from.")
-    mismatch = "Give the database that the model was built from."
-    with (_hdf5 if path.suffix.lower() in HDF5_SUFFIXES else _database)(path, mismatch) as read:
+    mismatch, kind = "Give the database that the model was built from.", None
+    with _reader(path, mismatch) as read:
         for name in names:
-            keypoints, descriptors = read(name)
+            keypoints, descriptors, its_kind = read(name)
             if descriptors is None and len(keypoints):
-                raise MapError("this image has no SIFT descriptors in the database", path=path, value=name)
-            if descriptors is None:
-                descriptors = np.zeros((0, _SIFT), dtype=np.uint8)
+                known = ", ".join(all_kinds())
+                raise MapError(f"this image has no descriptors of {known} in the database", path=path, value=name)
+            if its_kind is not None:
+                kind = _same(kind, its_kind, path, name)
             found.append((keypoints.astype(np.float32), descriptors))
-    return found
+    kind = kind or SIFT
+    return kind, [(pixels, kind.none() if descriptors is None else descriptors) for pixels, descriptors in found]
+
+
+def _same(kind: DescriptorKind | None, of_image: DescriptorKind, path: Path, name: str) -> DescriptorKind:
+    """The kind that descriptors before an image's, and its own, are of. MapError if they are of two."""
+    if kind not in (None, of_image):
+        problem = f"the descriptors of {name} are of another kind, {of_image.name}, than those before, {kind.name}"  # type: ignore[union-attr]
+        raise MapError(problem, path=path, fix="Give features of one extractor.")
+    return of_image
+
+
+def _reader(path: Path, mismatch: str) -> Any:
+    return (_hdf5 if path.suffix.lower() in HDF5_SUFFIXES else _database)(path, mismatch)
+
+
+def _named_kind(path: Path) -> DescriptorKind | None:
+    """The kind that a file of features is of by its name, as hloc gives it, or by the report of a map beside it."""
+    words = re.split(r"[^a-z0-9]+", path.stem.lower())
+    for name, kind in all_kinds().items():
+        if any(word.startswith(name) for word in words):
+            return kind
+    for folder in (path.parent, path.parent.parent / "map"):  # of photographs, the database is kept beside the map
+        try:
+            method = read_json_object(folder / REPORT_FILE)["config"]["extractor"]["method"]
+        except (OSError, ValueError, KeyError, TypeError):
+            continue
+        if method in that_extract():
+            return kind_of(method)
+    return None
+
+
+def _fitting(named: DescriptorKind | None, numbers: int, path: Path) -> DescriptorKind | None:
+    """The kind of learned descriptors of so many numbers: the one named, or else the only one that has as many."""
+    if named is not None and not named.in_bytes:
+        if named.dimension != numbers:
+            problem = f"descriptors of {named.name} have {named.dimension} numbers"
+            fix = "Name the file by what is in it, as hloc does: feats-disk.h5, feats-superpoint.h5."
+            raise MapError(problem, path=path, value=numbers, fix=fix)
+        return named
+    kinds = [kind for kind in all_kinds().values() if not kind.in_bytes and kind.dimension == numbers]
+    return kinds[0] if len(kinds) == 1 else None
 
 
 @contextmanager
@@ -105,6 +158,7 @@ def _database(path: Path, mismatch: str) -> Iterator[Callable[[str], _Features]]
     try:
         with closing(sqlite3.connect(f"{path.resolve().as_uri()}?{mode}", uri=True)) as database:
             ids: dict[str, int] = dict(database.execute("SELECT name, image_id FROM images"))
+            named = _named_kind(path)
             has_type = any(row[1] == "type" for row in database.execute("PRAGMA table_info(descriptors)"))
             query = f"SELECT rows, cols, data, {'type' if has_type else 0} FROM descriptors WHERE image_id = ?"
 
@@ -116,13 +170,29 @@ def _database(path: Path, mismatch: str) -> Iterator[Callable[[str], _Features]]
                 n, columns, data = row or (0, 2, b"")
                 keypoints = np.frombuffer(data or b"", dtype="<f4").reshape(n, columns)[:, :2].astype(np.float64)
                 n, columns, data, kind = database.execute(query, of_image).fetchone() or (0, 0, b"", 0)
-                if columns != _SIFT or kind not in _SIFT_TYPES or (n == 0 and len(keypoints)):
-                    return keypoints, None
-                return keypoints, np.frombuffer(data or b"", dtype=np.uint8).reshape(n, columns)
+                its_kind = _kind_in_database(kind, columns, named, path)
+                if its_kind is None or (n == 0 and len(keypoints)):
+                    return keypoints, None, None
+                values = np.frombuffer(data or b"", dtype=np.uint8).reshape(n, columns)
+                if not its_kind.in_bytes:
+                    values = its_kind.store(unit_descriptors(values.view("<f4")))
+                return keypoints, values, its_kind
 
             yield read
     except (sqlite3.Error, ValueError, TypeError) as error:
         raise MapError(f"cannot read the database: {error}", path=path, fix=fix) from error
+
+
+def _kind_in_database(
+    colmap_type: int, columns: int, named: DescriptorKind | None, path: Path
+) -> DescriptorKind | None:
+    """The kind of descriptors that take so many bytes each, by what a database says of them, -1 for nothing."""
+    if colmap_type == -1 and columns == SIFT.columns:
+        return SIFT
+    if colmap_type == -1:
+        return _fitting(named, columns // 4, path) if columns and columns % 4 == 0 else None
+    said = [kind for kind in all_kinds().values() if kind.colmap_type == colmap_type]
+    return said[0] if said and said[0].columns == columns else None
 
 
 @contextmanager
@@ -135,6 +205,7 @@ def _hdf5(path: Path, mismatch: str) -> Iterator[Callable[[str], _Features]]:
         raise MapError("features in HDF5 are read with h5py, which is not installed", path=path, fix=fix) from error
     try:
         with h5py.File(path, "r") as file:
+            named = _named_kind(path)
 
             def read(name: str) -> _Features:
                 if name not in file:
@@ -142,9 +213,13 @@ def _hdf5(path: Path, mismatch: str) -> Iterator[Callable[[str], _Features]]:
                 # hloc counts pixels from the centre of the top-left one, COLMAP from its corner
                 keypoints = file[name]["keypoints"][()].astype(np.float64)[:, :2] + 0.5
                 descriptors = file[name]["descriptors"][()].T
-                if descriptors.shape[1] != _SIFT or (len(descriptors) and descriptors.min() < 0):
-                    return keypoints, None
-                return keypoints, quantize_descriptors(unit_descriptors(descriptors))
+                may_be_sift = descriptors.shape[1] == SIFT.dimension and named in (None, SIFT)
+                if may_be_sift and not (len(descriptors) and descriptors.min() < 0):
+                    return keypoints, SIFT.store(unit_descriptors(descriptors)), SIFT
+                kind = _fitting(named, descriptors.shape[1], path)
+                if kind is None:
+                    return keypoints, None, None
+                return keypoints, kind.store(unit_descriptors(descriptors)), kind
 
             yield read
     except MapError:

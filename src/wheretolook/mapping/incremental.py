@@ -7,7 +7,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
+from wheretolook.features.descriptors import DescriptorKind, Stored
 from wheretolook.features.extraction import KeypointExtractor
 from wheretolook.features.keypoints import ExtractorConfig
+from wheretolook.features.registry import kind_of
 from wheretolook.mapping import photographs
 from wheretolook.mapping.building import extract_with_colors
 from wheretolook.mapping.colmap_model import read_model, write_model
 from wheretolook.mapping.photographs import PhotographCameras, list_photographs, photograph_pairs
-from wheretolook.mapping.triangulation import Stored, fill_database, match_pairs, stored_keypoints
+from wheretolook.mapping.triangulation import fill_database, match_pairs, stored_keypoints
 from wheretolook.utils.colmap import quiet_colmap, storing_in_database
 from wheretolook.utils.errors import MapError
 from wheretolook.utils.files import write_json
@@ -43,6 +45,7 @@ class PhotographFeatures:
     stored: list[Stored]  # pixels and descriptors of each photograph's keypoints
     colors: list[NDArray[np.uint8]]  # (N_i, 3) uint8 of each photograph's keypoints
     key: str  # changes whenever something changes that the keypoints depend on
+    kind: DescriptorKind  # of the descriptors
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +76,7 @@ def photograph_features(
     names = list_photographs(folder) if names is None else names
     files = [(name, (folder / name).stat().st_size, (folder / name).stat().st_mtime_ns) for name in names]
     how = [] if turned else ["as stored"]
-    key, path = _key([files, max_side_px, asdict(extractor), *how]), work / "features.npz"
+    key, path = _key([files, max_side_px, extractor.record(), *how]), work / "features.npz"
     kept = _load(path, key)
     if kept is None:
         kept = _extract(folder, names, max_side_px, KeypointExtractor(extractor, device), processes, progress, turned)
@@ -81,7 +84,7 @@ def photograph_features(
     ends = np.cumsum(kept["counts"])[:-1]
     pixels, descriptors, colors = (np.split(kept[name], ends) for name in ("pixels", "descriptors", "colors"))
     stored = list(zip(pixels, descriptors, strict=True))
-    return PhotographFeatures(names, kept["full_sizes"], kept["sizes"], stored, colors, key)
+    return PhotographFeatures(names, kept["full_sizes"], kept["sizes"], stored, colors, key, kind_of(extractor.method))
 
 
 def map_incrementally(
@@ -105,7 +108,7 @@ def map_incrementally(
     kept = _load(work / "matches.npz", key)
     if kept is None:
         with storing_in_database(database):
-            matches = list(match_pairs(features.stored, pairs, work, processes, progress))
+            matches = list(match_pairs(features.stored, pairs, work, processes, progress, features.kind))
         kept = {"matches": np.concatenate(matches), "counts": np.array([len(found) for found in matches])}
         save_npz(work / "matches.npz", {"key": np.array(key), **kept})
     intrinsics = [camera.todict() for camera in cameras.cameras]
@@ -143,7 +146,8 @@ def _extract(
 
     n = len(names)
     extracted = extract_with_colors(extractor, images(), n, processes, "map: extract", progress, same_size=False)
-    found = [(*stored_keypoints(keypoints), color) for keypoints, color in extracted]
+    kind = kind_of(extractor.config.method)
+    found = [(*stored_keypoints(keypoints, kind), color) for keypoints, color in extracted]
     counts = np.array([len(color) for *_, color in found])
     parts = zip(("pixels", "descriptors", "colors"), zip(*found, strict=True), strict=True)
     joined = {name: np.concatenate(values) for name, values in parts}
@@ -167,7 +171,7 @@ def _fill(
         image = pycolmap.Image(name=name, camera_id=cameras.cameras[row].camera_id, image_id=index + 1)
         model.add_image_with_trivial_frame(image)
     with storing_in_database(database):
-        fill_database(database, model, features.stored)
+        fill_database(database, model, features.stored, features.kind)
         with pycolmap.Database.open(str(database)) as db:
             for (i, j), found in zip(pairs.tolist(), matches, strict=True):
                 db.write_matches(i + 1, j + 1, found)

@@ -12,7 +12,9 @@ import torch
 from numpy.typing import DTypeLike, NDArray
 from tqdm.auto import tqdm
 
-from wheretolook.features.keypoints import quantize_descriptors, unit_descriptors
+from wheretolook.features.descriptors import DescriptorKind, unit_descriptors
+from wheretolook.features.registry import all_kinds
+from wheretolook.features.sift import SIFT
 from wheretolook.geometry.local_origin import local_origin
 from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 from wheretolook.mapping.colmap_model import ModelArrays, model_arrays, read_model
@@ -42,12 +44,24 @@ class Landmarks:
     mapping_direction_spread: NDArray[np.float32]  # (N,) 1 - |mean of the unit directions|: 0 if all are the same
     mapping_distance_m: NDArray[np.float32]  # (N,) mean distance of the mapping cameras
     mapping_distance_spread: NDArray[np.float32]  # (N,) standard deviation of these over their mean; NaN in old files
-    # (N, 128) mean over the track of the unit descriptors, times 512 as COLMAP stores them; None without a database
-    descriptors: NDArray[np.uint8] | None
+    # (N, D) mean over the track of the unit descriptors, as their kind is stored: of SIFT (N, 128) uint8, times 512 as
+    # COLMAP stores them; None without a database
+    descriptors: NDArray[Any] | None
     # (N,) cosine between the descriptor and the nearest one of another landmark; NaN without descriptors or others
     ambiguity: NDArray[np.float32]
     # (N,) mean focal length of the mapping cameras, of the logarithms; None in files from before it was told
     mapping_focal_px: NDArray[np.float32] | None = None
+    described_by: str | None = None  # the kind of learned descriptors; None for SIFT, or where there were none
+
+    @property
+    def features(self) -> str:
+        """Name of the kind of descriptors that the landmarks have, or had: see `wheretolook.features.registry`.
+
+        "" if there were none.
+        """
+        if self.described_by is not None:
+            return self.described_by
+        return SIFT.name if self.descriptors is not None or np.isfinite(self.ambiguity).any() else ""
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -75,11 +89,14 @@ class Landmarks:
         half precision, and compresses: about 28 bytes a landmark. Such landmarks serve visibility, features and
         scorers, but not localization.
         """
-        values = {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not None}
+        arrays = (f.name for f in fields(self) if f.name != "described_by")
+        values = {name: getattr(self, name) for name in arrays if getattr(self, name) is not None}
         if compact:
             values.pop("descriptors", None)
             far = local_origin(self.points).any()
             values = _floats(values, points=np.float64 if far else np.float32, others=np.float16)
+        if self.described_by is not None:
+            values["described_by"] = np.array(self.described_by)
         save_npz(Path(path), values, compress=compact)
 
     @classmethod
@@ -92,14 +109,20 @@ class Landmarks:
             values = load_npz(path)
         except ValueError as error:
             raise MapError(str(error), path=path, fix=fix) from error
-        names = {f.name for f in fields(cls)}
+        described_by = values.pop("described_by", None)
+        if described_by is not None and str(described_by) not in all_kinds():
+            fix = f"There are {', '.join(all_kinds())}: update wheretolook, or map again."
+            raise MapError("landmarks of unknown features", path=path, value=str(described_by), fix=fix)
+        kind = SIFT if described_by is None else all_kinds()[str(described_by)]
+        names = {f.name for f in fields(cls)} - {"described_by"}
         if set(values) and "mapping_distance_spread" not in values and "mapping_distance_m" in values:
             values["mapping_distance_spread"] = np.full(values["mapping_distance_m"].shape[:1], np.nan, np.float32)
         if set(values) | {"descriptors", "mapping_focal_px"} != names:
             raise MapError("not a file of landmarks", path=path, value=sorted(values), fix=fix)
         for name, value in values.items():
-            if value.ndim == 0 or value.dtype.kind not in ("iu" if name in _WHOLE else "f"):
-                problem = f"the array {name} is not one of {'whole ' if name in _WHOLE else ''}numbers, one a landmark"
+            whole = name in _WHOLE and (name != "descriptors" or kind.in_bytes)
+            if value.ndim == 0 or value.dtype.kind not in ("iu" if whole else "f"):
+                problem = f"the array {name} is not one of {'whole ' if whole else ''}numbers, one a landmark"
                 raise MapError(problem, path=path, value=f"{value.dtype} {value.shape}", fix=fix)
         if len({len(v) for v in values.values()}) != 1 or values["points"].shape[1:] != (3,):
             raise MapError("the arrays disagree on the number of landmarks", path=path, fix=fix)
@@ -109,11 +132,18 @@ class Landmarks:
                 raise MapError(f"the array {name} has another shape", path=path, value=value.shape, fix=fix)
         if not np.isfinite(values["points"]).all():
             raise MapError("some landmarks are not at finite places", path=path, fix=fix)
+        found = values.get("descriptors")
+        if found is not None and kind is not SIFT and found.shape[1] != kind.dimension:
+            problem = f"descriptors of {kind.name} have {kind.dimension} numbers"
+            raise MapError(problem, path=path, value=found.shape[1], fix=fix)
         arrays: dict[str, Any] = {
             "descriptors": None,
             "mapping_focal_px": None,
             **_floats(values, points=np.float64, others=np.float32),
+            "described_by": None if described_by is None else kind.name,
         }
+        if found is not None:
+            arrays["descriptors"] = found  # halves stay halves
         return cls(**arrays)
 
 
@@ -159,13 +189,16 @@ def load_colmap_landmarks(
         raise MapError("some points are not finite", path=model_dir, fix="Triangulate the model again.")
     _tell_left_out(observed, len(keep), worst_px, model_dir)
     model = _select_points(model, keep)
-    descriptors, ambiguity = None, np.full(len(keep), np.nan, dtype=np.float32)
+    described_by, descriptors, ambiguity = None, None, np.full(len(keep), np.nan, dtype=np.float32)
     observations = None if database is None else read_descriptors(database, model_dir, reconstruction, model)
     if observations is not None:
-        descriptors = _mean_descriptors(model, observations)
+        kind, of_observations = observations
+        descriptors = _mean_descriptors(model, of_observations, kind)
         ambiguity = nearest_other_cosine(descriptors, device, progress)
+        described_by = None if kind is SIFT else kind.name
     track_length, errors_px = np.diff(model.observation_start).astype(np.int32), model.errors_px.astype(np.float32)
     attributes: Any = {**_viewing_geometry(model), "descriptors": descriptors, "ambiguity": ambiguity}
+    attributes["described_by"] = described_by
     return Landmarks(model.point_ids, model.points, track_length, errors_px, **attributes)
 
 
@@ -179,17 +212,15 @@ def _tell_left_out(observed: NDArray[np.bool_], n_kept: int, worst_px: float, mo
     warnings.warn(text, MapWarning, stacklevel=3)
 
 
-def nearest_other_cosine(
-    descriptors: NDArray[np.uint8], device: str = "cpu", progress: bool = True
-) -> NDArray[np.float32]:
-    """Cosine between each descriptor (N, D) uint8 and the nearest one of another row. Returns (N,), NaN if N is 1.
+def nearest_other_cosine(descriptors: NDArray[Any], device: str = "cpu", progress: bool = True) -> NDArray[np.float32]:
+    """Cosine between each stored descriptor (N, D) and the nearest one of another row. Returns (N,), NaN if N is 1.
 
-    Sums of products of such integers are exact in float32, so the result does not depend on the machine.
+    Sums of products of bytes are exact in float32, so that of SIFT the result does not depend on the machine.
     """
     n, threads = len(descriptors), torch.get_num_threads()
     values = torch.as_tensor(descriptors, dtype=torch.float32, device=device)
     lengths = torch.as_tensor(np.linalg.norm(descriptors.astype(np.float64), axis=1), device=device)
-    inverse = 1 / lengths.clamp(min=1).float()
+    inverse = 1 / torch.where(lengths > 0, lengths, 1).float()
     best = torch.full((n,), -torch.inf, device=device)
     torch.set_num_threads(1)  # products are small: several threads would mostly wait for one another
     try:
@@ -243,11 +274,11 @@ def _viewing_geometry(model: ModelArrays) -> dict[str, NDArray[np.float32]]:
     }
 
 
-def _mean_descriptors(model: ModelArrays, observations: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def _mean_descriptors(model: ModelArrays, observations: NDArray[Any], kind: DescriptorKind) -> NDArray[Any]:
     start = model.observation_start
-    mean = np.empty((len(start) - 1, observations.shape[1]), dtype=np.uint8)
+    mean = np.empty((len(start) - 1, observations.shape[1]), dtype=observations.dtype)
     for i in range(0, len(mean), _BLOCK):
         last = min(i + _BLOCK, len(mean))
         track = unit_descriptors(observations[start[i] : start[last]])
-        mean[i:last] = quantize_descriptors(unit_descriptors(np.add.reduceat(track, start[i:last] - start[i])))
+        mean[i:last] = kind.store(unit_descriptors(np.add.reduceat(track, start[i:last] - start[i])))
     return mean

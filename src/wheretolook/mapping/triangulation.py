@@ -11,7 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from wheretolook.features.keypoints import Keypoints, quantize_descriptors
+from wheretolook.features.descriptors import DescriptorKind, Stored
+from wheretolook.features.keypoints import Keypoints
+from wheretolook.features.registry import kind_of
+from wheretolook.features.sift import SIFT
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.local_origin import local_origin
 from wheretolook.geometry.poses import camera_centers, transform
@@ -28,8 +31,7 @@ _ANGLE_DEG = (1.0, 55.0)  # between the rays of two images: less triangulates ba
 _DEPTH_RATIO = 2.5  # between the distances of two images to a point: beyond it, the scales differ too much
 _DEPTH_TOLERANCE = 0.05
 _PAIRS_AT_A_TIME = 64  # that a process matches; also the step of the progress bar
-Stored = tuple[NDArray[np.float32], NDArray[np.uint8]]  # pixels (N, 2) and descriptors (N, 128), as in a database
-MatchJob = tuple[NDArray[np.int64], list[Stored], Path]
+MatchJob = tuple[NDArray[np.int64], list[Stored], Path, DescriptorKind]
 
 
 def image_name(index: int) -> str:
@@ -51,7 +53,8 @@ def triangulate_known_poses(
     progress: bool,
 ) -> Any:
     """Triangulate what images (I) of one camera see from known poses (I, 3, 4); see `triangulate_model`."""
-    model, stored = _posed_model(camera, cam_from_world), [stored_keypoints(found) for found in keypoints]
+    kind, model = kind_of(config.extractor.method), _posed_model(camera, cam_from_world)
+    stored = [stored_keypoints(found, kind) for found in keypoints]
     return triangulate_model(database, model, stored, colors, pairs, config, clock, seed, processes, progress)
 
 
@@ -78,7 +81,7 @@ def triangulate_model(
     """
     import pycolmap
 
-    folder = database.parent
+    folder, kind = database.parent, kind_of(config.extractor.method)
     to_local, back = _local_frame(model)
     model.transform(to_local)  # rays that meet far from the origin are ill-conditioned
     seed %= 2**31  # COLMAP keeps it in an int
@@ -87,9 +90,9 @@ def triangulate_model(
         for index, (pixels, _) in enumerate(stored):
             points = [pycolmap.Point2D(p) for p in pixels.astype(np.float64)]
             model.images[index + 1].points2D = pycolmap.Point2DList(points)
-        fill_database(database, model, stored)
+        fill_database(database, model, stored, kind)
     with storing_in_database(database), clock("match"), pycolmap.Database.open(str(database)) as db:
-        matches = match_pairs(stored, pairs, folder, processes, progress)
+        matches = match_pairs(stored, pairs, folder, processes, progress, kind)
         for (i, j), matched in zip(pairs.tolist(), matches, strict=True):
             db.write_matches(i + 1, j + 1, matched)
     with storing_in_database(database), clock("verify"):
@@ -132,33 +135,41 @@ def color_points(model: Any, colors: Sequence[NDArray[np.uint8]]) -> None:
 
 
 def match_pairs(
-    stored: Sequence[Stored], pairs: NDArray[np.int64], folder: Path, processes: Processes, progress: bool = True
+    stored: Sequence[Stored],
+    pairs: NDArray[np.int64],
+    folder: Path,
+    processes: Processes,
+    progress: bool = True,
+    kind: DescriptorKind = SIFT,
 ) -> Generator[NDArray[np.uint32], None, None]:
     """Match pairs (P, 2) of images, without geometric verification. Yields (M, 2) indices of keypoints, pair by pair.
 
-    Works in processes instead of threads: pycolmap's BLAS is built without locks, so that two threads sometimes get the
-    same buffer, and the nearest neighbours come out wrong. Small databases are made in `folder` meanwhile.
+    SIFT is matched by COLMAP, learned features by `SimilarityMatcher`. Works in processes instead of threads: pycolmap's
+    BLAS is built without locks, so that two threads sometimes get the same buffer, and the nearest neighbours come out
+    wrong. Small databases are made in `folder` meanwhile.
     """
     chunks = [pairs[start : start + _PAIRS_AT_A_TIME] for start in range(0, len(pairs), _PAIRS_AT_A_TIME)]
     bar = tqdm(total=len(pairs), desc="map: match", disable=not progress, unit="pair")
     with bar, temporary_folder(".partial", parent=folder) as work:  # goes with what a killed process leaves in it
-        jobs = (_match_job(chunk, stored, work) for chunk in chunks)
+        jobs = (_match_job(chunk, stored, work, kind) for chunk in chunks)
         for matches in processes.map(_run_match_job, jobs):
             yield from matches
             bar.update(len(matches))
 
 
-def _match_job(pairs: NDArray[np.int64], stored: Sequence[Stored], folder: Path) -> MatchJob:
+def _match_job(pairs: NDArray[np.int64], stored: Sequence[Stored], folder: Path, kind: DescriptorKind) -> MatchJob:
     """Pairs (P, 2) renumbered to index the keypoints of their own images, these keypoints, and where to work."""
     images, renumbered = np.unique(pairs, return_inverse=True)
-    return renumbered.reshape(-1, 2), [stored[i] for i in images], folder
+    return renumbered.reshape(-1, 2), [stored[i] for i in images], folder, kind
 
 
 def _run_match_job(job: MatchJob) -> list[NDArray[np.uint32]]:
     """(M, 2) indices of matched keypoints, of each pair."""
+    pairs, stored, parent, kind = job
+    if not kind.in_bytes:
+        return _match_by_similarity(pairs, stored, kind)
     import pycolmap
 
-    pairs, stored, parent = job
     matching = pycolmap.FeatureMatchingOptions(num_threads=1, skip_geometric_verification=True)
     with temporary_folder(parent=parent) as folder:
         database, listed = folder / "database.db", Path(folder) / "pairs.txt"
@@ -170,6 +181,21 @@ def _run_match_job(job: MatchJob) -> list[NDArray[np.uint32]]:
             pycolmap.match_image_pairs(str(database), matching, pairing, device=pycolmap.Device.cpu)
         with pycolmap.Database.open(str(database)) as db:
             return [db.read_matches(i + 1, j + 1) for i, j in pairs.tolist()]
+
+
+def _match_by_similarity(
+    pairs: NDArray[np.int64], stored: Sequence[Stored], kind: DescriptorKind
+) -> list[NDArray[np.uint32]]:
+    """(M, 2) indices of keypoints that are each other's nearest, of each pair."""
+    from wheretolook.features.learned import one_thread
+    from wheretolook.features.similarity import SimilarityMatcher
+
+    found = []
+    with one_thread():
+        for i, j in pairs.tolist():
+            ((first, second),) = SimilarityMatcher(stored[j][1]).match([stored[i][1]], kind.min_similarity)
+            found.append(np.column_stack([first, second]).astype(np.uint32))
+    return found
 
 
 def _posed_model(camera: PinholeCamera, cam_from_world: NDArray[np.floating[Any]]) -> Any:
@@ -184,14 +210,19 @@ def _posed_model(camera: PinholeCamera, cam_from_world: NDArray[np.floating[Any]
     return model
 
 
-def stored_keypoints(keypoints: Keypoints) -> Stored:
-    """Keypoints as a database holds them."""
-    return keypoints.pixels, quantize_descriptors(keypoints.descriptors)
+def stored_keypoints(keypoints: Keypoints, kind: DescriptorKind = SIFT) -> Stored:
+    """Keypoints as files hold them."""
+    return keypoints.pixels, kind.store(keypoints.descriptors)
 
 
-def fill_database(database: Path, model: Any, stored: Iterable[Stored]) -> None:
-    """Make a COLMAP database of a reconstruction's cameras and images, and of their keypoints in the order of ids."""
+def fill_database(database: Path, model: Any, stored: Iterable[Stored], kind: DescriptorKind = SIFT) -> None:
+    """Make a COLMAP database of a reconstruction's cameras and images, and of their keypoints in the order of ids.
+
+    Descriptors that are not bytes stand in it as COLMAP 4 has them, in single precision.
+    """
     import pycolmap
+
+    colmap_type = pycolmap.FeatureExtractorType(kind.colmap_type)
 
     with pycolmap.Database.open(str(database)) as db:
         for camera in model.cameras.values():
@@ -203,7 +234,9 @@ def fill_database(database: Path, model: Any, stored: Iterable[Stored]) -> None:
             db.write_frame(image.frame, use_frame_id=True)
             db.write_image(image, use_image_id=True)
             db.write_keypoints(image_id, pixels)
-            db.write_descriptors(image_id, pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, descriptors))
+            if not kind.in_bytes:
+                descriptors = descriptors.astype("<f4").view(np.uint8).reshape(len(descriptors), kind.columns)
+            db.write_descriptors(image_id, pycolmap.FeatureDescriptors(colmap_type, descriptors))
 
 
 def shrink_depth(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:

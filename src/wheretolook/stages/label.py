@@ -6,7 +6,6 @@ import shutil
 import time
 from collections.abc import Mapping
 from contextlib import closing
-from dataclasses import asdict
 from pathlib import Path
 
 import pandas as pd
@@ -43,7 +42,7 @@ def label(experiment: Experiment, say: Say = print, tick: Tick = lambda work: No
             raise SceneError(f"{problem}and so not labelled", path=files.folder, fix=fix)
     to_label: list[tuple[SceneFolder, str]] = []
     for files in sorted(dataset.scenes, key=lambda files: files.split == "train"):  # those to evaluate on come first
-        parts = [asdict(config.localizer), asdict(extractor_of(files)), files.camera.record()]
+        parts = [config.localizer.record(), extractor_of(files).record(), files.camera.record()]
         made_from = [existing(files.mesh, SceneError, "scenes"), existing(files.landmarks, MapError, "map")]
         matches = ["store_matches"] if config.store_matches else []
         key = stage_key("label", [*parts, *made_from, read_stamp(files, "sample"), *matches])

@@ -85,5 +85,6 @@ def release_settings(experiment: Experiment) -> dict[str, Any]:
     settings = {name: asdict(getattr(experiment, name)) for name in ("scenes", "map", "occlusion", "sample")}
     settings = {"camera": experiment.camera.camera.record(), **settings}
     settings["scenes"]["meshes"] = meshes
-    settings["label"] = {"localizer": asdict(experiment.label.localizer)}
+    settings["map"]["extractor"] = experiment.map.extractor.record()
+    settings["label"] = {"localizer": experiment.label.localizer.record()}
     return dict(json.loads(json.dumps(settings, default=str)))

@@ -1,0 +1,45 @@
+"""ALIKED (Zhao et al., IEEE TIM 2023), its network n16rot, by kornia."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from wheretolook.features.descriptors import DescriptorKind
+from wheretolook.features.extractor import Extraction, Extractor
+
+if TYPE_CHECKING:
+    from wheretolook.features.keypoints import ExtractorConfig
+
+ALIKED = DescriptorKind("aliked", 128, "float16", min_similarity=0.8, colmap_type=1)
+
+_FILE = "aliked-n16rot.pth"
+_URLS = (
+    "https://huggingface.co/kornia/aliked/resolve/main/aliked-n16rot.pth",
+    "https://github.com/Shiaoming/ALIKED/raw/main/models/aliked-n16rot.pth",
+)
+_LEAST_SCORE = 0.2  # of a keypoint, the authors' own
+
+
+def _build(config: ExtractorConfig, device: str) -> Extraction:
+    from torch import Tensor, nn
+
+    from wheretolook.features.learned import Found, LearnedExtraction, kornia_feature, load_state
+
+    class Aliked(LearnedExtraction):
+        dimension = ALIKED.dimension
+
+        def make(self) -> nn.Module:
+            network = kornia_feature().ALIKED("aliked-n16rot", config.max_keypoints, _LEAST_SCORE)
+            return load_state(network, config.weights, _FILE, _URLS)
+
+        def detect(self, images: Tensor) -> list[Found]:
+            # ALIKED counts pixels from the middle of the first
+            found = self._network(images)
+            return [(each.keypoints + 0.5, each.descriptors, each.keypoint_scores) for each in found]
+
+    return Aliked(config, device)
+
+
+EXTRACTORS = (
+    Extractor("aliked", "ALIKED n16rot, by kornia.", ALIKED, _build, weights=_FILE, lightglue={"features": "aliked"}),
+)

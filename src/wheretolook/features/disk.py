@@ -1,0 +1,41 @@
+"""DISK (Tyszkiewicz et al., NeurIPS 2020), its network learnt with depth, by kornia."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from wheretolook.features.descriptors import DescriptorKind
+from wheretolook.features.extractor import Extraction, Extractor
+
+if TYPE_CHECKING:
+    from wheretolook.features.keypoints import ExtractorConfig
+
+DISK = DescriptorKind("disk", 128, "float16", min_similarity=0.8)
+
+_FILE = "depth-save.pth"
+_URLS = (
+    "https://huggingface.co/kornia/disk/resolve/main/depth-save.pth",
+    "https://raw.githubusercontent.com/cvlab-epfl/disk/master/depth-save.pth",
+)
+
+
+def _build(config: ExtractorConfig, device: str) -> Extraction:
+    from torch import Tensor, nn
+
+    from wheretolook.features.learned import Found, LearnedExtraction, kornia_feature, load_state
+
+    class Disk(LearnedExtraction):
+        dimension = DISK.dimension
+
+        def make(self) -> nn.Module:
+            return load_state(kornia_feature().DISK(), config.weights, _FILE, _URLS, within="extractor")
+
+        def detect(self, images: Tensor) -> list[Found]:
+            found = self._network(images, n=config.max_keypoints, pad_if_not_divisible=True)
+            # whole pixels, counted from the first
+            return [(each.keypoints + 0.5, each.descriptors, each.detection_scores) for each in found]
+
+    return Disk(config, device)
+
+
+EXTRACTORS = (Extractor("disk", "DISK, by kornia.", DISK, _build, weights=_FILE, lightglue={"features": "disk"}),)

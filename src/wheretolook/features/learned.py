@@ -1,0 +1,118 @@
+"""What extractors that are networks have in common: kornia, their weights, and images in batches."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from wheretolook.features.keypoints import ExtractorConfig, Keypoints
+from wheretolook.utils.errors import ConfigError, WeightsError
+
+INSTALL = "pip install 'wheretolook[learned]'"
+
+Found = tuple[Tensor, Tensor, Tensor]
+"""Keypoints of an image: (N, 2) pixels, (0.5, 0.5) in the middle of the first; (N, D) unit descriptors; (N,) scores."""
+
+
+class LearnedExtraction(ABC):
+    """A network of kornia that finds keypoints: on a CPU core image by image, on a GPU in batches.
+
+    Keypoints come with the highest score first. Raises ConfigError without kornia, WeightsError if there are no
+    weights, or others than the network's.
+    """
+
+    dimension: int
+
+    def __init__(self, config: ExtractorConfig, device: str) -> None:
+        self.config, self.device = config, torch.device(device)
+        self.in_batches = self.device.type != "cpu"
+        self._network = self.make().eval().to(self.device)
+
+    @abstractmethod
+    def make(self) -> nn.Module:
+        """The network with its weights, on a CPU."""
+
+    @abstractmethod
+    def detect(self, images: Tensor) -> list[Found]:
+        """Keypoints of images (B, 3, H, W), RGB in 0..1, on the device."""
+
+    def extract_batch(self, images: Sequence[NDArray[np.uint8]]) -> list[Keypoints]:
+        """Keypoints of images (H, W, 3) uint8 of one size, those of highest score first."""
+        for rgb in images:
+            if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3:
+                raise ValueError(f"expected an (H, W, 3) uint8 image, got {rgb.shape} {rgb.dtype}")
+        # on a CPU one by one: a batch would take no less time, but several times the memory
+        parts = [images] if self.in_batches else [[rgb] for rgb in images]
+        found: list[Keypoints] = []
+        with torch.inference_mode(), one_thread():
+            for part in parts:
+                if len(part):
+                    whole = torch.from_numpy(np.stack(part)).to(self.device)
+                    found += map(self._keypoints, self.detect(whole.permute(0, 3, 1, 2).float() / 255))
+        return found
+
+    def _keypoints(self, found: Found) -> Keypoints:
+        pixels, descriptors, scores = (value.float().cpu().numpy() for value in found)
+        if len(pixels) == 0:
+            return Keypoints.none(self.dimension)
+        keep = np.lexsort((pixels[:, 0], pixels[:, 1], -scores))[: self.config.max_keypoints]
+        return Keypoints(pixels[keep], descriptors[keep], np.ones(len(keep), np.float32))
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """One thread of PyTorch: workers have a core each, and sums do not depend on how many there are."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+def kornia_feature() -> Any:
+    """The module `kornia.feature`. ConfigError if it is not installed."""
+    try:
+        import kornia.feature
+    except ImportError as error:
+        raise ConfigError("learned features are found by kornia, which is not installed", fix=f"{INSTALL}.") from error
+    return kornia.feature
+
+
+def load_state(network: nn.Module, weights: str, name: str, urls: Sequence[str], within: str = "") -> nn.Module:
+    """Load the weights of a network: from a file, or without one kornia's copy, from its cache or the network.
+
+    A download is announced on standard error. `name` is what the file is usually called, `within` the entry of the file
+    that has the tensors, if it may have others. Raises WeightsError if the file is missing, damaged, or of another
+    network; or if none is given and none can be had.
+    """
+    fix = f"Give the file {name}: --map.extractor.weights FILE."
+    if weights and not Path(weights).is_file():
+        raise WeightsError("there are no such weights", path=weights, fix=fix)
+    try:
+        if weights:
+            state = torch.load(weights, map_location="cpu", weights_only=True)
+        else:
+            from kornia.core.download import load_state_dict_from_url
+
+            state = load_state_dict_from_url(list(urls), map_location="cpu", timeout=30)
+    except Exception as error:  # the unpickler and the network raise errors of many kinds
+        reason = str(error).strip().partition("\n")[0] or type(error).__name__
+        problem = f"cannot read the weights: {reason}" if weights else f"{name} cannot be downloaded: {reason}"
+        raise WeightsError(problem, path=weights or None, fix=fix) from error
+    try:
+        missing, unknown = network.load_state_dict(state.get(within, state), strict=False)
+        if unknown or {*missing} & {name for name, _ in network.named_parameters()}:  # constants may be missing
+            raise ValueError("other tensors")
+    except (RuntimeError, AttributeError, TypeError, ValueError) as error:
+        problem = f"these weights are not those of {type(network).__name__} as in {name}"
+        raise WeightsError(problem, path=weights or None, fix=fix) from error
+    return network

@@ -1,0 +1,38 @@
+"""All extractors, by name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache
+from importlib import import_module
+from types import MappingProxyType
+
+from wheretolook.features.descriptors import DescriptorKind
+from wheretolook.features.extractor import Extractor
+
+MODULES = ("sift", "aliked", "disk", "xfeat", "superpoint")
+"""Modules of `wheretolook.features` whose `EXTRACTORS` there are."""
+
+
+@cache
+def all_extractors() -> Mapping[str, Extractor]:
+    """Every extractor by its name."""
+    modules = (import_module(f"wheretolook.features.{module}") for module in MODULES)
+    return MappingProxyType({extractor.name: extractor for module in modules for extractor in module.EXTRACTORS})
+
+
+def that_extract() -> tuple[str, ...]:
+    """Names of the extractors that extract here."""
+    return tuple(name for name, extractor in all_extractors().items() if extractor.build is not None)
+
+
+@cache
+def all_kinds() -> Mapping[str, DescriptorKind]:
+    """Every kind of descriptors by its name."""
+    kinds = (extractor.descriptors for extractor in all_extractors().values())
+    return MappingProxyType({kind.name: kind for kind in kinds})
+
+
+def kind_of(method: str) -> DescriptorKind:
+    """The descriptors of an extractor by its name."""
+    return all_extractors()[method].descriptors

@@ -1,0 +1,113 @@
+"""SIFT (Lowe, IJCV 2004) as RootSIFT: OpenCV's and COLMAP's on a CPU core, Warp kernels' on a GPU."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wheretolook.features.descriptors import DescriptorKind, unit_descriptors
+from wheretolook.features.extractor import Extraction, Extractor
+from wheretolook.features.keypoints import ExtractorConfig, Keypoints
+from wheretolook.utils.colmap import quiet_colmap
+
+SIFT = DescriptorKind("sift", 128, "uint8", colmap_type=0)
+
+
+class OpenCvSift:
+    """OpenCV's SIFT on one CPU core."""
+
+    in_batches = False
+
+    def __init__(self, config: ExtractorConfig) -> None:
+        import cv2
+
+        # OpenCV divides its contrast threshold by the number of layers. Without the precise upscale, keypoints are
+        # biased.
+        contrast, self.config = 3 * config.peak_threshold, config
+        self._sift = cv2.SIFT.create(0, 3, contrast, config.edge_threshold, 1.6, enable_precise_upscale=True)
+
+    def extract_batch(self, images: Sequence[NDArray[np.uint8]]) -> list[Keypoints]:
+        """Keypoints of images (H, W, 3) uint8, those of most contrast first."""
+        return [self._extract(grey_bitmap(rgb).to_array()) for rgb in images]
+
+    def _extract(self, grey: NDArray[np.uint8]) -> Keypoints:
+        found, descriptors = self._sift.detectAndCompute(np.ascontiguousarray(grey), None)
+        if len(found) == 0:
+            return Keypoints.none()
+        octave = np.array([k.octave & 255 for k in found], dtype=np.uint8).view(np.int8)
+        table = np.array([(*k.pt, k.size / 2, k.response, k.angle) for k in found], dtype=np.float32)
+        usable = np.flatnonzero(octave >= self.config.first_octave)
+        x, y, scale, response, angle = table[usable].T
+        keep = usable[np.lexsort((angle, scale, y, x, -response))[: self.config.max_keypoints]]
+        descriptors = descriptors[keep]
+        descriptors = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-12))
+        # OpenCV puts (0, 0) at the centre of the top-left pixel.
+        return Keypoints(table[keep, :2] + np.float32(0.5), unit_descriptors(descriptors), table[keep, 2])
+
+
+class ColmapSift:
+    """COLMAP's SIFT on one CPU core; on a GPU it is not repeatable."""
+
+    in_batches = False
+
+    def __init__(self, config: ExtractorConfig) -> None:
+        import pycolmap
+
+        self.config, options = config, pycolmap.FeatureExtractionOptions()
+        options.num_threads = 1
+        options.sift.first_octave = config.first_octave
+        options.sift.max_num_features = config.max_keypoints
+        options.sift.peak_threshold = config.peak_threshold
+        options.sift.edge_threshold = config.edge_threshold
+        with quiet_colmap():
+            self._sift = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
+
+    def extract_batch(self, images: Sequence[NDArray[np.uint8]]) -> list[Keypoints]:
+        """Keypoints of images (H, W, 3) uint8, the largest first."""
+        return [self._extract(grey_bitmap(rgb)) for rgb in images]
+
+    def _extract(self, bitmap: Any) -> Keypoints:
+        keypoints, descriptors = self._sift.extract(bitmap)
+        if len(keypoints) == 0:
+            return Keypoints.none()
+        table = np.array([(k.x, k.y, k.compute_scale()) for k in keypoints], dtype=np.float32)
+        # COLMAP keeps whole scale levels, from the largest down, so there can be more than the limit.
+        keep = np.argsort(-table[:, 2], kind="stable")[: self.config.max_keypoints]
+        return Keypoints(table[keep, :2], unit_descriptors(descriptors.data[keep]), table[keep, 2])
+
+
+class GpuSift:
+    """OpenCV's SIFT by Warp kernels, on a CUDA device."""
+
+    in_batches = True
+
+    def __init__(self, config: ExtractorConfig, device: str) -> None:
+        from wheretolook.features.warp_sift import WarpSift
+
+        self._sift = WarpSift(config, device)
+
+    def extract_batch(self, images: Sequence[NDArray[np.uint8]]) -> list[Keypoints]:
+        """Keypoints of images (H, W, 3) uint8 of one size, those of most contrast first."""
+        return list(self._sift.extract_many(np.stack([grey_bitmap(rgb).to_array() for rgb in images])))
+
+
+def grey_bitmap(rgb: NDArray[np.uint8]) -> Any:
+    """Convert to grey as COLMAP does (Rec. 709 weights); with other weights other keypoints pass the thresholds."""
+    import pycolmap
+
+    if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3:
+        raise ValueError(f"expected an (H, W, 3) uint8 image, got {rgb.shape} {rgb.dtype}")
+    return pycolmap.Bitmap.from_array(np.ascontiguousarray(rgb)).clone_as_grey()
+
+
+def _opencv(config: ExtractorConfig, device: str) -> Extraction:
+    return OpenCvSift(config) if device == "cpu" else GpuSift(config, device)
+
+
+EXTRACTORS = (
+    Extractor("opencv", "SIFT as OpenCV finds it, and on a GPU Warp kernels up to rounding.", SIFT, _opencv),
+    Extractor("colmap", "SIFT as COLMAP finds it on a CPU.", SIFT, lambda config, device: ColmapSift(config)),
+)

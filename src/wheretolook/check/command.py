@@ -27,9 +27,9 @@ USAGE = "wheretolook check (--map SPARSE [--database FILE | --images FOLDER] | -
 
 _NOTES = """\
 FEATURES
-  Photographs are localized with the keypoints that the map was made from: a COLMAP database, or hloc's features in HDF5
-  (SIFT). A database.db beside the model is found by itself. With --images instead, SIFT is extracted anew, and the
-  landmarks are triangulated anew at the model's poses.
+  Photographs are localized with the keypoints that the map was made from, of SIFT, ALIKED, DISK, XFeat or SuperPoint: a
+  COLMAP database, or hloc's features in HDF5. A database.db beside the model is found by itself. With --images instead,
+  keypoints are extracted anew (SIFT, or by --extractor), and the landmarks triangulated anew at the model's poses.
 
 METRES
   A photograph counts as localized within 5 cm and 0.4 degrees. Where metres are not known, it is 1 % of the median
@@ -56,6 +56,8 @@ def parser() -> argparse.ArgumentParser:
     add("--scene", metavar="NAME", help="instead: a scene of a dataset, as `wheretolook map` made it")
     add("--database", type=Path, metavar="FILE", help="features: COLMAP's database.db, or hloc's feats-*.h5")
     add("--images", type=Path, metavar="FOLDER", help="instead: photographs, to extract them anew")
+    add("--extractor", metavar="NAME", help="of --images: opencv, colmap, aliked, disk or xfeat (opencv)")
+    add("--extractor-weights", metavar="FILE", default="", help="of a learned extractor; see docs/features.md")
     add("--metres", action="store_true", help="the map is in metres")
     add("--out", type=Path, metavar="FOLDER", help="where results go (data/checks/<name>)")
     add("--data", type=Path, default=Path("data"), metavar="FOLDER", help="folder of the datasets (data)")
@@ -114,6 +116,13 @@ def _refuse(options: argparse.Namespace) -> None:
     from wheretolook.methods.registry import check_method
     from wheretolook.select.weights import check_there
 
+    if options.extractor is not None or options.extractor_weights:
+        from wheretolook.features.keypoints import ExtractorConfig
+
+        ExtractorConfig(options.extractor or "opencv", weights=options.extractor_weights)  # refuses what there is not
+        if options.images is None:
+            fix = "Give --images, the folder of the photographs, or leave --extractor out."
+            raise ConfigError("nothing is extracted where features are given", value=options.extractor, fix=fix)
     for name in (*([options.method] if options.method else []), *options.also):
         check_method(name)
     check_there(options.weights)
@@ -133,6 +142,7 @@ def _name(options: argparse.Namespace) -> str:
 def _open(options: argparse.Namespace, out: Path, device: str, workers: int) -> tuple[PhotographedMap, OcclusionModel]:
     """The map, and what hides its landmarks; results go to a folder."""
     from wheretolook.check import source
+    from wheretolook.features.keypoints import ExtractorConfig
     from wheretolook.mapping.config import ExistingModelConfig
     from wheretolook.select.surroundings import surroundings
 
@@ -164,5 +174,6 @@ def _open(options: argparse.Namespace, out: Path, device: str, workers: int) -> 
             fix = "Map the scene again with `wheretolook map --map.keep_database true`, which keeps the features."
         raise MapError("neither the features nor the photographs of this map are known", path=model, fix=fix)
     if features is None:
-        model, features = source.extract_anew(model, images, out / "work", workers, device)
+        extractor = ExtractorConfig(options.extractor or "opencv", weights=options.extractor_weights)
+        model, features = source.extract_anew(model, images, out / "work", workers, device, extractor)
     return source.open_map(model, features, metric, name, keep_frame=mesh is not None), hides

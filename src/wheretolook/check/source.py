@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wheretolook.dataset.folders import Dataset, SceneFolder
+from wheretolook.features.keypoints import ExtractorConfig
 from wheretolook.geometry.camera import Camera, cameras_by_id
 from wheretolook.geometry.poses import Float, camera_centers, transform
 from wheretolook.labelling.labeller import versions
@@ -122,7 +123,7 @@ def open_map(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MapWarning)  # the error below tells the same
         if read_descriptors(features, model_dir, model, arrays) is None:
-            fix = "Give the folder of its photographs instead, --images: then SIFT is extracted from them."
+            fix = "Give the folder of its photographs instead, --images: then keypoints are extracted from them."
             problem = "these features are of no kind that is known, so nothing can be localized by them"
             raise MapError(problem, path=features, fix=fix)
     known = cameras_by_id(model.cameras, model_dir)
@@ -201,8 +202,10 @@ def says_metric(model_dir: Path) -> bool:
     return scale is not None and scale.is_metric
 
 
-def extract_anew(model_dir: Path, images: Path, work: Path, workers: int, device: str) -> tuple[Path, Path]:
-    """Triangulate a model's landmarks anew, from SIFT keypoints of its photographs; kept in `work`.
+def extract_anew(
+    model_dir: Path, images: Path, work: Path, workers: int, device: str, extractor: ExtractorConfig = ExtractorConfig()
+) -> tuple[Path, Path]:
+    """Triangulate a model's landmarks anew, from keypoints of its photographs; kept in `work`.
 
     Returns the folder of the new model and its database. Raises MapError if the photographs are not those of the model.
     """
@@ -212,7 +215,10 @@ def extract_anew(model_dir: Path, images: Path, work: Path, workers: int, device
     model = read_model(model_dir)
     parts = [fingerprint(path) for path in sorted(model_dir.glob("*.bin")) + sorted(model_dir.glob("*.txt"))]
     files = [[name, *_size_and_time(images / name)] for name in registered_names(model).values()]
-    key = {"versions": versions(), "model": parts, "images": str(images.resolve()), "photographs": digest_of(files)}
+    key: dict[str, Any] = {"versions": versions(), "model": parts, "images": str(images.resolve())}
+    key["photographs"] = digest_of(files)
+    if extractor != ExtractorConfig():
+        key["extractor"] = extractor.record()
     try:
         if read_json_object(note) == key and (out / DATABASE_FILE).is_file():
             return out, out / DATABASE_FILE
@@ -226,9 +232,8 @@ def extract_anew(model_dir: Path, images: Path, work: Path, workers: int, device
         )
     note.unlink(missing_ok=True)
     shutil.rmtree(out, ignore_errors=True)
-    config = MapConfig(
-        existing=ExistingModelConfig(model=model_dir), photographs=PhotographsConfig(images=images), keep_database=True
-    )
+    existing, photographs = ExistingModelConfig(model=model_dir), PhotographsConfig(images=images)
+    config = MapConfig(existing=existing, photographs=photographs, extractor=extractor, keep_database=True)
     work.mkdir(parents=True, exist_ok=True)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MapWarning)  # of the frame, which is seen to here

@@ -9,9 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from wheretolook.dataset.folders import RELEASE_FILE, Dataset, SceneFolder
+from wheretolook.features.sift import SIFT
 from wheretolook.learning.config import DECIDING, SharedConfig
 from wheretolook.learning.old_names import with_name
 from wheretolook.learning.scenes import with_also
+from wheretolook.mapping.landmarks import features_of
 from wheretolook.utils.errors import ConfigError, TableError
 from wheretolook.utils.files import fingerprint, sha256
 from wheretolook.utils.reading import read_json_object
@@ -54,6 +56,9 @@ def about_training(dataset: Dataset, method: str, config: SharedConfig, options:
         "camera": cameras[0].record() if len(cameras) == 1 else f"{len(cameras)} cameras",
         "config": {**asdict(options), **shared},
     }
+    features = sorted({features_of(scene.landmarks) for scene in seen if scene.landmarks.is_file()})
+    if features not in ([], [SIFT.name]):  # weights that say nothing are for SIFT, as are all older ones
+        about["features"] = features
     if config.also:
         about["also"] = list(config.also)
         own = tuple(scene for scene in dataset.scenes if scene.folder.parent == dataset.root)

@@ -44,6 +44,11 @@ def read_training(path: str | Path) -> dict[str, Any]:
     return with_name(read_weights(Path(path))[1].get("training", {}))
 
 
+def features_of_weights(path: str | Path) -> list[str]:
+    """Names of the features of the maps that weights have learnt from; see `read_weights`."""
+    return list(read_training(path).get("features", ["sift"]))
+
+
 def read_record(path: str | Path) -> dict[str, Any]:
     """The record beside weights: "about", "weights_sha256", "run_id", "metrics". WeightsError if missing or damaged."""
     beside = Path(path).with_suffix(".json")

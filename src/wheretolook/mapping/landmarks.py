@@ -147,6 +147,18 @@ class Landmarks:
         return cls(**arrays)
 
 
+def features_of(path: Path) -> str:
+    """Name of the kind of descriptors that a file of landmarks was made from, read alone; SIFT's if it says nothing.
+
+    "sift" also where there were no descriptors at all. Raises MapError if the file is missing or damaged.
+    """
+    try:
+        said = load_npz(path, ("described_by",)).get("described_by")
+    except ValueError as error:
+        raise MapError(str(error), path=path, fix="Run the map stage again.") from error
+    return SIFT.name if said is None else str(said)
+
+
 def _floats(values: dict[str, NDArray[Any]], points: DTypeLike, others: DTypeLike) -> dict[str, NDArray[Any]]:
     """The same arrays, with the points and all other arrays of floats cast to the types given."""
     floats = {name: points if name == "points" else others for name, value in values.items() if value.dtype.kind == "f"}

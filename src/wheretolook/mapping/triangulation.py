@@ -144,7 +144,7 @@ def match_pairs(
 ) -> Generator[NDArray[np.uint32], None, None]:
     """Match pairs (P, 2) of images, without geometric verification. Yields (M, 2) indices of keypoints, pair by pair.
 
-    SIFT is matched by COLMAP, learned features by `SimilarityMatcher`. Works in processes instead of threads: pycolmap's
+    SIFT is matched by COLMAP, learned features by `SimilarityMatcher`. Works in processes, not threads: pycolmap's
     BLAS is built without locks, so that two threads sometimes get the same buffer, and the nearest neighbours come out
     wrong. Small databases are made in `folder` meanwhile.
     """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable
 from functools import cache
 from importlib import import_module
@@ -11,7 +12,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, overload
 
 from wheretolook.methods.method import Method, ScorerOptions
-from wheretolook.utils.errors import CameraError, ConfigError, WeightsError
+from wheretolook.utils.errors import CameraError, ConfigError, OutOfRangeWarning, WeightsError
 from wheretolook.utils.shipped import WEIGHTS, or_shipped, shipped
 
 if TYPE_CHECKING:
@@ -235,4 +236,21 @@ def _build(method: Method, localization_map: LocalizationMap, options: ScorerOpt
             raise
         raise WeightsError(error.problem, path=options.weights, value=error.value, fix=error.fix) from None
     scorer.name = method.name
+    if options.weights is not None:
+        _warn_of_features(localization_map.landmarks.features, options.weights)
     return scorer
+
+
+_LOSS = {"sift": ""}
+"""What was measured of weights learnt with some features on maps by others, see docs/features.md."""
+
+
+def _warn_of_features(of_map: str, weights: Path) -> None:
+    """Warn if the landmarks of a map are of other features than weights have learnt from."""
+    from wheretolook.learning.weights import features_of_weights
+
+    learnt = features_of_weights(weights)
+    if of_map and of_map not in learnt:
+        measured = "".join(filter(None, (_LOSS.get(name, "") for name in learnt)))
+        text = f"the weights {weights.name} have learnt from maps by {', '.join(learnt)}, and this one is by {of_map}"
+        warnings.warn(f"{text}{measured}. `wheretolook check` measures it on yours.", OutOfRangeWarning, stacklevel=4)

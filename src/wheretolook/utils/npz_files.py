@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import IO, Any
 
@@ -40,8 +40,8 @@ class _Plain:
         self.write = file.write
 
 
-def load_npz(path: Path) -> dict[str, NDArray[Any]]:
-    """Read all arrays of an NPZ file by name. Raises ValueError if the file is missing or damaged.
+def load_npz(path: Path, only: Collection[str] | None = None) -> dict[str, NDArray[Any]]:
+    """Read all arrays of an NPZ file by name, or only some of them. ValueError if the file is missing or damaged.
 
     Also if it unfolds to far more than it has bytes, which is found out before anything is unfolded. Of an array that
     tells of more values than follow it, no more memory is touched than what follows.
@@ -52,7 +52,7 @@ def load_npz(path: Path) -> dict[str, NDArray[Any]]:
             unfolded = sum(member.file_size for member in stored.zip.infolist())
             if unfolded > max(FREE_BYTES, MAX_RATIO * n_bytes):
                 raise ValueError(f"its {n_bytes:,} bytes would unfold to {unfolded:,}")
-            arrays = {name: stored[name] for name in stored.files}
+            arrays = {name: stored[name] for name in stored.files if only is None or name in only}
             if not all(isinstance(array, np.ndarray) for array in arrays.values()):  # of a strange file, its bytes
                 raise ValueError("a file in it is no array")
             return arrays

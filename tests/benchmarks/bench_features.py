@@ -1,0 +1,175 @@
+"""Does a scorer learnt with SIFT rank views for learned features too? A map and labels by each extractor, one scorer.
+
+    python tests/benchmarks/bench_features.py --work FOLDER --features opencv aliked=aliked-n16rot.pth xfeat=xfeat.pt
+    python tests/benchmarks/bench_features.py --work FOLDER ... --scenes 1 2 --locations 60 --directions 12
+
+Each scene is an apartment made from its seed. Extractors map it along the same walk, and localize the same views of it:
+of locations anywhere, in directions all around. Keypoints are kept in --work, so that an interrupted run goes on, and
+other limits on the similarity (--similarities) are tried quickly. A table shows, for each extractor, the share of views
+that localize within 5 cm and 0.4 degrees; the scorer's AUC; and its regret: how much more often the best view of a
+location localizes than the one it chooses, over locations with any that does, in points. Beside it the same of `bins`,
+and of the scorer without the landmarks' ambiguity. Intervals are of 95 %, by a bootstrap over locations.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import bench_scenes
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.metrics import roc_auc_score
+from tqdm.auto import tqdm
+
+from wheretolook.features.extraction import KeypointExtractor
+from wheretolook.features.keypoints import ExtractorConfig, Keypoints
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.poses import pose_error, poses_looking_along
+from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.labelling.config import LocalizerConfig
+from wheretolook.labelling.localizer import Localizer
+from wheretolook.mapping.building import build_map
+from wheretolook.mapping.config import MapConfig
+from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.methods.registry import load_scorer, make_scorer
+from wheretolook.rendering.warp_renderer import WarpRenderer
+from wheretolook.utils.npz_files import load_npz, save_npz
+from wheretolook.viewpoints.table import LOCALIZED
+from wheretolook.visibility.occlusion import MeshOcclusion
+
+CAMERA = PinholeCamera()
+
+
+def looked_at(scene: bench_scenes.Scene, locations: int, directions: int, seed: int) -> NDArray[np.float64]:
+    """Poses (locations x directions, 3, 4): free places 0.8 to 2 m high, looked from all around."""
+    rng, (low, high) = np.random.default_rng(seed), scene.mesh.bounds
+    found = np.empty((0, 3))
+    while len(found) < locations:
+        places = rng.uniform((*low[:2], 0.8), (*high[:2], 2.0), (2000, 3))
+        found = np.concatenate([found, places[scene.free_space.is_free(places)]])
+    yaw = rng.uniform(0, 2 * np.pi, (locations, 1)) + 2 * np.pi * np.arange(directions) / directions
+    pitch = rng.uniform(-0.5, 0.5, (locations, directions))
+    ahead = np.stack([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)], axis=-1)
+    return poses_looking_along(np.repeat(found[:locations], directions, axis=0), ahead.reshape(-1, 3))
+
+
+def keypoints_of(
+    poses: NDArray[np.float64], scene: bench_scenes.Scene, extractor: KeypointExtractor, folder: Path, device: str
+) -> tuple[list[Keypoints], list[float]]:
+    """Keypoints of views (B, 3, 4), by an extractor and kept in a folder; and the CPU seconds that each took."""
+    renderer: Any = None
+    found, seconds = [], []
+    for row, pose in enumerate(tqdm(poses, f"{extractor.config.method}: extract", unit="view")):
+        path = folder / f"{row:05}.npz"
+        if not path.is_file():
+            renderer = renderer or WarpRenderer(scene.mesh, device)
+            rgb = renderer.render(CAMERA, pose[None]).rgb[0]
+            start = time.process_time()
+            made = extractor.extract(rgb)
+            took = np.array(time.process_time() - start)
+            folder.mkdir(parents=True, exist_ok=True)
+            save_npz(path, {"pixels": made.pixels, "descriptors": made.descriptors.astype(np.float16), "took": took})
+        kept = load_npz(path)
+        ones = np.ones(len(kept["pixels"]), np.float32)
+        found.append(Keypoints(kept["pixels"], kept["descriptors"].astype(np.float32), ones))
+        seconds.append(float(kept["took"]))
+    return found, seconds
+
+
+def localize(
+    localizer: Localizer, keypoints: list[Keypoints], poses: NDArray[np.float64]
+) -> tuple[NDArray[np.bool_], float]:
+    """Which views localize within 5 cm and 0.4 degrees, (B,), and the milliseconds to match one."""
+    good, spent = [], 0.0
+    for found, pose in zip(keypoints, poses, strict=True):
+        start = time.process_time()
+        ((rows, landmarks),) = localizer.match([found])
+        spent += time.process_time() - start
+        result = localizer.estimate(found, rows, landmarks)
+        error_m, error_deg = pose_error(np.full((3, 4), np.nan) if result.cam_from_world is None else result.cam_from_world, pose)  # noqa: E501  # fmt: skip
+        good.append(result.status == LOCALIZED and error_m < 0.05 and error_deg < 0.4)
+    return np.array(good), 1000 * spent / len(keypoints)
+
+
+def numbers(scores: NDArray[Any], good: NDArray[np.bool_], locations: NDArray[np.int64], seed: int = 0) -> str:
+    """AUC and regret of scores (L x D,) with intervals over the L locations, as text."""
+    rng, n = np.random.default_rng(seed), locations.max() + 1
+    per = scores.reshape(n, -1), good.reshape(n, -1)
+
+    def of(rows: NDArray[np.int64]) -> tuple[float, float]:
+        s, g = (part[rows] for part in per)
+        able = g.any(1)
+        chosen = np.take_along_axis(g, s.argmax(1)[:, None], axis=1)[:, 0]
+        auc = roc_auc_score(g.ravel(), s.ravel()) if 0 < g.mean() < 1 else np.nan
+        return auc, 100 * float(1 - chosen[able].mean()) if able.any() else np.nan
+
+    draws = np.array([of(rng.integers(0, n, n)) for _ in range(500)])
+    (auc, regret), low, high = of(np.arange(n)), *np.nanpercentile(draws, (2.5, 97.5), axis=0)
+    return f"{auc:.3f} ({low[0]:.3f} to {high[0]:.3f}) | {regret:.1f} ({low[1]:.1f} to {high[1]:.1f})"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add = parser.add_argument
+    add("--features", nargs="+", default=["opencv"], metavar="NAME[=WEIGHTS]", help="extractors (opencv)")
+    add("--scenes", nargs="+", type=int, default=[901], help="seeds of apartments")
+    add("--locations", type=int, default=60)
+    add("--directions", type=int, default=12)
+    add("--map-images", type=int, default=100)
+    add("--max-keypoints", type=int, default=2048)
+    add("--similarities", nargs="*", type=float, default=[], help="limits to try beside the extractor's own")
+    add("--device", default="cpu")
+    add("--work", type=Path, required=True, metavar="FOLDER", help="where maps and keypoints are kept")
+    args = parser.parse_args()
+    bench_scenes.use_one_thread()
+
+    rows: dict[tuple[str, float | None], list[Any]] = {}
+    for seed in args.scenes:
+        folder = args.work / f"scene-{seed}"
+        mesh = folder / "mesh.glb"
+        folder.mkdir(parents=True, exist_ok=True)
+        scene = bench_scenes.open_scene(mesh if mesh.is_file() else None, folder, seed, args.device)
+        poses = looked_at(scene, args.locations, args.directions, seed)
+        occlusion = MeshOcclusion(scene.free_space.raycaster, two_sided=scene.free_space.two_sided)
+        for each in args.features:
+            name, _, weights = each.partition("=")
+            config = ExtractorConfig(name, max_keypoints=args.max_keypoints, weights=weights)
+            place = folder / name / "map"
+            if not (place / "landmarks.npz").is_file():
+                settings = MapConfig(n_images=args.map_images, extractor=config)
+                build_map(scene.mesh, WarpRenderer(scene.mesh, args.device), scene.free_space, CAMERA, settings, seed,
+                          place, workers=1, device=args.device)  # fmt: skip
+            extractor = KeypointExtractor(config, args.device)
+            keypoints, seconds = keypoints_of(poses, scene, extractor, folder / name / "keypoints", args.device)
+            landmarks = Landmarks.load(place / "landmarks.npz")
+            looked = LocalizationMap(landmarks, CAMERA, occlusion, args.device)
+            unsure = replace(looked, landmarks=replace(landmarks, ambiguity=np.full_like(landmarks.ambiguity, np.nan)))
+            scorers = {"shipped": load_scorer(looked), "without ambiguity": load_scorer(unsure)}
+            scorers["bins"] = make_scorer("bins", looked)
+            scores = {scorer: one.score(poses) for scorer, one in scorers.items()}
+            limits: list[float | None] = [None, *(args.similarities if landmarks.features != "sift" else [])]
+            for limit in limits:
+                localizer = Localizer(landmarks, CAMERA, LocalizerConfig(min_similarity=limit), device=args.device)
+                good, match_ms = localize(localizer, keypoints, poses)
+                found = (good, scores, seconds, [len(one) for one in keypoints], len(landmarks), match_ms)
+                rows.setdefault((name, limit), []).append(found)
+
+    print("| features | landmarks | keypoints | s an image | ms to match | localize | scorer | AUC | regret |")
+    print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |")
+    for (name, limit), parts in rows.items():
+        good = np.concatenate([part[0] for part in parts])
+        locations = np.repeat(np.arange(len(good) // args.directions), args.directions)
+        about = f"{np.mean([part[4] for part in parts]):,.0f} | {np.median(np.concatenate([p[3] for p in parts])):.0f}"
+        about += f" | {np.median(np.concatenate([p[2] for p in parts])):.2f} | {np.mean([p[5] for p in parts]):.0f}"
+        for scorer in parts[0][1]:
+            values = numbers(np.concatenate([part[1][scorer] for part in parts]), good, locations)
+            called = name if limit is None else f"{name}, from {limit}"
+            print(f"| {called} | {about} | {100 * good.mean():.1f} % | {scorer} | {values} |")
+
+
+if __name__ == "__main__":
+    main()

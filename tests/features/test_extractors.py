@@ -1,0 +1,170 @@
+"""Every extractor owns its descriptors; learned ones are found by kornia, where it is installed."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from wheretolook.features.extraction import KeypointExtractor
+from wheretolook.features.keypoints import ExtractorConfig, quantize_descriptors, unit_descriptors
+from wheretolook.features.registry import all_extractors, all_kinds, kind_of, that_extract
+from wheretolook.features.similarity import SimilarityMatcher, mutual_plain
+from wheretolook.labelling.config import LocalizerConfig
+from wheretolook.utils.errors import ConfigError, WeightsError
+
+LEARNED = ("aliked", "disk", "xfeat")
+
+
+def unit(n: int, dimension: int, seed: int = 0) -> np.ndarray:
+    return unit_descriptors(np.random.default_rng(seed).normal(size=(n, dimension)))
+
+
+@pytest.mark.parametrize("kind", all_kinds().values(), ids=lambda kind: kind.name)
+def test_stored_descriptors_come_back_as_they_were_stored(kind):
+    values = unit(50, kind.dimension)
+    stored = kind.store(np.abs(values) if kind.in_bytes else values)
+    assert stored.dtype == kind.stored_as and kind.none().shape == (0, kind.dimension)
+    np.testing.assert_array_equal(kind.store(kind.restore(stored)), stored)
+    np.testing.assert_allclose(np.linalg.norm(kind.restore(stored), axis=1), 1, atol=0.02)
+    assert kind.store(kind.restore(kind.none())).shape == (0, kind.dimension)
+
+
+def test_sift_is_stored_as_colmap_stores_it():
+    values = np.abs(unit(20, 128))
+    np.testing.assert_array_equal(kind_of("opencv").store(values), quantize_descriptors(values))
+    assert kind_of("opencv") is kind_of("colmap")
+
+
+def test_the_records_of_older_maps_and_labels_stay_valid():
+    """Stages are done again when a record changes: a new option may not change that of everybody's maps."""
+    constants = {"first_octave": -1, "max_keypoints": 2048, "peak_threshold": 0.02 / 3, "edge_threshold": 10.0}
+    assert ExtractorConfig().record() == {"method": "opencv", **constants}
+    old = {"max_ratio": 0.85, "min_matches": 4, "max_error_px": 8.0, "min_inliers": 10, "seed": 0}
+    old |= {"confidence": 0.9999, "min_trials": 100, "max_trials": 10_000}
+    assert LocalizerConfig().record() == old
+    assert LocalizerConfig(min_similarity=0.7).record() == {**old, "min_similarity": 0.7}
+
+
+def test_what_is_in_weights_decides_not_where_they_lie(tmp_path):
+    for name, content in (("a", b"1"), ("b", b"1"), ("c", b"2")):
+        (tmp_path / name).write_bytes(content)
+    a, b, c = (ExtractorConfig("aliked", weights=str(tmp_path / name)).record() for name in "abc")
+    assert a == b != c
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"method": "orb"}, "opencv, colmap, aliked, disk, xfeat"),
+        ({"method": "superpoint"}, "unknown extractor"),  # known from files alone
+        ({"method": "opencv", "weights": "a.pth"}, "no weights"),
+    ],
+)
+def test_settings_that_no_extractor_has(options, told):
+    with pytest.raises(ConfigError, match=told):
+        ExtractorConfig(**options)
+
+
+def test_a_similarity_is_a_cosine():
+    with pytest.raises(ConfigError, match=r"cosine.*1\.5"):
+        LocalizerConfig(min_similarity=1.5)
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 700, 2000])
+def test_mutual_nearest_neighbours_are_those_of_all_products(n, monkeypatch):
+    monkeypatch.setattr("wheretolook.features.similarity._PRODUCTS", {"cpu": 60_000})  # several blocks
+    landmarks = unit(n, 64).astype(np.float16)
+    noisy = unit_descriptors(
+        np.concatenate([landmarks[: n // 2], landmarks[: n // 4]]) + 0.05 * unit(n // 2 + n // 4, 64, 1)
+    )
+    images = [np.concatenate([noisy, unit(30, 64, 2)]).astype(np.float16), np.zeros((0, 64), np.float16)]
+    matcher = SimilarityMatcher(landmarks)
+    for limit in (-1.0, 0.5, 0.9):
+        (keypoints, rows), nothing = matcher.match(images, limit)
+        assert len(nothing[0]) == len(nothing[1]) == 0
+        if n:
+            expected = mutual_plain(images[0], landmarks, limit)
+            found, plain = ({*zip(a.tolist(), b.tolist(), strict=True)} for a, b in ((keypoints, rows), expected))
+            assert len(found ^ plain) <= n // 1000  # sums that agree up to single precision
+        assert len(set(rows.tolist())) == len(rows) and (np.diff(keypoints) > 0).all()
+    if n > 2:
+        assert n // 4 < len(rows) <= n // 2  # of twins, the nearer
+
+
+def test_without_kornia_the_extra_to_install_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "kornia", None)
+    monkeypatch.setitem(sys.modules, "kornia.feature", None)
+    for method in LEARNED:
+        with pytest.raises(ConfigError, match=r"pip install 'wheretolook\[learned\]'"):
+            KeypointExtractor(ExtractorConfig(method))
+
+
+def untrained(method: str, folder: Path) -> Path:
+    """A file of weights as the authors of a network give theirs, but with random numbers."""
+    torch = pytest.importorskip("torch")
+    kornia = pytest.importorskip("kornia.feature", reason="learned features need kornia: pip install kornia")
+    torch.manual_seed(0)
+    if method == "aliked":
+        state = {
+            name: value for name, value in kornia.ALIKED("aliked-n16rot").state_dict().items() if "dkd" not in name
+        }
+    elif method == "disk":
+        state = {"extractor": kornia.DISK().state_dict()}
+    else:
+        state = kornia.XFeat().net.state_dict()
+        last = [name for name in state if name.startswith("keypoint_head") and name.endswith("weight")][-1]
+        state[last] *= 100  # so that some score passes the least one
+    path = folder / f"{method}.pth"
+    torch.save(state, path)
+    return path
+
+
+def image(seed: int = 0) -> np.ndarray:
+    from scipy.ndimage import gaussian_filter
+
+    rng = np.random.default_rng(seed)
+    return np.clip(128 + 120 * gaussian_filter(rng.normal(size=(100, 140, 3)), (1.5, 1.5, 0)) * 3, 0, 255).astype(
+        np.uint8
+    )
+
+
+@pytest.mark.parametrize("method", LEARNED)
+def test_learned_extractors_give_unit_descriptors_within_the_image(method, tmp_path):
+    weights = untrained(method, tmp_path)
+    extractor = KeypointExtractor(ExtractorConfig(method, max_keypoints=50, weights=str(weights)))
+    both = extractor.extract_batch([image(0), image(1)])
+    for found, rgb in zip(both, (image(0), image(1)), strict=True):
+        alone = extractor.extract(rgb)
+        np.testing.assert_array_equal(found.pixels, alone.pixels)
+        np.testing.assert_array_equal(found.descriptors, alone.descriptors)
+        assert 0 < len(found) <= 50
+        assert found.descriptors.shape == (len(found), kind_of(method).dimension)
+        np.testing.assert_allclose(np.linalg.norm(found.descriptors, axis=1), 1, atol=1e-4)
+        assert (found.pixels > 0).all() and (found.pixels < (140, 100)).all()
+    with pytest.raises(ValueError, match="expected an"):
+        extractor.extract(image()[..., 0])
+
+
+@pytest.mark.parametrize("method", LEARNED)
+def test_weights_that_are_not_the_networks(method, tmp_path, monkeypatch):
+    weights = untrained(method, tmp_path)
+    other = untrained("xfeat" if method != "xfeat" else "disk", tmp_path)
+    (tmp_path / "text.pth").write_text("no weights")
+    (tmp_path / "half.pth").write_bytes(weights.read_bytes()[:999])
+    for name in (other.name, "text.pth", "half.pth", "missing.pth"):
+        with pytest.raises(WeightsError, match=rf"{name}.*{all_extractors()[method].weights}.*--map.extractor.weights"):
+            KeypointExtractor(ExtractorConfig(method, weights=str(tmp_path / name)))
+
+    def offline(*arguments, **options):
+        raise OSError("Name or service not known")
+
+    monkeypatch.setattr("kornia.core.download.load_state_dict_from_url", offline)
+    with pytest.raises(WeightsError, match=r"cannot be downloaded: Name or service not known.*Give the file"):
+        KeypointExtractor(ExtractorConfig(method))
+
+
+def test_every_extractor_that_extracts_says_so():
+    assert that_extract() == ("opencv", "colmap", *LEARNED)

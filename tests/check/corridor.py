@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from wheretolook.features.keypoints import quantize_descriptors
+from wheretolook.features.descriptors import DescriptorKind
+from wheretolook.features.sift import SIFT
 from wheretolook.geometry.poses import Float, poses_looking_along
 from wheretolook.mapping.triangulation import fill_database
 
@@ -24,7 +25,12 @@ def corridor_poses() -> Float:
 
 
 def write_corridor(
-    folder: Path, noise_px: float = 0.2, photographs: int = N, scale: float = 1.0, rotation: Float = np.eye(3)
+    folder: Path,
+    noise_px: float = 0.2,
+    photographs: int = N,
+    scale: float = 1.0,
+    rotation: Float = np.eye(3),
+    kind: DescriptorKind = SIFT,
 ) -> tuple[Path, Path]:
     """Write the model and its database of keypoints and descriptors; their paths.
 
@@ -35,7 +41,9 @@ def write_corridor(
     front = rng.uniform((-2, 2, 0.2), (15, 3, 2.8), (1500, 3))
     back = rng.uniform((4, -3, 0.2), (9, -2, 2.8), (400, 3))
     points = np.concatenate([front, back])
-    words = rng.gamma(0.5, size=(len(points), 128))
+    words = rng.gamma(0.5, size=(len(points), kind.dimension))
+    if not kind.in_bytes:
+        words = rng.normal(size=words.shape)
     model = pycolmap.Reconstruction()
     for camera_id, (name, params) in enumerate(
         [("PINHOLE", [160.0, 160.0, 160.0, 120.0]), ("SIMPLE_RADIAL", [160.0, 160.0, 120.0, -0.02])], 1
@@ -50,8 +58,9 @@ def write_corridor(
         pixels = np.asarray(camera.img_from_cam(in_camera[ahead]))
         inside = ((pixels > 0) & (pixels < (WIDTH, HEIGHT))).all(1)
         rows, pixels = ahead[inside], pixels[inside] + rng.normal(0, noise_px, (int(inside.sum()), 2))
-        noisy = np.maximum(words[rows] + rng.normal(0, 0.05, (len(rows), 128)), 0)
-        stored.append((pixels.astype(np.float32), quantize_descriptors(noisy / np.linalg.norm(noisy, axis=1)[:, None])))
+        noisy = words[rows] + rng.normal(0, 0.05, (len(rows), kind.dimension))
+        noisy = np.maximum(noisy, 0) if kind.in_bytes else noisy
+        stored.append((pixels.astype(np.float32), kind.store(noisy / np.linalg.norm(noisy, axis=1)[:, None])))
         image = pycolmap.Image(
             name=f"{row:03}.jpg", camera_id=camera.camera_id, image_id=row + 1, keypoints=stored[-1][0].astype(float)
         )
@@ -66,8 +75,8 @@ def write_corridor(
                 track.add_element(image_id, keypoint)
             model.add_point3D(scale * points[point] @ rotation.T, track, np.zeros(3, dtype=np.uint8))
     model.update_point_3d_errors()
-    sparse, database = folder / "sparse", folder / "features.db"
+    sparse, database = folder / "sparse", folder / ("features.db" if kind is SIFT else f"{kind.name}.db")
     sparse.mkdir(parents=True)
     model.write_binary(str(sparse))
-    fill_database(database, model, stored)
+    fill_database(database, model, stored, kind)
     return sparse, database

@@ -40,6 +40,4 @@ def _build(config: ExtractorConfig, device: str) -> Extraction:
     return Aliked(config, device)
 
 
-EXTRACTORS = (
-    Extractor("aliked", "ALIKED n16rot, by kornia.", ALIKED, _build, weights=_FILE, lightglue={"features": "aliked"}),
-)
+EXTRACTORS = (Extractor("aliked", "ALIKED n16rot, by kornia.", ALIKED, _build, weights=_FILE, lightglue="aliked"),)

@@ -28,7 +28,7 @@ def _build(config: ExtractorConfig, device: str) -> Extraction:
         dimension = DISK.dimension
 
         def make(self) -> nn.Module:
-            return load_state(kornia_feature().DISK(), config.weights, _FILE, _URLS, within="extractor")
+            return load_state(kornia_feature().DISK(), config.weights, _FILE, _URLS, lambda state: state["extractor"])
 
         def detect(self, images: Tensor) -> list[Found]:
             found = self._network(images, n=config.max_keypoints, pad_if_not_divisible=True)
@@ -38,4 +38,4 @@ def _build(config: ExtractorConfig, device: str) -> Extraction:
     return Disk(config, device)
 
 
-EXTRACTORS = (Extractor("disk", "DISK, by kornia.", DISK, _build, weights=_FILE, lightglue={"features": "disk"}),)
+EXTRACTORS = (Extractor("disk", "DISK, by kornia.", DISK, _build, weights=_FILE, lightglue="disk"),)

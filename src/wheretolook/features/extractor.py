@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,4 +41,4 @@ class Extractor:
     descriptors: DescriptorKind
     build: Callable[[ExtractorConfig, str], Extraction] | None = None  # from settings and a device, "cpu" or CUDA
     weights: str = ""  # the file of a network's weights, as their authors call it; "" for none
-    lightglue: dict[str, Any] | None = None  # how kornia's LightGlue is built for it; None where there is none
+    lightglue: str = ""  # what kornia's LightGlue calls it; "" where there is none for it

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -87,14 +87,21 @@ def kornia_feature() -> Any:
     return kornia.feature
 
 
-def load_state(network: nn.Module, weights: str, name: str, urls: Sequence[str], within: str = "") -> nn.Module:
+def load_state(
+    network: nn.Module,
+    weights: str,
+    name: str,
+    urls: Sequence[str],
+    prepare: Callable[[dict[str, Any]], dict[str, Any]] = dict,
+    option: str = "--map.extractor.weights",
+) -> nn.Module:
     """Load the weights of a network: from a file, or without one kornia's copy, from its cache or the network.
 
-    A download is announced on standard error. `name` is what the file is usually called, `within` the entry of the file
-    that has the tensors, if it may have others. Raises WeightsError if the file is missing, damaged, or of another
+    A download is announced on standard error. `name` is what the file is usually called, `prepare` makes the network's
+    tensors by name from what the file holds. Raises WeightsError if the file is missing, damaged, or of another
     network; or if none is given and none can be had.
     """
-    fix = f"Give the file {name}: --map.extractor.weights FILE."
+    fix = f"Give the file {name}: {option} FILE."
     if weights and not Path(weights).is_file():
         raise WeightsError("there are no such weights", path=weights, fix=fix)
     try:
@@ -109,10 +116,10 @@ def load_state(network: nn.Module, weights: str, name: str, urls: Sequence[str],
         problem = f"cannot read the weights: {reason}" if weights else f"{name} cannot be downloaded: {reason}"
         raise WeightsError(problem, path=weights or None, fix=fix) from error
     try:
-        missing, unknown = network.load_state_dict(state.get(within, state), strict=False)
+        missing, unknown = network.load_state_dict(prepare(state), strict=False)
         if unknown or {*missing} & {name for name, _ in network.named_parameters()}:  # constants may be missing
             raise ValueError("other tensors")
-    except (RuntimeError, AttributeError, TypeError, ValueError) as error:
+    except (RuntimeError, AttributeError, TypeError, ValueError, KeyError) as error:
         problem = f"these weights are not those of {type(network).__name__} as in {name}"
         raise WeightsError(problem, path=weights or None, fix=fix) from error
     return network

@@ -39,4 +39,4 @@ def _build(config: ExtractorConfig, device: str) -> Extraction:
     return XFeat(config, device)
 
 
-EXTRACTORS = (Extractor("xfeat", "XFeat, by kornia.", XFEAT, _build, weights=_FILE, lightglue={"features": "xfeat"}),)
+EXTRACTORS = (Extractor("xfeat", "XFeat, by kornia.", XFEAT, _build, weights=_FILE, lightglue="xfeat"),)

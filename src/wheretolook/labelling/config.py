@@ -17,6 +17,11 @@ class LocalizerConfig:
             second nearest's.
         min_similarity: of learned features: a keypoint and a landmark that are each other's nearest match if the cosine
             between their descriptors is at least this; the extractor's own limit if none is given.
+        lightglue: file of LightGlue's weights for the map's features (aliked_lightglue.pth), or kornia for its copy. A
+            query is then matched with the mapping images that see most of the landmarks it seems to show, as hloc
+            localizes, instead of with landmarks. Needs a map with its database (`map.keep_database`) and the extra
+            `learned`.
+        lightglue_images: how many mapping images that is.
         max_error_px: reprojection error under which RANSAC counts a match as an inlier.
         min_inliers: inliers that a pose needs. With fewer it is taken for an accident: RANSAC finds some pose for
             almost any image.
@@ -33,6 +38,8 @@ class LocalizerConfig:
 
     max_ratio: float = 0.85
     min_similarity: float | None = None
+    lightglue: str = ""
+    lightglue_images: int = 5
     min_matches: int = field(default=4, init=False)
     max_error_px: float = 8.0
     min_inliers: int = 10
@@ -46,6 +53,8 @@ class LocalizerConfig:
             raise ConfigError("max_ratio must be in (0, 1]", value=self.max_ratio)
         if self.min_similarity is not None and not -1 <= self.min_similarity <= 1:
             raise ConfigError("min_similarity is a cosine, -1 to 1", value=self.min_similarity)
+        if self.lightglue_images < 1:
+            raise ConfigError("lightglue_images must be at least 1", value=self.lightglue_images)
         if self.min_inliers < 4 or self.max_error_px <= 0:
             raise ConfigError(
                 "the localizer needs min_inliers >= 4 and max_error_px > 0", value=(self.min_inliers, self.max_error_px)
@@ -53,8 +62,13 @@ class LocalizerConfig:
 
     def record(self) -> dict[str, Any]:
         """What decides which labels come out, as JSON values."""
-        later = {"min_similarity": None}  # options that older labels do not know, and what leaves everything as it was
-        return {name: value for name, value in asdict(self).items() if name not in later or value != later[name]}
+        record = asdict(self)
+        # options that older labels do not know, where they leave everything as it was
+        if self.min_similarity is None:
+            del record["min_similarity"]
+        if not self.lightglue:
+            del record["lightglue"], record["lightglue_images"]
+        return record
 
 
 @dataclass(frozen=True)

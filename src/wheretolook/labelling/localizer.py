@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import poselib
@@ -23,6 +24,9 @@ from wheretolook.labelling.config import LocalizerConfig
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.utils.errors import MapError
 from wheretolook.viewpoints.table import LOCALIZED, NO_POSE, TOO_FEW_MATCHES
+
+if TYPE_CHECKING:
+    from wheretolook.labelling.lightglue import LightGlueMatcher
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,8 +55,8 @@ class Localizer:
     Keypoints are extracted and matched to the landmarks' mean descriptors, SIFT's with Lowe's ratio test, learned ones
     where both are each other's nearest; PoseLib estimates the pose by P3P in LO-RANSAC and refines it on the inliers.
     The extractor must be what the map was made with, and may be left out where nothing is extracted; it and matching
-    run on the device, "cpu" or a CUDA device. Raises MapError if the landmarks have no descriptors, or others than the
-    extractor's.
+    run on the device, "cpu" or a CUDA device. `map_dir` is the folder of the map, which LightGlue needs
+    (`LocalizerConfig.lightglue`). Raises MapError if the landmarks have no descriptors, or others than the extractor's.
     """
 
     def __init__(
@@ -62,6 +66,7 @@ class Localizer:
         config: LocalizerConfig | None = None,
         extractor: ExtractorConfig | None = None,
         device: str = "cpu",
+        map_dir: Path | None = None,
     ) -> None:
         if landmarks.descriptors is None:
             raise MapError("landmarks without descriptors cannot be matched", fix="Build the map with its database.")
@@ -72,6 +77,11 @@ class Localizer:
         self._extract_with, self._device = extractor, device
         by_ratio = self.kind.in_bytes
         self._matcher = (DescriptorMatcher if by_ratio else SimilarityMatcher)(landmarks.descriptors, device)
+        self._guided: LightGlueMatcher | None = None
+        if self.config.lightglue:
+            from wheretolook.labelling.lightglue import LightGlueMatcher
+
+            self._guided = LightGlueMatcher(landmarks, map_dir, self.config.lightglue, device)
         self._camera, self._origin = camera, local_origin(landmarks.points)
         self._ransac = {
             "max_reproj_error": self.config.max_error_px,
@@ -107,8 +117,22 @@ class Localizer:
         """Step 1: keypoints of images, each (H, W, 3) uint8 and all of one size."""
         return self.extractor.extract_batch(images)
 
-    def match(self, keypoints: Sequence[Keypoints]) -> list[Matches]:
-        """Step 2: 2D-3D matches of several images at once; those of one image do not depend on the others."""
+    def match(self, keypoints: Sequence[Keypoints], camera: Camera | None = None) -> list[Matches]:
+        """Step 2: 2D-3D matches of several images at once; those of one image do not depend on the others.
+
+        The images are of the localizer's camera, or of the one given.
+        """
+        matches = self._match(keypoints)
+        if self._guided is None:
+            return matches
+        seen_by, n_images = camera or self._camera, self.config.lightglue_images
+        size = (seen_by.width, seen_by.height)
+        return [
+            self._guided.match(of_image, size, rows, n_images)
+            for of_image, (_, rows) in zip(keypoints, matches, strict=True)
+        ]
+
+    def _match(self, keypoints: Sequence[Keypoints]) -> list[Matches]:
         descriptors = [self.kind.store(of_image.descriptors) for of_image in keypoints]
         if isinstance(self._matcher, SimilarityMatcher):
             least = self.config.min_similarity

@@ -112,7 +112,8 @@ class ShardWorker:
             if device == "cuda":
                 device = f"cuda:{self.number % max(1, torch.cuda.device_count())}"
             renderer = WarpRenderer(load_mesh(job.mesh), device)
-            localizer = Localizer(Landmarks.load(job.landmarks), job.camera, job.localizer, job.extractor, device)
+            looked = (job.camera, job.localizer, job.extractor, device, job.landmarks.parent)
+            localizer = Localizer(Landmarks.load(job.landmarks), *looked)
             self._scene = job, renderer, localizer
         return self._scene[1:]
 
@@ -148,7 +149,7 @@ def label_rows(
     steps = [  # a batch is of one camera, which goes with it from step to step
         Step("render", lambda batch: (batch[0], renderer.render(batch[0], true_poses[batch[1]]).rgb)),
         Step("extract", lambda batch: (batch[0], localizer.extract(batch[1]))),
-        Step("match", lambda batch: (batch[0], list(zip(batch[1], localizer.match(batch[1]), strict=True)))),
+        Step("match", lambda batch: (batch[0], list(zip(batch[1], localizer.match(batch[1], batch[0]), strict=True)))),
         Step("pose", poses_of),
     ]
     found: list[Localization] = []

@@ -67,7 +67,7 @@ STAGES = {
         "make_maps",
         "Build a COLMAP map of every scene by renders, or of photographs: --images. Or take one of your own: --model.",
         "model mesh database images map.existing.name map.existing.camera_id map.n_images map.extractor.method "
-        "map.photographs.name map.photographs.scale.positions label.workers",
+        "map.extractor.weights map.photographs.name map.photographs.scale.positions label.workers",
         ("map", "scenes.free_space", "label.workers"),
         "--name photos --images FOLDER",
         {f"--{name}": f"--map.existing.{name}" for name in ("model", "mesh", "database")},
@@ -89,7 +89,7 @@ Mesh and database may be left out. With --images its landmarks are triangulated 
         "label",
         "Render and localize every viewpoint, measure the pose error. Resumes.",
         "engine label.ray_address label.workers label.shard_size label.store_matches label.localizer.max_ratio "
-        "label.localizer.max_error_px label.localizer.min_inliers tracking.folder",
+        "label.localizer.lightglue label.localizer.max_error_px label.localizer.min_inliers tracking.folder",
         ("label", "tracking"),
         "--config configs/paper.yaml --engine ray",
     ),

@@ -90,7 +90,8 @@ def localize(
         ((rows, landmarks),) = localizer.match([found])
         spent += time.process_time() - start
         result = localizer.estimate(found, rows, landmarks)
-        error_m, error_deg = pose_error(np.full((3, 4), np.nan) if result.cam_from_world is None else result.cam_from_world, pose)  # noqa: E501  # fmt: skip
+        estimate = np.full((3, 4), np.nan) if result.cam_from_world is None else result.cam_from_world
+        error_m, error_deg = pose_error(estimate, pose)
         good.append(result.status == LOCALIZED and error_m < 0.05 and error_deg < 0.4)
     return np.array(good), 1000 * spent / len(keypoints)
 

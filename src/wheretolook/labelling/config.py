@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any, Literal
 
 from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.files import sha256
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,8 @@ class LocalizerConfig:
             del record["min_similarity"]
         if not self.lightglue:
             del record["lightglue"], record["lightglue_images"]
+        elif Path(self.lightglue).is_file():  # what is in it, not where it lies
+            record["lightglue"] = sha256(Path(self.lightglue))
         return record
 
 

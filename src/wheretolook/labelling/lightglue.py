@@ -65,15 +65,14 @@ class LightGlueMatcher:
         votes = np.bincount(np.concatenate([*spans, np.zeros(0, np.int64)]), minlength=len(images.stored))
         best = np.argsort(-votes, kind="stable")[:n_images]
         found = [self._with(query, size, int(image)) for image in best[votes[best] > 0]]
-        keypoints, rows, scores = (np.concatenate([np.zeros(0), *part]) for part in zip(*found, strict=True)) if found else (np.zeros(0),) * 3  # noqa: E501  # fmt: skip
-        order = np.lexsort((rows, keypoints, -scores))
-        keypoints, rows = keypoints[order].astype(np.int64), rows[order].astype(np.int64)
-        first = np.zeros(len(order), dtype=bool)
-        first[np.unique(keypoints, return_index=True)[1]] = True
-        keypoints, rows = keypoints[first], rows[first]
-        first = np.sort(np.unique(rows, return_index=True)[1])
-        keypoints, rows = keypoints[first], rows[first]
-        order = np.argsort(keypoints, kind="stable")
+        none = np.zeros(0, dtype=np.int64)
+        if not found:
+            return none, none
+        keypoints, rows, scores = (np.concatenate(part) for part in zip(*found, strict=True))
+        surest = np.lexsort((rows, keypoints, -scores))
+        for values in (keypoints, rows):  # each keypoint once, then each landmark once
+            surest = surest[np.sort(np.unique(values[surest], return_index=True)[1])]
+        order = surest[np.argsort(keypoints[surest])]
         return keypoints[order], rows[order]
 
     def _with(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -122,8 +121,8 @@ def test_shards_with_and_without_matches_are_told_apart(room: MappedRoom, tmp_pa
     table, shards = pd.concat([facing(POSTER, 3, 1.5), facing(PLAIN, 1, 1.1)], ignore_index=True), tmp_path / "shards"
     settings = {
         "versions": versions(),
-        "localizer": asdict(LocalizerConfig()),
-        "extractor": asdict(ExtractorConfig()),
+        "localizer": LocalizerConfig().record(),
+        "extractor": ExtractorConfig().record(),
         "camera": CAMERA.record(),
         "renderer": "cpu raster",
         "mesh": fingerprint(room.mesh),

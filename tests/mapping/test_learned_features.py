@@ -72,7 +72,7 @@ def expected_means(model, landmarks: Landmarks, stored) -> np.ndarray:
 def test_learned_descriptors_are_read_and_averaged(tmp_path, kind, source):
     model, folder, keypoints, stored = case(tmp_path, kind)
     if source == "database":
-        path = database_of(tmp_path / f"{kind.name}.db", model, keypoints, stored, kind)
+        path = database_of(tmp_path / "database.db", model, keypoints, stored, kind)
     else:
         path = hdf5_of(tmp_path / f"feats-{kind.name}-n4096-r1024.h5", keypoints, stored)
     landmarks = load_colmap_landmarks(folder, path)

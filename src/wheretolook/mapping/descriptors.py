@@ -14,14 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wheretolook.features.descriptors import DescriptorKind, Stored, unit_descriptors
-from wheretolook.features.registry import all_kinds, kind_of, that_extract
+from wheretolook.features.registry import all_kinds
 from wheretolook.features.sift import SIFT
 from wheretolook.mapping.colmap_model import ModelArrays
-from wheretolook.mapping.scale import REPORT_FILE
 from wheretolook.utils.errors import MapError, MapWarning
-from wheretolook.utils.reading import read_json_object
 
 HDF5_SUFFIXES = (".h5", ".hdf5")
+_TABLE = "wheretolook_features"  # of a database: the name of the kind of its descriptors
 # An image's keypoints (K, 2) in pixels, its descriptors (K, D) as `DescriptorKind.store` gives them, and their kind;
 # None where it has none, or of a kind that is not known.
 _Features = tuple[NDArray[np.float64], NDArray[Any] | None, DescriptorKind | None]
@@ -34,9 +33,9 @@ def read_descriptors(
 
     They come from the file of features that the model was built from: a COLMAP database (`database.db` of version 3 or
     4; it is not written to), or hloc's features in HDF5 (`feats-*.h5`). Images are found by their names. What kind they
-    are the database says, or the report beside it; of HDF5 the file's name (`feats-disk.h5`), or where that says
-    nothing how many numbers there are: 64 for XFeat, 256 for SuperPoint, 128 without negatives for SIFT. None, with a
-    `MapWarning`, if the file holds no descriptors, or none of a kind in `wheretolook.features.registry`.
+    are the database says, or the file's name (`feats-disk.h5`), or where these say nothing how many numbers there are:
+    64 for XFeat, 256 for SuperPoint, 128 without negatives for SIFT. None, with a `MapWarning`, if the file holds no
+    descriptors, or none of a kind in `wheretolook.features.registry`.
 
     Raises MapError if the file is missing, unreadable, or not the one the model was built from, its descriptors are not
     all of one kind, or h5py is missing.
@@ -120,20 +119,27 @@ def _reader(path: Path, mismatch: str) -> Any:
     return (_hdf5 if path.suffix.lower() in HDF5_SUFFIXES else _database)(path, mismatch)
 
 
-def _named_kind(path: Path) -> DescriptorKind | None:
-    """The kind that a file of features is of by its name, as hloc gives it, or by the report of a map beside it."""
+def name_kind(database: Path, kind: DescriptorKind) -> None:
+    """Write into a COLMAP database what its descriptors are: COLMAP's own types know but a few. It reads it as ever."""
+    with closing(sqlite3.connect(database)) as connection, connection:
+        connection.execute(f"CREATE TABLE IF NOT EXISTS {_TABLE} (name TEXT)")
+        connection.execute(f"DELETE FROM {_TABLE}")
+        connection.execute(f"INSERT INTO {_TABLE} VALUES (?)", (kind.name,))
+
+
+def _kind_in_name(path: Path) -> DescriptorKind | None:
+    """The kind that a file of features is of by its name, as hloc gives it."""
     words = re.split(r"[^a-z0-9]+", path.stem.lower())
-    for name, kind in all_kinds().items():
-        if any(word.startswith(name) for word in words):
-            return kind
-    for folder in (path.parent, path.parent.parent / "map"):  # of photographs, the database is kept beside the map
-        try:
-            method = read_json_object(folder / REPORT_FILE)["config"]["extractor"]["method"]
-        except (OSError, ValueError, KeyError, TypeError):
-            continue
-        if method in that_extract():
-            return kind_of(method)
-    return None
+    kinds = (kind for name, kind in all_kinds().items() if any(word.startswith(name) for word in words))
+    return next(kinds, None)
+
+
+def _kind_written(database: sqlite3.Connection) -> DescriptorKind | None:
+    """What `name_kind` wrote; None if it did not."""
+    if not database.execute("SELECT 1 FROM sqlite_master WHERE type = 'table' AND name = ?", (_TABLE,)).fetchone():
+        return None
+    row = database.execute(f"SELECT name FROM {_TABLE}").fetchone()
+    return all_kinds().get(str(row[0])) if row else None
 
 
 def _fitting(named: DescriptorKind | None, numbers: int, path: Path) -> DescriptorKind | None:
@@ -158,7 +164,7 @@ def _database(path: Path, mismatch: str) -> Iterator[Callable[[str], _Features]]
     try:
         with closing(sqlite3.connect(f"{path.resolve().as_uri()}?{mode}", uri=True)) as database:
             ids: dict[str, int] = dict(database.execute("SELECT name, image_id FROM images"))
-            named = _named_kind(path)
+            named = _kind_written(database) or _kind_in_name(path)
             has_type = any(row[1] == "type" for row in database.execute("PRAGMA table_info(descriptors)"))
             query = f"SELECT rows, cols, data, {'type' if has_type else 0} FROM descriptors WHERE image_id = ?"
 
@@ -205,7 +211,7 @@ def _hdf5(path: Path, mismatch: str) -> Iterator[Callable[[str], _Features]]:
         raise MapError("features in HDF5 are read with h5py, which is not installed", path=path, fix=fix) from error
     try:
         with h5py.File(path, "r") as file:
-            named = _named_kind(path)
+            named = _kind_in_name(path)
 
             def read(name: str) -> _Features:
                 if name not in file:

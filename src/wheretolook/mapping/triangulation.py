@@ -18,6 +18,7 @@ from wheretolook.features.sift import SIFT
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.local_origin import local_origin
 from wheretolook.geometry.poses import camera_centers, transform
+from wheretolook.mapping.descriptors import name_kind
 from wheretolook.utils.colmap import quiet_colmap, storing_in_database
 from wheretolook.utils.files import temporary_folder
 from wheretolook.utils.processes import Processes
@@ -237,6 +238,8 @@ def fill_database(database: Path, model: Any, stored: Iterable[Stored], kind: De
             if not kind.in_bytes:
                 descriptors = descriptors.astype("<f4").view(np.uint8).reshape(len(descriptors), kind.columns)
             db.write_descriptors(image_id, pycolmap.FeatureDescriptors(colmap_type, descriptors))
+    if kind is not SIFT:
+        name_kind(database, kind)
 
 
 def shrink_depth(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -112,7 +112,7 @@ def load_state(
 
             state = load_state_dict_from_url(list(urls), map_location="cpu", timeout=30)
     except Exception as error:  # the unpickler and the network raise errors of many kinds
-        reason = str(error).strip().partition("\n")[0] or type(error).__name__
+        reason = str(error).strip().partition("\n")[0].partition(" Cache path:")[0].rstrip(".") or type(error).__name__
         problem = f"cannot read the weights: {reason}" if weights else f"{name} cannot be downloaded: {reason}"
         raise WeightsError(problem, path=weights or None, fix=fix) from error
     try:

@@ -241,16 +241,12 @@ def _build(method: Method, localization_map: LocalizationMap, options: ScorerOpt
     return scorer
 
 
-_LOSS = {"sift": ""}
-"""What was measured of weights learnt with some features on maps by others, see docs/features.md."""
-
-
 def _warn_of_features(of_map: str, weights: Path) -> None:
     """Warn if the landmarks of a map are of other features than weights have learnt from."""
     from wheretolook.learning.weights import features_of_weights
 
     learnt = features_of_weights(weights)
     if of_map and of_map not in learnt:
-        measured = "".join(filter(None, (_LOSS.get(name, "") for name in learnt)))
         text = f"the weights {weights.name} have learnt from maps by {', '.join(learnt)}, and this one is by {of_map}"
-        warnings.warn(f"{text}{measured}. `wheretolook check` measures it on yours.", OutOfRangeWarning, stacklevel=4)
+        fix = "What that costs has not been measured in general: `wheretolook check` measures it on your map"
+        warnings.warn(f"{text}. {fix}.", OutOfRangeWarning, stacklevel=4)

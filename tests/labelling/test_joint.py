@@ -113,7 +113,7 @@ def test_of_two_rooms_alike_the_looks_together_tell_which():
     """Two copies of a room, and one landmark in ten of its own in each. A look that is matched with the wrong copy has
     more inliers there than any other has; together the others outvote it, and the wrong copy is found as the rival."""
     room = a_room(2000)
-    points = np.concatenate([room, room + (20.0, 0, 0)])
+    points = np.concatenate([room, room + np.array([20.0, 0, 0])])
     poses, looks, _ = looks_from(room, axes=(*AXES, (0, -1, 0)), n=60, noise_px=0.3)
     wrong, rng = looks[1], np.random.default_rng(5)
     strong = look_at(room, poses[1], wrong.cam_from_rig, rng, n=110)[0]
@@ -150,7 +150,7 @@ def test_turns_that_are_known_to_a_degree_are_refined():
 
 def test_a_map_in_national_coordinates_gives_the_same():
     points, far = a_room(), np.array([4_512_300.0, 5_402_100.0, 300.0])
-    poses, looks, _ = looks_from(points, outliers=0.3, noise_px=0.5)
+    _, looks, _ = looks_from(points, outliers=0.3, noise_px=0.5)
     near = JointLocalizer(PoseEstimator(points)).localize(looks)
     away = JointLocalizer(PoseEstimator(points + far)).localize(looks)
     centers = camera_centers(away.cams_from_world) - far

@@ -121,8 +121,8 @@ def outcome_in_brief(label: pd.Series) -> str:
 def write_table(table: pd.DataFrame, path: Path, compact: bool = False) -> None:
     """Write a table atomically as zstd Parquet with checksums; the same rows give the same bytes.
 
-    Columns are those of `SCHEMA`, and of `CAMERA_FIELD`, `MATCH_FIELDS` and `PIXEL_FIELD` if they are there. A compact table has
-    `COMPACT_SCHEMA`, about 18 bytes a row; read back, its poses agree to 1e-12 and all else exactly.
+    Columns are those of `SCHEMA`, and of `CAMERA_FIELD`, `MATCH_FIELDS` and `PIXEL_FIELD` if they are there. A
+    compact table has `COMPACT_SCHEMA`, about 18 bytes a row; read back, its poses agree to 1e-12 and all else exactly.
     """
     schema, options = (COMPACT_SCHEMA, _COMPACT_FORMAT) if compact else (SCHEMA, {})
     if compact:

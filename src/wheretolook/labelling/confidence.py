@@ -35,7 +35,9 @@ def told_numbers(
 ) -> Float:
     """`TOLD` (B, 5) of B joint poses."""
     inliers, matches, rival = (np.asarray(x, dtype=np.float64) for x in (n_inliers, n_matches, elsewhere))
-    off = [np.clip(np.asarray(x, dtype=np.float64), LEAST_DEVIATION, MOST_DEVIATION) for x in (deviation_m, deviation_deg)]
+    off = [
+        np.clip(np.asarray(x, dtype=np.float64), LEAST_DEVIATION, MOST_DEVIATION) for x in (deviation_m, deviation_deg)
+    ]
     share = np.log((inliers + 0.5) / (matches + 1))
     return np.stack([np.log1p(inliers), np.log1p(rival), share, np.log(off[0]), np.log(off[1])], axis=-1)
 

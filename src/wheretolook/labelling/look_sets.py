@@ -15,8 +15,8 @@ from tqdm.auto import tqdm
 
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float, pose_error
-from wheretolook.labelling.config import LocalizerConfig
 from wheretolook.labelling.confidence import Confidence
+from wheretolook.labelling.config import LocalizerConfig
 from wheretolook.labelling.estimation import PoseEstimator
 from wheretolook.labelling.joint import JointLocalizer, Look, rig_of
 from wheretolook.utils.errors import TableError
@@ -89,7 +89,9 @@ def _look(table: pd.DataFrame, row: int, mount: Float, camera: Camera, n_points:
     if len(pixels) != 2 * len(landmarks) or not np.isfinite(pixels).all():
         raise TableError("a view's pixels do not fit its matches", value=(len(pixels), len(landmarks)), fix=fix)
     if len(landmarks) and (landmarks.min() < 0 or landmarks.max() >= n_points):
-        raise TableError(f"a view matched a landmark that the map of {n_points} lacks", value=int(landmarks.max()), fix=fix)
+        raise TableError(
+            f"a view matched a landmark that the map of {n_points} lacks", value=int(landmarks.max()), fix=fix
+        )
     return Look(mount, pixels.reshape(-1, 2), landmarks, camera)
 
 

@@ -15,14 +15,13 @@ from numpy.typing import NDArray
 
 from wheretolook.fisher.information import N_NUMBERS, bearing_numbers, information_matrices
 from wheretolook.geometry.poses import Float, poses_looking_along
-from wheretolook.methods.matchability.network import bearing_precision
 
 if TYPE_CHECKING:
     from wheretolook.methods.base import Scorer
 
 N_SUMS = 1 + N_NUMBERS  # landmarks expected to be found, and the information on the pose that lies in them
 PRIOR = 1e-3  # information on each coordinate before anything is seen, as of the network over the set of landmarks
-MOST_ENTRIES = 60_000  # landmarks in view of all looks that are described; of more, an even share stands for all
+MOST_ENTRIES = 24_000  # landmarks in view of all looks that are described; of more, an even share stands for all
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,11 +36,14 @@ class SeenAround:
         return len(self.chances)
 
     def sums(self, missed: NDArray[np.float32] | None = None) -> Float:
-        """Sums (D, N_SUMS) of each look, joined with looks by whose chances a landmark is missed, (U,); 1 if none."""
+        """Sums (D, N_SUMS) of each look, joined with looks by which landmarks are missed with chances (U,); 1 if none.
+
+        In single precision, which choosing between looks can do with; `union` is in double.
+        """
         if missed is None:
-            return self.chances.astype(np.float64) @ self.told
-        base = (1 - missed.astype(np.float64)) @ self.told
-        return base + (self.chances * missed).astype(np.float64) @ self.told
+            return np.asarray((self.chances @ self.told.astype(np.float32)).astype(np.float64))
+        left = missed.astype(np.float64)[:, None] * self.told
+        return np.asarray(self.told.sum(0) - left.sum(0) + self.chances @ left.astype(np.float32))
 
     def missed(self, looks: NDArray[np.int64] | list[int]) -> NDArray[np.float32]:
         """The chance (U,) that none of some looks finds each landmark."""
@@ -69,7 +71,9 @@ def seen_around(scorer: Scorer, location: Float, directions: Float, sure: bool =
     A scorer that learnt chances of landmarks gives them (`set`, `expected-...`); by others, and if `sure`, every
     landmark in view counts as found, and each with the same precision.
     """
-    import torch
+    import torch  # takes seconds to load
+
+    from wheretolook.methods.matchability.network import bearing_precision
 
     poses = poses_looking_along(np.tile(np.asarray(location, dtype=np.float64), (len(directions), 1)), directions)
     around, chances_of = scorer.localization_map, None if sure else _chances_of(scorer)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from itertools import permutations
+from itertools import pairwise, permutations
 from pathlib import Path
 
 import numpy as np
@@ -91,9 +91,7 @@ def test_the_order_turns_least_and_keeps_the_limit(seen: SeenAround) -> None:
         turns = Turns(AXES, start)
 
         def length(order: tuple[int, ...], start: tuple[float, ...] | None = start) -> float:
-            legs = sum(
-                rotation_angle_deg(rotations[a], rotations[b]) for a, b in zip(order[:-1], order[1:], strict=True)
-            )
+            legs = sum(rotation_angle_deg(rotations[a], rotations[b]) for a, b in pairwise(order))
             return float(legs) + (
                 0.0 if start is None else float(rotation_angle_deg(rotations[order[0]], rotation_looking_along(start)))
             )

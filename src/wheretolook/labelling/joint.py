@@ -129,8 +129,16 @@ class JointLocalizer:
             raise PoseError("a single look cannot be localized together with others", value=len(looks), fix=fix)
         return self.localize(looks)
 
-    def localize(self, looks: Sequence[Look]) -> JointLocalization:
-        """The joint pose of one look or more.
+    def alone(self, look: Look) -> tuple[Float, NDArray[np.bool_]] | None:
+        """What a look finds alone, which `localize` may be told where many sets share their looks; None if nothing."""
+        if len(look.rows) < self.estimator.config.min_matches:
+            return None
+        return self.estimator.estimate_here(look.pixels, self.estimator.points[look.rows], look.camera)
+
+    def localize(
+        self, looks: Sequence[Look], alone: Sequence[tuple[Float, NDArray[np.bool_]] | None] | None = None
+    ) -> JointLocalization:
+        """The joint pose of one look or more. What each finds alone may be known already.
 
         Raises a PoseError if there is none, a look's pose in the rig is no rigid transform, or its pixels and rows do
         not fit together.
@@ -140,7 +148,8 @@ class JointLocalizer:
         none = tuple(np.zeros(len(look.rows), dtype=bool) for look in looks)
         if n_matches < LEAST:
             return JointLocalization(TOO_FEW_MATCHES, None, None, none, n_matches)
-        rig = _Rig(self.estimator, looks, self.turn_noise_deg)
+        known = [self.alone(look) for look in looks] if alone is None else list(alone)
+        rig = _Rig(self.estimator, looks, self.turn_noise_deg, known)
         found = rig.hypotheses()
         if not found:
             return JointLocalization(NO_POSE, None, None, none, n_matches)
@@ -177,8 +186,14 @@ class _Hypothesis:
 class _Rig:
     """Looks as PoseLib takes them, and the poses they are consistent with."""
 
-    def __init__(self, estimator: PoseEstimator, looks: Sequence[Look], turn_noise_deg: float) -> None:
-        self.estimator, self.looks = estimator, looks
+    def __init__(
+        self,
+        estimator: PoseEstimator,
+        looks: Sequence[Look],
+        turn_noise_deg: float,
+        alone: list[tuple[Float, NDArray[np.bool_]] | None],
+    ) -> None:
+        self.estimator, self.looks, self.alone = estimator, looks, alone
         known = [known_to_poselib(look.camera.colmap, np.asarray(look.pixels, dtype=np.float64)) for look in looks]
         self.cameras, self.pixels = [camera for camera, _ in known], [pixels for _, pixels in known]
         self.points = [estimator.points[look.rows] for look in looks]
@@ -191,11 +206,10 @@ class _Rig:
 
     def hypotheses(self) -> list[_Hypothesis]:
         """Poses worth comparing: of all matches, then of each look alone; refined on all looks' inliers."""
-        seen = [k for k, pixels in enumerate(self.pixels) if len(pixels) >= self.estimator.config.min_matches]
         if len(self.looks) == 1:
             return self._alone(0)
         everything = self._sampled([np.ones(len(pixels), dtype=bool) for pixels in self.pixels])
-        return everything + [pose for k in seen for pose in self._alone(k)]
+        return everything + [pose for k in range(len(self.looks)) for pose in self._alone(k)]
 
     def among_outliers(self, best: _Hypothesis) -> list[_Hypothesis]:
         """The pose that most of what does not agree with the best one agrees on, if any."""
@@ -210,7 +224,7 @@ class _Rig:
 
     def _alone(self, k: int) -> list[_Hypothesis]:
         """The pose of one look alone; of the only one exactly as of a single image."""
-        found = self.estimator.estimate_here(self.looks[k].pixels, self.points[k], self.looks[k].camera)
+        found = self.alone[k]
         if found is None:
             return []
         pose = _in_rig(self.mounts[k], found[0])

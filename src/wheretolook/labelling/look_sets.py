@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -60,6 +61,7 @@ def label_sets(
     true, places = poses(table), table["location_id"].to_numpy()
     numbers = table[CAMERA_ID].to_numpy() if CAMERA_ID in table and isinstance(cameras, Mapping) else None
     rows: list[tuple[object, ...]] = []
+    alone: dict[int, Any] = {}  # what each view finds alone, which many sets ask for
     for taken in tqdm(sets, desc=progress, unit="set", disable=progress is None):
         chosen = np.asarray(taken, dtype=np.int64)
         if len(chosen) == 0 or chosen.min() < 0 or chosen.max() >= len(table):
@@ -70,7 +72,10 @@ def label_sets(
             for row, mount in zip(chosen, mounts, strict=True)
         ]
         start = time.perf_counter()
-        found = localizer.localize(looks)
+        for row, look in zip(chosen.tolist(), looks, strict=True):
+            if row not in alone:
+                alone[row] = localizer.alone(look)
+        found = localizer.localize(looks, [alone[row] for row in chosen.tolist()])
         seconds = time.perf_counter() - start
         if found.cams_from_world is None:
             error_m = error_deg = np.array([np.nan])

@@ -78,11 +78,12 @@ def choose_looks(
     turns: Turns,
     max_turn_deg: float | None = None,
     first: ArrayLike | None = None,
+    exchanges: int | None = None,
 ) -> ChosenLooks:
     """The n looks that are worth most together: greedily one after the other, then by exchange of single ones.
 
     `first` are single looks' own scores (D,): by them the first is chosen, the worth of one look unless given. The
-    total turn keeps within `max_turn_deg`. Never worth less than what greedy choice alone gives.
+    total turn keeps within `max_turn_deg`. There are `EXCHANGES` rounds of exchange unless told otherwise. Never worth less than what greedy choice alone gives.
 
     Raises a ConfigError for a number of looks that is none, or more than there are directions, and a PlanningError if
     no look can be reached.
@@ -97,7 +98,8 @@ def choose_looks(
         fix = "Raise the limit on turning, or look along more directions."
         raise PlanningError(f"no {n} looks can be reached", value=max_turn_deg, fix=fix)
     now = float(worth(seen.union(looks)[None])[0])
-    for _ in range(EXCHANGES if n > 1 else 0):
+    rounds = EXCHANGES if exchanges is None else exchanges
+    for _ in range(rounds if n > 1 else 0):
         before = now
         for k in range(n):
             others = looks[:k] + looks[k + 1 :]
@@ -140,7 +142,7 @@ def choose_exhaustively(
 
 
 def best_one_by_one(scores: Float, directions: Float, n: int, apart_deg: float = 40.0) -> list[int]:
-    """The n looks with the highest scores (D,) of their own, at least so far apart; nearer ones if there are no more."""
+    """The n looks with the highest scores (D,) of their own, at least so far apart if there are so many."""
     order = np.argsort(-np.asarray(scores), kind="stable").tolist()
     near = np.cos(np.radians(apart_deg))
     looks: list[int] = []

@@ -14,8 +14,8 @@ from wheretolook.fisher.exact import exact_information
 from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.poses import poses_looking_along, rotation_angle_deg, rotation_looking_along
 from wheretolook.looks.around import best_looks, candidates
-from wheretolook.looks.choice import Turns, best_one_by_one, choose_exhaustively, choose_looks, evenly_spread
-from wheretolook.looks.union import SeenAround, expected_of, seen_around, union_plain
+from wheretolook.looks.choice import Turns, best_one_by_one, choose_exhaustively, choose_looks, evenly_spread, worth_of
+from wheretolook.looks.union import SeenAround, log_position_variance, seen_around, union_plain
 from wheretolook.looks.worth import SetWorth, count_worth, fisher_worth
 from wheretolook.methods.base import Scorer
 from wheretolook.methods.matchability.score import ExpectedScorer
@@ -40,7 +40,9 @@ def some_seen(seed: int = 0, d: int = 9, u: int = 30) -> SeenAround:
     offsets = rng.normal(0, 2, (u, 3))
     from wheretolook.fisher.information import bearing_numbers
 
-    return SeenAround(chances, np.concatenate([np.ones((u, 1)), bearing_numbers(offsets)], 1), (chances > 0).sum(1))
+    return SeenAround(
+        chances, np.concatenate([np.ones((u, 1)), bearing_numbers(offsets)], 1), (chances > 0).sum(1), rng.random(d)
+    )
 
 
 def test_the_sums_of_a_set_are_those_added_landmark_by_landmark() -> None:
@@ -81,8 +83,11 @@ def test_greedy_choice_with_exchange_is_nearly_the_best_of_all_sets(worth: objec
         for n in (1, 2, 3):
             chosen, best = choose_looks(seen, worth, n, turns), choose_exhaustively(seen, worth, n, turns)  # type: ignore[arg-type]
             assert len({*chosen.looks}) == n
+            failed = np.prod(1 - seen.alone[list(chosen.looks)], keepdims=True)
             assert best.worth - 1e-9 <= chosen.worth + 0.05 * abs(best.worth)
-            assert chosen.worth == pytest.approx(float(worth(union_plain(seen, list(chosen.looks))[None])[0]), rel=1e-4)  # type: ignore[operator]
+            assert chosen.worth == pytest.approx(
+                float(worth(union_plain(seen, list(chosen.looks))[None], failed)[0]), rel=1e-4
+            )  # type: ignore[operator]
 
 
 def test_the_order_turns_least_and_keeps_the_limit(seen: SeenAround) -> None:
@@ -158,7 +163,15 @@ def test_bad_input_is_refused(seen: SeenAround, tmp_path: Path) -> None:
             SetWorth.load(tmp_path / "worth.json")
 
 
-def test_expected_of_one_landmark_is_the_prior_where_it_tells_nothing() -> None:
-    """Nothing seen leaves the prior's variance, 1 / 1e-3 in each of three coordinates."""
-    expected = expected_of(np.zeros((1, 16)))[0]
-    np.testing.assert_allclose(expected, [0, np.log(3000), np.log(3000)])
+def test_nothing_seen_leaves_the_variance_of_the_prior() -> None:
+    """1 / 1e-3 in each of three coordinates."""
+    np.testing.assert_allclose(log_position_variance(np.zeros((2, 16))), np.log(3000))
+
+
+def test_a_second_look_elsewhere_is_worth_more_than_one_at_the_same() -> None:
+    """Of equal scores, by the worth that ships."""
+    seen = some_seen(u=60)
+    same = SeenAround(np.repeat(seen.chances[:1], 3, axis=0), seen.told, seen.n_visible[:3], np.full(3, 0.3))
+    same.chances[2] = seen.chances[0, ::-1]
+    worth = SetWorth.shipped()
+    assert worth_of(same, worth, [0, 2]) > worth_of(same, worth, [0, 1]) > worth_of(same, worth, [0])

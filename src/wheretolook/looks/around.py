@@ -46,7 +46,7 @@ def best_looks(
         raise ConfigError(f"there are only {len(directions)} directions to choose from", value=n)
     rows = candidates(directions, scores, max(CANDIDATES, n), max_turn_deg, start)
     axes = directions[rows]
-    seen = seen_around(scorer, location, axes)
+    seen = seen_around(scorer, location, axes, scores[rows])
     chosen = choose_looks(seen, worth or SetWorth.shipped(), n, Turns(axes, start), max_turn_deg, scores[rows])
     return ChosenLooks(tuple(int(rows[look]) for look in chosen.looks), chosen.worth, chosen.total_turn_deg)
 

@@ -20,8 +20,9 @@ MOST_LOOKS = 6  # the order of so many is found by trying all
 EXCHANGES = 3  # rounds in which each look may be exchanged for a better one
 TOLERANCE_DEG = 1e-5  # angles may exceed a limit by this much, for rounding
 
-Worth = Callable[[Float], Float]
-"""Worths (B,) of sets from their sums (B, N_SUMS); higher is better."""
+Worth = Callable[[Float, Float], Float]
+"""Worths (B,) of sets from their sums (B, N_SUMS) and the chances (B,) that none of their looks localizes alone; higher
+is better."""
 
 
 @dataclass(frozen=True)
@@ -83,21 +84,22 @@ def choose_looks(
     """The n looks that are worth most together: greedily one after the other, then by exchange of single ones.
 
     `first` are single looks' own scores (D,): by them the first is chosen, the worth of one look unless given. The
-    total turn keeps within `max_turn_deg`. There are `EXCHANGES` rounds of exchange unless told otherwise. Never worth less than what greedy choice alone gives.
+    total turn keeps within `max_turn_deg`. There are `EXCHANGES` rounds of exchange unless told otherwise; a set is
+    never worth less than what greedy choice alone gives.
 
     Raises a ConfigError for a number of looks that is none, or more than there are directions, and a PlanningError if
     no look can be reached.
     """
     _check(n, len(seen), max_turn_deg)
     limit = np.inf if max_turn_deg is None else max_turn_deg + TOLERANCE_DEG
-    single = worth(seen.sums()) if first is None else np.asarray(first, dtype=np.float64)
+    single = _added(seen, worth, []) if first is None else np.asarray(first, dtype=np.float64)
     looks = _greedy(seen, worth, n, turns, np.full(n, limit), single)
     if looks is None:  # the best look may lie so far off that no turn is left for the others
         looks = _greedy(seen, worth, n, turns, limit * np.arange(1, n + 1) / n, single)
     if looks is None:
         fix = "Raise the limit on turning, or look along more directions."
         raise PlanningError(f"no {n} looks can be reached", value=max_turn_deg, fix=fix)
-    now = float(worth(seen.union(looks)[None])[0])
+    now = worth_of(seen, worth, looks)
     rounds = EXCHANGES if exchanges is None else exchanges
     for _ in range(rounds if n > 1 else 0):
         before = now
@@ -133,12 +135,17 @@ def choose_exhaustively(
     best: ChosenLooks | None = None
     for looks in combinations(range(len(seen)), n):
         total, order = turns.shortest(looks)
-        value = float(worth(seen.union(list(looks))[None])[0])
+        value = worth_of(seen, worth, list(looks))
         if total <= limit and (best is None or value > best.worth):
             best = ChosenLooks(order, value, total)
     if best is None:
         raise PlanningError(f"no {n} looks can be reached", value=max_turn_deg, fix="Raise the limit on turning.")
     return best
+
+
+def worth_of(seen: SeenAround, worth: Worth, looks: list[int]) -> float:
+    """The worth of a set of looks."""
+    return float(worth(seen.union(looks)[None], np.array([seen.failed(looks)]))[0])
 
 
 def best_one_by_one(scores: Float, directions: Float, n: int, apart_deg: float = 40.0) -> list[int]:
@@ -164,7 +171,7 @@ def evenly_spread(directions: Float, n: int, first: int) -> list[int]:
 
 def _added(seen: SeenAround, worth: Worth, looks: list[int]) -> Float:
     """The worth (D,) of some looks with each direction added."""
-    return worth(seen.sums(seen.missed(looks) if looks else None))
+    return worth(seen.sums(seen.missed(looks) if looks else None), seen.failed(looks) * (1 - seen.alone))
 
 
 def _best(value: Float, allowed: NDArray[np.bool_], looks: list[int]) -> int | None:

@@ -31,6 +31,7 @@ class SeenAround:
     chances: NDArray[np.float32]  # (D, U) of being found by the look; 0 of those it does not see
     told: Float  # (U, N_SUMS) float64, what a landmark adds to the sums if it is found
     n_visible: NDArray[np.int64]  # (D,) landmarks in view
+    alone: Float  # (D,) probability that the look localizes alone; 0 where nothing tells
 
     def __len__(self) -> int:
         return len(self.chances)
@@ -49,6 +50,10 @@ class SeenAround:
         """The chance (U,) that none of some looks finds each landmark."""
         return np.asarray(np.prod(1 - self.chances[np.asarray(looks, dtype=np.int64)], axis=0), dtype=np.float32)
 
+    def failed(self, looks: NDArray[np.int64] | list[int]) -> float:
+        """The chance that none of some looks localizes alone, each for itself."""
+        return float(np.prod(1 - self.alone[np.asarray(looks, dtype=np.int64)]))
+
     def union(self, looks: NDArray[np.int64] | list[int]) -> Float:
         """Sums (N_SUMS,) of a set of looks."""
         return np.asarray((1 - self.missed(looks).astype(np.float64)) @ self.told)
@@ -65,15 +70,19 @@ def union_plain(seen: SeenAround, looks: list[int]) -> Float:
     return sums
 
 
-def seen_around(scorer: Scorer, location: Float, directions: Float, sure: bool = False) -> SeenAround:
+def seen_around(
+    scorer: Scorer, location: Float, directions: Float, scores: Float | None = None, sure: bool = False
+) -> SeenAround:
     """What looks along directions (D, 3) from a location (3,) m see, by the chances that a scorer knows.
 
+    `scores` (D,) are what it gives the looks, which count as probabilities if they are of a method whose scores are.
     A scorer that learnt chances of landmarks gives them (`set`, `expected-...`); by others, and if `sure`, every
     landmark in view counts as found, and each with the same precision.
     """
     import torch  # takes seconds to load
 
     from wheretolook.methods.matchability.network import bearing_precision
+    from wheretolook.methods.registry import find
 
     poses = poses_looking_along(np.tile(np.asarray(location, dtype=np.float64), (len(directions), 1)), directions)
     around, chances_of = scorer.localization_map, None if sure else _chances_of(scorer)
@@ -102,7 +111,11 @@ def seen_around(scorer: Scorer, location: Float, directions: Float, sure: bool =
                 weight = np.ones(len(landmarks))
                 weight[column] = precision.double().cpu().numpy()
                 told[:, 1:] *= weight[:, None]
-    return SeenAround(chances, told * stride, n_visible)
+    alone = np.zeros(len(poses))
+    method = find(scorer.name)
+    if scores is not None and not sure and method is not None and method.probability:
+        alone = np.clip(np.asarray(scores, dtype=np.float64), 0, 1)
+    return SeenAround(chances, told * stride, n_visible, alone)
 
 
 def _chances_of(scorer: Scorer) -> Any:
@@ -117,13 +130,8 @@ def _chances_of(scorer: Scorer) -> Any:
     return None
 
 
-EXPECTED_OF_SET = ("log_expected_inliers", "log_position_variance", "log_orientation_variance")
-
-
-def expected_of(sums: Float) -> Float:
-    """`EXPECTED_OF_SET` (..., 3) of sums (..., N_SUMS): of the pose's covariance, the traces of its two blocks."""
+def log_position_variance(sums: Float) -> Float:
+    """Of sums (..., N_SUMS): the log (...,) of the trace of the position's block of the expected covariance."""
     information = information_matrices(sums[..., 1:]) + PRIOR * np.eye(6)
     covariance = np.linalg.inv(information)
-    position = np.trace(covariance[..., :3, :3], axis1=-2, axis2=-1)
-    orientation = np.trace(covariance[..., 3:, 3:], axis1=-2, axis2=-1)
-    return np.stack([np.log1p(sums[..., 0]), np.log(position), np.log(orientation)], axis=-1)
+    return np.log(np.trace(covariance[..., :3, :3], axis1=-2, axis2=-1))

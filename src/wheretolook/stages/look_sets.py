@@ -1,4 +1,4 @@
-"""Sets of looks compared: chosen together, one by one, spread evenly, and so on; localized together from stored matches."""
+"""Sets of looks compared: chosen together, one by one, spread evenly, and so on; joined from stored matches."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ STRATEGIES = {
 
 @dataclass(frozen=True)
 class LookConfig:
-    """What is compared. The numbers of looks, the strategies, how well turns are known, and the seed of what is drawn."""
+    """What is compared: numbers of looks, strategies, how well turns are known, and the seed of what is drawn."""
 
     numbers: tuple[int, ...] = NUMBERS
     strategies: tuple[str, ...] = tuple(STRATEGIES)
@@ -115,6 +115,7 @@ def compare_looks(
     Raises a TableError if the labels do not keep where landmarks were matched.
     """
     from wheretolook.labelling.look_sets import label_sets
+    from wheretolook.looks.choice import worth_of
     from wheretolook.looks.union import seen_around
     from wheretolook.looks.worth import SetWorth
 
@@ -127,7 +128,7 @@ def compare_looks(
     for _, rows in table.groupby("location_id").indices.items():
         axes, values = cam_from_world[rows, 2, :3], scores[rows]
         center = -cam_from_world[rows[0], :, :3].T @ cam_from_world[rows[0], :, 3]
-        seen, sure = (seen_around(scorer, center, axes, sure) for sure in (False, True))
+        seen, sure = (seen_around(scorer, center, axes, values, sure) for sure in (False, True))
         for strategy in config.strategies:
             for n in config.numbers:
                 if n > len(rows):
@@ -136,7 +137,7 @@ def compare_looks(
                 chosen = rows[looks]
                 sets.append(chosen.tolist())
                 first = bool(good[rows[int(values.argmax())]])
-                expected = float(worth(seen.union(looks)[None])[0])
+                expected = worth_of(seen, worth, looks)
                 about.append(
                     {"scene": scene.name, "strategy": strategy, "expected": expected, "single_good": first}
                     | {"any_good": bool(good[chosen].any())}

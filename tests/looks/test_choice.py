@@ -128,11 +128,11 @@ def test_more_looks_are_worth_more_and_the_first_is_the_best_alone(scorer: Score
 def test_candidates_are_the_best_that_lie_apart() -> None:
     axes, rng = direction_lattice(500), np.random.default_rng(0)
     scores = rng.random(500)
-    rows = candidates(axes, scores, 32)
-    assert rows[0] == scores.argmax() and len(rows) == 32
-    cosines = axes[rows] @ axes[rows].T - 2 * np.eye(32)
+    rows = candidates(axes, scores, 24)
+    assert rows[0] == scores.argmax() and len(rows) == 24
+    cosines = axes[rows] @ axes[rows].T - 2 * np.eye(24)
     assert cosines.max() < np.cos(np.radians(15))
-    close = candidates(axes, scores, 32, 40.0, axes[100])
+    close = candidates(axes, scores, 24, 40.0, axes[100])
     assert (axes[close] @ axes[100]).min() > np.cos(np.radians(80.1)) and close[0] in np.flatnonzero(
         axes @ axes[100] > np.cos(np.radians(40.1))
     )

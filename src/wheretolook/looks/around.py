@@ -16,7 +16,7 @@ from wheretolook.utils.errors import ConfigError
 if TYPE_CHECKING:
     from wheretolook.methods.base import Scorer
 
-CANDIDATES = 32
+CANDIDATES = 24
 """Directions of which a set is chosen: those with the best scores of their own that lie apart."""
 
 APART_DEG = 15.0

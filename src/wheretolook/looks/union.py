@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 N_SUMS = 1 + N_NUMBERS  # landmarks expected to be found, and the information on the pose that lies in them
 PRIOR = 1e-3  # information on each coordinate before anything is seen, as of the network over the set of landmarks
-MOST_ENTRIES = 24_000  # landmarks in view of all looks that are described; of more, an even share stands for all
+MOST_ENTRIES = 12_000  # landmarks in view of all looks that are described; of more, an even share stands for all
 
 
 @dataclass(frozen=True, eq=False)

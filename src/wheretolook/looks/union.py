@@ -83,6 +83,7 @@ def seen_around(
 
     from wheretolook.methods.matchability.network import bearing_precision
     from wheretolook.methods.registry import find
+    from wheretolook.visibility.frustum import LandmarkSets
 
     poses = poses_looking_along(np.tile(np.asarray(location, dtype=np.float64), (len(directions), 1)), directions)
     around, chances_of = scorer.localization_map, None if sure else _chances_of(scorer)
@@ -104,7 +105,7 @@ def seen_around(
         describer, log_odds = chances_of
         ends = np.concatenate([[0], np.bincount(of_look, minlength=len(poses)).cumsum()])
         with torch.inference_mode():
-            described = describer._describe(poses, torch.from_numpy(ends), torch.from_numpy(rows))
+            described = describer.describe(poses, LandmarkSets(ends, rows))
             chances[of_look, column] = log_odds(described.values).sigmoid().float().cpu().numpy()
             precision = bearing_precision(described.values, described.attributes)
             if precision is not None:  # the same from every look: it depends on the distance

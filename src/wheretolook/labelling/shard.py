@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -171,14 +171,13 @@ def label_rows(
     if not (store_matches or store_pixels):
         return labelled
     order = [np.argsort(result.matched_rows, kind="stable") for result in results]
-    labelled = labelled.assign(
-        matched_rows=[one.matched_rows[by].astype(np.int32) for one, by in zip(results, order, strict=True)],
-        inlier_rows=[np.sort(result.inlier_rows).astype(np.int32) for result in results],
-    )
-    if not store_pixels:
-        return labelled
-    pixels = [one.matched_pixels[by].astype(np.float32).ravel() for one, by in zip(results, order, strict=True)]
-    return labelled.assign(**{PIXELS: pixels})
+    ragged: dict[str, Any] = {
+        "matched_rows": [one.matched_rows[by].astype(np.int32) for one, by in zip(results, order, strict=True)],
+        "inlier_rows": [np.sort(result.inlier_rows).astype(np.int32) for result in results],
+    }
+    if store_pixels:
+        ragged[PIXELS] = [one.matched_pixels[by].ravel() for one, by in zip(results, order, strict=True)]
+    return labelled.assign(**ragged)
 
 
 def _batches(camera: Camera, rows: NDArray[np.int64]) -> list[NDArray[np.int64]]:

@@ -88,8 +88,9 @@ Mesh and database may be left out. With --images its landmarks are triangulated 
     "label": Stage(
         "label",
         "Render and localize every viewpoint, measure the pose error. Resumes.",
-        "engine label.ray_address label.workers label.shard_size label.store_matches label.localizer.max_ratio "
-        "label.localizer.lightglue label.localizer.max_error_px label.localizer.min_inliers tracking.folder",
+        "engine label.ray_address label.workers label.shard_size label.store_matches label.store_pixels "
+        "label.localizer.max_ratio label.localizer.lightglue label.localizer.max_error_px label.localizer.min_inliers "
+        "tracking.folder",
         ("label", "tracking"),
         "--config configs/paper.yaml --engine ray",
     ),

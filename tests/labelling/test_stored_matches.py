@@ -20,6 +20,7 @@ from wheretolook.labelling.shard import label_rows
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import load_mesh
+from wheretolook.utils.errors import TableError
 from wheretolook.utils.files import fingerprint
 from wheretolook.viewpoints.table import (
     LOCALIZED,
@@ -150,3 +151,26 @@ def test_shards_with_and_without_matches_are_told_apart(room: MappedRoom, tmp_pa
     write_table(read_table(stored), stored)  # it lost its rows
     label(table, room, shards, shard_size=4, store_matches=True)
     assert list(read_table(stored, matches=True).columns) == [*SCHEMA.names, *MATCH_FIELDS.names]
+
+
+def test_pixels_are_kept_in_the_order_of_the_landmarks(
+    room: MappedRoom, views: pd.DataFrame, matched: pd.DataFrame, tmp_path: Path
+) -> None:
+    """Where a good view's inliers were found lies within RANSAC's limit of where the true pose puts them."""
+    landmarks, rows = Landmarks.load(room.landmarks), np.flatnonzero(is_good(matched))[:4]
+    localizer, renderer = Localizer(landmarks, CAMERA), WarpRenderer(load_mesh(room.mesh))
+    some = views.iloc[rows].reset_index(drop=True)
+    kept = label_rows(some, renderer, localizer, CAMERA, store_pixels=True)
+    write_table(kept, tmp_path / "viewpoints.parquet")
+    back = read_table(tmp_path / "viewpoints.parquet", pixels=True)
+    assert "matched_pixels" not in read_table(tmp_path / "viewpoints.parquet", matches=True)
+    for row, pose in enumerate(poses(some)):
+        np.testing.assert_array_equal(back["matched_rows"][row], matched["matched_rows"][rows[row]])
+        pixels = back["matched_pixels"][row].reshape(-1, 2)
+        assert pixels.dtype == np.float32 and len(pixels) == len(back["matched_rows"][row])
+        inlier = np.isin(back["matched_rows"][row], back["inlier_rows"][row])
+        at = CAMERA.project(transform(pose, landmarks.points[back["matched_rows"][row][inlier]]))
+        assert np.linalg.norm(at - pixels[inlier], axis=1).max() < 10
+    with pytest.raises(TableError, match=r"matched_pixels.*--label\.store_pixels true"):
+        write_table(matched, tmp_path / "matches.parquet")
+        read_table(tmp_path / "matches.parquet", pixels=True)

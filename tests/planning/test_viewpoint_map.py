@@ -238,3 +238,20 @@ def test_the_blocks_of_a_build_do_not_matter(viewpoint_map: ViewpointMap, monkey
     again = build(room_landmarks(400))
     for name in ("ranked", "scores", "n_visible"):
         np.testing.assert_array_equal(getattr(again, name), getattr(viewpoint_map, name))
+
+
+def test_looks_are_chosen_together_in_a_free_voxel(viewpoint_map: ViewpointMap) -> None:
+    scorer = make_scorer("bins", room_map(room_landmarks(400)))
+    point = viewpoint_map.locations[3]
+    looks = viewpoint_map.best_looks(point, 3, scorer=scorer)
+    assert looks is not None and len({look.direction_id for look in looks}) == 3
+    assert viewpoint_map.best(point) in [looks[0], *(viewpoint_map.best_looks(point, 1, scorer=scorer) or [])]
+    near = viewpoint_map.best_looks(point, 3, 100.0, scorer=scorer, start=looks[0].axis)
+    assert near is not None
+    rotations = rotation_looking_along(np.array([looks[0].axis, *(look.axis for look in near)]))
+    assert rotation_angle_deg(rotations[:-1], rotations[1:]).sum() <= 100 + 1e-4
+    assert viewpoint_map.best_looks(np.array(GRID.upper) + 1, 2, scorer=scorer) is None
+    with pytest.raises(ConfigError, match="another scorer"):
+        viewpoint_map.best_looks(point, 2, scorer=make_scorer("visible", scorer.localization_map))
+    with pytest.raises(ConfigError, match="1 to 6 looks"):
+        viewpoint_map.best_looks(point, 9, scorer=scorer)

@@ -260,3 +260,35 @@ def test_ten_lines(sparse: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert look.score(views.cam_from_world)[0] == pytest.approx(views.score[0], rel=1e-6)
     look.save("views.csv")
     assert len(Path("views.csv").read_text().splitlines()) == 2
+
+
+def test_looks_chosen_together_are_worth_more_than_one(look: WhereToLook, tmp_path: Path) -> None:
+    one, three = look.best(POINTS, looks=1), look.best(POINTS, looks=3)
+    assert len(three) == 12 and three.set_score is not None and one.set_score is not None
+    np.testing.assert_allclose(one.axes, look.best(POINTS).axes, atol=1e-9)
+    np.testing.assert_array_equal(three.rank, np.tile([1, 2, 3], 4))
+    sets = three.set_score.reshape(4, 3)
+    assert (np.ptp(sets, axis=1) == 0).all() and (sets[:, 0] > one.set_score).all()
+    np.testing.assert_allclose(three.positions, np.repeat(POINTS, 3, axis=0), atol=1e-9)
+    near = look.best(POINTS, looks=3, max_total_turn_deg=90, pitch_deg=(-40, 40))
+    rotations = near.cam_from_world.reshape(4, 3, 3, 4)[..., :3]
+    turned = rotation_angle_deg(rotations[:, :-1], rotations[:, 1:]).sum(1)
+    assert (turned <= 90 + 1e-4).all() and (np.abs(near.pitch_deg) <= 40 + 1e-6).all()
+    three.save(tmp_path / "looks.csv")
+    assert "set_score" in (tmp_path / "looks.csv").read_text().splitlines()[0]
+    look.best(POINTS).save(tmp_path / "views.csv")
+    assert "set_score" not in (tmp_path / "views.csv").read_text()
+
+
+def test_looks_are_refused_where_they_make_no_sense(look: WhereToLook) -> None:
+    refused = (
+        ({"looks": 0}, "whole number of 1 to 6"),
+        ({"looks": 2.0}, "whole number of 1 to 6"),
+        ({"looks": 2, "n": 3}, "chosen together"),
+        ({"looks": 2, "max_turn_deg": 30}, "chosen together"),
+        ({"max_total_turn_deg": 30}, "for looks chosen together"),
+        ({"looks": 2, "max_total_turn_deg": -1}, "at least 0"),
+    )
+    for options, problem in refused:
+        with pytest.raises(ConfigError, match=problem):
+            look.best(POINTS, **options)

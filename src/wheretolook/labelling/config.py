@@ -89,6 +89,8 @@ class LabelConfig:
         shard_size: viewpoints in a shard. An interruption loses at most the shards that were being labelled.
         store_matches: keep which landmarks each view matched; needed to learn matchability. Their rows are in
             the column matched_rows, those that agree with the view's pose in inlier_rows.
+        store_pixels: keep also where in its image each view matched them, in the column matched_pixels; needed to
+            localize several looks from a place together.
     """
 
     localizer: LocalizerConfig = field(default_factory=LocalizerConfig)
@@ -97,6 +99,7 @@ class LabelConfig:
     workers: int = 0
     shard_size: int = 256
     store_matches: bool = False
+    store_pixels: bool = False
 
     def __post_init__(self) -> None:
         if self.engine not in ("local", "ray"):

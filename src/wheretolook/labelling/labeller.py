@@ -49,7 +49,8 @@ class LabelledScene:
     Attributes:
         task: the scene that was to be labelled.
         table: the viewpoints with status, error_m, error_deg and n_inliers; the paper's label y follows from them by
-            `viewpoints.table.is_good`. If the job stores matches, also `viewpoints.table.MATCH_FIELDS`.
+            `viewpoints.table.is_good`. If the job stores matches, also `viewpoints.table.MATCH_FIELDS`, and if
+            it stores pixels `PIXEL_FIELD`.
         manifest: versions, settings and fingerprints of what made the labels, and each shard's name and SHA-256.
         seconds: the workers' time in each step, for shards made in this run.
     """
@@ -136,6 +137,8 @@ class _SceneInProgress:
             settings["cameras"] = {number: camera.record() for number, camera in job.cameras}
         if job.store_matches:  # only then, so that shards without matches keep their names from earlier versions
             settings["store_matches"] = True
+        if job.store_pixels:
+            settings["store_pixels"] = True
         text = json.dumps(settings, sort_keys=True).encode()
         # a shard's file holds them all
         inputs = [name for name in (*SCHEMA.names, CAMERA_ID) if name not in LABELS and name in table]
@@ -192,7 +195,7 @@ def _finished(shard: Shard) -> pd.DataFrame | None:
     if not shard.path.exists():
         return None
     try:
-        done = read_table(shard.path, shard.job.store_matches)
+        done = read_table(shard.path, shard.job.store_matches, shard.job.store_pixels)
     except TableError:
         shard.path.unlink()
         return None

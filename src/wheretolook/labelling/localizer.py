@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import poselib
 from numpy.typing import NDArray
 
 from wheretolook.features.extraction import KeypointExtractor
@@ -17,10 +16,10 @@ from wheretolook.features.keypoints import ExtractorConfig, Keypoints
 from wheretolook.features.matching import DescriptorMatcher, Matches, match
 from wheretolook.features.registry import all_kinds, kind_of
 from wheretolook.features.similarity import SimilarityMatcher
-from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
-from wheretolook.geometry.local_origin import local_origin, poses_from
+from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float
 from wheretolook.labelling.config import LocalizerConfig
+from wheretolook.labelling.estimation import PoseEstimator
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.utils.errors import MapError
 from wheretolook.viewpoints.table import LOCALIZED, NO_POSE, TOO_FEW_MATCHES
@@ -40,6 +39,7 @@ class Localization:
         n_matches: number of 2D-3D matches.
         inlier_rows: (I,) rows of the landmarks that were matched and agree with the pose.
         matched_rows: (M,) rows of all landmarks that were matched, whatever the status.
+        matched_pixels: (M, 2) float32, where in the image each of them was.
     """
 
     status: str
@@ -47,6 +47,7 @@ class Localization:
     n_matches: int
     inlier_rows: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     matched_rows: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    matched_pixels: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 2), dtype=np.float32))
 
 
 class Localizer:
@@ -82,18 +83,7 @@ class Localizer:
             from wheretolook.labelling.lightglue import LightGlueMatcher
 
             self._guided = LightGlueMatcher(landmarks, map_dir, self.config.lightglue, device)
-        self._camera, self._origin = camera, local_origin(landmarks.points)
-        self._ransac = {
-            "max_reproj_error": self.config.max_error_px,
-            "seed": self.config.seed,
-            "success_prob": self.config.confidence,
-            "min_iterations": self.config.min_trials,
-            "max_iterations": self.config.max_trials,
-            "dyn_num_trials_mult": 1.0,  # as many trials as the confidence asks for; PoseLib makes three times as many
-        }
-        # Keypoints are accurate to a fraction of a pixel. PoseLib's own scale is half of RANSAC's limit, as if outliers
-        # just within the limit were accurate, too: poses are then worse.
-        self._refinement = {"loss_type": "CAUCHY", "loss_scale": 1.0}
+        self._camera, self._estimator = camera, PoseEstimator(landmarks.points, self.config)
 
     @cached_property
     def extractor(self) -> KeypointExtractor:
@@ -150,33 +140,13 @@ class Localizer:
 
         The image is of the localizer's camera, or of the one given.
         """
-        n_matches = len(keypoint_rows)
+        n_matches, matched_pixels = len(keypoint_rows), keypoints.pixels[keypoint_rows]
+        matched: dict[str, Any] = {"matched_rows": landmark_rows, "matched_pixels": matched_pixels}
         if n_matches < self.config.min_matches:
-            return Localization(TOO_FEW_MATCHES, None, n_matches, matched_rows=landmark_rows)
-        pixels, points = keypoints.pixels[keypoint_rows].astype(np.float64), self.landmarks.points[landmark_rows]
-        taken_with, seen = _known_to_poselib((camera or self._camera).colmap, pixels)
-        pose, found = poselib.estimate_absolute_pose(
-            seen, points - self._origin, taken_with, self._ransac, self._refinement
-        )
-        if found["num_inliers"] < 3 or not np.isfinite(pose.Rt).all():  # no three matches determine a pose
-            return Localization(NO_POSE, None, n_matches, matched_rows=landmark_rows)
-        status = LOCALIZED if found["num_inliers"] >= self.config.min_inliers else NO_POSE
-        inlier_rows = landmark_rows[np.asarray(found["inliers"], dtype=bool)]
-        return Localization(status, poses_from(pose.Rt, -self._origin), n_matches, inlier_rows, landmark_rows)
-
-
-POSELIBS_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")
-
-
-def _known_to_poselib(camera: ColmapCamera, pixels: Float) -> tuple[dict[str, Any], Float]:
-    """A camera as PoseLib takes it, and pixels (M, 2) of its image.
-
-    Of a model that PoseLib does not know, pixels become those of a pinhole with the same focal length, by their rays.
-    Rays that it would not see, more than 84 degrees off its axis, go far outside, where they are nobody's inliers.
-    """
-    if camera.model in POSELIBS_MODELS:
-        return camera.record(), pixels
-    pinhole = PinholeCamera(camera.width, camera.height, camera.mean_focal_px)
-    rays = camera.unproject(pixels)
-    ahead = rays[:, 2:] > 0.1
-    return pinhole.colmap.record(), np.where(ahead, pinhole.project(np.where(ahead, rays, (0, 0, 1))), 1e6)
+            return Localization(TOO_FEW_MATCHES, None, n_matches, **matched)
+        found = self._estimator.estimate(matched_pixels, landmark_rows, camera or self._camera)
+        if found is None:
+            return Localization(NO_POSE, None, n_matches, **matched)
+        cam_from_world, inliers = found
+        status = LOCALIZED if inliers.sum() >= self.config.min_inliers else NO_POSE
+        return Localization(status, cam_from_world, n_matches, landmark_rows[inliers], **matched)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -18,7 +18,7 @@ from wheretolook.labelling.config import LocalizerConfig
 from wheretolook.labelling.pipeline import Step, run_pipeline
 from wheretolook.utils.errors import WhereToLookError, WorkerError
 from wheretolook.utils.workers import use_one_core
-from wheretolook.viewpoints.table import CAMERA_ID, MATCH_FIELDS, poses
+from wheretolook.viewpoints.table import CAMERA_ID, MATCH_FIELDS, PIXEL_FIELD, PIXELS, poses
 
 if TYPE_CHECKING:
     from wheretolook.features.keypoints import Keypoints
@@ -47,6 +47,7 @@ class SceneJob:
     device: str = "cpu"  # with "cuda", workers spread over all GPUs
     store_matches: bool = False  # whether labelled rows get the columns of `viewpoints.table.MATCH_FIELDS`
     cameras: tuple[tuple[int, Camera], ...] = ()  # by number, where viewpoints say with which of several they look
+    store_pixels: bool = False  # whether they also get `viewpoints.table.PIXEL_FIELD`
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +90,8 @@ class ShardWorker:
             seconds: dict[str, float] = {}
             renderer, localizer = self._open(job)
             cameras = dict(job.cameras) or job.camera
-            labelled = label_rows(rows, renderer, localizer, cameras, seconds, tick, job.store_matches)
+            options = (seconds, tick, job.store_matches, job.store_pixels)
+            labelled = label_rows(rows, renderer, localizer, cameras, *options)
             return LabelledShard(labelled, seconds)
         except WhereToLookError:
             raise
@@ -126,13 +128,14 @@ def label_rows(
     seconds: dict[str, float] | None = None,
     tick: Tick = lambda n: None,
     store_matches: bool = False,
+    store_pixels: bool = False,
 ) -> pd.DataFrame:
     """Render viewpoints, localize the images and measure the errors, in batched steps that overlap in this process.
 
     Of several cameras, each viewpoint's `camera_id` says which looks. The time spent in each step (render, extract,
     match, pose) is added to `seconds`, and `tick` is called with the number of viewpoints just finished. Returns the
     table with status, error_m, error_deg and n_inliers filled in, and with `viewpoints.table.MATCH_FIELDS` if
-    `store_matches`; those of earlier labels are dropped.
+    `store_matches`, and also `PIXEL_FIELD` if `store_pixels`; those of earlier labels are dropped.
     """
     true_poses = poses(table)
     if not isinstance(cameras, Mapping):
@@ -160,18 +163,22 @@ def label_rows(
     none: Float = np.full((3, 4), np.nan)
     estimates = np.stack([none if result.cam_from_world is None else result.cam_from_world for result in results])
     error_m, error_deg = pose_error(estimates, true_poses)
-    labelled = table.drop(columns=MATCH_FIELDS.names, errors="ignore").assign(
+    labelled = table.drop(columns=[*MATCH_FIELDS.names, *PIXEL_FIELD.names], errors="ignore").assign(
         status=[result.status for result in results],
         error_m=error_m.astype(np.float32),
         error_deg=error_deg.astype(np.float32),
         n_inliers=np.array([len(result.inlier_rows) for result in results], dtype=np.int32),
     )
-    if not store_matches:
+    if not (store_matches or store_pixels):
         return labelled
-    return labelled.assign(
-        matched_rows=[np.sort(result.matched_rows).astype(np.int32) for result in results],
-        inlier_rows=[np.sort(result.inlier_rows).astype(np.int32) for result in results],
-    )
+    order = [np.argsort(result.matched_rows, kind="stable") for result in results]
+    ragged: dict[str, Any] = {
+        "matched_rows": [one.matched_rows[by].astype(np.int32) for one, by in zip(results, order, strict=True)],
+        "inlier_rows": [np.sort(result.inlier_rows).astype(np.int32) for result in results],
+    }
+    if store_pixels:
+        ragged[PIXELS] = [one.matched_pixels[by].ravel() for one, by in zip(results, order, strict=True)]
+    return labelled.assign(**ragged)
 
 
 def _batches(camera: Camera, rows: NDArray[np.int64]) -> list[NDArray[np.int64]]:

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from math import isfinite
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,9 +18,13 @@ from numpy.typing import ArrayLike, NDArray
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float, rotation_looking_along
 from wheretolook.learning.old_names import name_of
+from wheretolook.looks.around import best_looks
 from wheretolook.planning.map_file import ARRAYS, DESCRIPTION, REBUILD, read_map, write_map
 from wheretolook.planning.turns import angles_to_axis_deg, check_axis, turns_from_deg, within
-from wheretolook.utils.errors import MapFormatError
+from wheretolook.utils.errors import ConfigError, MapFormatError
+
+if TYPE_CHECKING:
+    from wheretolook.methods.base import Scorer
 
 Point = Sequence[float] | NDArray[Any]
 
@@ -209,6 +213,29 @@ class ViewpointMap:
         if np.shape(current) == (3, 3) and not np.linalg.det(np.asarray(current, dtype=np.float64)) > 0:
             raise ValueError(f"a rotation (3, 3) has a determinant of 1, got {np.asarray(current)}")
         return self._best_of(row, within(turns_from_deg(current, self._rotations), max_turn_deg))
+
+    def best_looks(
+        self, point: Point, n: int, max_turn_deg: float | None = None, *, scorer: Scorer, start: ArrayLike | None = None
+    ) -> list[ViewChoice] | None:
+        """The n orientations at a world point (3,) m whose looks are worth most together, in the order to look.
+
+        The map's scores tell which orientations are worth considering; what they see together is found out by the
+        `scorer` that the map was built with, at the point itself (`wheretolook.looks.around.best_looks`). The camera
+        turns by at most `max_turn_deg` in all, from the axis `start` (3,) on if that is given. None where no voxel is
+        free.
+
+        Raises ConfigError for a number of looks or a limit that is none, or the scorer of another method; and
+        PlanningError if no such looks can be reached.
+        """
+        if scorer.name != self.origin.scorer:
+            fix = f"Give the scorer {self.origin.scorer!r}."
+            raise ConfigError("the viewpoint map was built with another scorer", value=scorer.name, fix=fix)
+        row = self.row(point)
+        if row < 0:
+            return None
+        at, scores = np.asarray(point, dtype=np.float64), np.asarray(self.scores[row])
+        chosen = best_looks(scorer, at, self.directions, scores, n, max_turn_deg, start)
+        return [self._choice(row, look) for look in chosen.looks]
 
     def best_many(self, points: ArrayLike) -> ViewChoices:
         """The best orientation at each of world points (N, 3) m; raises as `rows`."""

@@ -208,7 +208,9 @@ def _manifest(path: Path) -> dict[str, Any]:
     """What labels were made with, but for the shards, of which there are thousands, and the matches, which stay."""
     try:
         content = read_json_object(path)
-        return {name: value for name, value in content.items() if name not in ("shards", "store_matches")}
+        return {
+            name: value for name, value in content.items() if name not in ("shards", "store_matches", "store_pixels")
+        }
     except (ValueError, AttributeError) as error:
         fix = "Remove it, or label the scene again."
         raise TableError(f"not what the label stage wrote: {error}", path=path, fix=fix) from error

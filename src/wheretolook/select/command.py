@@ -43,6 +43,7 @@ FRAMES
 EXAMPLES
   wheretolook select --map sparse/0 --at waypoints.csv --out views.csv
   wheretolook select --map sparse/0 --at 1,2,1.5 -0.5,2,1.5 --n 3 --out views.json
+  wheretolook select --map sparse/0 --at 1,2,1.5 --looks 3 --max-total-turn 180 --out looks.csv
   wheretolook select --map sparse/0 --at path.tum --max-turn 30 --pitch -30 30 --out views.tum
   wheretolook select --map sparse/0 --grid 0.5 --mesh house.glb --camera PINHOLE,640,480,320,320,320,240 --out views.csv
   wheretolook select --map sparse/0 --at waypoints.txt --fov 60 --format benchmark --out selected_poses.txt
@@ -63,6 +64,8 @@ def parser() -> argparse.ArgumentParser:
     add("--out", required=True, type=Path, metavar="FILE", help="file of the views; its ending tells the format")
     add("--format", metavar="NAME", help="csv, json, tum, colmap or benchmark; without it the ending of --out tells")
     add("--n", type=int, default=1, metavar="N", help="views of each waypoint, the best first (1)")
+    add("--looks", type=int, metavar="N", help="instead: N looks of each waypoint, chosen to be localized together")
+    add("--max-total-turn", type=float, metavar="DEG", help="how far the camera turns in all from look to look")
     add("--pitch", nargs=2, type=float, metavar=("LOW", "HIGH"), help="limit on pitch in degrees, 90 straight up")
     add("--max-turn", type=float, metavar="DEG", help="greatest rotation between a view and the next, in the order of")
     made._actions[-1].help += " the waypoints: the sequence with the greatest sum of scores, exactly"  # type: ignore[operator]
@@ -125,7 +128,14 @@ def run(arguments: Sequence[str]) -> int:
         waypoints = look.grid(options.grid)
     pitch = None if options.pitch is None else tuple(options.pitch)
     views = look.best(
-        waypoints, options.n, pitch_deg=pitch, max_turn_deg=options.max_turn, skip=options.skip, progress=True
+        waypoints,
+        options.n,
+        pitch_deg=pitch,
+        max_turn_deg=options.max_turn,
+        skip=options.skip,
+        progress=True,
+        looks=options.looks,
+        max_total_turn_deg=options.max_total_turn,
     )
     views.save(options.out, options.format)
     _tell(look, views, waypoints, options.out, time.monotonic() - start)
@@ -140,8 +150,8 @@ def _check(options: argparse.Namespace) -> Waypoints | None:
     from wheretolook.select.waypoints import parse_points, read_waypoints
     from wheretolook.select.weights import check_there
 
-    check_format(options.out, options.format, options.n)
-    check_limits(options.n, options.pitch, options.max_turn)
+    check_format(options.out, options.format, max(options.n, options.looks or 1))
+    check_limits(options.n, options.pitch, options.max_turn, options.looks, options.max_total_turn)
     if (options.at is None) == (options.grid is None):
         raise ConfigError("waypoints are given by --at or by --grid", fix="Give one of them.")
     _camera(options)

@@ -106,6 +106,7 @@ def _rows(views: SelectedViews) -> list[dict[str, Any]]:
                 "yaw_deg": float(yaw[row]),
                 "pitch_deg": float(pitch[row]),
                 "score": float(views.score[row]),
+                **({} if views.set_score is None else {"set_score": float(views.set_score[row])}),
                 "expected_inliers": inliers if np.isfinite(inliers) else None,
                 "n_visible": int(views.n_visible[row]),
                 "in_range": bool(views.in_range[row]),
@@ -119,7 +120,7 @@ def _rows(views: SelectedViews) -> list[dict[str, Any]]:
 
 
 FAR_M = 1000.0  # of a camera from the origin
-_DIGITS = {"yaw_deg": ".3f", "pitch_deg": ".3f", "score": ".9g", "expected_inliers": ".2f"}
+_DIGITS = {"yaw_deg": ".3f", "pitch_deg": ".3f", "score": ".9g", "set_score": ".9g", "expected_inliers": ".2f"}
 
 
 def _csv(views: SelectedViews) -> str:

@@ -4,11 +4,32 @@ from __future__ import annotations
 
 from numbers import Integral
 
+from wheretolook.looks.choice import MOST_LOOKS
 from wheretolook.utils.errors import ConfigError
 
 
-def check_limits(n: int, pitch_deg: tuple[float, float] | None, max_turn_deg: float | None) -> None:
-    """Raise a ConfigError unless these are a number of views, limits on pitch and a limit on turns, in degrees."""
+def check_limits(
+    n: int,
+    pitch_deg: tuple[float, float] | None,
+    max_turn_deg: float | None,
+    looks: int | None = None,
+    max_total_turn_deg: float | None = None,
+) -> None:
+    """Raise a ConfigError unless these are a number of views, limits on pitch and a limit on turns, in degrees.
+
+    And of looks chosen together, their number and the limit on their turns in all.
+    """
+    if looks is not None:
+        if not isinstance(looks, Integral) or not 1 <= looks <= MOST_LOOKS:
+            raise ConfigError(f"looks of a waypoint are a whole number of 1 to {MOST_LOOKS}", value=looks)
+        if n > 1 or max_turn_deg is not None:
+            fix = "Leave out the number of best views, and the limit on turns between waypoints."
+            raise ConfigError("looks are chosen together, at each waypoint for itself", value=looks, fix=fix)
+    elif max_total_turn_deg is not None:
+        fix = "Say how many looks there are."
+        raise ConfigError("a limit on turning in all is for looks chosen together", value=max_total_turn_deg, fix=fix)
+    if max_total_turn_deg is not None and not 0 <= max_total_turn_deg < float("inf"):
+        raise ConfigError("a limit on turning in all is degrees of at least 0", value=max_total_turn_deg)
     if not isinstance(n, Integral) or n < 1:
         raise ConfigError("views of a waypoint are a whole number of at least 1", value=n)
     if max_turn_deg is not None and n > 1:

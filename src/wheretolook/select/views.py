@@ -33,6 +33,7 @@ class SelectedViews:
     in_range: NDArray[np.bool_]  # (V,) whether the view is like those that the scorer has learnt from
     camera: Camera  # the one that looks
     method: str  # name of the scorer
+    set_score: Float | None = None  # (V,) that the waypoint's looks localize together, if they were chosen together
 
     def __len__(self) -> int:
         return len(self.score)
@@ -80,5 +81,6 @@ class SelectedViews:
 def joined(parts: Sequence[SelectedViews]) -> SelectedViews:
     """Views of one camera and method, one after another."""
     arrays = [field.name for field in fields(SelectedViews) if field.name not in ("waypoint_id", "camera", "method")]
+    arrays = [name for name in arrays if getattr(parts[0], name) is not None]
     values: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in arrays}
     return replace(parts[0], waypoint_id=tuple(name for part in parts for name in part.waypoint_id), **values)

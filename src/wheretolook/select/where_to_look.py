@@ -14,6 +14,7 @@ from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.lattices import Lattice, direction_lattice
 from wheretolook.geometry.poses import Float, check_poses, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.looks.around import best_looks
 from wheretolook.planning.sequences import TurnLimit, best_sequence
 from wheretolook.planning.turns import pan_tilt_angles
 from wheretolook.select.limits import check_limits
@@ -166,8 +167,10 @@ class WhereToLook:
         max_turn_deg: float | None = None,
         skip: bool = False,
         progress: bool = False,
+        looks: int | None = None,
+        max_total_turn_deg: float | None = None,
     ) -> SelectedViews:
-        """The best view, or the n best, at each of points (W, 3) metres in the world.
+        """The best view, or the n best, or the best set of looks, at each of points (W, 3) metres in the world.
 
         Args:
             points: where the camera is.
@@ -179,17 +182,25 @@ class WhereToLook:
                 (`wheretolook.planning.sequences.best_sequence`).
             skip: leave out points outside the map or inside geometry.
             progress: show a progress bar.
+            looks: instead of n, how many looks to choose together, for a camera that turns there and whose looks are
+                localized together (`wheretolook.looks.around.best_looks`). Their rank is the order to look in, and
+                `set_score` the probability that they localize.
+            max_total_turn_deg: how far the camera turns in all from the first look to the last.
 
         Raises:
             TableError: points of another shape, not finite, outside the map or inside geometry.
             ConfigError: n or the limits are no such numbers, or no direction is within the limit on pitch.
-            PlanningError: no sequence keeps the limit on turns.
+            PlanningError: no sequence, or no set of looks, keeps the limit on turns.
         """
-        axes = self._allowed(n, pitch_deg, max_turn_deg)
+        check_limits(n, pitch_deg, max_turn_deg, looks, max_total_turn_deg)
+        axes = self._allowed(looks or n, pitch_deg)
         waypoints = Waypoints.of(points, ids)
         rows = np.flatnonzero(usable_waypoints(self.localization_map, waypoints, skip))
         at = waypoints.points[rows]
         scores = self._scores_around(at, axes, progress)
+        if looks is not None:
+            self.views = self._looks(waypoints, rows, axes, scores, looks, max_total_turn_deg, progress)
+            return self.views
         if max_turn_deg is not None:
             chosen = best_sequence(scores, TurnLimit.of(axes, max_turn_deg)).direction_ids[:, None]
         else:
@@ -221,6 +232,36 @@ class WhereToLook:
             method=scorer.name,
         )
 
+    def _looks(
+        self,
+        waypoints: Waypoints,
+        rows: NDArray[np.int64],
+        axes: Float,
+        scores: Float,
+        n: int,
+        max_turn_deg: float | None,
+        progress: bool,
+    ) -> SelectedViews:
+        """The best n looks together at some of the waypoints, (R,) rows, by scores (R, D) of axes (D, 3)."""
+        at = waypoints.points[rows]
+        pairs = tqdm(zip(at, scores, strict=True), total=len(at), desc="looks", unit="waypoint", disable=not progress)
+        sets = [best_looks(self.scorer, place, axes, values, n, max_turn_deg) for place, values in pairs]
+        poses = poses_looking_along(np.repeat(at, n, axis=0), axes[[look for found in sets for look in found.looks]])
+        told, of_waypoint = self.scorer.report(poses), np.repeat(rows, n)
+        return SelectedViews(
+            waypoint=of_waypoint,
+            waypoint_id=tuple(waypoints.ids[row] for row in of_waypoint),
+            rank=np.tile(np.arange(1, n + 1), len(rows)),
+            cam_from_world=poses,
+            score=told.score,
+            expected_inliers=told.expected_inliers,
+            n_visible=told.n_visible,
+            in_range=told.in_range,
+            camera=self.localization_map.camera,
+            method=self.scorer.name,
+            set_score=np.repeat([found.worth for found in sets], n),
+        )
+
     def _scores_around(self, locations: Float, axes: Float, progress: bool) -> Float:
         """Scores (L, D) of all directions (D, 3) at locations (L, 3)."""
         kind = self.localization_map.device.partition(":")[0]
@@ -232,9 +273,8 @@ class WhereToLook:
                 bar.update(len(block))
         return scores
 
-    def _allowed(self, n: int, pitch_deg: tuple[float, float] | None, max_turn_deg: float | None) -> Float:
-        """The directions within the limit on pitch, (D, 3); a ConfigError if there is none, or a number is no limit."""
-        check_limits(n, pitch_deg, max_turn_deg)
+    def _allowed(self, n: int, pitch_deg: tuple[float, float] | None) -> Float:
+        """The directions within the limit on pitch, (D, 3); a ConfigError if there are fewer than n."""
         if pitch_deg is None:
             return self._enough(self.directions, n)
         low, high = pitch_deg

@@ -12,6 +12,7 @@ from wheretolook.config import Experiment
 from wheretolook.dataset.folders import Dataset
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.stages.inputs import Say, Tick, dataset_after
+from wheretolook.stages.look_sets import evaluate_looks
 from wheretolook.stages.one_at_a_time import reading, reads_dataset
 from wheretolook.utils.files import write_text
 from wheretolook.utils.tracking_config import TrackingConfig
@@ -24,11 +25,15 @@ if TYPE_CHECKING:
 
 @reads_dataset("evaluate")
 def evaluate(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> pd.DataFrame:
-    """Stage 6: the score table of all methods on the test scenes, `<dataset>/results/`, and nested MLflow runs."""
+    """Stage 6: the score table of all methods on the test scenes, `<dataset>/results/`, and nested MLflow runs.
+
+    Where labels keep where landmarks were matched, also `looks.csv` and `looks.md`: sets of looks localized together.
+    """
     dataset = dataset_after(experiment, "label")
     check_store(experiment.tracking)  # before the imports of what scores, which take seconds
     device, occlusion = experiment.warp_device, experiment.occlusion
     scores = evaluate_methods(dataset, experiment.evaluate, experiment.tracking, device=device, occlusion=occlusion)
+    evaluate_looks(dataset, experiment.evaluate, experiment.tracking, device=device)
     tick(1)
     return scores
 

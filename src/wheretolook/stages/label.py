@@ -44,7 +44,7 @@ def label(experiment: Experiment, say: Say = print, tick: Tick = lambda work: No
     for files in sorted(dataset.scenes, key=lambda files: files.split == "train"):  # those to evaluate on come first
         parts = [config.localizer.record(), extractor_of(files).record(), files.camera.record()]
         made_from = [existing(files.mesh, SceneError, "scenes"), existing(files.landmarks, MapError, "map")]
-        matches = ["store_matches"] if config.store_matches else []
+        matches = [name for name in ("store_matches", "store_pixels") if getattr(config, name)]
         key = stage_key("label", [*parts, *made_from, read_stamp(files, "sample"), *matches])
         if is_done(files, "label", key, files.table):
             shutil.rmtree(_shards(files), ignore_errors=True)  # killed before it could remove them
@@ -77,7 +77,7 @@ def _label(
         scene = open_scene(experiment, dataset, files)
         options = (config.localizer, extractor_of(files), scene.device, config.store_matches)
         cameras = tuple(files.cameras().items()) if files.cameras_file.is_file() else ()
-        job = SceneJob(files.mesh, files.landmarks, scene.camera, *options, cameras)
+        job = SceneJob(files.mesh, files.landmarks, scene.camera, *options, cameras, config.store_pixels)
         tasks.append(LabelTask(scene.name, job, files.read_table(), _shards(files)))
     seconds: dict[str, float] = {}
     start, replacing = time.monotonic(), False

@@ -89,6 +89,16 @@ All other numbers lie in the artifact `scores.csv`.""",
             "top-n": View("the best 1, 5 and 10 views", REGRET, (*_CHOICES[:2], *_TOP_N), _ALL),
         },
     ),
+    "looks": Purpose(
+        "looks",
+        """\
+Sets of looks from a place, localized together. Open the run (+) to compare: in it is a run for each `strategy` ×
+`n_looks`.
+
+- `good`: share of places where the looks localize together; **sort by it, highest first**
+- `gain`: this less the share where the look that is best alone localizes; `any_good`: where one of the looks does
+- `sure`, `sure_right`: share of poses called sure at 99 %, and of these the share that is right""",
+    ),
     "train": Purpose(
         "training",
         """\

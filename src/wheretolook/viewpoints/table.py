@@ -41,11 +41,16 @@ MATCH_FIELDS = pa.schema([("matched_rows", pa.list_(pa.int32())), ("inlier_rows"
 were matched in each view, and the inliers among them, as rows of the scene's `landmarks.npz`, ascending. A view without
 matches has two empty lists. Compact tables leave them out."""
 
+PIXEL_FIELD = pa.schema([("matched_pixels", pa.list_(pa.float32()))])
+"""A ragged column that a table with `MATCH_FIELDS` may have besides: x and y in turn of the pixel at which each of
+`matched_rows` was found, in their order. With it several views of a place can be localized together (`looks/`)."""
+
 CAMERA_FIELD = pa.schema([("camera_id", pa.int32())])
 """A column that a table may have in addition to `SCHEMA`, where a scene's viewpoints look with several cameras: the
 number of the camera in the scene's `cameras.txt`."""
 
 (CAMERA_ID,) = CAMERA_FIELD.names
+(PIXELS,) = PIXEL_FIELD.names
 
 CENTER_DECIMALS = 12  # of a metre; the centres of a location's viewpoints, each computed from its pose, differ by less
 
@@ -116,13 +121,13 @@ def outcome_in_brief(label: pd.Series) -> str:
 def write_table(table: pd.DataFrame, path: Path, compact: bool = False) -> None:
     """Write a table atomically as zstd Parquet with checksums; the same rows give the same bytes.
 
-    Columns are those of `SCHEMA`, and of `CAMERA_FIELD` and `MATCH_FIELDS` if they are there. A compact table has
-    `COMPACT_SCHEMA`, about 18 bytes a row; read back, its poses agree to 1e-12 and all else exactly.
+    Columns are those of `SCHEMA`, and of `CAMERA_FIELD`, `MATCH_FIELDS` and `PIXEL_FIELD` if they are there. A
+    compact table has `COMPACT_SCHEMA`, about 18 bytes a row; read back, its poses agree to 1e-12 and all else exactly.
     """
     schema, options = (COMPACT_SCHEMA, _COMPACT_FORMAT) if compact else (SCHEMA, {})
     if compact:
         table = table.assign(**dict(zip(CENTER_COLUMNS, _shared_centers(table).T, strict=True)))
-    further = [CAMERA_FIELD] if compact else [CAMERA_FIELD, MATCH_FIELDS]
+    further = [CAMERA_FIELD] if compact else [CAMERA_FIELD, MATCH_FIELDS, PIXEL_FIELD]
     schema = pa.schema(
         [*schema, *(field for part in further if set(part.names) <= set(table.columns) for field in part)]
     )
@@ -141,27 +146,28 @@ def _shared_centers(table: pd.DataFrame) -> Float:
     return np.round(np.where(apart, centers, shared), CENTER_DECIMALS) + 0.0  # no negative zero
 
 
-def has_matches(path: Path) -> bool:
-    """Whether a table holds `MATCH_FIELDS`; a file that cannot be read does not."""
+def has_matches(path: Path, pixels: bool = False) -> bool:
+    """Whether a table holds `MATCH_FIELDS`, with `pixels` also `PIXEL_FIELD`; a file that cannot be read does not."""
     try:
-        return {*MATCH_FIELDS.names} <= {*pq.read_schema(path).names}
+        return {*MATCH_FIELDS.names, *(PIXEL_FIELD.names if pixels else [])} <= {*pq.read_schema(path).names}
     except (pa.ArrowException, OSError, ValueError):
         return False
 
 
-def read_table(path: Path, matches: bool = False) -> pd.DataFrame:
+def read_table(path: Path, matches: bool = False, pixels: bool = False) -> pd.DataFrame:
     """Read the columns of `SCHEMA` of a table of viewpoints, compact or not, and of `CAMERA_FIELD` if it has that.
 
     With `matches` also those of `MATCH_FIELDS`: in each row two int32 arrays, (M,) of the landmarks matched and (I,) of
-    the inliers among them. Raises TableError if the file is missing, truncated, not a Parquet file, or lacks columns
-    that were asked for.
+    the inliers among them; with `pixels` also that of `PIXEL_FIELD`, (2 M,) float32. Raises TableError if the file is
+    missing, truncated, not a Parquet file, or lacks columns that were asked for.
     """
     if not path.is_file():
         raise TableError("there is no table of viewpoints", path=path, fix="Run the sample stage first.")
     try:
         with pq.ParquetFile(path, page_checksum_verification=True) as file:
             names = file.schema_arrow.names  # matches take long to read, so only if they are asked for
-            table = file.read([name for name in names if matches or name not in MATCH_FIELDS.names])
+            unwanted = ([] if matches or pixels else MATCH_FIELDS.names) + ([] if pixels else PIXEL_FIELD.names)
+            table = file.read([name for name in names if name not in unwanted])
     except (pa.ArrowException, OSError, ValueError) as error:
         fix = "It may be truncated: get it anew, or delete it and run the stage that writes it."
         raise TableError(f"not a readable Parquet file: {error}", path=path, fix=fix) from error
@@ -170,12 +176,14 @@ def read_table(path: Path, matches: bool = False) -> pd.DataFrame:
     missing = [name for name in schema.names if name not in names]
     if missing:
         raise TableError("columns are missing", path=path, value=missing, fix="Run the sample stage again.")
-    further = [name for name in CAMERA_FIELD.names if name in names] + (MATCH_FIELDS.names if matches else [])
+    wanted = (MATCH_FIELDS.names if matches or pixels else []) + (PIXEL_FIELD.names if pixels else [])
+    further = [name for name in CAMERA_FIELD.names if name in names] + wanted
     if further:
-        extra = pa.unify_schemas([CAMERA_FIELD, MATCH_FIELDS])
+        extra = pa.unify_schemas([CAMERA_FIELD, MATCH_FIELDS, PIXEL_FIELD])
         schema = pa.schema([*schema, *(extra.field(name) for name in further)])
-    if matches and (missing := [name for name in MATCH_FIELDS.names if name not in names]):
-        fix = "Label again with `--label.store_matches true`; compact tables never hold them."
+    if missing := [name for name in wanted if name not in names]:
+        option = "pixels" if PIXELS in missing else "matches"
+        fix = f"Label again with `--label.store_{option} true`; compact tables never hold them."
         raise TableError("it is not stored which landmarks were matched", path=path, value=missing, fix=fix)
     try:
         frame: pd.DataFrame = table.select(schema.names).cast(schema).to_pandas()

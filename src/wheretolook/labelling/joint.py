@@ -1,0 +1,365 @@
+"""Several looks localized together: one pose for a rig of views whose poses to one another are known.
+
+A camera that turns knows how far it turned. So N looks from a place are one camera with N parts (a generalized camera,
+Pless 2003), and all their matches must agree on one pose: where a map resembles itself, a single look may find a wrong
+pose with a hundred inliers, on which the others do not agree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import poselib
+from numpy.typing import ArrayLike, NDArray
+
+from wheretolook.geometry.camera import Camera
+from wheretolook.geometry.local_origin import poses_from
+from wheretolook.geometry.poses import Float, camera_centers, rotation_angle_deg
+from wheretolook.labelling.estimation import REFINEMENT, PoseEstimator, known_to_poselib
+from wheretolook.labelling.joint_refinement import refine_with_turns
+from wheretolook.utils.errors import ConfigError, PoseError
+from wheretolook.viewpoints.table import LOCALIZED, NO_POSE, TOO_FEW_MATCHES
+
+ELSEWHERE = 0.5, 10.0
+"""Metres and degrees by which a pose differs at least from the best to count as one elsewhere."""
+
+ROUNDS = 3
+"""Times that a pose is refined on its inliers, which are then found anew; mostly the second finds the same."""
+
+TRIALS_ELSEWHERE = 1000
+"""Trials of RANSAC at most on what does not agree with the best pose: with them it finds a pose that a sixth of these
+agree on; one with fewer is no rival."""
+
+LEAST = 4
+"""Matches, of all looks together, without which no pose is sought: one more than determine it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What one view of a rig matched."""
+
+    cam_from_rig: Float  # (3, 4) metres
+    pixels: Float  # (M, 2) of its image
+    rows: NDArray[np.int64]  # (M,) of the landmarks
+    camera: Camera
+
+
+@dataclass(frozen=True, eq=False)
+class JointLocalization:
+    """The pose that the matches of several looks agree on best, and how well they agree on it.
+
+    Attributes:
+        status: "localized", "too_few_matches" or "no_pose", as of a single image.
+        rig_from_world: (3, 4); None if there is none. With too few inliers it is kept, but the status is "no_pose".
+        cams_from_world: (N, 3, 4) the poses of the looks; beyond the rig's they hold the turns as they were found, if
+            these were not known exactly.
+        inliers: N masks (M_k,) of each look's matches, which agree with the pose.
+        n_matches: matches of all looks.
+        support: of the pose, a sum over inliers that falls from 1 to 0 as the error rises to its limit.
+        elsewhere: the greatest support of a pose that lies `ELSEWHERE`; 0 if there is none.
+        deviation: one standard deviation of the position (m) and of the orientation (degrees) that the inliers leave;
+            infinite where they do not determine the pose.
+    """
+
+    status: str
+    rig_from_world: Float | None
+    cams_from_world: Float | None
+    inliers: tuple[NDArray[np.bool_], ...]
+    n_matches: int
+    support: float = 0.0
+    elsewhere: float = 0.0
+    deviation: tuple[float, float] = (np.inf, np.inf)
+
+    @property
+    def n_inliers(self) -> int:
+        """Inliers of all looks."""
+        return int(sum(mask.sum() for mask in self.inliers))
+
+
+def turned_looks(turns: ArrayLike, matches: Sequence[tuple[Float, NDArray[np.int64]]], camera: Camera) -> list[Look]:
+    """Looks of a camera that turned about its centre, by rotations `cam_from_rig` (N, 3, 3) and pixels and rows each.
+
+    Raises a PoseError if these are no rotations.
+    """
+    rotations = np.asarray(turns, dtype=np.float64)
+    if rotations.ndim != 3 or rotations.shape[1:] != (3, 3) or len(rotations) != len(matches):
+        raise PoseError("turns are one rotation (3, 3) for each look", value=rotations.shape)
+    at_rig = np.zeros((len(rotations), 3, 1))
+    poses = np.concatenate([rotations, at_rig], axis=2)
+    return [Look(pose, pixels, rows, camera) for pose, (pixels, rows) in zip(poses, matches, strict=True)]
+
+
+def rig_of(cam_from_world: ArrayLike, tolerance_m: float = 1e-6) -> Float:
+    """cam_from_rig (N, 3, 4) of views (N, 3, 4) of one place; the rig's axes are those of the first.
+
+    Raises a PoseError if the views lie further from the first than the tolerance.
+    """
+    poses = np.asarray(cam_from_world, dtype=np.float64)
+    apart = np.linalg.norm(camera_centers(poses) - camera_centers(poses[:1]), axis=1)
+    if apart.max() > tolerance_m:
+        fix = "Give views that only turn, or a rig's poses to one another."
+        raise PoseError("these looks are not of one place", value=f"{apart.max():.3g} m apart", fix=fix)
+    rotations = poses[:, :, :3] @ poses[0, :, :3].T
+    return np.concatenate([rotations, np.zeros((len(poses), 3, 1))], axis=2)
+
+
+class JointLocalizer:
+    """Localizes looks together against points (N, 3) m; a single one exactly as `PoseEstimator` does.
+
+    Hypotheses come from PoseLib's LO-RANSAC over all matches (generalized P3P), and from each look alone. Each is
+    refined on what all looks have that agrees with it, and the best supported by all is taken. Errors are measured in
+    pixels of the looks' own images: by angles, as of one spherical camera, keypoints near the border of an image, where
+    a pixel spans a smaller angle, would count for less than they tell, and RANSAC would be twice as lenient there.
+
+    `turn_noise_deg` is one standard deviation of the angle, about each axis, to which the looks' turns are known.
+    """
+
+    def __init__(self, estimator: PoseEstimator, turn_noise_deg: float = 0.0) -> None:
+        if not 0 <= turn_noise_deg < 90:
+            fix = "Give one standard deviation in degrees, 0 if turns are known exactly."
+            raise ConfigError("the noise of turns is an angle of 0 to 90 degrees", value=turn_noise_deg, fix=fix)
+        self.estimator, self.turn_noise_deg = estimator, turn_noise_deg
+
+    def localize_together(self, looks: Sequence[Look]) -> JointLocalization:
+        """The joint pose of two looks or more. Raises a PoseError for fewer, and as `localize`."""
+        if len(looks) < 2:
+            fix = "Localize it as a single image."
+            raise PoseError("a single look cannot be localized together with others", value=len(looks), fix=fix)
+        return self.localize(looks)
+
+    def alone(self, look: Look) -> tuple[Float, NDArray[np.bool_]] | None:
+        """What a look finds alone, which `localize` may be told where many sets share their looks; None if nothing."""
+        if len(look.rows) < self.estimator.config.min_matches:
+            return None
+        return self.estimator.estimate_here(look.pixels, self.estimator.points[look.rows], look.camera)
+
+    def localize(
+        self, looks: Sequence[Look], alone: Sequence[tuple[Float, NDArray[np.bool_]] | None] | None = None
+    ) -> JointLocalization:
+        """The joint pose of one look or more. What each finds alone may be known already.
+
+        Raises a PoseError if there is none, a look's pose in the rig is no rigid transform, or its pixels and rows do
+        not fit together.
+        """
+        _check(looks)
+        config, n_matches = self.estimator.config, sum(len(look.rows) for look in looks)
+        none = tuple(np.zeros(len(look.rows), dtype=bool) for look in looks)
+        if n_matches < LEAST:
+            return JointLocalization(TOO_FEW_MATCHES, None, None, none, n_matches)
+        known = [self.alone(look) for look in looks] if alone is None else list(alone)
+        rig = _Rig(self.estimator, looks, self.turn_noise_deg, known)
+        found = rig.hypotheses()
+        if not found:
+            return JointLocalization(NO_POSE, None, None, none, n_matches)
+        found.sort(key=lambda pose: -pose.support)  # stable: of equals the first
+        best = found[0]
+        others = [pose for pose in found[1:] if best.elsewhere(pose)] + rig.among_outliers(best)
+        runner_up = max((pose.support for pose in others if best.elsewhere(pose)), default=0.0)
+        status = LOCALIZED if sum(mask.sum() for mask in best.inliers) >= config.min_inliers else NO_POSE
+        origin = -self.estimator.origin
+        poses = poses_from(best.cams_from_world, origin)
+        deviation = rig.deviation(best)
+        return JointLocalization(
+            status, poses_from(best.rig_from_world, origin), poses, best.inliers, n_matches, best.support, runner_up,
+            deviation,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _Hypothesis:
+    """A pose of the rig, in the estimator's world, and how well the looks agree with it."""
+
+    rig_from_world: Float
+    cams_from_world: Float
+    inliers: tuple[NDArray[np.bool_], ...]
+    support: float
+
+    def elsewhere(self, other: _Hypothesis) -> bool:
+        """Whether another pose is of another place or orientation."""
+        apart = np.linalg.norm(camera_centers(self.rig_from_world) - camera_centers(other.rig_from_world))
+        turned = rotation_angle_deg(self.rig_from_world[:, :3], other.rig_from_world[:, :3])
+        return bool(apart > ELSEWHERE[0] or turned > ELSEWHERE[1])
+
+
+class _Rig:
+    """Looks as PoseLib takes them, and the poses they are consistent with."""
+
+    def __init__(
+        self,
+        estimator: PoseEstimator,
+        looks: Sequence[Look],
+        turn_noise_deg: float,
+        alone: list[tuple[Float, NDArray[np.bool_]] | None],
+    ) -> None:
+        self.estimator, self.looks, self.alone = estimator, looks, alone
+        known = [known_to_poselib(look.camera.colmap, np.asarray(look.pixels, dtype=np.float64)) for look in looks]
+        self.cameras, self.pixels = [camera for camera, _ in known], [pixels for _, pixels in known]
+        self.points = [estimator.points[look.rows] for look in looks]
+        self.mounts = [np.asarray(look.cam_from_rig, dtype=np.float64) for look in looks]
+        self.noise = np.radians(turn_noise_deg) if len(looks) > 1 else 0.0
+        limit = estimator.config.max_error_px
+        focal = max(look.camera.mean_focal_px for look in looks)
+        # until the turns are refined, a match of a look that turned otherwise is off by as much
+        self.loose = float(np.hypot(limit, 4 * self.noise * focal))
+
+    def hypotheses(self) -> list[_Hypothesis]:
+        """Poses worth comparing: of all matches, then of each look alone; refined on all looks' inliers."""
+        if len(self.looks) == 1:
+            return self._alone(0)
+        everything = self._sampled([np.ones(len(pixels), dtype=bool) for pixels in self.pixels])
+        return everything + [pose for k in range(len(self.looks)) for pose in self._alone(k)]
+
+    def among_outliers(self, best: _Hypothesis) -> list[_Hypothesis]:
+        """The pose that most of what does not agree with the best one agrees on, if any."""
+        left = [~mask for mask in best.inliers]
+        if sum(mask.sum() for mask in left) < LEAST:
+            return []
+        if len(self.looks) > 1:
+            return self._sampled(left, TRIALS_ELSEWHERE)
+        matches = self.looks[0].pixels[left[0]], self.points[0][left[0]]
+        found = self.estimator.estimate_here(*matches, self.looks[0].camera, TRIALS_ELSEWHERE)
+        return [] if found is None else [self._supported(_in_rig(self.mounts[0], found[0]))]
+
+    def _alone(self, k: int) -> list[_Hypothesis]:
+        """The pose of one look alone; of the only one exactly as of a single image."""
+        found = self.alone[k]
+        if found is None:
+            return []
+        pose = _in_rig(self.mounts[k], found[0])
+        if len(self.looks) > 1:
+            return [self._refined(pose)]
+        return [replace(self._supported(pose), cams_from_world=found[0][None], inliers=(found[1],))]
+
+    def _sampled(self, taken: Sequence[NDArray[np.bool_]], trials: int | None = None) -> list[_Hypothesis]:
+        """The pose that RANSAC finds over some of all looks' matches."""
+        options = {**self.estimator.ransac, "max_reproj_error": self.loose}
+        options["max_iterations"] = trials or options["max_iterations"]
+        pixels = [of[mask] for of, mask in zip(self.pixels, taken, strict=True)]
+        points = [of[mask] for of, mask in zip(self.points, taken, strict=True)]
+        pose, found = poselib.estimate_generalized_absolute_pose(
+            pixels, points, [_poselib(mount) for mount in self.mounts], self.cameras, options, REFINEMENT
+        )
+        if found["num_inliers"] < LEAST or not np.isfinite(pose.Rt).all():
+            return []
+        return [self._refined(pose.Rt)]
+
+    def _refined(self, rig_from_world: Float) -> _Hypothesis:
+        """A pose refined on the inliers of all looks, until they stay the same."""
+        if self.noise:
+            return self._refined_with_turns(rig_from_world)
+        best = self._supported(rig_from_world)
+        mounts = [_poselib(mount) for mount in self.mounts]
+        for _ in range(ROUNDS):
+            if sum(mask.sum() for mask in best.inliers) < LEAST:
+                break
+            pixels = [of[mask] for of, mask in zip(self.pixels, best.inliers, strict=True)]
+            points = [of[mask] for of, mask in zip(self.points, best.inliers, strict=True)]
+            start = _poselib(best.rig_from_world)
+            pose, _ = poselib.refine_generalized_absolute_pose(pixels, points, start, mounts, self.cameras, REFINEMENT)
+            if not np.isfinite(pose.Rt).all():
+                break
+            again = self._supported(pose.Rt)
+            if again.support < best.support:
+                break
+            same = all(np.array_equal(*masks) for masks in zip(best.inliers, again.inliers, strict=True))
+            best = again
+            if same:
+                break
+        return best
+
+    def _refined_with_turns(self, rig_from_world: Float) -> _Hypothesis:
+        best = self._supported(rig_from_world, self.loose)
+        cams = _of_looks(self.mounts, rig_from_world)
+        for _ in range(ROUNDS):
+            if sum(mask.sum() for mask in best.inliers) < LEAST:
+                break
+            rig_from_world, cams = refine_with_turns(
+                self.looks, self.points, best.inliers, best.rig_from_world, cams, self.noise
+            )
+            best = self._supported(rig_from_world, cams=cams)
+        return best
+
+    def _supported(self, rig_from_world: Float, limit: float | None = None, cams: Float | None = None) -> _Hypothesis:
+        """A pose with its inliers, within a limit in pixels, and its support."""
+        limit = self.estimator.config.max_error_px if limit is None else limit
+        cams = _of_looks(self.mounts, rig_from_world) if cams is None else cams
+        inliers, support = [], 0.0
+        for look, points, pose in zip(self.looks, self.points, cams, strict=True):
+            squared = squared_errors(look.camera, look.pixels, points, pose) / limit**2
+            inliers.append(squared < 1)
+            support += float((1 - squared[squared < 1]).sum())
+        return _Hypothesis(rig_from_world, np.asarray(cams), tuple(inliers), support)
+
+    def deviation(self, pose: _Hypothesis) -> tuple[float, float]:
+        """One standard deviation of position (m) and orientation (degrees), by the inliers' errors and their spread."""
+        information, total, n = np.zeros((6, 6)), 0.0, 0
+        for look, points, mask, cam in zip(self.looks, self.points, pose.inliers, pose.cams_from_world, strict=True):
+            if not mask.any():
+                continue
+            offsets = points[mask] - camera_centers(cam)
+            distance = np.linalg.norm(offsets, axis=1)
+            bearing = offsets / np.maximum(distance, 1e-9)[:, None]
+            # a pixel off the axis spans less of an angle: by the cosine squared along, by the cosine across
+            cosine = np.clip((offsets @ cam[2, :3]) / np.maximum(distance, 1e-9), 0.05, 1)
+            weight = look.camera.mean_focal_px / cosine
+            across = np.eye(3) - bearing[:, :, None] * bearing[:, None, :]
+            skew = np.zeros((len(bearing), 3, 3))
+            skew[:, [0, 0, 1], [1, 2, 2]] = np.stack([-bearing[:, 2], bearing[:, 1], -bearing[:, 0]], 1)
+            skew -= skew.transpose(0, 2, 1)
+            jacobian = np.concatenate([across / distance[:, None, None], skew], axis=2) * weight[:, None, None]
+            information += np.einsum("nij,nik->jk", jacobian, jacobian)
+            squared = squared_errors(look.camera, look.pixels[mask], points[mask], cam)
+            total, n = total + float(squared.sum()), n + int(mask.sum())
+        if n <= 3 or np.linalg.cond(information) > 1e14:
+            return np.inf, np.inf
+        covariance = np.linalg.inv(information) * max(total / (2 * n - 6), 0.01)
+        return float(np.sqrt(np.trace(covariance[:3, :3]))), float(np.degrees(np.sqrt(np.trace(covariance[3:, 3:]))))
+
+
+def squared_errors(camera: Camera, pixels: Float, points: Float, cam_from_world: Float) -> Float:
+    """Squared reprojection errors (M,) of points (M, 3) at pixels (M, 2) of a pose's image; infinite behind it."""
+    there = points @ cam_from_world[:, :3].T + cam_from_world[:, 3]
+    ahead = there[:, 2] > 1e-6 if not camera.colmap.model.endswith("FISHEYE") else np.ones(len(there), dtype=bool)
+    projected = camera.project(np.where(ahead[:, None], there, (0.0, 0.0, 1.0)))
+    squared = ((projected - pixels) ** 2).sum(1)
+    return np.where(ahead & np.isfinite(squared), squared, np.inf)
+
+
+def _of_looks(mounts: Sequence[Float], rig_from_world: Float) -> Float:
+    """cam_from_world (N, 3, 4) of looks mounted in a rig by cam_from_rig."""
+    stacked = np.stack(mounts)
+    rotations = stacked[:, :, :3] @ rig_from_world[:, :3]
+    return np.concatenate([rotations, (stacked[:, :, :3] @ rig_from_world[:, 3] + stacked[:, :, 3])[..., None]], axis=2)
+
+
+def _in_rig(cam_from_rig: Float, cam_from_world: Float) -> Float:
+    """rig_from_world (3, 4) of a look's pose."""
+    rotation = cam_from_rig[:, :3].T
+    return np.concatenate(
+        [rotation @ cam_from_world[:, :3], (rotation @ (cam_from_world[:, 3] - cam_from_rig[:, 3]))[:, None]], axis=1
+    )
+
+
+def _poselib(pose: Float) -> poselib.CameraPose:
+    made = poselib.CameraPose()
+    made.R, made.t = pose[:, :3], pose[:, 3]
+    return made
+
+
+def _check(looks: Sequence[Look]) -> None:
+    if not looks:
+        raise PoseError("there is no look to localize", value=0)
+    for number, look in enumerate(looks):
+        mount = np.asarray(look.cam_from_rig, dtype=np.float64)
+        turn = mount[:, :3] if mount.shape == (3, 4) else np.zeros((3, 3))
+        rigid = (
+            np.isfinite(mount).all() and np.allclose(turn @ turn.T, np.eye(3), atol=1e-6) and np.linalg.det(turn) > 0
+        )
+        if not rigid:
+            fix = "Give a rotation (determinant 1) and a translation in metres."
+            raise PoseError(f"the turn of look {number} is no rotation", value=mount.tolist(), fix=fix)
+        if np.shape(look.pixels) != (len(look.rows), 2):
+            value = (np.shape(look.pixels), len(look.rows))
+            raise PoseError(f"look {number} needs a pixel (x, y) for each row of a landmark", value=value)

@@ -1,0 +1,1 @@
+"""Several looks from one place: what they see together, and which to take."""

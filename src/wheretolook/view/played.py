@@ -1,0 +1,107 @@
+"""Paths to play: a planned or compared one as this project writes it, or any file of poses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from wheretolook.geometry.poses import (
+    Float,
+    camera_centers,
+    invert_poses,
+    poses_looking_along,
+    rotation_from_quaternion,
+)
+from wheretolook.utils.errors import TableError
+from wheretolook.viewpoints.table import POSE_COLUMNS, poses
+
+FORWARD = "forward"
+MOST_POSES = 5000
+_FIX = """\
+Give the folder or path.csv of `wheretolook plan`, a scene's folder in results/paths of `wheretolook compare-paths`, a
+TUM trajectory (t x y z qx qy qz qw, camera-to-world), or a CSV of selected views."""
+
+Paths = dict[str, Float]
+"""cam_from_world (W, 3, 4) along a path, by the method that chose the views."""
+
+
+def read_paths(path: Path, pair: int = 0) -> Paths:
+    """The views along a path by method; of compared paths those of one pair, planned by each.
+
+    Where there is but one, the same places seen by a camera that looks ahead stand beside it, as `FORWARD`. Raises
+    TableError if there is no such file, or it holds no poses.
+    """
+    if path.is_dir():
+        for name in ("path.csv", "views.parquet"):
+            if (path / name).is_file():
+                return read_paths(path / name, pair)
+        raise TableError("no path lies in this folder", path=path, fix=_FIX)
+    if not path.is_file():
+        raise TableError("there is no such path", path=path, fix=_FIX)
+    if path.suffix == ".parquet":
+        found = _compared(path, pair)
+    elif path.suffix == ".csv":
+        found = {path.stem: _table(path)}
+    else:
+        found = {path.stem: _trajectory(path)}
+    for along in found.values():
+        if not 2 <= len(along) <= MOST_POSES or not np.isfinite(along).all():
+            raise TableError(f"a path has 2 to {MOST_POSES} finite poses", path=path, value=len(along), fix=_FIX)
+    if len(found) == 1:
+        name, along = next(iter(found.items()))
+        return {FORWARD: looking_ahead(camera_centers(along)), name: along}
+    return found
+
+
+def looking_ahead(positions: Float) -> Float:
+    """Poses (W, 3, 4) at places (W, 3) m of a camera that looks where it goes, level, and before it stops as before."""
+    steps = np.diff(positions, axis=0, append=positions[-1:])
+    steps[:, 2] = 0
+    still = np.linalg.norm(steps, axis=1) < 1e-6
+    moving = np.flatnonzero(~still)
+    if len(moving) == 0:
+        steps[:] = (1.0, 0.0, 0.0)
+    else:
+        last = np.maximum.accumulate(np.where(still, -1, np.arange(len(steps))))
+        steps = steps[np.where(last < 0, moving[0], last)]
+    return poses_looking_along(positions, steps)
+
+
+def _compared(path: Path, pair: int) -> Paths:
+    try:
+        table = pd.read_parquet(path)
+        table = table[(table["pair"] == pair) & (table["task"] == "planned")].sort_values("waypoint", kind="stable")
+        found = {str(name): poses(rows) for name, rows in table.groupby("method", sort=False)}
+    except (OSError, ValueError, KeyError) as error:
+        raise TableError(f"no compared paths: {error}", path=path, fix=_FIX) from error
+    if not found:
+        raise TableError("there is no such pair of a start and a goal", path=path, value=pair, fix="Give --pair.")
+    return found
+
+
+def _table(path: Path) -> Float:
+    """Poses of a CSV: of a plan (cam_from_world), or of selected views (x, y, z, qw..., camera-to-world)."""
+    try:
+        table = pd.read_csv(path, comment="#")
+        if {*POSE_COLUMNS} <= {*table}:
+            return poses(table)
+        return _from_centers(table[list("xyz")].to_numpy(float), table[["qw", "qx", "qy", "qz"]].to_numpy(float))
+    except (OSError, ValueError, KeyError) as error:
+        raise TableError(f"no poses in this table: {error}", path=path, fix=_FIX) from error
+
+
+def _trajectory(path: Path) -> Float:
+    try:
+        rows = np.loadtxt(path, comments="#", ndmin=2)
+    except (OSError, ValueError) as error:
+        raise TableError(f"no trajectory: {error}", path=path, fix=_FIX) from error
+    if rows.ndim != 2 or rows.shape[1] != 8:
+        raise TableError("a TUM trajectory has eight columns", path=path, value=rows.shape[-1], fix=_FIX)
+    return _from_centers(rows[:, 1:4], rows[:, [7, 4, 5, 6]])
+
+
+def _from_centers(centers: Float, wxyz: Float) -> Float:
+    """cam_from_world of centres (W, 3) m and camera-to-world quaternions (W, 4)."""
+    return invert_poses(np.concatenate([rotation_from_quaternion(wxyz), centers[..., None]], axis=-1))

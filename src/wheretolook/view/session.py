@@ -1,0 +1,407 @@
+"""One who looks: what was chosen, what is computed for it, and what is drawn. Nobody else's choices change it."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from wheretolook.geometry.lattices import axes_of_angles
+from wheretolook.geometry.poses import Float, poses_looking_along, quaternion_from_rotation, rotation_from_quaternion
+from wheretolook.planning.turns import pan_tilt_angles
+from wheretolook.utils.errors import WhereToLookError
+from wheretolook.view import drawing
+from wheretolook.view.controls import HINT, LIMITS, build
+from wheretolook.view.scores import Place, judged_labels, landmarks_seen, look_around, report_of
+from wheretolook.view.seen import picture_of
+from wheretolook.view.shared import Shared
+from wheretolook.view.state import ViewState
+from wheretolook.view.worker import LATER, NOW, SOON
+
+if TYPE_CHECKING:
+    from viser import ClientHandle
+
+_log = logging.getLogger(__name__)
+
+REDRAW_S = 0.4  # between two pictures of a floor that fills
+AT_ONCE = 2  # places of a floor between two looks at what is more urgent: one for each core
+SAME_DEG = 0.3  # the sliders say what is drawn already
+MOST_SHOWN = 400_000  # landmarks that are sent to a browser
+PIXELS = {"thickness_units": "screen"}
+PATH_COLORS = ((120, 120, 120), (213, 94, 0), (0, 114, 178), (0, 158, 115), (204, 121, 167))
+
+
+class Session:
+    """What one client sees. Callbacks note what was chosen; all computing is the worker's."""
+
+    def __init__(self, client: ClientHandle, shared: Shared, state: ViewState, host: str) -> None:
+        self.client, self.shared, self.host = client, shared, host
+        self.scene, self.opened = client.scene, shared.opened
+        method = state.method if state.method in self.opened.methods else self.opened.methods[0]
+        occlusion = state.occlusion if state.occlusion in self.opened.occlusions else self.opened.occlusions[0]
+        height = shared.usual_m if state.height is None else state.height
+        if state.cut is None and self.opened.mesh is not None:
+            state = replace(state, cut=min(height + 0.35, float(self.opened.mesh.bounds[1, 2])))
+        self.state = replace(state, method=method, occlusion=occlusion, height=height)
+        self.place: Place | None = None
+        self.axis: Float | None = None
+        self.range = (0.0, 1.0)
+        self.closed = False
+        self._follows = 0.0  # when the browser's camera was last put somewhere by the program
+        self._gizmo: Any = None
+        self.controls = build(client.gui, shared, self.state)
+        self._connect()
+        self.draw_scene()
+        self.fill_floor()
+        if state.place is not None:
+            self.go_to(np.array(state.place), None if state.yaw is None else (state.yaw, state.pitch or 0.0))
+
+    # -- what is chosen ------------------------------------------------------------------------------------------------
+
+    def on(self, handle: Any, then: Callable[[], None], event: str = "on_update") -> None:
+        """Do something when a control changes. What fails is told to this client, and to nobody else."""
+        getattr(handle, event)(lambda _: self.safely(then))
+
+    def safely(self, then: Callable[[], None]) -> None:
+        """Do something; an error becomes a notice."""
+        try:
+            if not self.closed:
+                then()
+        except Exception as error:
+            self.failed(error)
+
+    def failed(self, error: Exception) -> None:
+        """Tell this client what went wrong."""
+        if self.closed:
+            return
+        if isinstance(error, WhereToLookError):
+            body = str(error)
+        else:
+            _log.error("the viewer failed", exc_info=error)
+            body = f"{type(error).__name__}: {error}. The terminal tells more."
+        self.client.add_notification("That did not work", body, color="red", auto_close_seconds=15)
+        self.controls.told.content = body if self.place is None else self.controls.told.content
+
+    def submit(self, kind: str, urgency: int, steps: Iterator[object]) -> None:
+        """Compute something for this client, in place of what of that kind is still to be done."""
+        if not self.closed:
+            self.shared.worker.submit(self.client.client_id, kind, urgency, steps, self.failed)
+
+    def _connect(self) -> None:
+        c = self.controls
+        for handle in (c.method, c.occlusion):
+            self.on(handle, self._chosen)
+        for handle in (c.height, c.threshold):
+            self.on(handle, self._slid)
+        self.on(c.cut, self._cut)
+        self.on(c.n, self._chosen_n)
+        self.on(c.view, lambda: self.show_best(int(c.view.value) - 1))
+        for handle in (c.yaw, c.pitch):
+            self.on(handle, self._turned)
+        self.on(c.through, self._look_through)
+        for name in c.shown:
+            self.on(c.shown[name], self.draw_scene)
+        self.on(c.limits, self._judge)
+        self.on(c.dark, lambda: self.theme(bool(c.dark.value)))
+        self.client.camera.on_update(lambda _: self.safely(self._camera_moved))
+
+    def theme(self, dark: bool) -> None:
+        """Light or dark."""
+        self.client.gui.configure_theme(dark_mode=dark, show_logo=False, show_share_button=False, control_width="large")
+
+    def _chosen(self) -> None:
+        c = self.controls
+        self.state = replace(self.state, method=c.method.value, occlusion=c.occlusion.value)
+        self.fill_floor()
+        if self.place is not None:
+            self.go_to(self.place.position, self._angles())
+        self._judge()
+
+    def _chosen_n(self) -> None:
+        self.state = replace(self.state, n=int(self.controls.n.value))
+        self.controls.view.max = max(2, self.state.n)
+        if self.place is not None:
+            self.go_to(self.place.position, self._angles())
+
+    def _slid(self) -> None:
+        c = self.controls
+        before = self.state
+        self.state = replace(before, height=float(c.height.value), threshold=float(c.threshold.value))
+        self.fill_floor()
+        if before.threshold != self.state.threshold:
+            self._judge()
+
+    def _cut(self) -> None:
+        self.state = replace(self.state, cut=float(self.controls.cut.value))
+        self.submit("scene", SOON, _once(self.draw_scene))
+
+    def _turned(self) -> None:
+        axis = axes_of_angles((self.controls.yaw.value, self.controls.pitch.value))
+        if self.axis is None or np.degrees(np.arccos(np.clip(axis @ self.axis, -1, 1))) > SAME_DEG:
+            self.turn_to(axis)
+
+    def _angles(self) -> tuple[float, float] | None:
+        return None if self.axis is None else (float(self.controls.yaw.value), float(self.controls.pitch.value))
+
+    def _look_through(self) -> None:
+        if self.place is None or self.axis is None:
+            self.controls.through.value = False
+        elif self.controls.through.value:
+            self._follows, camera = time.monotonic(), self.client.camera
+            with self.client.atomic():
+                camera.position = self.place.position
+                camera.look_at = self.place.position + 0.05 * self.axis
+            self._visible(False)
+        else:
+            self._visible(True)
+            camera = self.client.camera
+            camera.position = self.place.position + self.shared.mark_m * np.array([-8.0, -8.0, 9.0])
+            camera.look_at = self.place.position
+
+    def _camera_moved(self) -> None:
+        camera = self.client.camera
+        point = tuple(float(x) for x in camera.position), tuple(float(x) for x in camera.look_at)
+        if np.isfinite(point).all():
+            self.state = replace(self.state, eye=point[0], target=point[1])  # type: ignore[arg-type]
+            self.tell_state()
+        if self.controls.through.value and time.monotonic() - self._follows > 0.3:
+            self.turn_to(rotation_from_quaternion(camera.wxyz)[:, 2])
+
+    # -- the scene -----------------------------------------------------------------------------------------------------
+
+    def draw_scene(self) -> None:
+        """Mesh, landmarks and mapping cameras, cut open."""
+        shown, cut, opened = self.controls.shown, self.state.cut, self.opened
+        if shown["mesh"].value and (mesh := self.shared.mesh(cut)) is not None:
+            self.scene.add_glb("/mesh", mesh, cast_shadow=False, receive_shadow=False)
+        else:
+            self.scene.remove_by_name("/mesh")
+        points = opened.landmarks.points
+        rows = np.arange(len(points)) if cut is None else np.flatnonzero(points[:, 2] <= cut)
+        rows = rows[:: max(1, -(-len(rows) // MOST_SHOWN))]
+        self._landmarks(points[rows] if shown["landmarks"].value else points[:0])
+        if shown["cameras"].value and opened.mapping_poses is not None:
+            edges = drawing.frusta(opened.camera, opened.mapping_poses, self.shared.mark_m)
+            self.scene.add_line_segments("/cameras", edges, (86, 180, 233), thickness=1.2, thickness_units="screen")
+        else:
+            self.scene.remove_by_name("/cameras")
+        if (floor := self.scene.get_handle_by_name("/floor")) is not None:
+            floor.visible = bool(shown["floor"].value)
+        self._judge()
+
+    def _landmarks(self, points: Float) -> None:
+        if len(points) == 0:
+            self.scene.remove_by_name("/landmarks")
+            return
+        center = points.mean(0)  # offsets in half precision would be coarse far from the origin
+        self.scene.add_point_cloud(
+            "/landmarks", (points - center).astype(np.float32), (150, 150, 155), point_size=0.0018 * self.shared.size_m,
+            point_shape="circle", precision="float32", position=center, point_shading="flat",
+        )  # fmt: skip
+
+    def _visible(self, on: bool) -> None:
+        """Show or hide what would stand in the way of one who looks from the place itself."""
+        for name in ("/sphere", "/view", "/views", "/turn", "/seen", "/told"):
+            if (handle := self.scene.get_handle_by_name(name)) is not None:
+                handle.visible = on
+
+    def fill_floor(self) -> None:
+        """Colour the floor, as its scores come in."""
+        self.submit("floor", LATER, self._floor())
+        self.tell_state()
+
+    def _floor(self) -> Iterator[None]:
+        state = self.state
+        assert state.height is not None
+        self.controls.status.content = f"Scoring by **{state.method}** ..."
+        floor, look = self.shared.floor(state.method, state.occlusion, state.height)
+        if len(floor.cells) == 0:
+            self.scene.remove_by_name("/floor")
+            self.controls.status.content = f"No camera can be at {state.height:.2f} m. Try another height."
+            return
+        yield
+        drawn = 0.0
+        while not floor.done:
+            floor.score_next(look, AT_ONCE)
+            if floor.n_scored >= floor.n_first and time.monotonic() - drawn > REDRAW_S:
+                self._draw_floor(floor, state)
+                drawn = time.monotonic()
+            yield
+        self._draw_floor(floor, state)
+
+    def _draw_floor(self, floor: Any, state: ViewState) -> None:
+        raster = floor.raster()
+        probable = self.shared.is_probability(state.method)
+        known = raster[np.isfinite(raster)]
+        span = (0.0, 1.0) if probable else (float(known.min()), float(known.max()))
+        if span != self.range:
+            self.range = span
+            self.controls.legend.content = drawing.legend(*span, "score")
+        threshold = self.state.threshold if probable else None
+        image = drawing.floor_image(raster, *span, threshold)
+        rows, columns = floor.shape
+        center = (*(floor.lower + np.array([columns, rows]) * floor.cell_m / 2), floor.height_m)
+        if self.closed:
+            return
+        size = {"render_width": columns * floor.cell_m, "render_height": rows * floor.cell_m}
+        self.scene.add_image(
+            "/floor", image, **size, format="png", cast_shadow=False, receive_shadow=False, position=center,
+            visible=bool(self.controls.shown["floor"].value),
+        )  # fmt: skip
+        done = floor.scores[: floor.n_scored]
+        told = f"**{state.method}**: {floor.n_scored:,} of {len(floor.cells):,} places"
+        if probable:
+            told += f", good at {100 * np.mean(done >= state.threshold):.0f} %"
+        self.controls.status.content = told
+
+    def _judge(self) -> None:
+        if self.opened.labels is None or not self.controls.shown["labels"].value:
+            self.scene.remove_by_name("/labels")
+            self.controls.judged.content = ""
+            return
+        self.submit("labels", SOON, self._labels())
+
+    def _labels(self) -> Iterator[None]:
+        state, table = self.state, self.opened.labels
+        assert table is not None
+        scorer, told = self.shared.look(state.method, state.occlusion).scorer, None
+        for told in judged_labels(scorer, table, LIMITS[self.controls.limits.value], state.threshold):
+            yield
+        assert told is not None
+        colors = np.where(told.good[:, None], drawing.GOOD, drawing.BAD)
+        text = f"{len(told.good):,} labelled views, {100 * told.good.mean():.0f} % localize."
+        if self.shared.is_probability(state.method):
+            colors[told.promised], colors[told.missed] = drawing.PROMISED, drawing.MISSED
+            text += f" Wrong at {state.threshold:.2f}: {told.promised.sum()} promised and lost (orange), "
+            text += f"{told.missed.sum()} localized unexpectedly (blue)."
+        segments = drawing.label_arrows(told.positions, told.axes, colors, self.shared.mark_m)
+        self.scene.add_line_segments("/labels", *segments, thickness=2.0, thickness_units="screen")
+        self.controls.judged.content = text
+
+    # -- a place -------------------------------------------------------------------------------------------------------
+
+    def go_to(self, position: Float, angles: tuple[float, float] | None = None) -> None:
+        """Look around at a place; then at its best view, or as the angles (yaw, pitch) in degrees say."""
+        self.submit("place", SOON, self._around(np.asarray(position, dtype=np.float64), angles))
+
+    def _around(self, position: Float, angles: tuple[float, float] | None) -> Iterator[None]:
+        if self.place is None:
+            self.controls.told.content = "Scoring all directions ..."
+        look = self.shared.look(self.state.method, self.state.occlusion)
+        yield
+        place = look_around(look, position, self.state.n)
+        self.place = place
+        self.state = replace(self.state, place=(float(position[0]), float(position[1]), float(position[2])))
+        low, high = self.range if self.shared.is_probability(self.state.method) else (0.0, 0.0)
+        if low == high:
+            low, high = float(place.scores.min()), float(place.scores.max())
+        mark = self.shared.mark_m
+        glb = drawing.sphere_glb(place.directions, place.scores, low, high, mark)
+        self.scene.add_glb("/sphere", glb, position=position, cast_shadow=False, receive_shadow=False)
+        edges = drawing.frusta(self.opened.camera, place.best.cam_from_world, 2.2 * mark)
+        colors = np.repeat(drawing.score_colors(place.best.score, low, high), 8, axis=0)
+        self.scene.add_line_segments(
+            "/views", edges, np.repeat(colors[:, None], 2, axis=1), thickness=2.0, thickness_units="screen"
+        )
+        self._turning(position)
+        self.controls.told.content = _told(place, self.state)
+        self.turn_to(place.best.axes[0] if angles is None else axes_of_angles(angles))
+        self.controls.view.max = max(2, len(place.best))
+
+    def _turning(self, position: Float) -> None:
+        """Rings that turn the camera by hand."""
+        self._gizmo = self.scene.add_transform_controls(
+            "/turn", 3.0 * self.shared.mark_m, disable_axes=True, disable_sliders=True, position=position, opacity=0.6,
+            line_width=1.5,
+        )  # fmt: skip
+        self._gizmo.on_update(lambda _: self.safely(self._dragged))
+
+    def _dragged(self) -> None:
+        self.turn_to(rotation_from_quaternion(self._gizmo.wxyz)[:, 2], by_hand=True)
+
+    def show_best(self, number: int) -> None:
+        """Look along one of the best views."""
+        if self.place is not None and 0 <= number < len(self.place.best):
+            self.turn_to(self.place.best.axes[number])
+
+    def turn_to(self, axis: Float, by_hand: bool = False) -> None:
+        """Look along an axis (3,) at the place; its score follows at once."""
+        if self.place is None or not np.isfinite(axis).all() or np.linalg.norm(axis) < 1e-9:
+            return
+        self.axis = np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis)
+        self.submit("view", NOW, self._view(self.place.position, self.axis, by_hand))
+
+    def _view(self, position: Float, axis: Float, by_hand: bool) -> Iterator[None]:
+        c, mark = self.controls, self.shared.mark_m
+        look = self.shared.look(self.state.method, self.state.occlusion)
+        report = report_of(look.scorer, position, axis)
+        score = float(report.score[0])
+        told = f"**score {score:.3g}** · {report.n_visible[0]:,} landmarks in view"
+        if np.isfinite(report.expected_inliers[0]):
+            told += f" · {report.expected_inliers[0]:,.0f} expected to be found"
+        if not report.in_range[0]:
+            told += " · unlike what was learnt from"
+        c.picture_told.content = told
+        pose = poses_looking_along(position, axis)
+        wxyz = quaternion_from_rotation(pose[:, :3].T)
+        color = tuple(drawing.score_colors(np.array(score), *self.range).tolist())
+        camera = self.opened.camera
+        fov = 2 * np.arctan(camera.height / 2 / camera.mean_focal_px)
+        visible = not c.through.value
+        self.scene.add_camera_frustum(
+            "/view", fov, camera.width / camera.height, scale=3.0 * mark, color=color, wxyz=wxyz, position=position,
+            thickness=3.5, thickness_units="screen", visible=visible, cast_shadow=False, receive_shadow=False,
+        )  # fmt: skip
+        self.client.flush()
+        if not by_hand and self._gizmo is not None:
+            self._gizmo.wxyz = wxyz
+        yaw, pitch = (float(np.degrees(angle)) for angle in pan_tilt_angles(axis))
+        c.yaw.value, c.pitch.value = round(yaw * 2) / 2, round(pitch * 2) / 2
+        self.state = replace(self.state, yaw=round(yaw, 1), pitch=round(pitch, 1))
+        yield
+        seen = landmarks_seen(look.scorer, pose, self.shared.teller(self.state.occlusion))
+        if len(seen.points):
+            center = seen.points.mean(0)
+            self.scene.add_point_cloud(
+                "/seen", (seen.points - center).astype(np.float32), drawing.score_colors(seen.chances),
+                point_size=0.0045 * self.shared.size_m, point_shape="circle", precision="float32", position=center,
+                point_shading="flat", visible=visible,
+            )  # fmt: skip
+        else:
+            self.scene.remove_by_name("/seen")
+        yield
+        image, what = picture_of(self.opened, pose, seen)
+        c.picture.image, c.picture.visible = image, True
+        c.picture.label = what
+        self.tell_state()
+
+    def tell_state(self) -> None:
+        """Show the state as a text and a link."""
+        text = self.state.text()
+        if self.controls.state.value != text:
+            self.controls.state.value = text
+            self.controls.link.content = f"[A link to this view]({self.state.link(self.host)})"
+
+    def close(self) -> None:
+        """The client has gone."""
+        self.closed = True
+        self.shared.worker.forget(self.client.client_id)
+
+
+def _told(place: Place, state: ViewState) -> str:
+    x, y, z = place.position
+    share = np.mean(place.scores >= state.threshold)
+    told = f"At {x:.2f}, {y:.2f}, {z:.2f} m: best {place.best.score[0]:.3g}, median {np.median(place.scores):.3g}"
+    return f"{told}; {100 * share:.0f} % of directions are good." if place.scores.max() <= 1 else f"{told}."
+
+
+def _once(then: Callable[[], None]) -> Iterator[None]:
+    then()
+    yield
+
+
+__all__ = ["HINT", "Session"]

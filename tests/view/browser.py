@@ -29,7 +29,9 @@ class Tab:
         self._socket, self._number, self.errors = connect(address, max_size=1 << 27), 0, []  # type: ignore[var-annotated]
         for domain in ("Page", "Runtime", "Log"):
             self.call(f"{domain}.enable")
-        self.call("Emulation.setDeviceMetricsOverride", width=size[0], height=size[1], deviceScaleFactor=1, mobile=False)
+        self.call(
+            "Emulation.setDeviceMetricsOverride", width=size[0], height=size[1], deviceScaleFactor=1, mobile=False
+        )
 
     def call(self, method: str, **params: Any) -> Any:
         """What the browser answers."""
@@ -102,8 +104,14 @@ class Browser:
         program = chromium()
         assert program is not None
         options = ["--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--use-angle=swiftshader"]
-        options += ["--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--remote-debugging-port=0", "--no-first-run"]
-        options += ["--disable-background-networking", "--hide-scrollbars", "--remote-allow-origins=*"]
+        options += [
+            "--enable-unsafe-swiftshader",
+            "--ignore-gpu-blocklist",
+            "--remote-debugging-port=0",
+            "--no-first-run",
+        ]
+        options += ["--disable-background-networking", "--hide-scrollbars", "--no-first-run"]
+        options += ["--remote-allow-origins=*"]
         options += ["--disable-renderer-backgrounding", "--disable-background-timer-throttling"]
         options += ["--disable-backgrounding-occluded-windows"]
         self.size, self._tabs = size, []  # type: ignore[var-annotated]

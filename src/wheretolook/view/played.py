@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from wheretolook.geometry.poses import (
     Float,
@@ -15,7 +17,7 @@ from wheretolook.geometry.poses import (
     rotation_from_quaternion,
 )
 from wheretolook.utils.errors import TableError
-from wheretolook.viewpoints.table import POSE_COLUMNS, poses
+from wheretolook.viewpoints.table import POSE_COLUMNS, UNLABELLED, is_good, poses
 
 FORWARD = "forward"
 MOST_POSES = 5000
@@ -23,8 +25,20 @@ _FIX = """\
 Give the folder or path.csv of `wheretolook plan`, a scene's folder in results/paths of `wheretolook compare-paths`, a
 TUM trajectory (t x y z qx qy qz qw, camera-to-world), or a CSV of selected views."""
 
-Paths = dict[str, Float]
-"""cam_from_world (W, 3, 4) along a path, by the method that chose the views."""
+
+@dataclass(frozen=True, eq=False)
+class Played:
+    """The views of one method along a path."""
+
+    cam_from_world: Float  # (W, 3, 4)
+    localized: NDArray[np.bool_] | None = None  # (W,) whether each localized within 5 cm and 0.4 degrees, if tried
+
+    def __len__(self) -> int:
+        return len(self.cam_from_world)
+
+
+Paths = dict[str, Played]
+"""By the method that chose the views."""
 
 
 def read_paths(path: Path, pair: int = 0) -> Paths:
@@ -43,15 +57,15 @@ def read_paths(path: Path, pair: int = 0) -> Paths:
     if path.suffix == ".parquet":
         found = _compared(path, pair)
     elif path.suffix == ".csv":
-        found = {path.stem: _table(path)}
+        found = {_name(path): Played(_table(path))}
     else:
-        found = {path.stem: _trajectory(path)}
-    for along in found.values():
+        found = {_name(path): Played(_trajectory(path))}
+    for along in (played.cam_from_world for played in found.values()):
         if not 2 <= len(along) <= MOST_POSES or not np.isfinite(along).all():
             raise TableError(f"a path has 2 to {MOST_POSES} finite poses", path=path, value=len(along), fix=_FIX)
     if len(found) == 1:
-        name, along = next(iter(found.items()))
-        return {FORWARD: looking_ahead(camera_centers(along)), name: along}
+        name, told = next(iter(found.items()))
+        return {FORWARD: Played(looking_ahead(camera_centers(told.cam_from_world))), name: told}
     return found
 
 
@@ -69,11 +83,19 @@ def looking_ahead(positions: Float) -> Float:
     return poses_looking_along(positions, steps)
 
 
+def _name(path: Path) -> str:
+    """What a path is called: of a plan, "planned"."""
+    return "planned" if path.name == "path.csv" else path.stem
+
+
 def _compared(path: Path, pair: int) -> Paths:
     try:
         table = pd.read_parquet(path)
         table = table[(table["pair"] == pair) & (table["task"] == "planned")].sort_values("waypoint", kind="stable")
-        found = {str(name): poses(rows) for name, rows in table.groupby("method", sort=False)}
+        found = {}
+        for name, rows in table.groupby("method", sort=False):
+            tried = not (rows["status"] == UNLABELLED).any()
+            found[str(name)] = Played(poses(rows), is_good(rows) if tried else None)
     except (OSError, ValueError, KeyError) as error:
         raise TableError(f"no compared paths: {error}", path=path, fix=_FIX) from error
     if not found:

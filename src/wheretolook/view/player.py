@@ -17,6 +17,10 @@ from wheretolook.view.worker import SOON
 
 STEP_S = 0.25  # between two steps, at least
 
+LOCALIZED = ' <span style="color:#009E73">● localized</span>'
+LOST = ' <span style="color:#D55E00">● lost</span>'
+LIKELY_LOST = ' <span style="color:#D55E00">● likely lost</span>'
+
 
 class Player:
     """The cameras of all methods go from step to step together; one whose path is shorter waits at its end."""
@@ -27,7 +31,7 @@ class Player:
         self._reports: dict[tuple[str, str, str], ViewReport] = {}
         self._playing, self._shown = threading.Event(), threading.Event()
         for name, color in zip(self.paths, self._colors(), strict=False):
-            line = camera_centers(self.paths[name])
+            line = camera_centers(self.paths[name].cam_from_world)
             segments = np.stack([line[:-1], line[1:]], axis=1)
             session.scene.add_line_segments(f"/path/{name}", segments, color, thickness=4.0, thickness_units="screen")
         controls = session.controls
@@ -75,13 +79,13 @@ class Player:
         opened, state, camera = session.opened, session.state, session.opened.camera
         fov = 2 * np.arctan(camera.height / 2 / camera.mean_focal_px)
         look = session.shared.look(state.method, state.occlusion)
-        for (name, along), color in zip(self.paths.items(), self._colors(), strict=False):
+        for (name, played), color in zip(self.paths.items(), self._colors(), strict=False):
             key = (name, state.method, state.occlusion)
             if key not in self._reports:
-                self._reports[key] = look.scorer.report(along)
+                self._reports[key] = look.scorer.report(played.cam_from_world)
                 yield
-            report, at = self._reports[key], min(step, len(along) - 1)
-            pose: Float = along[at]
+            report, at = self._reports[key], min(step, len(played) - 1)
+            pose: Float = played.cam_from_world[at]
             seen = landmarks_seen(look.scorer, pose, session.shared.teller(state.occlusion))
             image, _ = picture_of(opened, pose, seen)
             session.scene.add_camera_frustum(
@@ -91,10 +95,11 @@ class Player:
                 cast_shadow=False, receive_shadow=False,
             )  # fmt: skip
             score = float(report.score[at])
-            lost = session.shared.is_probability(state.method) and score < state.threshold
             told = f"**{name}**: score {score:.3g}, {report.n_visible[at]:,} landmarks"
-            if lost:
-                told += ' <span style="color:#D55E00">● likely lost</span>'
+            if played.localized is not None:
+                told += LOCALIZED if played.localized[at] else LOST
+            elif session.shared.is_probability(state.method) and score < state.threshold:
+                told += LIKELY_LOST
             session.controls.path_told[name].content = told
             session.controls.path_pictures[name].image = image
             yield

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator
 from dataclasses import dataclass, field
 from math import ceil
 from typing import Any
@@ -32,7 +32,8 @@ class Floor:
     """Free places at one height, on a grid, and the best score at each as it comes in.
 
     `lower` (2,) and `cell_m` place the grid of `shape` (rows along y, columns along x); `cells` (K,) are flat indices
-    of the free cells, coarse ones first; `scores` (K,) and the best direction's `axes` (K, 3) are NaN until computed.
+    of the free cells, coarse ones first; `ground_m` is the height of the ground below, where it is known; `scores` (K,)
+    and the best direction's `axes` (K, 3) are NaN until computed.
     """
 
     height_m: float
@@ -40,6 +41,7 @@ class Floor:
     cell_m: float
     shape: tuple[int, int]
     cells: NDArray[np.int64]
+    ground_m: float | None = None
     scores: Float = field(init=False)
     axes: Float = field(init=False)
     n_scored: int = field(default=0, init=False)
@@ -99,7 +101,10 @@ def floor_at(space: Any, hides: Any, height_m: float) -> Floor:
     free[free] = ~hides.inside_geometry(floor.points[free])
     cells = np.flatnonzero(free)
     order = np.argsort(_level(cells, (rows, columns)), kind="stable")
-    return Floor(height_m, lower, cell, (rows, columns), cells[order])
+    ground = None
+    if len(cells) and hasattr(space, "floor_below"):
+        ground = float(np.median(space.floor_below(floor.points[cells])))
+    return Floor(height_m, lower, cell, (rows, columns), cells[order], ground)
 
 
 def _level(cells: NDArray[np.int64], shape: tuple[int, int]) -> NDArray[np.int64]:
@@ -189,8 +194,8 @@ class JudgedLabels:
 
 def judged_labels(
     scorer: Scorer, table: pd.DataFrame, limits: tuple[float, float], threshold: float
-) -> Iterator[JudgedLabels | None]:
-    """Score labelled viewpoints in blocks: None while it goes on, at last what came of it.
+) -> Generator[None, None, JudgedLabels]:
+    """Score labelled viewpoints, a block at each step. The generator returns what came of it.
 
     A view is good if it localized with errors below limits in metres and degrees.
     """
@@ -201,4 +206,4 @@ def judged_labels(
         scores[rows] = scorer.score(cam_from_world[rows])
         yield None
     positions = -(np.swapaxes(cam_from_world[..., :3], 1, 2) @ cam_from_world[..., 3:])[..., 0]
-    yield JudgedLabels(positions, cam_from_world[:, 2, :3], is_good(table, *limits), scores, threshold)
+    return JudgedLabels(positions, cam_from_world[:, 2, :3], is_good(table, *limits), scores, threshold)

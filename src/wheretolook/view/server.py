@@ -18,15 +18,16 @@ from wheretolook.view.shared import Shared
 from wheretolook.view.state import ViewState
 
 PORT, HOST = 8080, "127.0.0.1"
-EXTRA = "pip install 'wheretolook[view]'"
+EXTRAS = {"viser": "view", "rerun": "record"}
 
 _log = logging.getLogger(__name__)
 
 
 def require(package: str) -> None:
-    """Raise a ConfigError that tells how to install a package of the extra `view`, if it is missing."""
+    """Raise a ConfigError that tells how to install viser or rerun, if it is missing."""
     if find_spec(package) is None:
-        raise ConfigError(f"the viewer needs the package {package}", fix=f"{EXTRA}.")
+        fix = f"Install it: pip install 'wheretolook[{EXTRAS[package]}]'."
+        raise ConfigError(f"this needs the package {package}", fix=fix)
 
 
 def check_port(host: str, port: int) -> None:
@@ -144,10 +145,11 @@ class Viewer:
             session.close()
 
     def _clicked(self, session: Any, waypoints: Any, event: Any) -> None:
-        point = where_clicked(event.ray_origin, event.ray_direction, session.state.height)
+        point = where_clicked(event.ray_origin, event.ray_direction, session.scenery.drawn_m)
         low, high = np.asarray(self.shared.opened.space.bounds)
         if point is None or not ((point[:2] >= low[:2]) & (point[:2] <= high[:2])).all():
             return
+        point[2] = session.state.height
         if session.controls.placing.value:
             waypoints.add(point)
         else:

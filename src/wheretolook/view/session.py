@@ -15,8 +15,9 @@ from wheretolook.geometry.poses import Float, poses_looking_along, quaternion_fr
 from wheretolook.planning.turns import pan_tilt_angles
 from wheretolook.utils.errors import WhereToLookError
 from wheretolook.view import drawing
-from wheretolook.view.controls import HINT, LIMITS, build
-from wheretolook.view.scores import Place, judged_labels, landmarks_seen, look_around, report_of
+from wheretolook.view.controls import build
+from wheretolook.view.scenery import Scenery
+from wheretolook.view.scores import Place, landmarks_seen, look_around, report_of
 from wheretolook.view.seen import picture_of
 from wheretolook.view.shared import Shared
 from wheretolook.view.state import ViewState
@@ -27,11 +28,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-REDRAW_S = 0.4  # between two pictures of a floor that fills
-AT_ONCE = 2  # places of a floor between two looks at what is more urgent: one for each core
 SAME_DEG = 0.3  # the sliders say what is drawn already
-MOST_SHOWN = 400_000  # landmarks that are sent to a browser
-PIXELS = {"thickness_units": "screen"}
 PATH_COLORS = ((120, 120, 120), (213, 94, 0), (0, 114, 178), (0, 158, 115), (204, 121, 167))
 
 
@@ -49,11 +46,11 @@ class Session:
         self.state = replace(state, method=method, occlusion=occlusion, height=height)
         self.place: Place | None = None
         self.axis: Float | None = None
-        self.range = (0.0, 1.0)
         self.closed = False
         self._follows = 0.0  # when the browser's camera was last put somewhere by the program
         self._gizmo: Any = None
         self.controls = build(client.gui, shared, self.state)
+        self.scenery = Scenery(client.scene, shared, self.controls)
         self._connect()
         self.draw_scene()
         self.fill_floor()
@@ -105,7 +102,7 @@ class Session:
         self.on(c.through, self._look_through)
         for name in c.shown:
             self.on(c.shown[name], self.draw_scene)
-        self.on(c.limits, self._judge)
+        self.on(c.limits, self.judge)
         self.on(c.dark, lambda: self.theme(bool(c.dark.value)))
         self.client.camera.on_update(lambda _: self.safely(self._camera_moved))
 
@@ -119,7 +116,7 @@ class Session:
         self.fill_floor()
         if self.place is not None:
             self.go_to(self.place.position, self._angles())
-        self._judge()
+        self.judge()
 
     def _chosen_n(self) -> None:
         self.state = replace(self.state, n=int(self.controls.n.value))
@@ -133,7 +130,7 @@ class Session:
         self.state = replace(before, height=float(c.height.value), threshold=float(c.threshold.value))
         self.fill_floor()
         if before.threshold != self.state.threshold:
-            self._judge()
+            self.judge()
 
     def _cut(self) -> None:
         self.state = replace(self.state, cut=float(self.controls.cut.value))
@@ -175,112 +172,23 @@ class Session:
 
     def draw_scene(self) -> None:
         """Mesh, landmarks and mapping cameras, cut open."""
-        shown, cut, opened = self.controls.shown, self.state.cut, self.opened
-        if shown["mesh"].value and (mesh := self.shared.mesh(cut)) is not None:
-            self.scene.add_glb("/mesh", mesh, cast_shadow=False, receive_shadow=False)
-        else:
-            self.scene.remove_by_name("/mesh")
-        points = opened.landmarks.points
-        rows = np.arange(len(points)) if cut is None else np.flatnonzero(points[:, 2] <= cut)
-        rows = rows[:: max(1, -(-len(rows) // MOST_SHOWN))]
-        self._landmarks(points[rows] if shown["landmarks"].value else points[:0])
-        if shown["cameras"].value and opened.mapping_poses is not None:
-            edges = drawing.frusta(opened.camera, opened.mapping_poses, self.shared.mark_m)
-            self.scene.add_line_segments("/cameras", edges, (86, 180, 233), thickness=1.2, thickness_units="screen")
-        else:
-            self.scene.remove_by_name("/cameras")
-        if (floor := self.scene.get_handle_by_name("/floor")) is not None:
-            floor.visible = bool(shown["floor"].value)
-        self._judge()
-
-    def _landmarks(self, points: Float) -> None:
-        if len(points) == 0:
-            self.scene.remove_by_name("/landmarks")
-            return
-        center = points.mean(0)  # offsets in half precision would be coarse far from the origin
-        self.scene.add_point_cloud(
-            "/landmarks", (points - center).astype(np.float32), (150, 150, 155), point_size=0.0018 * self.shared.size_m,
-            point_shape="circle", precision="float32", position=center, point_shading="flat",
-        )  # fmt: skip
-
-    def _visible(self, on: bool) -> None:
-        """Show or hide what would stand in the way of one who looks from the place itself."""
-        for name in ("/sphere", "/view", "/views", "/turn", "/seen", "/told"):
-            if (handle := self.scene.get_handle_by_name(name)) is not None:
-                handle.visible = on
+        self.scenery.draw(self.state)
+        self.judge()
 
     def fill_floor(self) -> None:
         """Colour the floor, as its scores come in."""
-        self.submit("floor", LATER, self._floor())
+        self.submit("floor", LATER, self.scenery.fill(self.state))
         self.tell_state()
 
-    def _floor(self) -> Iterator[None]:
-        state = self.state
-        assert state.height is not None
-        self.controls.status.content = f"Scoring by **{state.method}** ..."
-        floor, look = self.shared.floor(state.method, state.occlusion, state.height)
-        if len(floor.cells) == 0:
-            self.scene.remove_by_name("/floor")
-            self.controls.status.content = f"No camera can be at {state.height:.2f} m. Try another height."
-            return
-        yield
-        drawn = 0.0
-        while not floor.done:
-            floor.score_next(look, AT_ONCE)
-            if floor.n_scored >= floor.n_first and time.monotonic() - drawn > REDRAW_S:
-                self._draw_floor(floor, state)
-                drawn = time.monotonic()
-            yield
-        self._draw_floor(floor, state)
+    def judge(self) -> None:
+        """Show the labels, and where the prediction was wrong."""
+        self.submit("labels", SOON, self.scenery.judge(self.state))
 
-    def _draw_floor(self, floor: Any, state: ViewState) -> None:
-        raster = floor.raster()
-        probable = self.shared.is_probability(state.method)
-        known = raster[np.isfinite(raster)]
-        span = (0.0, 1.0) if probable else (float(known.min()), float(known.max()))
-        if span != self.range:
-            self.range = span
-            self.controls.legend.content = drawing.legend(*span, "score")
-        threshold = self.state.threshold if probable else None
-        image = drawing.floor_image(raster, *span, threshold)
-        rows, columns = floor.shape
-        center = (*(floor.lower + np.array([columns, rows]) * floor.cell_m / 2), floor.height_m)
-        if self.closed:
-            return
-        size = {"render_width": columns * floor.cell_m, "render_height": rows * floor.cell_m}
-        self.scene.add_image(
-            "/floor", image, **size, format="png", cast_shadow=False, receive_shadow=False, position=center,
-            visible=bool(self.controls.shown["floor"].value),
-        )  # fmt: skip
-        done = floor.scores[: floor.n_scored]
-        told = f"**{state.method}**: {floor.n_scored:,} of {len(floor.cells):,} places"
-        if probable:
-            told += f", good at {100 * np.mean(done >= state.threshold):.0f} %"
-        self.controls.status.content = told
-
-    def _judge(self) -> None:
-        if self.opened.labels is None or not self.controls.shown["labels"].value:
-            self.scene.remove_by_name("/labels")
-            self.controls.judged.content = ""
-            return
-        self.submit("labels", SOON, self._labels())
-
-    def _labels(self) -> Iterator[None]:
-        state, table = self.state, self.opened.labels
-        assert table is not None
-        scorer, told = self.shared.look(state.method, state.occlusion).scorer, None
-        for told in judged_labels(scorer, table, LIMITS[self.controls.limits.value], state.threshold):
-            yield
-        assert told is not None
-        colors = np.where(told.good[:, None], drawing.GOOD, drawing.BAD)
-        text = f"{len(told.good):,} labelled views, {100 * told.good.mean():.0f} % localize."
-        if self.shared.is_probability(state.method):
-            colors[told.promised], colors[told.missed] = drawing.PROMISED, drawing.MISSED
-            text += f" Wrong at {state.threshold:.2f}: {told.promised.sum()} promised and lost (orange), "
-            text += f"{told.missed.sum()} localized unexpectedly (blue)."
-        segments = drawing.label_arrows(told.positions, told.axes, colors, self.shared.mark_m)
-        self.scene.add_line_segments("/labels", *segments, thickness=2.0, thickness_units="screen")
-        self.controls.judged.content = text
+    def _visible(self, on: bool) -> None:
+        """Show or hide what would stand in the way of one who looks from the place itself."""
+        for name in ("/sphere", "/view", "/views", "/turn", "/seen"):
+            if (handle := self.scene.get_handle_by_name(name)) is not None:
+                handle.visible = on
 
     # -- a place -------------------------------------------------------------------------------------------------------
 
@@ -296,7 +204,7 @@ class Session:
         place = look_around(look, position, self.state.n)
         self.place = place
         self.state = replace(self.state, place=(float(position[0]), float(position[1]), float(position[2])))
-        low, high = self.range if self.shared.is_probability(self.state.method) else (0.0, 0.0)
+        low, high = self.scenery.range if self.shared.is_probability(self.state.method) else (0.0, 0.0)
         if low == high:
             low, high = float(place.scores.min()), float(place.scores.max())
         mark = self.shared.mark_m
@@ -315,9 +223,14 @@ class Session:
     def _turning(self, position: Float) -> None:
         """Rings that turn the camera by hand."""
         self._gizmo = self.scene.add_transform_controls(
-            "/turn", 3.0 * self.shared.mark_m, disable_axes=True, disable_sliders=True, position=position, opacity=0.6,
+            "/turn",
+            3.0 * self.shared.mark_m,
+            disable_axes=True,
+            disable_sliders=True,
+            position=position,
+            depth_test=False,
             line_width=1.5,
-        )  # fmt: skip
+        )
         self._gizmo.on_update(lambda _: self.safely(self._dragged))
 
     def _dragged(self) -> None:
@@ -348,14 +261,23 @@ class Session:
         c.picture_told.content = told
         pose = poses_looking_along(position, axis)
         wxyz = quaternion_from_rotation(pose[:, :3].T)
-        color = tuple(drawing.score_colors(np.array(score), *self.range).tolist())
         camera = self.opened.camera
         fov = 2 * np.arctan(camera.height / 2 / camera.mean_focal_px)
         visible = not c.through.value
         self.scene.add_camera_frustum(
-            "/view", fov, camera.width / camera.height, scale=3.0 * mark, color=color, wxyz=wxyz, position=position,
-            thickness=3.5, thickness_units="screen", visible=visible, cast_shadow=False, receive_shadow=False,
-        )  # fmt: skip
+            "/view",
+            fov,
+            camera.width / camera.height,
+            scale=3.0 * mark,
+            color=drawing.PROMISED,
+            wxyz=wxyz,
+            position=position,
+            thickness=4,
+            thickness_units="screen",
+            visible=visible,
+            cast_shadow=False,
+            receive_shadow=False,
+        )
         self.client.flush()
         if not by_hand and self._gizmo is not None:
             self._gizmo.wxyz = wxyz
@@ -367,10 +289,16 @@ class Session:
         if len(seen.points):
             center = seen.points.mean(0)
             self.scene.add_point_cloud(
-                "/seen", (seen.points - center).astype(np.float32), drawing.score_colors(seen.chances),
-                point_size=0.0045 * self.shared.size_m, point_shape="circle", precision="float32", position=center,
-                point_shading="flat", visible=visible,
-            )  # fmt: skip
+                "/seen",
+                (seen.points - center).astype(np.float32),
+                drawing.score_colors(seen.chances),
+                point_size=0.0045 * self.shared.size_m,
+                point_shape="circle",
+                precision="float32",
+                position=center,
+                point_shading="flat",
+                visible=visible,
+            )
         else:
             self.scene.remove_by_name("/seen")
         yield
@@ -402,6 +330,3 @@ def _told(place: Place, state: ViewState) -> str:
 def _once(then: Callable[[], None]) -> Iterator[None]:
     then()
     yield
-
-
-__all__ = ["HINT", "Session"]

@@ -21,9 +21,10 @@ from wheretolook.geometry.poses import camera_centers, poses_looking_along
 from wheretolook.select.where_to_look import WhereToLook
 from wheretolook.utils.errors import ConfigError, InUseError, TableError
 from wheretolook.view import drawing
+from wheretolook.view.checks import check_port
 from wheretolook.view.opened import open_map
 from wheretolook.view.played import FORWARD, looking_ahead, read_paths
-from wheretolook.view.server import Viewer, check_port, where_clicked
+from wheretolook.view.server import Viewer, where_clicked
 from wheretolook.view.shared import Shared
 from wheretolook.view.state import ViewState
 from wheretolook.view.waypoints import views_file

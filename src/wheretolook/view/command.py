@@ -65,6 +65,9 @@ def parser() -> argparse.ArgumentParser:
     add("--state", default="", metavar="TEXT", help="what to show at first, from the page's field `state`")
     add("--dark", action="store_true", help="dark at first")
     add("--record", type=Path, metavar="FILE", help="instead of a page: a Rerun recording, FILE.rrd")
+    add(
+        "--film", type=Path, metavar="FILE", help="instead of a page: the path, method beside method, FILE.webp or .gif"
+    )
     add("--device", default="auto", metavar="NAME", help="auto, cpu, cuda, cuda:1 (auto)")
     return made
 
@@ -75,13 +78,14 @@ def run(arguments: Sequence[str]) -> int:
     _refuse(options)
     from dataclasses import replace
 
-    from wheretolook.view.played import read_paths
-    from wheretolook.view.shared import Shared
     from wheretolook.view.state import ViewState
 
     state = ViewState.parse(options.state)
     if options.method:
         state = replace(state, method=options.method)
+    from wheretolook.view.played import read_paths
+    from wheretolook.view.shared import Shared
+
     paths = None if options.path is None else read_paths(options.path, options.pair)
     opened = _open(options)
     if state.method and state.method not in opened.methods:
@@ -93,6 +97,12 @@ def run(arguments: Sequence[str]) -> int:
 
         record(Shared(opened, paths), options.record, state)
         print(f"{told}, in {time.monotonic() - start:.0f} s: {options.record}")
+        return 0
+    if options.film is not None:
+        from wheretolook.view.film import film
+
+        n_frames = film(Shared(opened, paths), options.film, state)
+        print(f"{told}, {n_frames} pictures in {time.monotonic() - start:.0f} s: {options.film}")
         return 0
     from wheretolook.view.server import Viewer
 
@@ -110,7 +120,7 @@ def run(arguments: Sequence[str]) -> int:
 
 def _refuse(options: argparse.Namespace) -> None:
     """Whatever can be refused before anything is read."""
-    from wheretolook.view.server import check_port, require
+    from wheretolook.view.checks import check_port, require
 
     if (options.map is None) == (options.scene is None):
         raise ConfigError("what is looked at is given by --scene or by --map", fix="Give one of them.")
@@ -121,10 +131,17 @@ def _refuse(options: argparse.Namespace) -> None:
         raise ConfigError("a camera is described in two ways", value=options.camera, fix="Give one of them.")
     if options.images is not None and not options.images.is_dir():
         raise ConfigError("there is no such folder of photographs", path=options.images, fix="Correct the path.")
+    if options.record is not None and options.film is not None:
+        raise ConfigError("a recording and a film are made one at a time", value=str(options.film), fix="Give one.")
     if options.record is not None:
         require("rerun")
         if options.record.suffix != ".rrd":
             raise ConfigError("a Rerun recording is a .rrd", path=options.record, fix="Name it so.")
+    elif options.film is not None:
+        if options.film.suffix not in (".webp", ".gif"):
+            raise ConfigError("this film is a .webp or a .gif", path=options.film, fix="Name it so.")
+        if options.path is None or (options.map is not None and options.mesh is None):
+            raise ConfigError("a film needs a path, and a mesh to render", path=options.film, fix="Give --path.")
     else:
         require("viser")
         check_port(options.host, options.port)

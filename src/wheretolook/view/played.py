@@ -16,10 +16,11 @@ from wheretolook.geometry.poses import (
     poses_looking_along,
     rotation_from_quaternion,
 )
+from wheretolook.planning.config import FORWARD, PathsConfig
 from wheretolook.utils.errors import TableError
 from wheretolook.viewpoints.table import POSE_COLUMNS, UNLABELLED, is_good, poses
 
-FORWARD = "forward"
+COMPARED = PathsConfig()  # its limits of errors, by which a view of a path counts as localized
 MOST_POSES = 5000
 _FIX = """\
 Give the folder or path.csv of `wheretolook plan`, a scene's folder in results/paths of `wheretolook compare-paths`, a
@@ -31,7 +32,7 @@ class Played:
     """The views of one method along a path."""
 
     cam_from_world: Float  # (W, 3, 4)
-    localized: NDArray[np.bool_] | None = None  # (W,) whether each localized within 5 cm and 0.4 degrees, if tried
+    localized: NDArray[np.bool_] | None = None  # (W,) whether each localized, as compared paths count it, if tried
 
     def __len__(self) -> int:
         return len(self.cam_from_world)
@@ -95,7 +96,9 @@ def _compared(path: Path, pair: int) -> Paths:
         found = {}
         for name, rows in table.groupby("method", sort=False):
             tried = not (rows["status"] == UNLABELLED).any()
-            found[str(name)] = Played(poses(rows), is_good(rows) if tried else None)
+            found[str(name)] = Played(
+                poses(rows), is_good(rows, COMPARED.max_error_m, COMPARED.max_error_deg) if tried else None
+            )
     except (OSError, ValueError, KeyError) as error:
         raise TableError(f"no compared paths: {error}", path=path, fix=_FIX) from error
     if not found:

@@ -42,6 +42,11 @@ def score_colors(values: Float, low: float = 0.0, high: float = 1.0) -> Rgb:
     return colors
 
 
+def linear_light(colors: Any) -> Rgb:
+    """Colours (..., 3) as a browser's 3D graphics takes them at vertices: of sRGB it would make paler ones."""
+    return (255 * (np.asarray(colors) / 255.0) ** 2.2).round().astype(np.uint8)
+
+
 def legend(low: float, high: float, unit: str) -> str:
     """The scale of colours, as HTML."""
     stops = ",".join("rgb({},{},{})".format(*_colors()[k]) for k in range(0, 256, 15))
@@ -74,11 +79,10 @@ def sphere_glb(directions: Float, scores: Float, low: float, high: float, radius
     a, b, c = np.moveaxis(directions[triangles], 1, 0)
     inward = (np.cross(b - a, c - a) * a).sum(1) < 0
     triangles[inward] = triangles[inward][:, ::-1]
-    light = (score_colors(scores, low, high) / 255.0) ** 2.2  # glTF has linear light in vertices
     mesh = TexturedMesh(
         (directions * radius_m).astype(np.float32), triangles.astype(np.int32),
         np.zeros((len(triangles), 3, 2), np.float32), np.zeros(len(triangles), np.int32),
-        (np.full((4, 4, 3), 255, np.uint8),), (light * 255).round().astype(np.uint8),
+        (np.full((4, 4, 3), 255, np.uint8),), linear_light(score_colors(scores, low, high)),
     )  # fmt: skip
     return glb_bytes(mesh)
 
@@ -136,7 +140,7 @@ def small_camera(camera: Camera) -> Camera:
 def label_arrows(positions: Float, axes: Float, colors: Any, length_m: float) -> tuple[Float, Rgb]:
     """Line segments (B, 2, 3) from places along axes, and their colours (B, 2, 3)."""
     segments = np.stack([positions, positions + length_m * axes], axis=1)
-    return segments, np.repeat(np.asarray(colors, dtype=np.uint8)[:, None], 2, axis=1)
+    return segments, np.repeat(linear_light(colors)[:, None], 2, axis=1)
 
 
 def size_of(points: Float) -> float:

@@ -77,7 +77,6 @@ class Player:
     def _steps(self, step: int) -> Iterator[None]:
         session = self.session
         opened, state, camera = session.opened, session.state, session.opened.camera
-        fov = 2 * np.arctan(camera.height / 2 / camera.mean_focal_px)
         look = session.shared.look(state.method, state.occlusion)
         for (name, played), color in zip(self.paths.items(), self._colors(), strict=False):
             key = (name, state.method, state.occlusion)
@@ -89,11 +88,19 @@ class Player:
             seen = landmarks_seen(look.scorer, pose, session.shared.teller(state.occlusion))
             image, _ = picture_of(opened, pose, seen)
             session.scene.add_camera_frustum(
-                f"/path/{name}/camera", fov, camera.width / camera.height, scale=2.0 * session.shared.mark_m,
-                color=color, image=image, wxyz=quaternion_from_rotation(pose[:, :3].T),
-                position=camera_centers(pose), thickness=3.0, thickness_units="screen",
-                cast_shadow=False, receive_shadow=False,
-            )  # fmt: skip
+                f"/path/{name}/camera",
+                session.fov,
+                camera.width / camera.height,
+                scale=2.0 * session.shared.mark_m,
+                color=color,
+                image=image,
+                wxyz=quaternion_from_rotation(pose[:, :3].T),
+                position=camera_centers(pose),
+                thickness=3.0,
+                thickness_units="screen",
+                cast_shadow=False,
+                receive_shadow=False,
+            )
             score = float(report.score[at])
             told = f"**{name}**: score {score:.3g}, {report.n_visible[at]:,} landmarks"
             if played.localized is not None:

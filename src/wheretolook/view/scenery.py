@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 REDRAW_S = 0.4  # between two pictures of a floor that fills
 AT_ONCE = 2  # places of a floor between two looks at what is more urgent: one for each core
 ABOVE_GROUND_M = 0.03  # a floor is drawn over carpets
+READ_S = 1.5  # until a browser has read a mesh
 MOST_SHOWN = 400_000  # landmarks that are sent to a browser
 
 
@@ -33,25 +35,45 @@ class Scenery:
         self.scene, self.shared, self.controls = scene, shared, controls
         self.range, self.drawn_m = (0.0, 1.0), shared.usual_m
         self._floor: Floor | None = None
+        self._mesh: bytes | None = None
+        self._mesh_name = ""
 
-    def draw(self, state: ViewState) -> None:
-        """Draw mesh, landmarks and mapping cameras, as far as they are to be seen."""
-        shown, cut, opened = self.controls.shown, state.cut, self.shared.opened
-        if shown["mesh"].value and (mesh := self.shared.mesh(cut)) is not None:
-            self.scene.add_glb("/mesh", mesh, cast_shadow=False, receive_shadow=False)
-        else:
-            self.scene.remove_by_name("/mesh")
+    def draw(self, state: ViewState, inside: bool = False) -> None:
+        """Draw mesh, landmarks and mapping cameras, as far as they are to be seen; the mesh whole and nothing else for
+        one who stands inside."""
+        shown, cut, opened = self.controls.shown, None if inside else state.cut, self.shared.opened
+        self._draw_mesh(self.shared.mesh(cut) if shown["mesh"].value else None)
         points = opened.landmarks.points
         rows = np.arange(len(points)) if cut is None else np.flatnonzero(points[:, 2] <= cut)
         rows = rows[:: max(1, -(-len(rows) // MOST_SHOWN))]
         self._landmarks(points[rows] if shown["landmarks"].value else points[:0])
-        if shown["cameras"].value and opened.mapping_poses is not None:
+        if shown["cameras"].value and opened.mapping_poses is not None and not inside:
             edges = drawing.frusta(opened.camera, opened.mapping_poses, self.shared.mark_m)
             self.scene.add_line_segments("/cameras", edges, (86, 180, 233), thickness=1.2, thickness_units="screen")
         else:
             self.scene.remove_by_name("/cameras")
-        if (floor := self.scene.get_handle_by_name("/floor")) is not None:
-            floor.visible = bool(shown["floor"].value)
+        for name in ("/floor", "/labels"):
+            if (handle := self.scene.get_handle_by_name(name)) is not None:
+                handle.visible = bool(shown[name[1:]].value) and not inside
+
+    def _draw_mesh(self, mesh: bytes | None) -> None:
+        """Put a mesh in place of the one that is drawn, which stays until the browser has read the new one."""
+        if mesh is self._mesh:
+            return
+        old, self._mesh = self._mesh_name, mesh
+        if mesh is not None:
+            self._mesh_name = "/mesh/a" if old != "/mesh/a" else "/mesh/b"
+            self.scene.add_glb(self._mesh_name, mesh, cast_shadow=False, receive_shadow=False)
+        else:
+            self._mesh_name = ""
+        if old:
+            later = threading.Timer(READ_S if mesh is not None else 0.0, self._remove, (old,))
+            later.daemon = True
+            later.start()
+
+    def _remove(self, name: str) -> None:
+        if name != self._mesh_name:
+            self.scene.remove_by_name(name)
 
     def _landmarks(self, points: Float) -> None:
         if len(points) == 0:

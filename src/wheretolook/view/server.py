@@ -72,8 +72,9 @@ class Viewer:
         camera.far = max(1000.0, 20 * shared.size_m)
         camera.near = min(0.01, shared.size_m / 1000)
         camera.fov = np.radians(50)
+        middle = middle + 0.07 * shared.size_m * np.array([0.82, -0.57, 0.0])  # the panel is on the right
         camera.look_at = self.state.target or tuple(middle)
-        camera.position = self.state.eye or tuple(middle + shared.size_m * np.array([-0.45, -0.65, 0.85]))
+        camera.position = self.state.eye or tuple(middle + shared.size_m * np.array([-0.5, -0.72, 0.95]))
 
     def _joined(self, client: Any) -> None:
         """Whoever joins gets a session; if theirs fails, others do not notice."""

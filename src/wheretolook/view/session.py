@@ -28,6 +28,9 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
+IN_THE_WAY = ("/sphere", "/view", "/views", "/turn", "/seen")
+"""What stands in the way of one who looks from the place itself."""
+
 SAME_DEG = 0.3  # the sliders say what is drawn already
 PATH_COLORS = ((120, 120, 120), (213, 94, 0), (0, 114, 178), (0, 158, 115), (204, 121, 167))
 
@@ -49,6 +52,7 @@ class Session:
         self.closed = False
         self._follows = 0.0  # when the browser's camera was last put somewhere by the program
         self._gizmo: Any = None
+        self._outside: Any = None  # where the scene was seen from before one stood in it
         self.controls = build(client.gui, shared, self.state)
         self.scenery = Scenery(client.scene, shared, self.controls)
         self._connect()
@@ -145,19 +149,31 @@ class Session:
         return None if self.axis is None else (float(self.controls.yaw.value), float(self.controls.pitch.value))
 
     def _look_through(self) -> None:
+        """Stand at the place with the camera's field of view, or look from outside again."""
+        through, camera = bool(self.controls.through.value), self.client.camera
         if self.place is None or self.axis is None:
             self.controls.through.value = False
-        elif self.controls.through.value:
-            self._follows, camera = time.monotonic(), self.client.camera
-            with self.client.atomic():
+            return
+        self._follows = time.monotonic()
+        with self.client.atomic():
+            if through:
+                self._outside = camera.position, camera.look_at, camera.fov
+                camera.fov = self.fov
                 camera.position = self.place.position
                 camera.look_at = self.place.position + 0.05 * self.axis
-            self._visible(False)
-        else:
-            self._visible(True)
-            camera = self.client.camera
-            camera.position = self.place.position + self.shared.mark_m * np.array([-8.0, -8.0, 9.0])
-            camera.look_at = self.place.position
+            elif self._outside is not None:
+                camera.fov = self._outside[2]
+                camera.position, camera.look_at = self._outside[:2]
+        for name in IN_THE_WAY:
+            if (handle := self.scene.get_handle_by_name(name)) is not None:
+                handle.visible = not through
+        self.submit("scene", SOON, _once(self.draw_scene))
+
+    @property
+    def fov(self) -> float:
+        """The camera's field of view from top to bottom, radians; of one with distortion, about."""
+        camera = self.opened.camera
+        return 2 * float(np.arctan(camera.height / 2 / camera.mean_focal_px))
 
     def _camera_moved(self) -> None:
         camera = self.client.camera
@@ -172,8 +188,10 @@ class Session:
 
     def draw_scene(self) -> None:
         """Mesh, landmarks and mapping cameras, cut open."""
-        self.scenery.draw(self.state)
-        self.judge()
+        inside = bool(self.controls.through.value)
+        self.scenery.draw(self.state, inside)
+        if not inside:
+            self.judge()
 
     def fill_floor(self) -> None:
         """Colour the floor, as its scores come in."""
@@ -183,12 +201,6 @@ class Session:
     def judge(self) -> None:
         """Show the labels, and where the prediction was wrong."""
         self.submit("labels", SOON, self.scenery.judge(self.state))
-
-    def _visible(self, on: bool) -> None:
-        """Show or hide what would stand in the way of one who looks from the place itself."""
-        for name in ("/sphere", "/view", "/views", "/turn", "/seen"):
-            if (handle := self.scene.get_handle_by_name(name)) is not None:
-                handle.visible = on
 
     # -- a place -------------------------------------------------------------------------------------------------------
 
@@ -211,7 +223,7 @@ class Session:
         glb = drawing.sphere_glb(place.directions, place.scores, low, high, mark)
         self.scene.add_glb("/sphere", glb, position=position, cast_shadow=False, receive_shadow=False)
         edges = drawing.frusta(self.opened.camera, place.best.cam_from_world, 2.2 * mark)
-        colors = np.repeat(drawing.score_colors(place.best.score, low, high), 8, axis=0)
+        colors = np.repeat(drawing.linear_light(drawing.score_colors(place.best.score, low, high)), 8, axis=0)
         self.scene.add_line_segments(
             "/views", edges, np.repeat(colors[:, None], 2, axis=1), thickness=2.0, thickness_units="screen"
         )
@@ -262,11 +274,10 @@ class Session:
         pose = poses_looking_along(position, axis)
         wxyz = quaternion_from_rotation(pose[:, :3].T)
         camera = self.opened.camera
-        fov = 2 * np.arctan(camera.height / 2 / camera.mean_focal_px)
         visible = not c.through.value
         self.scene.add_camera_frustum(
             "/view",
-            fov,
+            self.fov,
             camera.width / camera.height,
             scale=3.0 * mark,
             color=drawing.PROMISED,
@@ -292,7 +303,7 @@ class Session:
                 "/seen",
                 (seen.points - center).astype(np.float32),
                 drawing.score_colors(seen.chances),
-                point_size=0.0045 * self.shared.size_m,
+                point_size=0.0032 * self.shared.size_m,
                 point_shape="circle",
                 precision="float32",
                 position=center,

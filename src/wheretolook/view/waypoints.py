@@ -67,9 +67,15 @@ class WaypointList:
             return
         at = np.array(self.points)
         scene.add_point_cloud(
-            "/waypoints", (at - at[0]).astype(np.float32), COLOR, point_size=0.35 * size, point_shape="circle",
-            precision="float32", position=at[0], point_shading="flat",
-        )  # fmt: skip
+            "/waypoints",
+            (at - at[0]).astype(np.float32),
+            COLOR,
+            point_size=0.35 * size,
+            point_shape="circle",
+            precision="float32",
+            position=at[0],
+            point_shading="flat",
+        )
 
     def _save(self) -> None:
         if not self.points:

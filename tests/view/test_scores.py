@@ -118,7 +118,7 @@ def test_labels_are_compared_with_the_scorer(room: Opened) -> None:
 def test_methods_are_those_that_can_score_here_the_best_first(room: Opened) -> None:
     assert room.methods[0] == "set" and {"visible", "bins", "mlp-2d+z", "forward"} <= {*room.methods}
     assert "random" not in room.methods and room.occlusions == ("hidden-points", "none")
-    with pytest.raises(ConfigError, match="no such method"):
+    with pytest.raises(ConfigError, match="unknown method"):
         room.look("nonsense")
     with pytest.raises(ConfigError, match="no such occlusion"):
         room.look("set", "mesh")

@@ -133,11 +133,8 @@ class Opened:
         key = (method, occlusion, directions)
         if key not in self._looks:
             around, weights = self.map_of(occlusion), weights_of(method, self.weights)
-            named = method if method in self.methods else ""
-            if not named:
-                raise ConfigError("there is no such method here", value=method, fix=f"Use {', '.join(self.methods)}.")
             is_first = method == self.methods[0] and weights is not None
-            scorer = load_scorer(weights, around) if is_first else make_scorer(named, around, weights=weights)
+            scorer = load_scorer(weights, around) if is_first else make_scorer(method, around, weights=weights)
             self._looks[key] = WhereToLook(scorer, direction_lattice(directions), self.space)
         return self._looks[key]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -119,7 +120,8 @@ def _table(path: Path) -> Float:
 
 def _trajectory(path: Path) -> Float:
     try:
-        rows = np.loadtxt(path, comments="#", ndmin=2)
+        with warnings.catch_warnings(action="ignore"):  # of an empty file, which has no eight columns
+            rows = np.loadtxt(path, comments="#", ndmin=2)
     except (OSError, ValueError) as error:
         raise TableError(f"no trajectory: {error}", path=path, fix=_FIX) from error
     if rows.ndim != 2 or rows.shape[1] != 8:

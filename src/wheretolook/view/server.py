@@ -6,6 +6,7 @@ import contextlib
 import io
 import logging
 import threading
+import warnings
 from dataclasses import replace
 from typing import Any
 
@@ -155,6 +156,8 @@ def _server(host: str, port: int, label: str) -> Any:
         def request_share_url(self, verbose: bool = True) -> str | None:
             return None
 
+    # a client may leave while something is drawn for it
+    warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
     logging.getLogger("websockets.server").addFilter(_one_line)
     with contextlib.redirect_stdout(io.StringIO()):
         made = Server(host, port, label=label, verbose=False)

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from wheretolook.space.free_space import FreeSpace
     from wheretolook.view.photographs import Photographs
 
+MOST_SCORERS = 8  # that are kept: those of large maps take a hundred megabytes each
 DIRECTIONS = 500
 """Directions around a clicked place, as `wheretolook select` looks along."""
 
@@ -136,6 +137,9 @@ class Opened:
             is_first = method == self.methods[0] and weights is not None
             scorer = load_scorer(weights, around) if is_first else make_scorer(method, around, weights=weights)
             self._looks[key] = WhereToLook(scorer, direction_lattice(directions), self.space)
+            if len(self._looks) > MOST_SCORERS:
+                del self._looks[next(iter(self._looks))]  # the one that was asked for longest ago
+        self._looks[key] = self._looks.pop(key)
         return self._looks[key]
 
     def _occlusion(self, name: str) -> OcclusionModel:

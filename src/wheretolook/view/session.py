@@ -6,6 +6,7 @@ import logging
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,7 +14,7 @@ import numpy as np
 from wheretolook.geometry.lattices import axes_of_angles
 from wheretolook.geometry.poses import Float, poses_looking_along, quaternion_from_rotation, rotation_from_quaternion
 from wheretolook.planning.turns import pan_tilt_angles
-from wheretolook.utils.errors import WhereToLookError
+from wheretolook.utils.errors import ConfigError, TableError, WhereToLookError
 from wheretolook.view import drawing
 from wheretolook.view.controls import build
 from wheretolook.view.scenery import Scenery
@@ -49,7 +50,7 @@ class Session:
         self.state = replace(state, method=method, occlusion=occlusion, height=height)
         self.place: Place | None = None
         self.axis: Float | None = None
-        self.closed = False
+        self.closed, self._lock = False, Lock()
         self._follows = 0.0  # when the browser's camera was last put somewhere by the program
         self._gizmo: Any = None
         self._outside: Any = None  # where the scene was seen from before one stood in it
@@ -87,6 +88,11 @@ class Session:
         self.client.add_notification("That did not work", body, color="red", auto_close_seconds=15)
         self.controls.told.content = body if self.place is None else self.controls.told.content
 
+    def note(self, **changes: Any) -> None:
+        """Change the state; callbacks come in several threads."""
+        with self._lock:
+            self.state = replace(self.state, **changes)
+
     def submit(self, kind: str, urgency: int, steps: Iterator[object]) -> None:
         """Compute something for this client, in place of what of that kind is still to be done."""
         if not self.closed:
@@ -116,14 +122,14 @@ class Session:
 
     def _chosen(self) -> None:
         c = self.controls
-        self.state = replace(self.state, method=c.method.value, occlusion=c.occlusion.value)
+        self.note(method=c.method.value, occlusion=c.occlusion.value)
         self.fill_floor()
         if self.place is not None:
             self.go_to(self.place.position, self._angles())
         self.judge()
 
     def _chosen_n(self) -> None:
-        self.state = replace(self.state, n=int(self.controls.n.value))
+        self.note(n=int(self.controls.n.value))
         self.controls.view.max = max(2, self.state.n)
         if self.place is not None:
             self.go_to(self.place.position, self._angles())
@@ -131,13 +137,13 @@ class Session:
     def _slid(self) -> None:
         c = self.controls
         before = self.state
-        self.state = replace(before, height=float(c.height.value), threshold=float(c.threshold.value))
+        self.note(height=float(c.height.value), threshold=float(c.threshold.value))
         self.fill_floor()
         if before.threshold != self.state.threshold:
             self.judge()
 
     def _cut(self) -> None:
-        self.state = replace(self.state, cut=float(self.controls.cut.value))
+        self.note(cut=float(self.controls.cut.value))
         self.submit("scene", SOON, _once(self.draw_scene))
 
     def _turned(self) -> None:
@@ -179,8 +185,8 @@ class Session:
         camera = self.client.camera
         point = tuple(float(x) for x in camera.position), tuple(float(x) for x in camera.look_at)
         if np.isfinite(point).all():
-            self.state = replace(self.state, eye=point[0], target=point[1])  # type: ignore[arg-type]
-            self.tell_state()
+            self.note(eye=point[0], target=point[1])
+            self.submit("state", LATER, _once(self.tell_state))
         if self.controls.through.value and time.monotonic() - self._follows > 0.3:
             self.turn_to(rotation_from_quaternion(camera.wxyz)[:, 2])
 
@@ -213,9 +219,13 @@ class Session:
             self.controls.told.content = "Scoring all directions ..."
         look = self.shared.look(self.state.method, self.state.occlusion)
         yield
-        place = look_around(look, position, self.state.n)
+        try:
+            place = look_around(look, position, self.state.n)
+        except TableError as error:
+            problem = "no camera can be there: it is outside the map or inside geometry"
+            raise ConfigError(problem, value=tuple(np.round(position, 2).tolist())) from error
         self.place = place
-        self.state = replace(self.state, place=(float(position[0]), float(position[1]), float(position[2])))
+        self.note(place=(float(position[0]), float(position[1]), float(position[2])))
         low, high = self.scenery.range if self.shared.is_probability(self.state.method) else (0.0, 0.0)
         if low == high:
             low, high = float(place.scores.min()), float(place.scores.max())
@@ -294,7 +304,7 @@ class Session:
             self._gizmo.wxyz = wxyz
         yaw, pitch = (float(np.degrees(angle)) for angle in pan_tilt_angles(axis))
         c.yaw.value, c.pitch.value = round(yaw * 2) / 2, round(pitch * 2) / 2
-        self.state = replace(self.state, yaw=round(yaw, 1), pitch=round(pitch, 1))
+        self.note(yaw=round(yaw, 1), pitch=round(pitch, 1))
         yield
         seen = landmarks_seen(look.scorer, pose, self.shared.teller(self.state.occlusion))
         if len(seen.points):

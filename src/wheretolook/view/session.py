@@ -32,7 +32,6 @@ _log = logging.getLogger(__name__)
 IN_THE_WAY = ("/sphere", "/view", "/views", "/turn", "/seen")
 """What stands in the way of one who looks from the place itself."""
 
-SAME_DEG = 0.3  # the sliders say what is drawn already
 PATH_COLORS = ((120, 120, 120), (213, 94, 0), (0, 114, 178), (0, 158, 115), (204, 121, 167))
 
 
@@ -64,9 +63,12 @@ class Session:
 
     # -- what is chosen ------------------------------------------------------------------------------------------------
 
-    def on(self, handle: Any, then: Callable[[], None], event: str = "on_update") -> None:
-        """Do something when a control changes. What fails is told to this client, and to nobody else."""
-        getattr(handle, event)(lambda _: self.safely(then))
+    def on(self, handle: Any, then: Callable[[], None], event: str = "on_update", by_hand: bool = False) -> None:
+        """Do something when a control changes, on request only by hand, not by the program.
+
+        What fails is told to this client, and to nobody else.
+        """
+        getattr(handle, event)(lambda told: None if by_hand and told.client is None else self.safely(then))
 
     def safely(self, then: Callable[[], None]) -> None:
         """Do something; an error becomes a notice."""
@@ -108,7 +110,7 @@ class Session:
         self.on(c.n, self._chosen_n)
         self.on(c.view, lambda: self.show_best(int(c.view.value) - 1))
         for handle in (c.yaw, c.pitch):
-            self.on(handle, self._turned)
+            self.on(handle, self._turned, by_hand=True)
         self.on(c.through, self._look_through)
         for name in c.shown:
             self.on(c.shown[name], self.draw_scene)
@@ -147,9 +149,7 @@ class Session:
         self.submit("scene", SOON, _once(self.draw_scene))
 
     def _turned(self) -> None:
-        axis = axes_of_angles((self.controls.yaw.value, self.controls.pitch.value))
-        if self.axis is None or np.degrees(np.arccos(np.clip(axis @ self.axis, -1, 1))) > SAME_DEG:
-            self.turn_to(axis)
+        self.turn_to(axes_of_angles((self.controls.yaw.value, self.controls.pitch.value)), sliders=True)
 
     def _angles(self) -> tuple[float, float] | None:
         return None if self.axis is None else (float(self.controls.yaw.value), float(self.controls.pitch.value))
@@ -256,21 +256,24 @@ class Session:
         self._gizmo.on_update(lambda _: self.safely(self._dragged))
 
     def _dragged(self) -> None:
-        self.turn_to(rotation_from_quaternion(self._gizmo.wxyz)[:, 2], by_hand=True)
+        self.turn_to(rotation_from_quaternion(self._gizmo.wxyz)[:, 2], rings=True)
 
     def show_best(self, number: int) -> None:
         """Look along one of the best views."""
         if self.place is not None and 0 <= number < len(self.place.best):
             self.turn_to(self.place.best.axes[number])
 
-    def turn_to(self, axis: Float, by_hand: bool = False) -> None:
-        """Look along an axis (3,) at the place; its score follows at once."""
+    def turn_to(self, axis: Float, rings: bool = False, sliders: bool = False) -> None:
+        """Look along an axis (3,) at the place; its score follows at once.
+
+        `rings` or `sliders` say what it was turned by, which is then left as it is.
+        """
         if self.place is None or not np.isfinite(axis).all() or np.linalg.norm(axis) < 1e-9:
             return
         self.axis = np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis)
-        self.submit("view", NOW, self._view(self.place.position, self.axis, by_hand))
+        self.submit("view", NOW, self._view(self.place.position, self.axis, rings, sliders))
 
-    def _view(self, position: Float, axis: Float, by_hand: bool) -> Iterator[None]:
+    def _view(self, position: Float, axis: Float, rings: bool, sliders: bool) -> Iterator[None]:
         c, mark = self.controls, self.shared.mark_m
         look = self.shared.look(self.state.method, self.state.occlusion)
         report = report_of(look.scorer, position, axis)
@@ -300,10 +303,11 @@ class Session:
             receive_shadow=False,
         )
         self.client.flush()
-        if not by_hand and self._gizmo is not None:
+        if not rings and self._gizmo is not None:
             self._gizmo.wxyz = wxyz
         yaw, pitch = (float(np.degrees(angle)) for angle in pan_tilt_angles(axis))
-        c.yaw.value, c.pitch.value = round(yaw * 2) / 2, round(pitch * 2) / 2
+        if not sliders:
+            c.yaw.value, c.pitch.value = round(yaw * 2) / 2, round(pitch * 2) / 2
         self.note(yaw=round(yaw, 1), pitch=round(pitch, 1))
         yield
         seen = landmarks_seen(look.scorer, pose, self.shared.teller(self.state.occlusion))

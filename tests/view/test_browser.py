@@ -26,7 +26,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.skipif(chromium() is None, reason="t
 @pytest.fixture(scope="module")
 def viewer(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Viewer]:
     opened = open_map(write_room(tmp_path_factory.mktemp("room") / "sparse"), weights=WEIGHTS)
-    told = poses_looking_along(POINTS, (-1.0, -0.5, 0.0))
+    told = poses_looking_along(POINTS, np.tile((-1.0, -0.5, 0.0), (4, 1)))
     paths = {FORWARD: Played(looking_ahead(POINTS)), "set": Played(told, np.array([True, True, False, True]))}
     made = Viewer(Shared(opened, paths), port=0, state=ViewState(occlusion="none"))
     yield made

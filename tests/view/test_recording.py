@@ -51,7 +51,8 @@ def test_a_film_shows_both_cameras_step_by_step(tmp_path: Path) -> None:
     mesh = tmp_path / "room.glb"
     save_glb(furnished_room(), mesh)
     opened = open_map(write_room(tmp_path / "sparse", n=200), mesh, weights=WEIGHTS)
-    paths = {FORWARD: Played(looking_ahead(POINTS)), "set": Played(poses_looking_along(POINTS, (-1.0, -0.5, 0.0)))}
+    told = poses_looking_along(POINTS, np.tile((-1.0, -0.5, 0.0), (4, 1)))
+    paths = {FORWARD: Played(looking_ahead(POINTS)), "set": Played(told)}
     n = film(Shared(opened, paths), tmp_path / "way.webp", ViewState(method="visible", occlusion="none", threshold=5))
     with Image.open(tmp_path / "way.webp") as picture:
         assert n == len(POINTS) == picture.n_frames and picture.size == (960, 430)

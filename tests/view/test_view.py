@@ -122,13 +122,21 @@ def test_paths_are_read_from_every_file_that_holds_poses(tmp_path: Path, sparse:
     ]
     table = pd.concat(rows).assign(status="localized", error_m=0.01, error_deg=0.1)
     table.loc[table["method"] == "forward", "error_m"] = 1.0
-    (tmp_path / "compared").mkdir()
-    table.to_parquet(tmp_path / "compared" / "views.parquet")
-    found = read_paths(tmp_path / "compared", 1)
+    scene = tmp_path / "paths" / "compared"
+    scene.mkdir(parents=True)
+    table.drop(columns=["status", "error_m", "error_deg"]).to_parquet(scene / "views.parquet")
+    found = read_paths(scene, 1)
+    assert [*found] == ["forward", "set"] and found["set"].localized is None
+    table.assign(scene="compared").to_parquet(scene.parent / "views.parquet")
+    found = read_paths(scene, 1)
     assert [*found] == ["forward", "set"] and found["set"].localized is not None and found["set"].localized.all()
     assert found["forward"].localized is not None and not found["forward"].localized.any()
     with pytest.raises(TableError, match="pair"):
-        read_paths(tmp_path / "compared", 7)
+        read_paths(scene, 7)
+    lost = table["method"].eq("set") & table["pair"].eq(1)  # a method found no path: the views along the given one
+    both = pd.concat([table[~lost], table[table["pair"] == 1].assign(task="given")])
+    both.assign(scene="compared").to_parquet(scene.parent / "views.parquet")
+    np.testing.assert_allclose(read_paths(scene, 1)["set"].cam_from_world, wanted, atol=1e-9)
 
 
 def test_looking_ahead_follows_the_path_and_keeps_on_where_it_stands() -> None:

@@ -18,6 +18,7 @@ from wheretolook.geometry.poses import (
     rotation_from_quaternion,
 )
 from wheretolook.planning.config import FORWARD, PathsConfig
+from wheretolook.planning.path_comparison import GIVEN, PLANNED
 from wheretolook.utils.errors import TableError
 from wheretolook.viewpoints.table import POSE_COLUMNS, UNLABELLED, is_good, poses
 
@@ -91,20 +92,35 @@ def _name(path: Path) -> str:
 
 
 def _compared(path: Path, pair: int) -> Paths:
+    """The paths of a pair, as each method planned them, or where one found none, its views along the given one."""
     try:
-        table = pd.read_parquet(path)
-        table = table[(table["pair"] == pair) & (table["task"] == "planned")].sort_values("waypoint", kind="stable")
+        table = _labelled(path)
+        table = table[table["pair"] == pair].sort_values("waypoint", kind="stable")
+        methods = [name for name in table["method"].unique() if " " not in name]  # others choose by another rule
+        planned, given = (table[table["task"] == task] for task in (PLANNED, GIVEN))
+        chosen = planned if {*methods} <= {*planned["method"]} else given
         found = {}
-        for name, rows in table.groupby("method", sort=False):
-            tried = not (rows["status"] == UNLABELLED).any()
-            found[str(name)] = Played(
-                poses(rows), is_good(rows, COMPARED.max_error_m, COMPARED.max_error_deg) if tried else None
-            )
-    except (OSError, ValueError, KeyError) as error:
+        for name in methods:
+            rows = chosen[chosen["method"] == name]
+            tried = "status" in rows and not (rows["status"] == UNLABELLED).any()
+            good = is_good(rows, COMPARED.max_error_m, COMPARED.max_error_deg) if tried else None
+            found[str(name)] = Played(poses(rows), good)
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise TableError(f"no compared paths: {error}", path=path, fix=_FIX) from error
     if not found:
         raise TableError("there is no such pair of a start and a goal", path=path, value=pair, fix="Give --pair.")
     return found
+
+
+def _labelled(path: Path) -> pd.DataFrame:
+    """Compared paths of a scene, with their labels, which stand in the table of all scenes beside its folder."""
+    everything = path.parent.parent / path.name
+    if everything.is_file():
+        table = pd.read_parquet(everything)
+        table = table[table["scene"] == path.parent.name]
+        if len(table):
+            return table
+    return pd.read_parquet(path)
 
 
 def _table(path: Path) -> Float:

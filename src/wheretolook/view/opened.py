@@ -200,17 +200,20 @@ def open_scene(
     from wheretolook.dataset.scene import Scene, SceneConfig
     from wheretolook.mapping.colmap_model import holds_model
     from wheretolook.view.photographs import Photographs
-    from wheretolook.viewpoints.table import UNLABELLED
+    from wheretolook.viewpoints.table import CAMERA_ID, UNLABELLED
 
     if not files.landmarks.is_file():
         fix = "Run `wheretolook map` for its dataset."
         raise MapError("this scene is half made: it has no map", path=files.map, fix=fix)
-    scene = Scene(files, camera or next(iter(files.cameras().values())), SceneConfig(assume_metric=True), device)
+    number, own = next(iter(files.cameras().items()))
+    scene = Scene(files, camera or own, SceneConfig(assume_metric=True), device)
     mesh = scene.mesh if files.mesh.is_file() else None
     space = scene.scanned_space if mesh is not None and files.is_scanned else None
     labels = None
     if files.table.is_file() and camera is None:
         table = files.read_table()
+        if CAMERA_ID in table:
+            table = table[table[CAMERA_ID] == number]
         labels = table[table["status"] != UNLABELLED].reset_index(drop=True)
     folder = photographs_of(files.map)
     shown = Photographs.of_model(files.map, folder) if folder is not None and holds_model(files.map) else None

@@ -36,6 +36,8 @@ class Player:
             session.scene.add_line_segments(f"/path/{name}", segments, color, thickness=4.0, thickness_units="screen")
         controls = session.controls
         session.on(controls.step, lambda: self.show(int(controls.step.value) - 1))
+        for handle in (controls.method, controls.occlusion):
+            session.on(handle, lambda: self.show(int(controls.step.value) - 1))
         session.on(controls.play, self.toggle, "on_click")
         self.show(0)
 

@@ -127,3 +127,15 @@ def test_methods_are_those_that_can_score_here_the_best_first(room: Opened) -> N
 def test_a_map_that_is_none_is_refused(tmp_path: Path) -> None:
     with pytest.raises(MapError):
         open_map(tmp_path)
+
+
+def test_a_scene_of_a_dataset_has_its_labels_and_no_mesh_if_there_is_none(tmp_path: Path) -> None:
+    from synthetic_dataset import CAMERA, make_dataset
+    from wheretolook.view.opened import find_opened
+
+    dataset = make_dataset(tmp_path / "set", ("test",), n_locations=4, n_directions=5)
+    opened = find_opened(tmp_path, dataset.scenes[0].name, "", None, WEIGHTS, "cpu")
+    assert opened.labels is not None and len(opened.labels) == 20 and opened.camera == CAMERA
+    assert opened.mesh is None and opened.renderer is None and opened.photographs is None
+    floor = floor_at(opened.space, opened.map_of("none").occlusion, 1.5)
+    assert len(floor.cells) and floor.ground_m is None

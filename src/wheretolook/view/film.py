@@ -13,7 +13,7 @@ from matplotlib.style import context
 from tqdm.auto import tqdm
 
 from wheretolook.figures.house_image import Dollhouse, dollhouse, draw_house, draw_segments, frustum_segments
-from wheretolook.figures.style import BLUE, GREEN, INK, RC, VERMILION, new_figure
+from wheretolook.figures.style import BLUE, GREEN, RC, VERMILION, new_figure
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.utils.errors import ConfigError
@@ -127,5 +127,7 @@ def _draw_view(axes: Axes, image: drawing.Rgb, name: str, good: bool, so_far: np
     axes.spines[:].set(visible=True, color=GREEN if good else VERMILION, linewidth=4)
     title = "looks ahead" if name == FORWARD else "looks where it was told"
     axes.set_title(title, fontsize=11, color=color, fontweight="bold", loc="left")
-    verdict = f"{'localized' if good else 'LOST'}   {100 * np.mean(so_far):.0f} % so far"
-    axes.set_title(verdict, fontsize=10, color=GREEN if good else INK, loc="right")
+    verdict = f"{'localized' if good else 'LOST'}, {100 * np.mean(so_far):.0f} % so far"
+    box = {"boxstyle": "square,pad=0.3", "facecolor": GREEN if good else VERMILION, "edgecolor": "none"}
+    place = {"transform": axes.transAxes, "ha": "left", "va": "bottom"}
+    axes.text(0.03, 0.04, verdict, fontsize=10, color="white", fontweight="bold", bbox=box, **place)

@@ -55,7 +55,7 @@ def test_a_film_shows_both_cameras_step_by_step(tmp_path: Path) -> None:
     paths = {FORWARD: Played(looking_ahead(POINTS)), "set": Played(told)}
     n = film(Shared(opened, paths), tmp_path / "way.webp", ViewState(method="visible", occlusion="none", threshold=5))
     with Image.open(tmp_path / "way.webp") as picture:
-        assert n == len(POINTS) == picture.n_frames and picture.size == (960, 430)
+        assert n == len(POINTS) == picture.n_frames and picture.size == (760, 430)
         first = np.asarray(picture.convert("RGB")).astype(int)
         picture.seek(2)
         assert (np.abs(np.asarray(picture.convert("RGB")).astype(int) - first).max(axis=2) > 60).mean() > 0.02

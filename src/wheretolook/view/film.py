@@ -25,7 +25,7 @@ from wheretolook.view.seen import picture_of
 from wheretolook.view.shared import Shared
 from wheretolook.view.state import ViewState
 
-SIZE_IN, DPI = (9.6, 4.3), 100
+SIZE_IN, DPI = (7.6, 4.3), 100
 FRAME_MS, LAST_MS = 220, 2500  # how long a picture stands, and the last
 MOST_FRAMES = 60
 COLORS = {FORWARD: VERMILION}
@@ -74,7 +74,7 @@ def _frames(shared: Shared, state: ViewState) -> Iterator[drawing.Rgb]:
         with context(RC):
             figure = new_figure(*SIZE_IN)
             figure.set_dpi(DPI)
-            grid = figure.add_gridspec(2, 2, width_ratios=(1.15, 1.0))
+            grid = figure.add_gridspec(2, 2, width_ratios=(1.6, 1.0))
             above = figure.add_subplot(grid[:, 0])
             draw_house(above, house, 0.35)
             for row, (name, played, good) in enumerate(zip((first, second), (ahead, told), verdicts, strict=True)):
@@ -127,7 +127,8 @@ def _draw_view(axes: Axes, image: drawing.Rgb, name: str, good: bool, so_far: np
     axes.spines[:].set(visible=True, color=GREEN if good else VERMILION, linewidth=4)
     title = "looks ahead" if name == FORWARD else "looks where it was told"
     axes.set_title(title, fontsize=11, color=color, fontweight="bold", loc="left")
-    verdict = f"{'localized' if good else 'LOST'}, {100 * np.mean(so_far):.0f} % so far"
+    share = f"{100 * np.mean(so_far):.0f} % so far"
+    verdict = f"localized: {share}" if good else f"LOST, localized: {share}"
     box = {"boxstyle": "square,pad=0.3", "facecolor": GREEN if good else VERMILION, "edgecolor": "none"}
     place = {"transform": axes.transAxes, "ha": "left", "va": "bottom"}
     axes.text(0.03, 0.04, verdict, fontsize=10, color="white", fontweight="bold", bbox=box, **place)

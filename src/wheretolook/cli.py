@@ -210,6 +210,7 @@ Without --config it is configs/release.yaml, whose runs are logged first. Tables
 OWN = {
     "select": ("wheretolook.select.command", "The best views at places of your own COLMAP model; needs no dataset."),
     "check": ("wheretolook.check.command", "How well views of your own map are told apart, by its own photographs."),
+    "view": ("wheretolook.view.command", "A scene or your own map in the browser, with the score of every view."),
     "export": ("wheretolook.robot.command", "What a robot needs to score views of your own map, without PyTorch."),
     "benchmark": ("wheretolook.benchmark.command", "The Active Localization Benchmark on its scene folders."),
 }

@@ -81,6 +81,13 @@ class Scorer(ABC):
         """How many landmarks poses (B, 3, 4) can be expected to find, (B,); NaN where the method does not tell."""
         return np.full(len(cam_from_world), np.nan)
 
+    def found_chances(self, cam_from_world: Float) -> tuple[NDArray[np.int64], Float] | None:
+        """Rows (K,) of the landmarks that one view (3, 4) sees, and each one's chance of being found (K,), in [0, 1].
+
+        None where the method does not tell.
+        """
+        return None
+
     def score_binned(self, cam_from_world: Float, binned: BinnedViews) -> Float:
         """What `score` gives, (B,), for poses that the map's `bin_views` has binned already, with all `CHANNELS`."""
         return self.score(cam_from_world)

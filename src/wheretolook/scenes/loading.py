@@ -93,6 +93,11 @@ def save_glb(mesh: TexturedMesh, path: str | PathLike[str], jpeg_quality: int = 
     triangles are grouped by texture, and corners with the same position and texture coordinates share a vertex. The
     file is replaced in one step. Raises ConfigError if the quality is not in 1 to 100.
     """
+    write_bytes(Path(path), glb_bytes(mesh, jpeg_quality))
+
+
+def glb_bytes(mesh: TexturedMesh, jpeg_quality: int = 90) -> bytes:
+    """The file that `save_glb` writes. Raises as it does."""
     if not 1 <= jpeg_quality <= 100:
         raise ConfigError("JPEG quality is a number from 1 to 100", value=jpeg_quality)
     scene = trimesh.Scene()
@@ -102,7 +107,7 @@ def save_glb(mesh: TexturedMesh, path: str | PathLike[str], jpeg_quality: int = 
             part = _geometry(mesh, faces, _EncodedJpeg(texture, jpeg_quality))
             at = trimesh.transformations.translation_matrix(mesh.origin) if mesh.origin.any() else None
             scene.add_geometry(part, node_name=f"part_{index}", transform=at)
-    write_bytes(Path(path), trimesh.exchange.gltf.export_glb(scene, tree_postprocessor=_mark_unlit))
+    return bytes(trimesh.exchange.gltf.export_glb(scene, tree_postprocessor=_mark_unlit))
 
 
 def _mesh_file(path: Path) -> Path:

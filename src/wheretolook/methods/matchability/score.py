@@ -8,6 +8,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from wheretolook.fisher.metrics import METRICS, metric_of
@@ -69,6 +70,12 @@ class Expectation:
             self._poses, self._sums, self.quantities = cam_from_world.copy(), sums, quantities
         return self._sums
 
+    def found_chances(self, describer: LandmarkDescriber, cam_from_world: Float) -> tuple[NDArray[np.int64], Float]:
+        """Rows (K,) of the landmarks that one view (3, 4) sees, and each one's chance of being found (K,)."""
+        described = describer.describe(check_poses(cam_from_world[None]))
+        chances = self._log_odds(described.values).sigmoid().double()
+        return described.rows.cpu().numpy(), np.asarray(chances.cpu().numpy())
+
     def _log_odds(self, values: Tensor) -> Tensor:
         """Calibrated log-odds (E,) of being found of landmarks (E, A)."""
         with torch.inference_mode():
@@ -109,6 +116,10 @@ class ExpectedScorer(LandmarkScorer):
     def expected_inliers(self, cam_from_world: Float) -> Float:
         """(B,), the sum of the chances of being found over the landmarks in view."""
         return self._expectation.sums(self.describer, cam_from_world)[:, 0]
+
+    def found_chances(self, cam_from_world: Float) -> tuple[NDArray[np.int64], Float]:
+        """Of all landmarks that a view sees."""
+        return self._expectation.found_chances(self.describer, cam_from_world)
 
 
 class ExpectedFisherScorer(LandmarkScorer):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from wheretolook.geometry.poses import Float, check_poses
@@ -62,6 +63,13 @@ class SetScorer(LandmarkScorer):
                 found = sums * n_visible / described.counts.clamp(min=1)
             told.expected_inliers[rows] = found.cpu().numpy()
         return told
+
+    def found_chances(self, cam_from_world: Float) -> tuple[NDArray[np.int64], Float]:
+        """Of all landmarks that a view sees, by the part of the network that looks at single ones."""
+        described = self.describer.describe(check_poses(cam_from_world[None]))
+        with torch.inference_mode():
+            chances = self.network.matchability(described.values).sigmoid().double()
+        return described.rows.cpu().numpy(), np.asarray(chances.cpu().numpy())
 
     def _chances(self, cam_from_world: Float, described: ViewLandmarks, n_visible: Tensor) -> Float:
         height = torch.from_numpy(cam_from_world[:, 2, 2]).to(described.values)

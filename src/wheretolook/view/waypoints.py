@@ -1,0 +1,91 @@
+"""Waypoints that one who looks has placed, and the file of their best views, as `wheretolook select` writes it."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from wheretolook.geometry.poses import Float
+from wheretolook.select.where_to_look import WhereToLook
+from wheretolook.utils.errors import ConfigError
+from wheretolook.view.controls import FILES
+from wheretolook.view.session import Session
+from wheretolook.view.worker import SOON
+
+MOST = 500
+COLOR = (213, 94, 0)
+
+
+def views_file(look: WhereToLook, points: Float, n: int, format: str) -> bytes:
+    """The file of the n best views at points (W, 3) m, in a format of `FILES`; formats of one view each get that.
+
+    Raises a TableError for points outside the map or inside geometry.
+    """
+    kind, ending = FILES[format]
+    views = look.best(points, 1 if kind in ("tum", "benchmark") else n)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"views{ending}"
+        views.save(path, kind)
+        return path.read_bytes()
+
+
+class WaypointList:
+    """The waypoints of one client."""
+
+    def __init__(self, session: Session) -> None:
+        self.session, self.points = session, []  # type: ignore[var-annotated]
+        controls = session.controls
+        session.on(controls.add, self._add_place, "on_click")
+        session.on(controls.clear, self._clear, "on_click")
+        session.on(controls.save, self._save, "on_click")
+
+    def add(self, point: Float) -> None:
+        """Place one more."""
+        if len(self.points) >= MOST:
+            raise ConfigError("there is room for no more waypoints", value=MOST, fix="Save these and begin anew.")
+        self.points.append(np.asarray(point, dtype=np.float64))
+        self._draw()
+
+    def _add_place(self) -> None:
+        if self.session.place is None:
+            raise ConfigError("no place is looked at", fix="Click one on the floor first.")
+        self.add(self.session.place.position)
+
+    def _clear(self) -> None:
+        self.points.clear()
+        self._draw()
+
+    def _draw(self) -> None:
+        scene, size = self.session.scene, self.session.shared.mark_m
+        rows = [f"{k + 1}. {x:.2f}, {y:.2f}, {z:.2f}" for k, (x, y, z) in enumerate(self.points)]
+        self.session.controls.waypoints.content = "\n".join(rows) or "No waypoints yet."
+        if not self.points:
+            scene.remove_by_name("/waypoints")
+            return
+        at = np.array(self.points)
+        scene.add_point_cloud(
+            "/waypoints",
+            (at - at[0]).astype(np.float32),
+            COLOR,
+            point_size=0.35 * size,
+            point_shape="circle",
+            precision="float32",
+            position=at[0],
+            point_shading="flat",
+        )
+
+    def _save(self) -> None:
+        if not self.points:
+            fix = "Tick `clicks set waypoints` and click the floor, or add the place looked at."
+            raise ConfigError("there are no waypoints to save", fix=fix)
+        self.session.submit("save", SOON, self._saved())
+
+    def _saved(self) -> Iterator[None]:
+        session, format = self.session, str(self.session.controls.format.value)
+        look = session.shared.look(session.state.method, session.state.occlusion)
+        content = views_file(look, np.array(self.points), session.state.n, format)
+        session.client.send_file_download(f"views{FILES[format][1]}", content, save_immediately=True)
+        yield

@@ -1,0 +1,89 @@
+"""One thread that computes for all who look: the most urgent first, and of what somebody asks for again, the newest."""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import threading
+from collections.abc import Callable, Hashable, Iterator
+from dataclasses import dataclass, field
+
+NOW, SOON, LATER = 0, 1, 2
+"""Urgency of work: a view turned by hand, a place clicked, a floor that fills."""
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(order=True)
+class _Job:
+    urgency: int
+    turn: int
+    key: tuple[Hashable, str] = field(compare=False)
+    steps: Iterator[object] = field(compare=False)
+    failed: Callable[[Exception], None] = field(compare=False)
+
+
+class Worker:
+    """Computes jobs, iterators each, one step at a time.
+
+    Scorers are not for several threads, and two cores have no more to give. Between two steps a more urgent job goes
+    first; jobs as urgent take turns, so that nobody waits for all of another's floor. A job that raises is told so, by
+    `failed`, and ends; others go on.
+    """
+
+    def __init__(self) -> None:
+        self._jobs: dict[tuple[Hashable, str], _Job] = {}
+        self._turns, self._wake, self._stopped = itertools.count(), threading.Condition(), False
+        self._thread = threading.Thread(target=self._run, name="scores", daemon=True)
+        self._thread.start()
+
+    def submit(
+        self, owner: Hashable, kind: str, urgency: int, steps: Iterator[object], failed: Callable[[Exception], None]
+    ) -> None:
+        """Do a job of an owner, in place of the one of that kind that is still to be done."""
+        with self._wake:
+            self._jobs[owner, kind] = _Job(urgency, next(self._turns), (owner, kind), steps, failed)
+            self._wake.notify()
+
+    def forget(self, owner: Hashable) -> None:
+        """Drop all jobs of an owner."""
+        with self._wake:
+            for key in [key for key in self._jobs if key[0] == owner]:
+                del self._jobs[key]
+
+    def stop(self) -> None:
+        """End after the step that is being done."""
+        with self._wake:
+            self._stopped = True
+            self._wake.notify()
+        self._thread.join(timeout=10)
+
+    def _run(self) -> None:
+        while True:
+            with self._wake:
+                while not self._jobs and not self._stopped:
+                    self._wake.wait()
+                if self._stopped:
+                    return
+                job = min(self._jobs.values())
+            self._step(job)
+
+    def _step(self, job: _Job) -> None:
+        goes_on = False
+        try:
+            next(job.steps)
+            goes_on = True
+        except StopIteration:
+            pass
+        except Exception as error:  # whatever one job raises, the others go on
+            _log.debug("a job failed: %s", job.key, exc_info=error)
+            try:
+                job.failed(error)
+            except Exception:
+                _log.exception("what failed could not be told")
+        with self._wake:
+            if self._jobs.get(job.key) is job:
+                if goes_on:
+                    job.turn = next(self._turns)
+                else:
+                    del self._jobs[job.key]

@@ -1,0 +1,146 @@
+"""A headless Chromium, driven through the DevTools protocol."""
+
+from __future__ import annotations
+
+import base64
+import json
+import shutil
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from urllib.request import Request, urlopen
+
+NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
+
+
+def chromium() -> str | None:
+    """The browser's program, if there is one."""
+    return next((path for name in NAMES if (path := shutil.which(name))), None)
+
+
+class Tab:
+    """One page; `errors` are those of its console, and exceptions nobody caught."""
+
+    def __init__(self, address: str, size: tuple[int, int]) -> None:
+        from websockets.sync.client import connect
+
+        self._socket, self._number, self.errors = connect(address, max_size=1 << 27), 0, []  # type: ignore[var-annotated]
+        for domain in ("Page", "Runtime", "Log"):
+            self.call(f"{domain}.enable")
+        self.call(
+            "Emulation.setDeviceMetricsOverride", width=size[0], height=size[1], deviceScaleFactor=1, mobile=False
+        )
+
+    def call(self, method: str, **params: Any) -> Any:
+        """What the browser answers."""
+        self._number += 1
+        self._socket.send(json.dumps({"id": self._number, "method": method, "params": params}))
+        while True:
+            message = json.loads(self._socket.recv(timeout=60))
+            self._note(message)
+            if message.get("id") == self._number:
+                assert "error" not in message, message["error"]
+                return message["result"]
+
+    def _note(self, message: dict[str, Any]) -> None:
+        params = message.get("params", {})
+        if message.get("method") == "Runtime.exceptionThrown":
+            self.errors.append(params["exceptionDetails"].get("text", "") + str(params["exceptionDetails"]))
+        if message.get("method") == "Runtime.consoleAPICalled" and params["type"] == "error":
+            self.errors.append(" ".join(str(part.get("value", part.get("description"))) for part in params["args"]))
+        if message.get("method") == "Log.entryAdded" and params["entry"]["level"] == "error":
+            self.errors.append(f"{params['entry']['text']} {params['entry'].get('url', '')}")
+
+    def go(self, url: str) -> None:
+        self.call("Page.navigate", url=url)
+
+    def evaluate(self, script: str) -> Any:
+        result = self.call("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
+        return result["result"].get("value")
+
+    @property
+    def text(self) -> str:
+        """What can be read on the page."""
+        return str(self.evaluate("document.body ? document.body.innerText : ''"))
+
+    def wait(self, what: Callable[[Tab], bool], seconds: float = 60.0) -> None:
+        """Until something is so."""
+        end = time.monotonic() + seconds
+        while not what(self):
+            assert time.monotonic() < end, f"it did not happen; the page says:\n{self.text}\n{self.errors}"
+            time.sleep(0.1)
+
+    def click(self, x: float, y: float) -> None:
+        for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
+            button = {} if kind == "mouseMoved" else {"button": "left", "clickCount": 1}
+            self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, **button)
+
+    def press(self, label: str) -> None:
+        """Click the first element whose whole text is this."""
+        found = self.evaluate(
+            "(() => { const e = [...document.querySelectorAll('button, [role=tab], label, span, p, div')]"
+            f".filter(e => e.innerText && e.innerText.trim() === {json.dumps(label)}"
+            " && e.getBoundingClientRect().width > 0).pop();"
+            " if (!e) return null; e.scrollIntoView({block: 'center'}); const r = e.getBoundingClientRect();"
+            " return [r.x + r.width / 2, r.y + r.height / 2]; })()"
+        )
+        assert found, f"there is no {label!r} on the page:\n{self.text}"
+        self.click(*found)
+
+    def picture(self, path: Path) -> None:
+        """Write a picture of the page, PNG."""
+        path.write_bytes(base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"]))
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+class Browser:
+    """Several tabs of one browser, whose profile lies in a folder."""
+
+    def __init__(self, folder: Path, size: tuple[int, int] = (1280, 800)) -> None:
+        program = chromium()
+        assert program is not None
+        options = ["--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--use-angle=swiftshader"]
+        options += [
+            "--enable-unsafe-swiftshader",
+            "--ignore-gpu-blocklist",
+            "--remote-debugging-port=0",
+            "--no-first-run",
+        ]
+        options += ["--disable-background-networking", "--hide-scrollbars", "--no-first-run"]
+        options += ["--remote-allow-origins=*"]
+        options += ["--disable-renderer-backgrounding", "--disable-background-timer-throttling"]
+        options += ["--disable-backgrounding-occluded-windows"]
+        self.size, self._tabs = size, []  # type: ignore[var-annotated]
+        self.process = subprocess.Popen(
+            [program, *options, f"--window-size={size[0]},{size[1]}", f"--user-data-dir={folder}", "about:blank"],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        port, end = folder / "DevToolsActivePort", time.monotonic() + 60
+        while not (port.is_file() and port.read_text().strip()):
+            assert time.monotonic() < end and self.process.poll() is None, "Chromium does not start"
+            time.sleep(0.1)
+        self.port = int(port.read_text().split()[0])
+
+    def open(self, url: str) -> Tab:
+        """A new tab."""
+        request = Request(f"http://127.0.0.1:{self.port}/json/new?about:blank", method="PUT")
+        with urlopen(request) as answer:
+            tab = Tab(json.load(answer)["webSocketDebuggerUrl"], self.size)
+        self._tabs.append(tab)
+        tab.go(url)
+        return tab
+
+    def close(self) -> None:
+        for tab in self._tabs:
+            tab.close()
+        self.process.terminate()
+        try:
+            self.process.wait(timeout=15)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()

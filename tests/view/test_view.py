@@ -1,0 +1,281 @@
+"""What the viewer reads, refuses and serves, without a browser."""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+pytest.importorskip("viser")
+
+from selection.room import POINTS, WEIGHTS, write_room
+from wheretolook.cli import main
+from wheretolook.geometry.poses import camera_centers, poses_looking_along
+from wheretolook.select.where_to_look import WhereToLook
+from wheretolook.utils.errors import ConfigError, InUseError, TableError
+from wheretolook.view import drawing
+from wheretolook.view.checks import check_port
+from wheretolook.view.opened import open_map
+from wheretolook.view.played import FORWARD, looking_ahead, read_paths
+from wheretolook.view.server import Viewer, where_clicked
+from wheretolook.view.shared import Shared
+from wheretolook.view.state import ViewState
+from wheretolook.view.waypoints import views_file
+from wheretolook.view.worker import LATER, NOW, Worker
+from wheretolook.viewpoints.table import pose_columns
+
+STATE = ViewState("visible", "none", 3, 0.25, 1.4, 2.0, (1.0, 2.0, 1.5), -30.0, 5.0, (0.0, 0.0, 9.0), (1.0, 1.0, 0.0))
+
+
+@pytest.fixture(scope="module")
+def sparse(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_room(tmp_path_factory.mktemp("view") / "sparse")
+
+
+@pytest.fixture
+def viewer(sparse: Path) -> Iterator[Viewer]:
+    made = Viewer(Shared(open_map(sparse, weights=WEIGHTS)), port=0, state=ViewState(method="visible"))
+    yield made
+    made.stop()
+
+
+def test_a_state_survives_text_and_link() -> None:
+    assert ViewState.parse(STATE.text()) == STATE and ViewState.parse("") == ViewState() and ViewState().text() == ""
+    link = STATE.link("localhost:8080")
+    assert link.startswith("http://localhost:8080/?websocket=ws://localhost:8080/?view=")
+    assert not {*link.partition("?")[2]} & {*' &#%+"<>'}  # the browser takes it as it is
+    assert ViewState.of_path("/" + link.rpartition("/")[2]) == STATE
+    assert ViewState.of_path("/") is None and ViewState.of_path("/?other=1") is None
+
+
+@pytest.mark.parametrize("text", ["n=0", "n=x", "height=nan", "place=1,2", "place=1,2,inf", "what=1", "n", "x" * 3000])
+def test_nonsense_is_no_state(text: str) -> None:
+    with pytest.raises(ConfigError):
+        ViewState.parse(text)
+
+
+def test_a_port_in_use_is_refused_with_another_one(sparse: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(InUseError, match="--port"):
+            check_port("127.0.0.1", port)
+        assert main(["view", "--map", str(sparse), "--port", str(port)]) == 2
+    assert f"{port}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "given, told",
+    [
+        ([], "--scene or by --map"),
+        (["--map", "nowhere"], "nowhere"),
+        (["--map", "nowhere", "--scene", "x"], "--scene or by --map"),
+        (["--scene", "x", "--data", "nowhere"], "no such folder of datasets"),
+        (["--scene", "x", "--mesh", "x.glb"], "belong to --map"),
+        (["--map", "nowhere", "--state", "n=0"], "no state"),
+        (["--map", "nowhere", "--port", "70000"], "65535"),
+        (["--map", "nowhere", "--host", "no.such.host.invalid"], "no such host"),
+        (["--map", "nowhere", "--path", "nowhere.csv"], "no such path"),
+        (["--map", "nowhere", "--images", "nowhere"], "no such folder of photographs"),
+    ],
+)
+def test_bad_options_are_refused_plainly(given: list[str], told: str, capsys: pytest.CaptureFixture[str]) -> None:
+    port = [] if "--port" in given else ["--port", "0"]
+    assert main(["view", *given, *port]) == 2
+    said = capsys.readouterr().err
+    assert told in said and "Traceback" not in said
+
+
+def test_a_scene_half_made_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    about = {"camera": {"width": 64, "height": 48, "focal_px": 32.0}, "scenes": [{"name": "half", "split": "test"}]}
+    (tmp_path / "set" / "half").mkdir(parents=True)
+    (tmp_path / "set" / "dataset.json").write_text(json.dumps(about))
+    assert main(["view", "--scene", "half", "--data", str(tmp_path), "--port", "0"]) == 2
+    assert "half made" in capsys.readouterr().err
+
+
+def test_paths_are_read_from_every_file_that_holds_poses(tmp_path: Path, sparse: Path) -> None:
+    look = WhereToLook.from_colmap(sparse, method="visible", occlusion="none", directions=60)
+    views = look.best(POINTS)
+    wanted = views.cam_from_world
+    views.save(tmp_path / "views.csv")
+    views.save(tmp_path / "views.tum")
+    pd.DataFrame({"score": 0.5, **pose_columns(wanted)}).to_csv(tmp_path / "path.csv", index=False)
+    for name, method in (("views.csv", "views"), ("views.tum", "views"), ("path.csv", "planned")):
+        found = read_paths(tmp_path / name)
+        assert [*found] == [FORWARD, method] and found[method].localized is None
+        np.testing.assert_allclose(found[method].cam_from_world, wanted, atol=1e-5)
+        np.testing.assert_allclose(camera_centers(found[FORWARD].cam_from_world), POINTS, atol=1e-5)
+    assert [*read_paths(tmp_path)] == [FORWARD, "planned"]
+    rows = [
+        pd.DataFrame({**pose_columns(wanted), "method": method, "pair": pair, "task": "planned", "waypoint": range(4)})
+        for pair in (0, 1)
+        for method in ("forward", "set")
+    ]
+    table = pd.concat(rows).assign(status="localized", error_m=0.01, error_deg=0.1)
+    table.loc[table["method"] == "forward", "error_m"] = 1.0
+    scene = tmp_path / "paths" / "compared"
+    scene.mkdir(parents=True)
+    table.drop(columns=["status", "error_m", "error_deg"]).to_parquet(scene / "views.parquet")
+    found = read_paths(scene, 1)
+    assert [*found] == ["forward", "set"] and found["set"].localized is None
+    table.assign(scene="compared").to_parquet(scene.parent / "views.parquet")
+    found = read_paths(scene, 1)
+    assert [*found] == ["forward", "set"] and found["set"].localized is not None and found["set"].localized.all()
+    assert found["forward"].localized is not None and not found["forward"].localized.any()
+    with pytest.raises(TableError, match="pair"):
+        read_paths(scene, 7)
+    lost = table["method"].eq("set") & table["pair"].eq(1)  # a method found no path: the views along the given one
+    both = pd.concat([table[~lost], table[table["pair"] == 1].assign(task="given")])
+    both.assign(scene="compared").to_parquet(scene.parent / "views.parquet")
+    np.testing.assert_allclose(read_paths(scene, 1)["set"].cam_from_world, wanted, atol=1e-9)
+
+
+def test_looking_ahead_follows_the_path_and_keeps_on_where_it_stands() -> None:
+    at = np.array([(0.0, 0, 1), (0, 0, 1), (1, 0, 1), (1, 2, 1.5), (1, 2, 1.5)])
+    axes = looking_ahead(at)[:, 2, :3]
+    np.testing.assert_allclose(axes, [(1, 0, 0), (1, 0, 0), (0, 1, 0), (0, 1, 0), (0, 1, 0)], atol=1e-12)
+
+
+@pytest.mark.parametrize("text", ["", "1 2 3\n", "x,y\n1,2\n", "\0\0"])
+def test_what_is_no_path_is_refused(tmp_path: Path, text: str) -> None:
+    for name in ("path.csv", "path.tum"):
+        (tmp_path / name).write_text(text)
+        with pytest.raises(TableError):
+            read_paths(tmp_path / name)
+
+
+def test_a_click_meets_the_floor() -> None:
+    np.testing.assert_allclose(where_clicked((0, 0, 5), (1, 0, -2), 1.0), (2, 0, 1))  # type: ignore[arg-type]
+    assert where_clicked((0, 0, 5), (1, 0, 2), 1.0) is None and where_clicked((0, 0, 5), (1, 0, 0), 1.0) is None
+    assert where_clicked((0, 0, float("nan")), (1, 0, -1), 1.0) is None and where_clicked((), (), 1.0) is None
+
+
+@pytest.mark.parametrize("format", ["CSV", "JSON", "TUM trajectory", "COLMAP images.txt", "benchmark poses"])
+def test_waypoints_are_saved_as_select_writes_them(sparse: Path, tmp_path: Path, format: str) -> None:
+    look = WhereToLook.from_colmap(sparse, method="visible", occlusion="none", directions=60)
+    kind, ending = {
+        "CSV": ("csv", ".csv"),
+        "JSON": ("json", ".json"),
+        "TUM trajectory": ("tum", ".tum"),
+        "COLMAP images.txt": ("colmap", ".txt"),
+        "benchmark poses": ("benchmark", ".txt"),
+    }[format]
+    n = 1 if kind in ("tum", "benchmark") else 3
+    look.best(POINTS, n).save(tmp_path / f"wanted{ending}", kind)
+    assert views_file(look, POINTS, 3, format) == (tmp_path / f"wanted{ending}").read_bytes()
+
+
+def test_urgent_work_goes_first_and_what_fails_stops_nothing_else() -> None:
+    worker, done, failed, wait = Worker(), [], [], threading.Event()
+
+    def steps(name: str, n: int) -> Iterator[None]:
+        wait.wait(10)
+        for step in range(n):
+            done.append((name, step))
+            yield
+
+    def fails() -> Iterator[None]:
+        yield
+        raise ValueError("nonsense")
+
+    worker.submit(1, "floor", LATER, steps("first", 3), failed.append)
+    worker.submit(2, "floor", LATER, steps("second", 2), failed.append)
+    worker.submit(3, "floor", LATER, fails(), failed.append)
+    worker.submit(1, "old", NOW, steps("old", 5), failed.append)
+    worker.submit(1, "old", NOW, steps("new", 2), failed.append)
+    worker.submit(4, "floor", LATER, steps("gone", 5), failed.append)
+    worker.forget(4)
+    wait.set()
+    end = time.monotonic() + 10
+    while len(done) < 7 or not failed:
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    worker.stop()
+    names = [name for name, _ in done]
+    assert names.count("first") == 3 and names.count("second") == 2 and "gone" not in names
+    assert names.index("new") <= 1 and [str(error) for error in failed] == ["nonsense"]
+
+
+def test_pictures_show_scores_in_the_projects_colors() -> None:
+    raster = np.array([[0.0, np.nan], [1.0, 0.4]])
+    image = drawing.floor_image(raster, 0, 1, 0.5)
+    cell = drawing.CELL_PX
+    assert image.shape == (2 * cell, 2 * cell, 4) and image[0, cell, 3] == 0 and image[0, 0, 3] > 200
+    np.testing.assert_array_equal(image[cell, 0, :3], drawing.score_colors(np.array(1.0)))
+    assert (drawing.score_colors(np.array([np.nan])) == drawing.UNKNOWN).all()
+    glb = drawing.sphere_glb(np.vstack([np.eye(3), -np.eye(3)]), np.linspace(0, 1, 6), 0, 1, 0.2)
+    assert glb[:4] == b"glTF"
+    pose = poses_looking_along((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
+    assert pose.shape == (3, 4)
+
+
+def _client(viewer: Viewer, view: str = ""):  # type: ignore[no-untyped-def]
+    import viser
+    from websockets.sync.client import connect
+
+    address = f"ws://127.0.0.1:{viewer.port}/{view}"
+    return connect(address, subprotocols=[f"viser-v{viser.__version__}"], max_size=None)  # type: ignore[list-item]
+
+
+def camera_message() -> bytes:
+    """What a browser says of its camera when it joins."""
+    import msgspec
+
+    about = {"wxyz": [1, 0, 0, 0], "position": [0, 0, 9], "fov": 1.0, "near": 0.1, "far": 99.0}
+    about |= {"look_at": [0, 0, 0], "up_direction": [0, 0, 1], "image_height": 600, "image_width": 800}
+    return msgspec.msgpack.encode({"type": "ViewerCameraMessage", **about})
+
+
+def _until(what, seconds: float = 20.0) -> None:  # type: ignore[no-untyped-def]
+    end = time.monotonic() + seconds
+    while not what():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+def test_each_client_has_its_own_state_and_nonsense_hurts_nobody(viewer: Viewer) -> None:
+    import msgspec
+
+    with _client(viewer) as first, _client(viewer, "?view=n=2;place=1.5,2,1.5;method=bins") as second:
+        first.send(camera_message())
+        second.send(camera_message())
+        _until(lambda: len(viewer.sessions) == 2 and any(s.place is not None for s in viewer.sessions.values()))
+        by_method = {session.state.method: session for session in viewer.sessions.values()}
+        assert {*by_method} == {"visible", "bins"}
+        place = by_method["bins"].place
+        assert len(place.best) == 2 and by_method["visible"].place is None
+        np.testing.assert_allclose(place.position, (1.5, 2, 1.5))
+        for nonsense in (b"\xff\x00nonsense", "text", msgspec.msgpack.encode({"type": "NoSuchMessage"})):
+            with _client(viewer) as bad:
+                bad.send(camera_message())
+                bad.send(nonsense)
+                time.sleep(0.1)
+        click = {"type": "ScenePointerMessage", "event_type": "click", "screen_pos": [[0.5, 0.5]], "modifier": None}
+        rays = {"ray_origin": [1.5, 2.0, 9.0], "ray_direction": [float("nan"), 0, -1]}
+        first.send(msgspec.msgpack.encode({**click, **rays}))
+        first.send(msgspec.msgpack.encode({**click, **rays, "ray_direction": [0, 0, -1]}))
+        _until(lambda: by_method["visible"].place is not None)
+        np.testing.assert_allclose(by_method["visible"].place.position[:2], (1.5, 2))
+        _until(lambda: len(viewer.sessions) == 2)
+
+
+def test_nothing_but_the_page_is_served_and_no_client_opens_it_to_the_world(viewer: Viewer) -> None:
+    from urllib.error import HTTPError
+    from urllib.request import urlopen
+
+    with urlopen(viewer.url.replace("localhost", "127.0.0.1")) as answer:
+        assert b"<html" in answer.read(2000).lower()
+    for path in ("/../../etc/passwd", "/%2e%2e/%2e%2e/etc/passwd", "/sparse/images.bin"):
+        with pytest.raises(HTTPError):
+            urlopen(f"http://127.0.0.1:{viewer.port}{path}")
+    assert viewer.server.request_share_url() is None
+    assert viewer.server.get_host() == "127.0.0.1"

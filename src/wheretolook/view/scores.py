@@ -23,7 +23,7 @@ FLOOR_DIRECTIONS = 96
 """Directions looked along at each place of a floor, 19 degrees apart: the best of them is as good as the best of 500
 to within a hundredth or two, and takes a third of the time."""
 
-COARSE = 4  # cells along each axis between the places of a floor that are scored first
+COARSE = 8  # cells along each axis between the places of a floor that are scored first
 VIEWS_AT_ONCE = 1 << 10  # labelled views scored between two looks at what else is to be done
 
 

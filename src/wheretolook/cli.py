@@ -106,23 +106,28 @@ Mesh and database may be left out. With --images its landmarks are triangulated 
         "evaluate",
         "Score all methods on the test scenes.",
         "evaluate.methods evaluate.weights evaluate.split evaluate.top_n evaluate.thresholds evaluate.occlusions "
-        "evaluate.candidates evaluate.heading evaluate.reference evaluate.seed tracking.folder",
+        "evaluate.candidates evaluate.photographs evaluate.heading evaluate.reference evaluate.seed tracking.folder",
         ("evaluate", "occlusion", "tracking"),
         "--config configs/demo.yaml --evaluate.methods '[random, visible, set]'",
         notes="What evaluate.methods may name: wheretolook evaluate --list-methods",
     ),
     "adapt": Stage(
         "adapt",
-        "Adapt the weights that ship to one scene, by views localized there; kept only if that makes them better.",
-        "scene weights out minutes adapt.seed label.workers tracking.folder",
+        "Adapt the weights that ship to one place, by views localized there; kept only if that makes them better.",
+        "scene map images database weights out minutes adapt.seed label.workers tracking.folder",
         ("adapt", *_SPACE, "label", "tracking"),
-        "--config configs/demo.yaml --scene apartment-000 --minutes 5",
-        {f"--{name}": f"--adapt.{name}" for name in ("scene", "weights", "out", "minutes")},
+        "--map sparse/0 --database database.db\n  "
+        "wheretolook adapt --config configs/demo.yaml --scene apartment-000 --minutes 5",
+        {
+            f"--{name}": f"--adapt.{name}"
+            for name in ("scene", "map", "images", "database", "weights", "out", "minutes")
+        },
         notes="""\
-Takes the scene's labels, or, where it has none, labels as many of its viewpoints as the minutes allow; done again, it
-goes on with more. The weights are for this place alone:
-  wheretolook viewpoint-map --config configs/demo.yaml --scene apartment-000 \\
-      --weights data/demo/adapted/apartment-000.safetensors --out room.map""",
+Learns from the map's own photographs, left out in blocks as `wheretolook check` does, of a COLMAP model (--map) or of a
+scene made of photographs; and from a scene's labels, or, where it has a mesh and none, from as many of its viewpoints
+as can be labelled in the minutes; done again, it goes on with more. The weights are for this place alone:
+  wheretolook select --map sparse/0 --weights data/checks/mymap/adapted.safetensors \\
+      --at 1,2,1.4 --out views.csv""",
     ),
     "viewpoint-map": Stage(
         "viewpoint_map",
@@ -352,7 +357,8 @@ def _run(command: str, arguments: list[str]) -> int:
     else:
         start = time.monotonic()
         getattr(stages, STAGES[command].function)(experiment)
-        print(f"done in {time.monotonic() - start:.0f} s: {experiment.root}")
+        where = f": {experiment.root}" if experiment.root.is_dir() else ""  # of a map alone there is no dataset
+        print(f"done in {time.monotonic() - start:.0f} s{where}")
     return 0
 
 

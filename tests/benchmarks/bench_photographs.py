@@ -1,16 +1,18 @@
 """How well methods rank real photographs, by `wheretolook check` on maps made here: of photographs, or of known poses.
 
-    python tests/benchmarks/bench_photographs.py --images my/photographs --work work/mine --out mine.csv
-    python tests/benchmarks/bench_photographs.py --poses 7-scenes/redkitchen/seq-01 --work work/kitchen
+    python tests/benchmarks/bench_photographs.py --images fox --work work/fox --out photographs.csv
+    python tests/benchmarks/bench_photographs.py --poses kitchen --work work/kitchen --out photographs.csv
 
 Photographs are mapped as `wheretolook map --images` does, or from the poses beside them (7-Scenes layout:
 frame-*.color.*, .depth.png, .pose.txt with world_from_cam in metres). Such poses choose the pairs to match and the
 first triangulation; bundle adjustment then refines them and the focal length, and the result is fitted to them. Then
 the map is checked (docs/check.md): blocks are left out, and localized against the rest.
 
-The table has, for each method: AUC over all photographs left out and that of pairs of one block, each with a 95 %
-interval by resampling blocks; and of the first method the expected calibration error, and real over expected inliers.
-`--work` keeps maps and blocks, so that other weights are quickly scored; results of the check lie in its `check`.
+The table has, for each method: AUC over all photographs left out and that of pairs of one block, and regret, each with
+a 95 % interval by resampling blocks; of the first method the expected calibration error, and real over expected
+inliers; and a row for that method adapted to the place, judged by blocks that it has not learnt from (docs/adapt.md).
+`--out` keeps the rows of other places that the file has. `--work` keeps maps and blocks, so that other weights are
+quickly scored; results of the check lie in its `check`.
 """
 
 from __future__ import annotations
@@ -26,12 +28,17 @@ import cv2
 import numpy as np
 import pandas as pd
 import pycolmap
+from scipy.special import expit
 from tqdm.auto import tqdm
 
 from wheretolook.check.checking import check_map
-from wheretolook.check.report import CheckReport
+from wheretolook.check.learning import photographed_views
+from wheretolook.check.leave_out import left_out_blocks
+from wheretolook.check.numbers import measure
+from wheretolook.check.report import place_radius
 from wheretolook.check.scores import Scoring
-from wheretolook.check.source import open_map
+from wheretolook.check.source import PhotographedMap, open_map, says_metric
+from wheretolook.evaluation.adaptation import compare_log_odds, gain_markdown
 from wheretolook.figures.check import check_figure
 from wheretolook.figures.style import save_figure
 from wheretolook.geometry.camera import PinholeCamera
@@ -50,8 +57,10 @@ from wheretolook.mapping.triangulation import (
     shrink_depth,
     surface_overlap,
 )
+from wheretolook.methods.adapted.fit import adapt
 from wheretolook.utils.colmap import quiet_colmap
 from wheretolook.utils.processes import Processes
+from wheretolook.visibility.hidden_points import HiddenPointRemoval
 
 PARTNERS = 20  # that each photograph with a pose is matched with
 ROUNDS = 3  # of triangulation and bundle adjustment
@@ -135,22 +144,43 @@ def map_known_poses(folder: Path, work: Path, focal_px: float) -> None:
     model.write_binary(str(work / "map"))
 
 
-def table(scene: str, report: CheckReport) -> pd.DataFrame:
-    """One row for each method."""
-    numbers, rows = report.numbers, []
+def rows_of(scene: str, numbers: Mapping[str, Any], method: str) -> list[dict[str, Any]]:
+    """One row for each method; of one of them what else a check measures."""
+    rows = []
     for name, found in numbers["methods"].items():
         row = {"scene": scene, "method": name, "views": numbers["n_views"], "good": numbers["n_localized"]}
         row["blocks"] = numbers["n_blocks"]
-        for column in ("auc", "auc_within_blocks", "regret"):
-            ends = {"": "value", "_low": "low", "_high": "high"}
-            row |= {column + end: found[column][key] for end, key in ends.items()}
-        if name == report.method:
+        for column in ("auc", "auc_above_visible", "auc_within_blocks", "regret"):
+            row |= _ends(column, found[column])
+        if name == method:
             ratios = numbers["inliers_found_over_expected"] or {}
-            row["ece"] = (numbers["ece"] or {}).get("value")
+            row |= _ends("ece", numbers["ece"] or {})
             row |= {f"real_over_expected_{which}": ratio["value"] for which, ratio in ratios.items()}
             row["in_range"] = numbers["share_in_range"]
         rows.append(row)
-    return pd.DataFrame(rows)
+    return rows
+
+
+def _ends(column: str, measured: Mapping[str, Any]) -> dict[str, Any]:
+    ends = {"": "value", "_low": "low", "_high": "high"}
+    return {column + end: measured.get(key) for end, key in ends.items()}
+
+
+def adapted_rows(scene: str, opened: PhotographedMap, work: Path, weights: Path, views: int) -> list[dict[str, Any]]:
+    """The row of the weights adapted to the place, by blocks that they have not learnt from."""
+    left_out = left_out_blocks(opened, work, views)
+    learnt_from = photographed_views(opened, left_out, weights, HiddenPointRemoval())
+    learnt = adapt(learnt_from)
+    judged = (learnt_from.log_odds, learnt.held_out, learnt_from.good, learnt_from.place, learnt_from.centers)
+    gain = compare_log_odds(*judged, blocks=learnt_from.blocks)
+    kernel = f"kernel {learnt.length_m} m, {learnt.amplitude}" if learnt.amplitude else "calibrated alone"
+    print(gain_markdown(gain), f"{kernel}; {'kept' if gain.is_better else 'not kept'}", sep="\n")
+    found = pd.concat([one.views.assign(block=one.block.number) for one in left_out], ignore_index=True)
+    found = found.assign(score=expit(learnt.held_out), in_range=True, expected_inliers=np.nan)
+    numbers = measure(found, ["adapted"], ["score"], learnt_from.centers, place_radius(opened), True)
+    rows = rows_of(scene, {**numbers, "share_in_range": None}, "adapted")
+    none = dict.fromkeys(_ends("auc_above_visible", {}))
+    return [{**row, **none, "kept": gain.is_better} for row in rows]
 
 
 def main() -> None:
@@ -162,6 +192,7 @@ def main() -> None:
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument("--images", type=Path, help="folder of photographs, to be mapped from nothing else")
     source.add_argument("--poses", type=Path, help="folder of photographs, depth images and poses, as of 7-Scenes")
+    parser.add_argument("--name", help="what the table calls the place (that of the folder)")
     parser.add_argument("--weights", type=Path, help="file or folder of weights (those that ship)")
     parser.add_argument("--also", nargs="+", default=["expected-inliers", "bins"], help="other methods to compare")
     parser.add_argument("--views", type=int, default=60, help="of a block, at most (default: %(default)s)")
@@ -176,22 +207,30 @@ def main() -> None:
         if args.poses and not holds_model(work / "map"):
             map_known_poses(args.poses, work, args.focal_px)
         if args.images:
-            photographs = PhotographsConfig(images=args.images, max_side_px=args.max_side_px)
-            report = map_photographs(MapConfig(photographs=photographs), work / "map", work / "photographs")
-            metric = report.scale.is_metric
-        mapped, scene = time.perf_counter(), (args.poses or args.images).resolve().name
+            if not holds_model(work / "map"):
+                photographs = PhotographsConfig(images=args.images, max_side_px=args.max_side_px)
+                map_photographs(MapConfig(photographs=photographs), work / "map", work / "photographs")
+            metric = says_metric(work / "map")
+        mapped, scene = time.perf_counter(), args.name or (args.poses or args.images).resolve().name
         opened = open_map(work / "map", work / "photographs" / "database.db", metric, scene)
         scoring = Scoring(weights=args.weights, also=tuple(args.also))
         found = check_map(opened, work / "check" / "work", scoring, views=args.views, workers=args.workers)
         found.save(work / "check")
         save_figure(check_figure(found), work / "check" / "check.png")
-    print("\n".join(found.lines()))
-    print(f"mapped in {mapped - start:.0f} s, checked in {time.perf_counter() - mapped:.0f} s\n")
-    rows = table(scene, found)
+        print("\n".join(found.lines()))
+        print(f"mapped in {mapped - start:.0f} s, checked in {time.perf_counter() - mapped:.0f} s\n")
+        lines = rows_of(scene, found.numbers, found.method)
+        chosen = scoring.chosen
+        if found.method == "set" and chosen is not None:
+            lines += adapted_rows(scene, opened, work / "check" / "work", chosen, args.views)
+    rows = pd.DataFrame(lines)
     print(rows.to_string(index=False, float_format="{:.3f}".format))
     if args.out:
+        if args.out.is_file():
+            others = pd.read_csv(args.out)
+            rows = pd.concat([others[others["scene"] != scene], rows], ignore_index=True)
         args.out.parent.mkdir(parents=True, exist_ok=True)
-        rows.to_csv(args.out, index=False)
+        rows.sort_values("scene", kind="stable").to_csv(args.out, index=False, float_format="%.4g")
 
 
 if __name__ == "__main__":

@@ -12,12 +12,13 @@ from sklearn.gaussian_process import GaussianProcessClassifier
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 
 from synthetic_dataset import make_dataset
+from wheretolook.evaluation.calibration import expected_calibration_error
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import camera_centers, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.learning.trained_network import TrainedNetwork
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.methods.adapted.fit import PRIOR, LocalizedViews, adapt, fit, folds_of, log_losses
+from wheretolook.methods.adapted.fit import PRIOR, LocalizedViews, adapt, fit, folds_of, log_losses, splits
 from wheretolook.methods.adapted.kernel import Correction, nearness
 from wheretolook.methods.adapted.network import AdaptedNetwork
 from wheretolook.methods.registry import load_scorer
@@ -97,6 +98,53 @@ def test_views_of_a_location_are_left_out_together() -> None:
     fold = folds_of(group)
     assert all(len(np.unique(fold[group == number])) == 1 for number in range(23))
     assert np.bincount(fold).min() >= 4 * 7
+
+
+def photographed(shift: float, seed: int = 0) -> LocalizedViews:
+    """120 photographs in six blocks, each twice: with its block, and with one of two large ones. Everywhere alike, the
+    scorer hopes too little, by a shift of its log-odds."""
+    rng, n = np.random.default_rng(seed), 120
+    photograph = np.concatenate([np.arange(n), np.arange(n)])
+    group = np.concatenate([np.repeat(np.arange(6), n // 6), np.repeat([6, 7], n // 2)])
+    centers = rng.uniform((-3, -3, 0.5), (3, 3, 2), (n, 3))[photograph]
+    axes = fibonacci_sphere(n)[rng.permutation(n)][photograph]
+    log_odds = rng.normal(0, 2, 2 * n)
+    good = rng.random(2 * n) < expit(log_odds + shift)
+    return LocalizedViews(log_odds, good, centers, axes, group, photograph, photograph // 4)
+
+
+def test_photographs_are_judged_by_blocks_that_hold_none_of_those_learnt_from() -> None:
+    views = photographed(0.0)
+    judged = np.zeros(len(views), dtype=int)
+    for out, learnt in splits(views):
+        judged += out
+        assert len(np.unique(views.group[out])) == 1 and len(learnt) > 0
+        assert not np.isin(learnt.photograph, views.photograph[out]).any()
+    assert (judged == 1).all()
+
+
+def test_photographs_calibrate_what_they_say_nothing_else_of() -> None:
+    views = photographed(2.0)
+    learnt = adapt(views)
+    assert log_losses(learnt.held_out, views.good).mean() < log_losses(views.log_odds, views.good).mean() - 0.1
+    before, after = (expected_calibration_error(expit(z), views.good) for z in (views.log_odds, learnt.held_out))
+    assert after < before / 2
+    assert learnt.adaptation.scale == pytest.approx(1, abs=0.4)
+    assert learnt.adaptation.offset == pytest.approx(2, abs=0.8)
+
+
+def test_rendered_views_and_photographs_are_learnt_from_together() -> None:
+    rendered, photographs = random_views(20), photographed(1.0)
+    both = rendered.joined(photographs)
+    assert len(both) == len(rendered) + len(photographs)
+    assert not np.isin(both.group[both.photograph < 0], both.group[both.photograph >= 0]).any()
+    assert not np.isin(both.place[both.photograph < 0], both.place[both.photograph >= 0]).any()
+    assert (both.blocks[: len(rendered)] == -1).all() and len(np.unique(both.blocks[len(rendered) :])) == 8
+    parts = list(splits(both))
+    assert len(parts) == 5 and sum(out.sum() for out, _ in parts) == len(both)
+    for out, learnt in parts:
+        again = np.intersect1d(learnt.photograph, both.photograph[out])
+        assert again.tolist() in ([], [-1])
 
 
 def test_corrections_one_by_one_and_on_a_grid_are_the_plain_sum() -> None:

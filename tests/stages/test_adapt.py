@@ -166,3 +166,43 @@ def test_views_that_were_labelled_wait_for_the_next_run_and_go_when_they_are_of_
     assert not {*every} & {*shards.rglob("*.parquet")}  # of other viewpoints
     assert stage("label", locations=12) == 0
     assert not shards.exists()
+
+
+@pytest.mark.slow
+def test_views_are_labelled_for_some_minutes_and_found_again(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """From nothing: a small apartment is made, mapped and sampled; then adapt labels, stops, and goes on."""
+    settings = tmp_path / "small.yaml"
+    settings.write_text("""\
+name: small
+camera: {width: 320, height: 240, focal_px: 160}
+scenes:
+  train: 0
+  test: 1
+  apartment: {n_rooms: 3, area_m2: 26, texture_size: 1024, texels_per_m: 40, light_spacing_m: 0.5, light_rays: 4}
+map: {n_images: 24}
+sample: {grid: [6, 6, 4], directions: 100, keep: 50, max_locations: 40, max_directions: 8}
+label: {workers: 1, shard_size: 32}
+""")
+    where = ["--config", str(settings), "--data", str(tmp_path / "data"), "--device", "cpu"]
+    where += ["--tracking.folder", str(tmp_path / "mlruns")]
+    assert main(["adapt", *where]) == 2  # nothing is there
+    for stage in ("scenes", "map", "sample"):
+        assert main([stage, *where]) == 0
+    (scene,) = Dataset.load(tmp_path / "data" / "small").scenes
+    n_views = len(scene.read_table())
+    assert n_views > 256  # the clock starts with the first 128, and is looked at after the next
+    capsys.readouterr()
+    assert main(["adapt", *where, "--minutes", "0.0001"]) == 0
+    said = capsys.readouterr()
+    assert f"labelling up to {n_views} views, for 0.0001 minutes at most" in said.out
+    assert f"256 of {n_views} views labelled; run it again to go on" in said.out and "learning from 256" in said.out
+    assert "label:" in said.err  # the progress bar
+    made = {path: path.stat().st_mtime_ns for path in scene.folder.glob("adapt-shards/*/*.parquet")}
+    assert sum(len(pd.read_parquet(path)) for path in made) >= 256
+    assert main(["adapt", *where]) == 0
+    said = capsys.readouterr()
+    assert f"learning from {n_views} rendered views" in said.out and "run it again" not in said.out
+    assert made == {path: path.stat().st_mtime_ns for path in made}  # nothing was labelled twice
+    assert len(list(finished_runs(TrackingConfig(tmp_path / "mlruns"), "adapt"))) == 2

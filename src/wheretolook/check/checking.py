@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tqdm.auto import tqdm
-
-from wheretolook.check.blocks import VIEWS, choose_blocks
-from wheretolook.check.leave_out import leave_out
+from wheretolook.check.blocks import VIEWS
+from wheretolook.check.leave_out import left_out_blocks
 from wheretolook.check.report import CheckReport, make_report
 from wheretolook.check.scores import Scoring, check_place, score_views
 from wheretolook.check.source import PhotographedMap
@@ -30,12 +28,6 @@ def check_map(
     `views` of a block are localized. Raises MapError if blocks leave no map; WeightsError if weights cannot be used.
     """
     check_place(source, scoring, device)
-    blocks = choose_blocks(source, views)
-    left_out = []
-    total = sum(len(block.looked_at) for block in blocks)
-    with tqdm(total=total, desc="check: leave out, localize", unit="view") as bar:
-        for one in leave_out(source, blocks, work, workers, device):
-            left_out.append(one)
-            bar.update(len(one.views))
+    left_out = left_out_blocks(source, work, views, workers, device)
     method, scored = score_views(source, left_out, scoring, occlusion or HiddenPointRemoval(), device)
     return make_report(source, left_out, method, scored, scoring.also)

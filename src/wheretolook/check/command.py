@@ -86,6 +86,7 @@ def run(arguments: Sequence[str]) -> int:
     from wheretolook.check.scores import Scoring
     from wheretolook.figures.check import check_figure
     from wheretolook.figures.style import save_figure
+    from wheretolook.learning.weights import read_training
     from wheretolook.utils.devices import usable_device
 
     device, workers = usable_device(options.device), options.workers or len(os.sched_getaffinity(0))
@@ -98,6 +99,11 @@ def run(arguments: Sequence[str]) -> int:
         report.save(out)
         save_figure(check_figure(report), out / "check.png")
     print("\n".join(report.lines()))
+    if scoring.chosen is not None and read_training(scoring.chosen).get("photographs"):
+        print(
+            "the weights are adapted to a place and may have learnt from these photographs: then all this flatters "
+            "them; `wheretolook adapt` has told what they are worth on blocks that they have not learnt from"
+        )
     print(f"done in {time.monotonic() - start:.0f} s: {out}")
     return 0
 
@@ -161,19 +167,12 @@ def _open(options: argparse.Namespace, out: Path, device: str, workers: int) -> 
         fix = "Say --metres if it is, or leave --mesh out."
         raise ConfigError("a mesh is of use only for a map in metres", value=str(mesh), fix=fix)
     hides, _ = surroundings(mesh, None, 1000.0, options.occlusion, model, device)
-    images, features = options.images, options.database
-    if images is None and features is None:
-        features = source.features_beside(model)
-        images = source.photographs_of(model) if features is None else None
-    if features is None and images is None:
-        from wheretolook.mapping.colmap_model import read_model
-
-        read_model(model)  # if there is no model at all, that is said
-        fix = "Give --database, the database.db that it was built from, or --images, the folder of its photographs."
-        if scene is not None and scene.mesh.is_file():  # its images were rendered, and are gone
-            fix = "Map the scene again with `wheretolook map --map.keep_database true`, which keeps the features."
-        raise MapError("neither the features nor the photographs of this map are known", path=model, fix=fix)
-    if features is None:
-        extractor = ExtractorConfig(options.extractor or "opencv", weights=options.extractor_weights)
-        model, features = source.extract_anew(model, images, out / "work", workers, device, extractor)
+    given = options.images or options.database or source.features_beside(model) or source.photographs_of(model)
+    if given is None and scene is not None and scene.mesh.is_file():  # its images were rendered, and are gone
+        problem = "neither the features nor the photographs of this map are known"
+        fix = "Map the scene again with `wheretolook map --map.keep_database true`, which keeps the features."
+        raise MapError(problem, path=model, fix=fix)
+    extractor = ExtractorConfig(options.extractor or "opencv", weights=options.extractor_weights)
+    where = (out / "work", workers, device, extractor)
+    model, features = source.features_of(model, options.images, options.database, *where)
     return source.open_map(model, features, metric, name, keep_frame=mesh is not None), hides

@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from tqdm.auto import tqdm
 
-from wheretolook.check.blocks import Block
+from wheretolook.check.blocks import VIEWS, Block, choose_blocks
 from wheretolook.check.source import MAX_ERROR_DEG, PhotographedMap, digest_of
 from wheretolook.features.keypoints import Keypoints
 from wheretolook.geometry.camera import Camera
@@ -68,6 +69,19 @@ class _Job:
     limits: Float
     folder: Path
     device: str
+
+
+def left_out_blocks(
+    source: PhotographedMap, work: Path, views: int = VIEWS, workers: int = 1, device: str = "cpu"
+) -> list[LeftOut]:
+    """Leave all blocks out of a map, with a progress bar; finished ones are kept in `work`."""
+    blocks, found = choose_blocks(source, views), []
+    total = sum(len(block.looked_at) for block in blocks)
+    with tqdm(total=total, desc="check: leave out, localize", unit="view") as bar:
+        for one in leave_out(source, blocks, work, workers, device):
+            found.append(one)
+            bar.update(len(one.views))
+    return found
 
 
 def leave_out(

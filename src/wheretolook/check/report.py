@@ -138,13 +138,17 @@ def make_report(
     others = [name for name in also if name not in (method, VISIBLE)]
     methods = [method, *others, *([VISIBLE] if method != VISIBLE else [])]
     columns = ["score" if name == method else name for name in methods]
-    radius = PLACE_OF_DEPTH * (DEPTH_M if not source.is_metric else float(np.nanmedian(source.depth_m)))
     centers = (source.own_centers * source.from_model.scale)[views["row"].to_numpy()]
-    numbers = measure(views, methods, columns, centers, radius, is_probability(method))
+    numbers = measure(views, methods, columns, centers, place_radius(source), is_probability(method))
     parts = weak_parts(source, list(left_out), views)
     return CheckReport(
         source, method, views, _photographs(source, views, parts), _blocks(source, left_out, views), numbers, parts
     )
+
+
+def place_radius(source: PhotographedMap) -> float:
+    """How far apart the cameras of views are at most that share a place, see `PLACE_OF_DEPTH`."""
+    return PLACE_OF_DEPTH * (DEPTH_M if not source.is_metric else float(np.nanmedian(source.depth_m)))
 
 
 def _photographs(source: PhotographedMap, views: pd.DataFrame, parts: Sequence[WeakPart]) -> pd.DataFrame:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from tqdm.auto import tqdm
 
 from wheretolook.check.leave_out import LeftOut
 from wheretolook.check.source import PhotographedMap
+from wheretolook.evaluation.photographs import number_of
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float
 from wheretolook.inputs.localization_map import LocalizationMap
@@ -29,7 +30,6 @@ from wheretolook.visibility.occlusion import OcclusionModel
 from wheretolook.visibility.remembered import RememberedOcclusion
 
 VISIBLE = "visible"  # the method that all are compared with: its score here is the number of landmarks in view
-_OF_THE_MAP = ("expected-inliers",)  # methods that give a share of the map's landmarks, which here becomes their number
 
 
 @dataclass(frozen=True)
@@ -87,15 +87,9 @@ def score_views(
     with tqdm(total=sum(len(one.views) for one in left_out), desc="check: score", unit="view") as bar:
         for one in left_out:
             views = one.views.copy()
-            kept = np.setdiff1d(np.arange(len(source.poses)), one.block.left_out)
-            poses = compact_poses(source.poses[kept])
-            hides = occlusion if occlusion.name == "none" else RememberedOcclusion(occlusion)
-            looking = [source.cameras[row] for row in views["row"]]
-            around = LocalizationMap(one.landmarks, looking[0], hides, device, poses)
             columns: dict[str, Float] = {}
-            for camera, rows in _by_camera(looking):
-                looked = source.poses[views["row"].to_numpy()[rows]]
-                found = _score(around.of_camera(camera), looked, scoring)
+            for rows, around in maps_without(source, one, occlusion, device):
+                found = _score(around, source.poses[views["row"].to_numpy()[rows]], scoring)
                 name = found.pop("name")
                 for column, values in found.items():
                     columns.setdefault(column, np.full(len(views), np.nan))[rows] = values
@@ -103,6 +97,18 @@ def score_views(
             views = views.assign(**columns, block=one.block.number, is_part=one.block.is_part)
             parts.append(views.astype({"in_range": bool, "n_visible": np.int64}))
     return name, pd.concat(parts, ignore_index=True)
+
+
+def maps_without(
+    source: PhotographedMap, one: LeftOut, occlusion: OcclusionModel, device: str
+) -> Iterator[tuple[NDArray[np.int64], LocalizationMap]]:
+    """The map without a block as each camera of its photographs looks at it, and the rows of the block's views."""
+    kept = np.setdiff1d(np.arange(len(source.poses)), one.block.left_out)
+    hides = occlusion if occlusion.name == "none" else RememberedOcclusion(occlusion)
+    looking = [source.cameras[row] for row in one.views["row"]]
+    around = LocalizationMap(one.landmarks, looking[0], hides, device, compact_poses(source.poses[kept]))
+    for camera, rows in _by_camera(looking):
+        yield rows, around.of_camera(camera)
 
 
 def _by_camera(cameras: Sequence[Camera]) -> list[tuple[Camera, NDArray[np.int64]]]:
@@ -113,19 +119,19 @@ def _by_camera(cameras: Sequence[Camera]) -> list[tuple[Camera, NDArray[np.int64
 
 
 def _score(around: LocalizationMap, poses: Float, scoring: Scoring) -> dict[str, Any]:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", OutOfRangeWarning)  # the results tell how many are in range
-        scorer = replace(scoring, anywhere=True).scorer(around)  # `check_place` has seen to it
-        told = scorer.report(poses)
-        found: dict[str, Any] = {"name": scorer.name, "score": told.score * _number(scorer.name, around)}
-        found |= {"expected_inliers": told.expected_inliers, "n_visible": told.n_visible, "in_range": told.in_range}
-        found[VISIBLE] = told.n_visible
-        for other in scoring.also:
-            if other not in (VISIBLE, scorer.name):
-                values = make_scorer(other, around, weights=weights_of(other, None)).score(poses)
-                found[other] = values * _number(other, around)
+    scorer = _quietly(replace(scoring, anywhere=True).scorer, around)  # `check_place` has seen to it
+    told = _quietly(scorer.report, poses)
+    found: dict[str, Any] = {"name": scorer.name, "score": told.score * number_of(scorer.name, around)}
+    found |= {"expected_inliers": told.expected_inliers, "n_visible": told.n_visible, "in_range": told.in_range}
+    found[VISIBLE] = told.n_visible
+    for other in scoring.also:
+        if other not in (VISIBLE, scorer.name):
+            beside = make_scorer(other, around, weights=weights_of(other, None))
+            found[other] = _quietly(beside.score, poses) * number_of(other, around)
     return found
 
 
-def _number(method: str, around: LocalizationMap) -> int:
-    return len(around.landmarks) if method in (*_OF_THE_MAP, VISIBLE) else 1
+def _quietly(call: Callable[..., Any], *arguments: Any) -> Any:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", OutOfRangeWarning)  # the results tell how many are in range
+        return call(*arguments)

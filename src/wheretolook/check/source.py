@@ -181,19 +181,54 @@ def features_beside(model_dir: Path) -> Path | None:
         if (place / DATABASE_FILE).is_file():
             return place / DATABASE_FILE
     found = [path for suffix in HDF5_SUFFIXES for path in sorted(model_dir.glob(f"*{suffix}"))]
-    return found[0] if len(found) == 1 else None
+    if len(found) == 1:
+        return found[0]
+    named = _reported(model_dir, "existing", "database")
+    return Path(named) if named is not None and Path(named).is_file() else None
 
 
 def photographs_of(model_dir: Path) -> Path | None:
     """The folder of photographs that a map of this project was made from, if its report names one that is there."""
-    try:
-        named = read_json_object(model_dir / REPORT_FILE)["config"]["photographs"]["images"]
-    except (OSError, ValueError, KeyError, TypeError):
-        named = None
-    for folder in (model_dir / "images", *([Path(named)] if isinstance(named, str) else [])):
+    named = _reported(model_dir, "photographs", "images")
+    for folder in (model_dir / "images", *([Path(named)] if named is not None else [])):
         if folder.is_dir():
             return folder
     return None
+
+
+def _reported(model_dir: Path, group: str, name: str) -> str | None:
+    """A path among the settings in the report of a map of this project; None if there is none."""
+    try:
+        found = read_json_object(model_dir / REPORT_FILE)["config"][group][name]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return found if isinstance(found, str) and found else None
+
+
+def features_of(
+    model_dir: Path,
+    images: Path | None,
+    database: Path | None,
+    work: Path,
+    workers: int,
+    device: str,
+    extractor: ExtractorConfig = ExtractorConfig(),
+) -> tuple[Path, Path]:
+    """The folder of a map's model, and the features of its photographs: those given or those that are found.
+
+    From the folder of the photographs alone both are made anew, in `work` (`extract_anew`). Raises MapError if neither
+    features nor photographs are known.
+    """
+    if images is None and database is None:
+        database = features_beside(model_dir)
+        images = photographs_of(model_dir) if database is None else None
+    if database is not None:
+        return model_dir, database
+    if images is None:
+        read_model(model_dir)  # if there is no model at all, that is said
+        fix = "Give --database, the database.db that it was built from, or --images, the folder of its photographs."
+        raise MapError("neither the features nor the photographs of this map are known", path=model_dir, fix=fix)
+    return extract_anew(model_dir, images, work, workers, device, extractor)
 
 
 def says_metric(model_dir: Path) -> bool:

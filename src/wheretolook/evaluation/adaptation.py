@@ -21,7 +21,8 @@ NEIGHBOURS_M = 1.0  # locations in one square of the floor of this side are resa
 
 @dataclass(frozen=True)
 class Gain:
-    """What adapting has changed; intervals are of 95 % over locations, neighbours resampled together.
+    """What adapting has changed; intervals are of 95 % over locations, neighbours resampled together, or over
+    blocks of photographs.
 
     `before` and `after` have log loss, AUC, regret in percentage points and expected calibration error, by name.
     """
@@ -36,18 +37,32 @@ class Gain:
         """Whether the chances are truer by more than the interval, and views are not chosen worse by more than it."""
         return self.log_loss_less[1] > 0 and not self.regret_less[2] < 0
 
+    @property
+    def is_worse(self) -> bool:
+        """Whether the chances are less true, or views are chosen worse, by more than the interval."""
+        return self.log_loss_less[2] < 0 or self.regret_less[2] < 0
+
 
 def compare_log_odds(
-    before: Float, after: Float, good: NDArray[np.bool_], location: NDArray[np.integer], centers: Float, seed: int = 0
+    before: Float,
+    after: Float,
+    good: NDArray[np.bool_],
+    location: NDArray[np.integer],
+    centers: Float,
+    seed: int = 0,
+    blocks: NDArray[np.integer] | None = None,
 ) -> Gain:
     """Compare log-odds (B,) of views that localize or not (B,), at locations by number (B,), of cameras (B, 3) m.
 
-    Of regret the locations count that have several views.
+    Of regret the locations count that have several views. Photographs of a block (`blocks` (B,), -1 for views that are
+    none) are resampled together, and a location of theirs lies in one block.
     """
     ids, row, times = np.unique(location, return_inverse=True, return_counts=True)
     row = row.reshape(-1)
     first = np.unique(row, return_index=True)[1]
     squares = np.unique(np.floor(centers[first, :2] / NEIGHBOURS_M), axis=0, return_inverse=True)[1].reshape(-1)
+    if blocks is not None:
+        squares = np.where(blocks[first] >= 0, squares.max() + 1 + blocks[first], squares)
     bootstrap = LocationBootstrap(np.zeros(len(ids), dtype=np.int64), RESAMPLES, seed, squares)
 
     def less(values: Float, counts: Float) -> tuple[float, float, float]:

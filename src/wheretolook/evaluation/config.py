@@ -43,6 +43,8 @@ class EvaluateConfig:
         heading: heading of the method "forward": one direction, or the waypoints of a path. In the world; the direction
             of travel nearest to a location is the heading there. Empty for a horizontal heading drawn for each
             location.
+        photographs: whether photographs that were left out of the scenes' maps are views, too, as by
+            `wheretolook check`; in rows of their own, with "photographs" in the column `candidates`.
         reference: method that every other is compared with, by its name, such as "bins" or "mlp-2d+z". Empty for
             "set", or else "mlp-2d+3d", or else the first learned one.
     """
@@ -58,6 +60,7 @@ class EvaluateConfig:
     candidates: tuple[int, ...] = (0,)
     block_m: float = 1.0
     heading: tuple[tuple[float, float, float], ...] = ()
+    photographs: bool = False
     reference: str = ""
 
     def __post_init__(self) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import pandas as pd
 
-from wheretolook.evaluation.score_table import main_rows, methods_of, reference_of, threshold_keys
+from wheretolook.evaluation.score_table import PHOTOGRAPHS, main_rows, methods_of, reference_of, threshold_keys
 from wheretolook.evaluation.scores import RELEASED_DIVISOR, by_chance
 from wheretolook.methods.styles import ORACLE, method_group, method_style
 from wheretolook.utils.markdown import markdown_table
@@ -29,7 +29,11 @@ def score_markdown(scores: pd.DataFrame, title: str = "Localization score") -> s
     and by set of candidates if there are several (the tables above are of the first); shares divided by the released
     code's constant; calibration; probes apart. What an older table lacks is left out.
     """
-    main = main_rows(scores)
+    main, of_photographs = main_rows(scores), _of_photographs(scores)
+    if len(main) and not of_photographs.all():
+        scores, photographs = scores[~of_photographs], scores[of_photographs]
+    else:
+        photographs = scores.iloc[:0]
     probe = main["method"].map(method_group) == "probes"
     methods, probes = main[~probe], main[probe]
     pooled = methods[methods["scene"] == ALL]
@@ -45,6 +49,7 @@ def score_markdown(scores: pd.DataFrame, title: str = "Localization score") -> s
     parts += _scene_tables(methods, keys[0], counts[0])
     parts += _comparison(scores, "occlusion", "occlusion model", "", keys[0])
     parts += _comparison(scores, "candidates", "set of candidates", _CANDIDATES, keys[0])
+    parts += _photographs(photographs, keys, counts[0])
     parts += _released_table(first, keys)
     parts += _calibration(first)
     if len(probes):
@@ -56,6 +61,24 @@ def score_markdown(scores: pd.DataFrame, title: str = "Localization score") -> s
             _table(rows, [*_score_columns(keys, 1), *_RANKING], "probe"),
         ]
     return "\n\n".join(parts) + "\n"
+
+
+def _of_photographs(scores: pd.DataFrame) -> pd.Series[bool]:
+    return scores["candidates"] == PHOTOGRAPHS if "candidates" in scores else pd.Series(False, index=scores.index)
+
+
+def _photographs(rows: pd.DataFrame, keys: Sequence[str], n: int) -> list[str]:
+    """The table of photographs where there are rendered views before them."""
+    if rows.empty:
+        return []
+    first = rows[(rows["scene"] == ALL) & (rows["top_n"] == n)]
+    columns = [*_score_columns(keys, len(keys)), *_certainty_columns(first, keys[0]), *_RANKING]
+    return [
+        "## Photographs",
+        f"{_about(rows)} {_best(n)} of each.",
+        _table(first, columns),
+        *_scene_tables(rows, keys[0], n),
+    ]
 
 
 def best_in_words(scores: pd.DataFrame) -> str:
@@ -119,7 +142,12 @@ def _about(main: pd.DataFrame) -> str:
     n_locations = main.loc[main["scene"] == ALL, "n_locations"].iloc[0]
     text = f"Scenes: {', '.join(scenes)}; {n_locations:,} locations"
     candidates = main["candidates"].iloc[0] if "candidates" in main else ALL
-    if candidates != ALL:
+    if candidates == PHOTOGRAPHS:
+        text += (
+            "; views are photographs, left out of their maps in blocks and scored on the map without their block; a "
+            "location is a place that photographs of a block share, of one or more"
+        )
+    elif candidates != ALL:
         text += f"; to choose from there are the {candidates} directions of a location by the landmarks they see"
     return f"{text}."
 

@@ -56,6 +56,7 @@ class ScoredSet:
     scores: Mapping[str, Float]  # (B,) scores of these views, by method
     choices: Choices  # what each method chooses
     table: pd.DataFrame  # the score table, with columns `occlusion` and `candidates`
+    scenes: Sequence[SceneFolder]  # by their numbers in the views
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,16 +148,12 @@ def best_of(table: pd.DataFrame) -> tuple[dict[str, str], dict[str, float]]:
 
 
 def _runs_with_locations(
-    scored: Sequence[ScoredSet],
-    params: Mapping[str, Any],
-    scenes: Sequence[SceneFolder],
-    config: EvaluateConfig,
-    file: Path,
+    scored: Sequence[ScoredSet], params: Mapping[str, Any], config: EvaluateConfig, file: Path
 ) -> Iterator[NestedRun]:
     """The runs of `runs_of_rows`, each with a `file` that holds what was chosen until the next is asked for."""
     for one in scored:
         for nested in runs_of_rows(one.table, params):
-            chosen = [location_table(one, nested.params["method"], n, scenes, config) for n in config.top_n]
+            chosen = [location_table(one, nested.params["method"], n, one.scenes, config) for n in config.top_n]
             with replacing(file) as partial:
                 pd.concat(chosen).to_parquet(partial, index=False)
             yield replace(nested, files=(file,))
@@ -199,6 +196,8 @@ def log_evaluation(
     views, scenes = evaluation.views, evaluation.scenes
     params = evaluation_params(dataset, scenes, evaluation.weights)
     params |= {name: value for name, value in asdict(config).items() if name not in ("weights", "methods")}
+    if not config.photographs:
+        del params["photographs"]  # as before there were any
     if config.occlusions:
         params |= {f"occlusion_{name}": value for name, value in asdict(occlusion).items() if name != "model"}
     for method in methods_named(config.methods, scorers()) if len(dataset.cameras) == 1 else []:
@@ -217,7 +216,7 @@ def log_evaluation(
             if file.is_file() and file.suffix != ".partial":  # a killed process may have left one
                 client.log_artifact(run, str(file))
         file = folder / LOCATIONS_PARQUET
-        log_nested(tracking, run, "evaluate", _runs_with_locations(evaluation.scored, params, scenes, config, file))
+        log_nested(tracking, run, "evaluate", _runs_with_locations(evaluation.scored, params, config, file))
 
 
 def latest_scores(tracking: TrackingConfig, dataset: str | None = None) -> pd.DataFrame | None:

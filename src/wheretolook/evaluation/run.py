@@ -13,16 +13,20 @@ from numpy.typing import NDArray
 from wheretolook.dataset.folders import Dataset, SceneFolder
 from wheretolook.evaluation.calibration import calibration_rows, fit_temperature
 from wheretolook.evaluation.config import EvaluateConfig
+from wheretolook.evaluation.photographs import LeftOutPhotographs, photographs_set, score_photographs
+from wheretolook.evaluation.ranking import TestViews
 from wheretolook.evaluation.results import Evaluation, ScoredSet
 from wheretolook.evaluation.scores import choose, is_probability, score_table
 from wheretolook.evaluation.scoring import Weights, check_unseen, choose_weights, score_scenes
-from wheretolook.evaluation.views import candidate_sets, views_of
+from wheretolook.evaluation.views import CandidateSet, candidate_sets, views_of
 from wheretolook.geometry.poses import Float
 from wheretolook.learning.provenance import TrainedModel
 from wheretolook.methods.registry import methods_named, scorers
 from wheretolook.utils.errors import TableError
 from wheretolook.viewpoints.table import UNLABELLED, is_good
 from wheretolook.visibility.config import OcclusionConfig
+
+Scores = Mapping[str, Float]  # by method
 
 
 def compare_methods(
@@ -32,6 +36,7 @@ def compare_methods(
     progress: bool = True,
     device: str = "cpu",
     occlusion: OcclusionConfig = OcclusionConfig(),
+    photographs: Sequence[LeftOutPhotographs] = (),
 ) -> Evaluation:
     """Score and compare all methods on the scenes of one split; see `wheretolook.stages.evaluate.evaluate_methods`."""
     scenes = dataset.split(config.split)
@@ -41,27 +46,48 @@ def compare_methods(
     weights = choose_weights(dataset, config, models)
     if config.split == "test":
         check_unseen(scenes, weights)
-    tables = [scene.read_table() for scene in scenes]
-    views, location_id = views_of(scenes, tables, config)
-    sets = candidate_sets(views, location_id, scenes, tables, config)
     occlusions = [None if name is None else replace(occlusion, model=name) for name in config.occlusions or (None,)]
     temperatures, n_val = _fit_temperatures(dataset, config, weights, device, progress, occlusions[0])
+
+    def tabulated(among: Sequence[SceneFolder], candidates: CandidateSet, values: Scores, used: str) -> ScoredSet:
+        choices = choose(candidates.views, values, config.top_n)
+        part = score_table(candidates.views, values, [one.name for one in among], config, temperatures, choices)
+        part.insert(1, "occlusion", used)
+        part.insert(2, "candidates", candidates.name)
+        return ScoredSet(used, candidates, values, choices, part, among)
+
     scored: list[ScoredSet] = []
+    all_views: list[TestViews] = []
     calibration = pd.DataFrame()
-    for model in occlusions:
-        scores, used = score_scenes(dataset, scenes, tables, config, weights, device, progress, model)
-        if not scored:
-            calibration = _calibration(scores, views.good[:, 0], temperatures, n_val)
-        for candidates in sets:
-            subset = {method: values[candidates.mask] for method, values in scores.items()}
-            choices = choose(candidates.views, subset, config.top_n)
-            names = [scene.name for scene in scenes]
-            part = score_table(candidates.views, subset, names, config, temperatures, choices)
-            part.insert(1, "occlusion", used)
-            part.insert(2, "candidates", candidates.name)
-            scored.append(ScoredSet(used, candidates, subset, choices, part))
+    photographed = {one.scene.name for one in photographs}
+    rendered = [scene for scene in scenes if scene.name not in photographed or has_labels(scene)]
+    if rendered:
+        tables = [scene.read_table() for scene in rendered]
+        views, location_id = views_of(rendered, tables, config)
+        all_views.append(views)
+        sets = candidate_sets(views, location_id, rendered, tables, config)
+        for model in occlusions:
+            scores, used = score_scenes(dataset, rendered, tables, config, weights, device, progress, model)
+            if not scored:
+                calibration = _calibration(scores, views.good[:, 0], temperatures, n_val)
+            for candidates in sets:
+                subset = {method: values[candidates.mask] for method, values in scores.items()}
+                scored.append(tabulated(rendered, candidates, subset, used))
+    if photographs:
+        candidates = photographs_set(photographs, config)
+        all_views.append(candidates.views)
+        scores = score_photographs(photographs, config, weights, progress)
+        if not rendered:
+            calibration = _calibration(scores, candidates.views.good[:, 0], temperatures, n_val)
+        used = " ".join(sorted({one.occlusion for one in photographs}))
+        scored.append(tabulated([one.scene for one in photographs], candidates, scores, used))
     table = pd.concat([one.table for one in scored], ignore_index=True)
-    return Evaluation(scenes, weights, views, scored, table, calibration)
+    return Evaluation(scenes, weights, all_views[0], scored, table, calibration)
+
+
+def has_labels(scene: SceneFolder) -> bool:
+    """Whether views of a scene have been labelled."""
+    return scene.table.is_file() and bool((scene.read_table()["status"] != UNLABELLED).any())
 
 
 def _fit_temperatures(

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 
 import pandas as pd
 
+PHOTOGRAPHS = "photographs"  # in the column `candidates`: of rows whose views are photographs left out of their maps
+
 
 def threshold_keys(scores: pd.DataFrame) -> list[str]:
     """Thresholds of a score table, by the names its columns use."""

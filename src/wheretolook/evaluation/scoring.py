@@ -118,7 +118,7 @@ def score_scenes(
             for camera, rows in views_by_camera(scene, table, BLOCK):
                 if camera != looking:
                     looking, looked_at = camera, localization_map.of_camera(camera)
-                    scorers = _scorers(looked_at, config, weights)
+                    scorers = scorers_of(looked_at, config, weights)
                     reference_method(scorers, config.reference)  # an unknown one is told before the work
                 block = cam_from_world[rows]
                 binned = looked_at.bin_views(block)
@@ -135,12 +135,15 @@ def score_scenes(
     return {method: np.concatenate(parts) for method, parts in scores.items()}, " ".join(sorted(used))
 
 
-def _scorers(localization_map: LocalizationMap, config: EvaluateConfig, weights: Weights) -> dict[str, Scorer]:
+def scorers_of(
+    localization_map: LocalizationMap, config: EvaluateConfig, weights: Weights, anywhere: bool = False
+) -> dict[str, Scorer]:
+    """The scorers to compare, by the names of their rows; `anywhere` as of `make_scorer`."""
     found: dict[str, Scorer] = {}
     for method in methods_named(config.methods, scorers()):
         paths = [path for path, kind in weights.items() if kind == method.weights]
         for path in paths if method.weights else [None]:
-            scorer = make_scorer(method.name, localization_map, config.seed, path, config.heading)
+            scorer = make_scorer(method.name, localization_map, config.seed, path, config.heading, anywhere)
             # two files of one method are told apart by their names
             which = SHIPPED if path is not None and path.parent == shipped(WEIGHTS) else path
             found[f"{method.name} {which}" if method.name in found else method.name] = scorer

@@ -6,19 +6,24 @@ import shutil
 import time
 import warnings
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from wheretolook.config import Experiment
 from wheretolook.dataset.folders import Dataset, SceneFolder, views_by_camera
 from wheretolook.dataset.scene import Scene
 from wheretolook.dataset.stamps import read_stamp
+from wheretolook.geometry.poses import Float
+from wheretolook.mapping.config import ExistingModelConfig
 from wheretolook.stages.inputs import Say, Tick, extractor_of, open_scene, refuse_release
+from wheretolook.stages.left_out import CHECKS, check_name, knows_photographs, leave_photographs_out
 from wheretolook.stages.one_at_a_time import reading
-from wheretolook.utils.errors import ConfigError, OutOfRangeWarning, SceneError, TableError, WeightsError
+from wheretolook.utils.errors import ConfigError, MapError, OutOfRangeWarning, SceneError, TableError, WeightsError
 from wheretolook.utils.files import fingerprint, write_text
 from wheretolook.utils.reading import read_json_object
 from wheretolook.utils.shipped import WEIGHTS, shipped
@@ -29,7 +34,8 @@ if TYPE_CHECKING:
     from wheretolook.inputs.localization_map import LocalizationMap
     from wheretolook.labelling.labeller import LabelTask
     from wheretolook.methods.adapted.fit import Adapted, LocalizedViews
-    from wheretolook.methods.set.score import SetScorer
+    from wheretolook.methods.base import Scorer
+    from wheretolook.visibility.occlusion import OcclusionModel
 
 FOLDER = "adapted"  # of a dataset: adapted weights, and what they have gained
 LEAST_VIEWS, LEAST_LOCATIONS, LEAST_OF_A_KIND = 100, 10, 10
@@ -37,51 +43,138 @@ _AT_ONCE = 128  # views between two looks at the clock
 _PLACE = 256  # landmarks by which the place is known again
 
 
-def adapt(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> Path | None:
-    """Adapt a scorer to one scene by its labels, or by views labelled now, in the time given: `<dataset>/adapted/`.
+@dataclass(frozen=True)
+class _Place:
+    """What weights are adapted to, and where they go."""
 
-    Of views that were not learnt from it is told what the adapted weights have gained, in `<scene>.md` and an MLflow
-    run. They are kept if their chances are truer by more than the 95 % interval and they do not choose worse by more
-    than it. Returns their file, or None if the weights that it started from are not bettered.
+    name: str
+    dataset: str  # its name; empty for a map of one's own
+    source: Path  # what errors name
+    weights: Path  # to start from
+    path: Path  # of the adapted weights
+
+
+def adapt(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> Path | None:
+    """Adapt a scorer to one scene, or to a COLMAP map of photographs, by views that were localized there.
+
+    Views are the map's photographs, left out in blocks as `wheretolook check` does, and a scene's rendered views: its
+    labels, or where it has a mesh views labelled now, in the time given. Of views that were not learnt from it is told
+    what the adapted weights have gained, in `<scene>.md` and an MLflow run. They are kept if their chances are truer by
+    more than the 95 % interval and they do not choose worse by more than it; with both kinds of views, those of the
+    photographs must not be less true by more than it. Returns their file, or None if the weights that it started from
+    are not bettered.
 
     Raises:
-        ConfigError: no such scene. SceneError: it has neither labels nor a mesh to render.
+        ConfigError: no such scene. SceneError: it has neither labels, nor a mesh to render, nor photographs.
         TableError: it has no viewpoints, or too few, or all localize, or none.
         WeightsError: the weights to start from are not of the method `set`.
+        MapError: the map is not in metres, or lies on its side, or its photographs' features are not known.
     """
-    from wheretolook.evaluation.adaptation import compare_log_odds, gain_markdown
-    from wheretolook.methods.adapted.fit import adapt as learn
-
     config = experiment.adapt
+    weights = config.weights or shipped(WEIGHTS) / "set.safetensors"
+    if config.map is not None:
+        return _adapt_map(experiment, config.map, weights, say, tick)
     refuse_release(experiment.root)
     with reading(experiment.root, "adapt", FOLDER):
         dataset = Dataset.load(experiment.root)
         files = _scene(dataset, config.scene)
-        weights = config.weights or shipped(WEIGHTS) / "set.safetensors"
         path = config.out or dataset.root / FOLDER / f"{files.name}.safetensors"
         _check_out(path, weights)
         check_store(experiment.tracking)
         scene = open_scene(experiment, dataset, files)
-        table = _labelled(experiment, files, scene, say)
-        views = labelled_views(files, scene, table, weights)
-        _check_enough(views, files)
-        say(f"{files.name}: learning from {len(views):,} views, {views.good.mean():.0%} of which localize")
-        learnt = learn(views, config.seed)
-        gain = compare_log_odds(views.log_odds, learnt.held_out, views.good, views.group, views.centers, config.seed)
-        text = gain_markdown(gain)
-        write_text(path.with_suffix(".md"), f"# {files.name}: adapted by {len(views):,} views\n\n{text}")
-        if gain.is_better:
-            _save(path, files, scene, weights, learnt, views, gain)
-            say(f"{text}\n{files.name}: the adapted weights are better -> {path}")
-        else:
-            say(f"{text}\n{files.name}: adapting does not make the weights better here: use {weights}")
-            if config.out is None and path.is_file():  # of an earlier run, by other labels
-                path.unlink()
-                say(f"{files.name}: removed {path}, which an earlier run had made")
-        with kept_if_not_logged(f"what was gained, {path.with_suffix('.md')},"):
-            _log(experiment, dataset, files, weights, path, learnt, views, gain)
-        tick(1)
-        return path if gain.is_better else None
+        has_photographs = knows_photographs(files, config.images, config.database)
+        table = _labelled(experiment, files, scene, has_photographs, say)
+        views = None if table is None else labelled_views(files, scene, table, weights)
+        if has_photographs:
+            if files.is_photographed:
+                scene.require_metres()
+            name = check_name(experiment, files)
+            try:
+                left_out = _left_out(experiment, files.map, scene.occlusion, weights, name, say)
+                views = left_out if views is None else views.joined(left_out)
+            except MapError as error:
+                if views is None:
+                    raise
+                say(f"{files.name}: its photographs are not learnt from: {error}")
+        assert views is not None
+        _check_enough(views, files.table if table is not None else files.map)
+        place = _Place(files.name, dataset.name, files.table, weights, path)
+        return _learn(experiment, place, views, files.read_landmarks().points, say, tick)
+
+
+def _adapt_map(experiment: Experiment, model: Path, weights: Path, say: Say, tick: Tick) -> Path | None:
+    """Adapt to a COLMAP map by its photographs alone."""
+    from wheretolook.mapping.colmap_model import model_arrays, read_model
+    from wheretolook.mapping.scale import read_scale
+    from wheretolook.select.surroundings import surroundings
+
+    name = ExistingModelConfig(model=model).scene_name
+    path = experiment.adapt.out or experiment.data / CHECKS / name / "adapted.safetensors"
+    _check_out(path, weights)
+    check_store(experiment.tracking)
+    scale = read_scale(model)
+    if scale is not None and not scale.is_metric and not experiment.map.photographs.assume_metric:
+        fix = "Map it with a scale (map.photographs.scale), or pass --map.photographs.assume_metric true."
+        raise MapError("the map has no scale, and this needs metres", path=model, value=scale.source, fix=fix)
+    points = model_arrays(read_model(model)).points
+    device, asked = experiment.warp_device, experiment.occlusion.model
+    hides, _ = surroundings(None, None, 1000.0, "none" if asked == "none" else "hidden-points", model, device)
+    views = _left_out(experiment, model, hides, weights, name, say)
+    _check_enough(views, model)
+    return _learn(experiment, _Place(name, "", model, weights, path), views, points, say, tick)
+
+
+def _left_out(
+    experiment: Experiment, model: Path, occlusion: OcclusionModel, weights: Path, name: str, say: Say
+) -> LocalizedViews:
+    """A map's photographs, left out in blocks: in the folder of its check, so that neither does it again."""
+    from wheretolook.check.learning import photographed_views
+
+    _set_scorer_file(weights)  # refused now, not after the work
+    settings = experiment.adapt
+    mesh, given = occlusion.name == "mesh", (settings.images, settings.database)
+    source, left_out = leave_photographs_out(experiment, "adapt", model, name, True, mesh, *given, say, True)
+    return photographed_views(source, left_out, weights, occlusion, experiment.warp_device)
+
+
+def _learn(
+    experiment: Experiment, place: _Place, views: LocalizedViews, points: Float, say: Say, tick: Tick
+) -> Path | None:
+    """Learn from a place's views; keep, tell and log what came of it."""
+    from wheretolook.evaluation.adaptation import compare_log_odds, gain_markdown
+    from wheretolook.methods.adapted.fit import adapt as learn
+
+    name, path, seed = place.name, place.path, experiment.adapt.seed
+    photographs = views.photograph >= 0
+    kinds = {"rendered views": ~photographs, "left-out photographs": photographs}
+    told = " and ".join(f"{rows.sum():,} {kind}" for kind, rows in kinds.items() if rows.any())
+    say(f"{name}: learning from {told}, {views.good.mean():.0%} of which localize")
+    learnt = learn(views, seed)
+
+    def gain_of(rows: NDArray[np.bool_]) -> Gain:
+        some = views.rows(rows)
+        judged = some.good, some.place, some.centers, seed, some.blocks
+        return compare_log_odds(some.log_odds, learnt.held_out[rows], *judged)
+
+    gain = gain_of(np.ones(len(views), dtype=bool))
+    text, is_better = gain_markdown(gain), gain.is_better
+    if photographs.any() and not photographs.all():
+        of_photographs = gain_of(photographs)
+        is_better = is_better and not of_photographs.is_worse
+        text += f"\nOf the photographs alone:\n\n{gain_markdown(of_photographs)}"
+    write_text(path.with_suffix(".md"), f"# {name}: adapted by {told}\n\n{text}")
+    if is_better:
+        _save(place, points, learnt, views, gain)
+        say(f"{text}\n{name}: the adapted weights are better -> {path}")
+    else:
+        say(f"{text}\n{name}: adapting does not make the weights better here: use {place.weights}")
+        if experiment.adapt.out is None and path.is_file():  # of an earlier run, by other labels
+            path.unlink()
+            say(f"{name}: removed {path}, which an earlier run had made")
+    with kept_if_not_logged(f"what was gained, {path.with_suffix('.md')},"):
+        _log(experiment, place, learnt, views, gain, is_better)
+    tick(1)
+    return path if is_better else None
 
 
 def _scene(dataset: Dataset, name: str) -> SceneFolder:
@@ -101,15 +194,26 @@ def _check_out(path: Path, weights: Path) -> None:
         raise ConfigError("the adapted weights would replace those that they start from", path=path, fix=fix)
 
 
-def _labelled(experiment: Experiment, files: SceneFolder, scene: Scene, say: Say) -> pd.DataFrame:
-    """The scene's labelled viewpoints: all if the label stage has been here, else those that the time allows."""
+def _labelled(
+    experiment: Experiment, files: SceneFolder, scene: Scene, has_photographs: bool, say: Say
+) -> pd.DataFrame | None:
+    """The scene's labelled viewpoints: all if the label stage has been here, else those that the time allows.
+
+    None where there are photographs alone.
+    """
     if read_stamp(files, "label") is not None:
         shutil.rmtree(files.adapt_shards, ignore_errors=True)  # of views that have labels now
         return files.read_table()
     if not files.mesh.is_file():
-        problem = "this scene has neither labels nor a mesh that views could be rendered from"
-        raise SceneError(problem, path=files.folder, fix="Use the weights that ship, or give the map a mesh.")
+        if has_photographs:
+            return None
+        problem = "this scene has neither labels, nor a mesh to render views of, nor the photographs of its map"
+        fix = "Give --database or --images, the map's photographs, or use the weights that ship."
+        raise SceneError(problem, path=files.folder, fix=fix)
     if read_stamp(files, "sample") is None:
+        if has_photographs:
+            say(f"{files.name}: no viewpoints are sampled, so photographs alone are learnt from")
+            return None
         problem = "the sample stage has not been run for this scene since its input was made"
         raise TableError(problem, path=files.folder, fix="Run `wheretolook sample`.")
     return _label_for(experiment, files, scene, say)
@@ -184,64 +288,74 @@ def labelled_views(files: SceneFolder, scene: Scene, table: pd.DataFrame, weight
     return LocalizedViews(log_odds, is_good(table), camera_centers(cam_from_world), axes, group)
 
 
-def _scorer(weights: Path, localization_map: LocalizationMap) -> SetScorer:
+def _scorer(weights: Path, localization_map: LocalizationMap) -> Scorer:
     from wheretolook.methods.registry import load_scorer
-    from wheretolook.methods.set.score import SetScorer
 
-    scorer = load_scorer(weights, localization_map)
-    if not isinstance(scorer, SetScorer):
+    _set_scorer_file(weights)
+    return load_scorer(weights, localization_map)
+
+
+def _set_scorer_file(weights: Path) -> None:
+    """Raise WeightsError unless a file has weights of a set network."""
+    from wheretolook.learning.weights import method_of_weights
+
+    if (kind := method_of_weights(weights)) != "set":
         fix = "Give weights of the method set, or leave them out for those that ship."
-        raise WeightsError("only a set network is adapted", path=weights, value=scorer.name, fix=fix)
-    return scorer
+        raise WeightsError("only a set network is adapted", path=weights, value=kind, fix=fix)
 
 
-def _check_enough(views: LocalizedViews, files: SceneFolder) -> None:
+def _check_enough(views: LocalizedViews, source: Path) -> None:
     n_good, n_locations = int(views.good.sum()), len(np.unique(views.group))
-    of_a_kind = min(n_good, len(views) - n_good)
-    if len(views) < LEAST_VIEWS or n_locations < LEAST_LOCATIONS or of_a_kind < LEAST_OF_A_KIND:
+    of_a_kind, rendered = min(n_good, len(views) - n_good), views.photograph < 0
+    few = rendered.any() and (len(views) < LEAST_VIEWS or n_locations < LEAST_LOCATIONS)
+    if few or of_a_kind < LEAST_OF_A_KIND:
+        if not rendered.any():
+            value = f"{len(views)} left-out photographs, {n_good} of which localize"
+            problem = (
+                f"adapting needs {LEAST_OF_A_KIND} left-out photographs that localize and {LEAST_OF_A_KIND} that do not"
+            )
+            raise MapError(problem, path=source, value=value, fix="Use the weights that ship.")
         value = f"{len(views)} views at {n_locations} locations, {n_good} of which localize"
         problem = (
             f"adapting needs {LEAST_VIEWS} labelled views at {LEAST_LOCATIONS} locations, of which {LEAST_OF_A_KIND} "
             f"localize and {LEAST_OF_A_KIND} do not"
         )
-        raise TableError(problem, path=files.table, value=value, fix="Sample more viewpoints, or give more minutes.")
+        raise TableError(problem, path=source, value=value, fix="Sample more viewpoints, or give more minutes.")
 
 
-def _save(
-    path: Path, files: SceneFolder, scene: Scene, weights: Path, learnt: Adapted, views: LocalizedViews, gain: Gain
-) -> None:
+def _save(place: _Place, points: Float, learnt: Adapted, views: LocalizedViews, gain: Gain) -> None:
     import torch
 
     from wheretolook.learning.trained_network import TrainedNetwork
     from wheretolook.methods.adapted.network import AdaptedNetwork
     from wheretolook.methods.set.network import SetNetwork
 
-    base, found = TrainedNetwork.load(weights, SetNetwork, "set"), learnt.adaptation
-    points = files.read_landmarks().points
-    place = points[np.arange(min(_PLACE, len(points))) * len(points) // max(1, min(_PLACE, len(points)))]
-    sizes = len(found.weights), len(place)
+    base, found = TrainedNetwork.load(place.weights, SetNetwork, "set"), learnt.adaptation
+    some = points[np.arange(min(_PLACE, len(points))) * len(points) // max(1, min(_PLACE, len(points)))]
+    sizes = len(found.weights), len(some)
     kernel = base.scale, base.offset, found.length_m, found.sharpness
     network = AdaptedNetwork(base.network, *kernel, *sizes)
     for name, values in (("centers", found.centers), ("axes", found.axes), ("weights", found.weights)):
         setattr(network, f"support_{name}", torch.from_numpy(np.array(values, dtype=np.float64)))
-    network.place = torch.from_numpy(np.array(place, dtype=np.float64))
+    network.place = torch.from_numpy(np.array(some, dtype=np.float64))
     trained = TrainedNetwork("adapted", network, base.camera, found.scale, found.offset, base.training_range)
-    about = {"scene": files.name, "views": len(views), "weights_sha256": fingerprint(weights)}
-    trained.save(path, {**about, "before": gain.before, "after": gain.after})
+    about = {"scene": place.name, "views": len(views), "photographs": int((views.photograph >= 0).sum())}
+    about |= {"weights_sha256": fingerprint(place.weights)}
+    trained.save(place.path, {**about, "before": gain.before, "after": gain.after})
 
 
 def _log(
-    experiment: Experiment, dataset: Dataset, files: SceneFolder, weights: Path, path: Path, learnt: Adapted,
-    views: LocalizedViews, gain: Gain,
-) -> None:  # fmt: skip
+    experiment: Experiment, place: _Place, learnt: Adapted, views: LocalizedViews, gain: Gain, is_better: bool
+) -> None:
     from wheretolook.utils.tracking import log, start_run
 
-    params = {"dataset": dataset.name, "scene": files.name, "weights": weights, "views": len(views)}
+    params = {"dataset": place.dataset, "scene": place.name, "weights": place.weights, "views": len(views)}
+    params |= {"photographs": int((views.photograph >= 0).sum())}
     params |= {"length_m": learnt.length_m, "amplitude": learnt.amplitude, "scale": learnt.adaptation.scale}
     metrics = {**gain.after, **{f"{name}_before": value for name, value in gain.before.items()}}
-    metrics |= {"better": float(gain.is_better), "log_loss_less": gain.log_loss_less[0]}
-    with start_run(experiment.tracking, files.name, "adapt", params) as (client, run):
+    metrics |= {"better": float(is_better), "log_loss_less": gain.log_loss_less[0]}
+    with start_run(experiment.tracking, place.name, "adapt", params) as (client, run):
         log(client, run, metrics=metrics)
-        client.log_artifact(run, str(path.with_suffix(".md")))
-        if gain.is_better:
-            client.log_artifact(run, str(path))
+        client.log_artifact(run, str(place.path.with_suffix(".md")))
+        if is_better:
+            client.log_artifact(run, str(place.path))

@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
 from wheretolook.config import Experiment
 from wheretolook.dataset.folders import Dataset
+from wheretolook.dataset.stamps import read_stamp
 from wheretolook.evaluation.config import EvaluateConfig
-from wheretolook.stages.inputs import Say, Tick, dataset_after
+from wheretolook.stages.inputs import Say, Tick, dataset_after, open_scene
+from wheretolook.stages.left_out import check_name, knows_photographs, leave_photographs_out
 from wheretolook.stages.look_sets import evaluate_looks
 from wheretolook.stages.one_at_a_time import reading, reads_dataset
+from wheretolook.utils.errors import MapError
 from wheretolook.utils.files import write_text
 from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.utils.tracking_store import check_store, kept_if_not_logged
 from wheretolook.visibility.config import OcclusionConfig
 
 if TYPE_CHECKING:
+    from wheretolook.evaluation.photographs import LeftOutPhotographs
     from wheretolook.learning.provenance import TrainedModel
 
 
@@ -29,13 +34,39 @@ def evaluate(experiment: Experiment, say: Say = print, tick: Tick = lambda work:
 
     Where labels keep where landmarks were matched, also `looks.csv` and `looks.md`: sets of looks localized together.
     """
-    dataset = dataset_after(experiment, "label")
+    config, device = experiment.evaluate, experiment.warp_device
+    dataset = dataset_after(experiment, "label", knows_photographs if config.photographs else lambda scene: False)
     check_store(experiment.tracking)  # before the imports of what scores, which take seconds
-    device, occlusion = experiment.warp_device, experiment.occlusion
-    scores = evaluate_methods(dataset, experiment.evaluate, experiment.tracking, device=device, occlusion=occlusion)
-    evaluate_looks(dataset, experiment.evaluate, experiment.tracking, device=device)
+    how: dict[str, Any] = {"device": device, "occlusion": experiment.occlusion}
+    if config.photographs:
+        how["photographs"] = _photographs(experiment, dataset, say)
+    scores = evaluate_methods(dataset, config, experiment.tracking, **how)
+    labelled = tuple(scene for scene in dataset.scenes if read_stamp(scene, "label") is not None)
+    if any(scene.split == config.split for scene in labelled):
+        evaluate_looks(replace(dataset, scenes=labelled), config, experiment.tracking, device=device)
     tick(1)
     return scores
+
+
+def _photographs(experiment: Experiment, dataset: Dataset, say: Say) -> list[LeftOutPhotographs]:
+    """The photographs of the maps of a split's scenes, left out of them."""
+    from wheretolook.check.learning import evaluated_photographs
+    from wheretolook.check.source import says_metric
+
+    found = []
+    for files in dataset.split(experiment.evaluate.split):
+        if knows_photographs(files):
+            metric = experiment.map.photographs.assume_metric or not files.is_photographed or says_metric(files.map)
+            name, keep_frame = check_name(experiment, files), files.mesh.is_file()
+            how = (metric, keep_frame, None, None, say)
+            source, left_out = leave_photographs_out(experiment, "evaluate", files.map, name, *how)
+            hides = open_scene(experiment, dataset, files).occlusion
+            found.append(evaluated_photographs(files, source, left_out, hides, experiment.warp_device))
+    if not found:
+        problem = "no scene of the split has a map whose photographs, or their features, are known"
+        fix = "Map photographs (`wheretolook map --images`), or a model with its database or images."
+        raise MapError(problem, path=dataset.root, value=experiment.evaluate.split, fix=fix)
+    return found
 
 
 def evaluate_methods(
@@ -47,6 +78,7 @@ def evaluate_methods(
     device: str = "cpu",
     occlusion: OcclusionConfig = OcclusionConfig(),
     show: bool = True,
+    photographs: Sequence[LeftOutPhotographs] = (),
 ) -> pd.DataFrame:
     """Compare all methods on the scenes of one split.
 
@@ -59,7 +91,8 @@ def evaluate_methods(
     model, and hold for all rows; without val scenes, or when these are evaluated, they are not known.
 
     The scenes need not be of the dataset the models were trained on. `models` are compared instead of those that
-    `config.weights` tells; `progress` shows a bar, and prints the table at the end unless `show` is off; `occlusion`
+    `config.weights` tells; `photographs` that were left out of their maps are views, too, with rows of their own;
+    `progress` shows a bar, and prints the table at the end unless `show` is off; `occlusion`
     has the settings of the models that `config.occlusions` names. Returns the tables of
     `wheretolook.evaluation.scores.score_table`, one below the other, with columns `occlusion` and `candidates`.
 
@@ -81,7 +114,7 @@ def evaluate_methods(
     folder = results_folder(dataset, config)
     with reading(dataset.root, "evaluate", folder.name):
         check_store(tracking)
-        found = compare_methods(dataset, config, models, progress, device, occlusion)
+        found = compare_methods(dataset, config, models, progress, device, occlusion, photographs)
         write_results(folder, found.table, found.calibration, title)
         with kept_if_not_logged(f"the evaluation in {folder}", not_logged(dataset)):
             log_evaluation(dataset, found, config, tracking, occlusion, folder)

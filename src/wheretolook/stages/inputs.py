@@ -26,8 +26,10 @@ Tick = Callable[[float], None]
 """Told how much of a stage's work is done: 1 a scene, or 1 in all for stages that do not go scene by scene."""
 
 
-def dataset_after(experiment: Experiment, needs: str) -> Dataset:
-    """The dataset, if the stage that is needed has been run for all of its scenes as they are now.
+def dataset_after(
+    experiment: Experiment, needs: str, but: Callable[[SceneFolder], bool] = lambda scene: False
+) -> Dataset:
+    """The dataset, if the stage that is needed has been run for all of its scenes as they are now, but for some.
 
     Raises ConfigError if it was made with another camera, or is a release where meshes and maps are needed; TableError
     if there is none, or the stage has not been run.
@@ -42,7 +44,7 @@ def dataset_after(experiment: Experiment, needs: str) -> Dataset:
         problem = "the dataset was made with another camera"
         raise ConfigError(problem, path=experiment.root, value=others[0], fix=fix)
     for scene in dataset.scenes:
-        if read_stamp(scene, needs) is None:
+        if read_stamp(scene, needs) is None and not but(scene):
             problem = f"the {needs} stage has not been run for this scene since its input was made"
             raise TableError(problem, path=scene.folder, fix=f"Run `wheretolook {needs}`.")
     return dataset

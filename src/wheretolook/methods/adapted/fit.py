@@ -8,7 +8,8 @@ the scorer was wrong nearby, as where it resembles another; far from localized v
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, field, fields
 from itertools import product
 
 import numpy as np
@@ -37,14 +38,39 @@ class LocalizedViews:
     centers: Float  # (B, 3) m, cameras in the map's frame
     axes: Float  # (B, 3) unit optical axes
     group: NDArray[np.int64]  # (B,) views of a group are never learnt from and judged by at once: of a location, say
+    # (B,) number of the photograph that a view is, as one may be left out with several blocks; -1 for rendered views
+    photograph: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    # (B,) number of the place that a view is at: of its views one is chosen; the group where it is not given
+    place: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+
+    def __post_init__(self) -> None:
+        if len(self.photograph) != len(self.good):
+            object.__setattr__(self, "photograph", np.full(len(self.good), -1))
+        if len(self.place) != len(self.good):
+            object.__setattr__(self, "place", self.group)
 
     def __len__(self) -> int:
         return len(self.good)
 
+    @property
+    def blocks(self) -> NDArray[np.int64]:
+        """Number of the block that each photograph was left out with (B,), -1 for rendered views."""
+        return np.where(self.photograph >= 0, self.group, -1)
+
     def rows(self, rows: NDArray[np.integer] | NDArray[np.bool_]) -> LocalizedViews:
         """Some of the views."""
-        parts = (self.log_odds, self.good, self.centers, self.axes, self.group)
-        return LocalizedViews(*(part[rows] for part in parts))  # type: ignore[arg-type]
+        return LocalizedViews(*(getattr(self, part.name)[rows] for part in fields(self)))
+
+    def joined(self, other: LocalizedViews) -> LocalizedViews:
+        """These views and others of the same place, whose groups and places are others than these."""
+        shifts = {"group": 0, "place": 0}
+        for name in shifts if len(self) else ():
+            shifts[name] = int(getattr(self, name).max()) + 1
+        parts = [
+            np.concatenate([getattr(self, part.name), getattr(other, part.name) + shifts.get(part.name, False)])
+            for part in fields(self)
+        ]
+        return LocalizedViews(*parts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +100,7 @@ def fit(
     """The adaptation that views make most likely, with a kernel of this length and variance; 0 calibrates only."""
     learnt = evenly(views, most) if amplitude else views
     y, fixed = learnt.good.astype(np.float64), np.column_stack([learnt.log_odds, np.ones(len(learnt))])
-    if not amplitude:
+    if not amplitude or not len(learnt):
         scale, offset = _calibration(fixed, y)
         return Adaptation(scale, offset, length_m, sharpness, np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
     poses = learnt.centers, learnt.axes
@@ -148,19 +174,43 @@ class Adapted:
 
 
 def adapt(views: LocalizedViews, seed: int = 0) -> Adapted:
-    """Adapt by cross-validation: the kernel with the least log loss over views that were not learnt from."""
-    fold = folds_of(views.group, seed=seed)
-    kernels = [(1.0, 0.0), *product(LENGTHS_M, AMPLITUDES)]
+    """Adapt by cross-validation: the kernel with the least log loss over views that were not learnt from.
 
-    def held_out(kernel: tuple[float, float], most: int) -> Float:
+    Photographs alone calibrate only: they are few, and a correction by pose was no better for blocks that were not
+    learnt from (docs/adapt.md), while calibration leaves the order of a map's views as it is.
+    """
+    rendered = (views.photograph < 0).any()
+    best, found = _choose_kernel(views, seed) if rendered else (1.0, 0.0), np.zeros(len(views))
+    for out, learnt in splits(views, seed):
+        found[out] = fit(learnt, *best).log_odds(views.rows(out))
+    return Adapted(fit(views, *best), *best, found)
+
+
+def splits(views: LocalizedViews, seed: int = 0) -> Iterator[tuple[NDArray[np.bool_], LocalizedViews]]:
+    """Views to judge by (B,), each once, and those to learn from then.
+
+    Locations are judged by in `FOLDS` parts; where there are photographs alone, one block after the other. Photographs
+    that are judged by are not learnt from, in whatever block they are.
+    """
+    rendered = (views.photograph < 0).any()
+    fold = folds_of(views.group, FOLDS if rendered else len(views), seed)
+    for number in np.unique(fold):
+        out = fold == number
+        again = (views.photograph >= 0) & np.isin(views.photograph, views.photograph[out])
+        yield out, views.rows(~out & ~again)
+
+
+def _choose_kernel(views: LocalizedViews, seed: int) -> tuple[float, float]:
+    """Length and variance of the kernel that is the best for views that were not learnt from."""
+    parts = list(splits(views, seed))
+
+    def loss(kernel: tuple[float, float]) -> float:
         found = np.zeros(len(views))
-        for number in np.unique(fold):
-            out = fold == number
-            found[out] = fit(views.rows(~out), *kernel, most=most).log_odds(views.rows(out))
-        return found
+        for out, learnt in parts:
+            found[out] = fit(learnt, *kernel, most=TRIED_SUPPORT).log_odds(views.rows(out))
+        return float(log_losses(found, views.good).mean())
 
-    best = min(kernels, key=lambda kernel: log_losses(held_out(kernel, TRIED_SUPPORT), views.good).mean())
-    return Adapted(fit(views, *best), *best, held_out(best, MAX_SUPPORT))
+    return min([(1.0, 0.0), *product(LENGTHS_M, AMPLITUDES)], key=loss)
 
 
 def log_losses(log_odds: Float, good: NDArray[np.bool_]) -> Float:

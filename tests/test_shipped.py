@@ -73,7 +73,7 @@ def test_a_missing_configuration_names_those_that_ship(capsys: pytest.CaptureFix
     assert main(["map", "--config", "configs/smal.yaml"]) == 2
     assert "Did you mean configs/small.yaml?" in capsys.readouterr().err
     assert main(["map", "--config", "x"]) == 2
-    assert "one that ships: configs/apartments.yaml, " in capsys.readouterr().err
+    assert "one that ships: configs/aliked.yaml, configs/apartments.yaml, " in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("elsewhere")

@@ -66,8 +66,8 @@ STAGES = {
     "map": Stage(
         "make_maps",
         "Build a COLMAP map of every scene by renders, or of photographs: --images. Or take one of your own: --model.",
-        "model mesh database images map.existing.name map.existing.camera_id map.n_images map.extractor.method "
-        "map.extractor.weights map.photographs.name map.photographs.scale.positions label.workers",
+        "model mesh database images map.existing.name map.n_images map.extractor.method "
+        "map.photographs.name map.photographs.scale.positions label.workers",
         ("map", "scenes.free_space", "label.workers"),
         "--name photos --images FOLDER",
         {f"--{name}": f"--map.existing.{name}" for name in ("model", "mesh", "database")},

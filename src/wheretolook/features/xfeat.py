@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from wheretolook.features.descriptors import DescriptorKind
 from wheretolook.features.extractor import Extraction, Extractor
@@ -33,7 +33,8 @@ def _build(config: ExtractorConfig, device: str) -> Extraction:
             height, width = images.shape[-2:]
             # whole pixels of the image reduced to multiples of 32, counted from the first
             ratio = images.new_tensor([width / max(32, width // 32 * 32), height / max(32, height // 32 * 32)])
-            found = self._network.detectAndCompute(images)
+            detect: Any = self._network.detectAndCompute
+            found = detect(images)
             return [(each["keypoints"] + ratio / 2, each["descriptors"], each["scores"]) for each in found]
 
     return XFeat(config, device)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -128,8 +129,8 @@ def _first_rows(pooled: pd.DataFrame) -> pd.DataFrame:
     return pooled[pooled["top_n"] == pooled["top_n"].iloc[0]].set_index("method")
 
 
-def _interval(row: pd.Series, column: str) -> tuple[float, float, float]:
-    """Value and ends of the interval, in percent; NaN where they are not known."""
+def _interval(row: Any, column: str) -> tuple[float, float, float]:
+    """Value and ends of the interval in a row of the table, in percent; NaN where they are not known."""
     name, _, key = column.partition("_")
     names = (column, f"{name}_low_{key}", f"{name}_high_{key}")
     value, low, high = (100 * float(row.get(one, np.nan)) for one in names)

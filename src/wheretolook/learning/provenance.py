@@ -13,7 +13,6 @@ from wheretolook.features.sift import SIFT
 from wheretolook.learning.config import DECIDING, SharedConfig
 from wheretolook.learning.old_names import with_name
 from wheretolook.learning.scenes import with_also
-from wheretolook.mapping.landmarks import features_of
 from wheretolook.utils.errors import ConfigError, TableError
 from wheretolook.utils.files import fingerprint, sha256
 from wheretolook.utils.reading import read_json_object
@@ -56,6 +55,8 @@ def about_training(dataset: Dataset, method: str, config: SharedConfig, options:
         "camera": cameras[0].record() if len(cameras) == 1 else f"{len(cameras)} cameras",
         "config": {**asdict(options), **shared},
     }
+    from wheretolook.mapping.landmarks import features_of
+
     features = sorted({features_of(scene.landmarks) for scene in seen if scene.landmarks.is_file()})
     if features not in ([], [SIFT.name]):  # weights that say nothing are for SIFT, as are all older ones
         about["features"] = features

@@ -105,7 +105,7 @@ def seen_around(
         describer, log_odds = chances_of
         ends = np.concatenate([[0], np.bincount(of_look, minlength=len(poses)).cumsum()])
         with torch.inference_mode():
-            described = describer.describe(poses, LandmarkSets(ends, rows))
+            described = describer.describe(poses, LandmarkSets(ends, rows.astype(np.int32)))
             chances[of_look, column] = log_odds(described.values).sigmoid().float().cpu().numpy()
             precision = bearing_precision(described.values, described.attributes)
             if precision is not None:  # the same from every look: it depends on the distance

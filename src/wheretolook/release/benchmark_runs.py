@@ -42,5 +42,5 @@ def log_runtimes(
         if len(growth):
             growth.to_csv(folder / SCALING_CSV, index=False)
             save_figure(scaling_figure(growth), folder / "visibility-scaling.png")
-        client.log_artifacts(run, folder)
+        client.log_artifacts(run, str(folder))
     return run

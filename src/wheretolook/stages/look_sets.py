@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pandas as pd
@@ -134,7 +134,7 @@ def compare_looks(
                 if n > len(rows):
                     continue
                 looks = _looks(strategy, n, axes, values, seen, sure, rng)
-                chosen = rows[looks]
+                chosen = np.asarray(rows)[looks]
                 sets.append(chosen.tolist())
                 first = bool(good[rows[int(values.argmax())]])
                 expected = worth_of(seen, worth, looks)
@@ -224,12 +224,12 @@ def write_looks(folder: Path, sets: pd.DataFrame, title: str) -> pd.DataFrame:
         [row.strategy, str(row.n_looks), str(row.n_locations), _share(row.good, row.good_low, row.good_high),
          _share(row.gain, row.gain_low, row.gain_high), f"{100 * row.any_good:.1f}", f"{100 * row.sure:.1f}",
          "" if np.isnan(row.sure_right) else f"{100 * row.sure_right:.1f}"]
-        for row in table.itertuples()
+        for row in cast("Iterable[Any]", table.itertuples())
     ]  # fmt: skip
     head = ["looks", "N", "places", "localized together", "over one look", "any alone", "sure", "of these right"]
     stops = [
         [f"{r.asked:.2f}", f"{r.looks:.2f}", f"{100 * r.good:.1f}", f"{100 * r.of_most:.1f}"]
-        for r in stopping.itertuples()
+        for r in cast("Iterable[Any]", stopping.itertuples())
     ]
     parts = [f"# {title}", markdown_table(head, shares)]
     parts += ["## When to stop", markdown_table(["asked", "looks", "localized", "of all looks' share"], stops)]

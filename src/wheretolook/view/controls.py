@@ -67,7 +67,8 @@ class Controls:
 
 def build(gui: GuiApi, shared: Shared, state: ViewState) -> Controls:
     """Make the panel for one client, as its state says."""
-    opened, made = shared.opened, {}
+    opened = shared.opened
+    made: dict[str, Any] = {}
     low, high = shared.low_m, shared.high_m
     blank = np.full((270, 360, 3), (38, 40, 46), np.uint8)
     tabs = gui.add_tab_group()

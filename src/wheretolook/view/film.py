@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,6 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.style import context
 from tqdm.auto import tqdm
 
+from wheretolook.figures.config import Look
 from wheretolook.figures.house_image import Dollhouse, dollhouse, draw_house, draw_segments, frustum_segments
 from wheretolook.figures.style import BLUE, GREEN, RC, VERMILION, new_figure
 from wheretolook.geometry.camera import Camera
@@ -57,7 +59,7 @@ def film(shared: Shared, path: Path, state: ViewState = ViewState()) -> int:
     with replacing(path, path.with_name(f".partial-{path.name}")) as partial:
         if path.suffix == ".gif":
             frames = [frame.quantize(128) for frame in frames]
-        more = {"quality": QUALITY, "method": 6} if path.suffix == ".webp" else {}
+        more: dict[str, Any] = {"quality": QUALITY, "method": 6} if path.suffix == ".webp" else {}
         frames[0].save(partial, save_all=True, append_images=frames[1:], duration=times, loop=0, **more)
     return len(frames)
 
@@ -130,5 +132,5 @@ def _draw_view(axes: Axes, image: drawing.Rgb, name: str, good: bool, so_far: np
     share = f"{100 * np.mean(so_far):.0f} % so far"
     verdict = f"localized: {share}" if good else f"LOST, localized: {share}"
     box = {"boxstyle": "square,pad=0.3", "facecolor": GREEN if good else VERMILION, "edgecolor": "none"}
-    place = {"transform": axes.transAxes, "ha": "left", "va": "bottom"}
+    place: Look = {"transform": axes.transAxes, "ha": "left", "va": "bottom"}
     axes.text(0.03, 0.04, verdict, fontsize=10, color="white", fontweight="bold", bbox=box, **place)

@@ -165,7 +165,7 @@ def landmarks_seen(scorer: Scorer, pose: Float, teller: Scorer | None = None) ->
         found = teller.found_chances(pose)
     around = scorer.localization_map
     if found is None:
-        rows = around.landmarks_in_view(pose[None])[0]
+        rows = around.landmarks_in_view(pose[None])[0].astype(np.int64)
         found = rows, np.full(len(rows), np.nan)
     points = around.landmarks.points[found[0]]
     return SeenLandmarks(points, around.camera.project(points @ pose[:, :3].T + pose[:, 3]), found[1])

@@ -106,7 +106,7 @@ Mesh and database may be left out. With --images its landmarks are triangulated 
         "evaluate",
         "Score all methods on the test scenes.",
         "evaluate.methods evaluate.weights evaluate.split evaluate.top_n evaluate.thresholds evaluate.occlusions "
-        "evaluate.candidates evaluate.photographs evaluate.heading evaluate.reference evaluate.seed tracking.folder",
+        "evaluate.candidates evaluate.photographs evaluate.reference evaluate.seed tracking.folder",
         ("evaluate", "occlusion", "tracking"),
         "--config configs/demo.yaml --evaluate.methods '[random, visible, set]'",
         notes="What evaluate.methods may name: wheretolook evaluate --list-methods",
@@ -126,8 +126,7 @@ Mesh and database may be left out. With --images its landmarks are triangulated 
 Learns from the map's own photographs, left out in blocks as `wheretolook check` does, of a COLMAP model (--map) or of a
 scene made of photographs; and from a scene's labels, or, where it has a mesh and none, from as many of its viewpoints
 as can be labelled in the minutes; done again, it goes on with more. The weights are for this place alone:
-  wheretolook select --map sparse/0 --weights data/checks/mymap/adapted.safetensors \\
-      --at 1,2,1.4 --out views.csv""",
+  wheretolook select --map sparse/0 --weights data/checks/mymap/adapted.safetensors --at 1,2,1.4 --out views.csv""",
     ),
     "viewpoint-map": Stage(
         "viewpoint_map",

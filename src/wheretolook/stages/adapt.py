@@ -242,12 +242,12 @@ def _label_for(experiment: Experiment, files: SceneFolder, scene: Scene, say: Sa
     ]
     say(f"{files.name}: labelling up to {len(table):,} views, for {config.minutes:g} minutes at most")
     done: dict[str, pd.DataFrame] = {}
-    end = None  # counted from the first views that are labelled now: what lay there comes at once
+    end = None  # counted from when work began on the first views that are labelled now: what lay there comes at once
     with closing(label_scenes(tasks, label)) as results:
         for labelled in results:
             done[labelled.task.name] = labelled.table
             if labelled.seconds and end is None:
-                end = time.monotonic() + 60 * config.minutes
+                end = time.monotonic() + 60 * config.minutes - sum(labelled.seconds.values()) / experiment.n_workers
             if end is not None and time.monotonic() >= end:
                 break
     _remove_stale(files.adapt_shards, tasks)

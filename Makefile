@@ -1,6 +1,6 @@
 # make demo   sets everything up and runs the whole line on the embedded default
-# make test   sets everything up and runs linter, type checker and the tests: about six minutes on two cores
-# make test-all   the same and the slow tests too, in a quarter of an hour
+# make test   sets everything up and runs linter, type checker and the tests: nine minutes on two cores
+# make test-all   the same and the slow tests too, in half an hour
 # make ui     opens MLflow on the runs, those of the release included; make lab opens Jupyter on the notebooks
 # make html   runs all notebooks and writes them as pages, notebooks/html; make docs builds the documentation, site/
 # Options: TORCH=cuda for the CUDA build of PyTorch, PYTHON=python3.12, PORT=5001 for make ui. See environment.md.

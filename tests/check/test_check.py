@@ -217,6 +217,7 @@ def _adapted(folder: Path, place: np.ndarray) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_adapted_weights_are_checked_on_their_map_without_most_of_its_landmarks(
     checked: Path, corridor: tuple[Path, Path], tmp_path: Path
 ) -> None:
@@ -236,6 +237,7 @@ def test_adapted_weights_are_checked_on_their_map_without_most_of_its_landmarks(
     run([*arguments, elsewhere, "--anywhere"])
 
 
+@pytest.mark.slow
 def test_a_map_of_any_scale_and_frame_gives_the_same(
     corridor: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -174,6 +174,7 @@ def test_two_view_landmarks_add_short_tracks(built, room, room_free_space, rende
     assert many.median_track_length < few.median_track_length
 
 
+@pytest.mark.slow
 def test_earlier_map_is_replaced_and_extras_are_optional(room, room_free_space, renderer, tmp_path):
     folder = tmp_path / "map"
     config = MapConfig(n_images=10, walk=WalkConfig(image_spacing_m=0.35))

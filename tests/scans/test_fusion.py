@@ -123,6 +123,7 @@ def test_renders_look_like_the_colour_images(tum, mesh, appearance):
     assert (len(found.mesh.textures) > 3) == (appearance == "texture")
 
 
+@pytest.mark.slow
 def test_textures_are_sharper_than_colours_at_vertices(tum, mesh):
     pose, images = walk()[[25]], []
     for one in (mesh, scan(tum).mesh, scan(tum, appearance="colors").mesh):

@@ -34,6 +34,7 @@ def pid_after(seconds: float) -> int:
     return os.getpid()
 
 
+@pytest.mark.slow
 def test_processes_outlive_the_thread_that_started_them() -> None:
     first: list[int] = []
     with Processes(2) as processes:

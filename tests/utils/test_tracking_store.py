@@ -239,6 +239,7 @@ def test_two_first_runs_at_once_make_one_store(tmp_path: Path, begun: list[subpr
     assert {path.name for path in tracking.root.iterdir()} <= {"mlflow.db", "artifacts"}
 
 
+@pytest.mark.slow
 def test_a_process_killed_while_it_makes_the_store_leaves_nothing_that_blocks(
     tmp_path: Path, begun: list[subprocess.Popen[str]]
 ) -> None:

@@ -8,7 +8,7 @@ of locations anywhere, in directions all around. Keypoints are kept in --work, s
 other limits on the similarity (--similarities) are tried quickly. A table shows, for each extractor, the share of views
 that localize within 5 cm and 0.4 degrees; the scorer's AUC; and its regret: how much more often the best view of a
 location localizes than the one it chooses, over locations with any that does, in points. Beside it the same of `bins`,
-and of the scorer without the landmarks' ambiguity. Intervals are of 95 %, by a bootstrap over locations.
+and of the scorer without the landmarks' ambiguity, and of --weights. Intervals are of 95 %, by a bootstrap over locations.
 """
 
 from __future__ import annotations
@@ -123,6 +123,7 @@ def main() -> None:
     add("--map-images", type=int, default=100)
     add("--max-keypoints", type=int, default=2048)
     add("--similarities", nargs="*", type=float, default=[], help="limits to try beside the extractor's own")
+    add("--weights", nargs="*", default=[], metavar="NAME=FILE", help="of other scorers to compare")
     add("--device", default="cpu")
     add("--work", type=Path, required=True, metavar="FOLDER", help="where maps and keypoints are kept")
     args = parser.parse_args()
@@ -143,13 +144,14 @@ def main() -> None:
             if not (place / "landmarks.npz").is_file():
                 settings = MapConfig(n_images=args.map_images, extractor=config)
                 build_map(scene.mesh, WarpRenderer(scene.mesh, args.device), scene.free_space, CAMERA, settings, seed,
-                          place, workers=1, device=args.device)  # fmt: skip
+                          place, scene.free_space.raycaster, workers=1, device=args.device)  # fmt: skip
             extractor = KeypointExtractor(config, args.device)
             keypoints, seconds = keypoints_of(poses, scene, extractor, folder / name / "keypoints", args.device)
             landmarks = Landmarks.load(place / "landmarks.npz")
             looked = LocalizationMap(landmarks, CAMERA, occlusion, args.device)
             unsure = replace(looked, landmarks=replace(landmarks, ambiguity=np.full_like(landmarks.ambiguity, np.nan)))
             scorers = {"shipped": load_scorer(looked), "without ambiguity": load_scorer(unsure)}
+            scorers |= {name: load_scorer(file, looked) for name, _, file in (w.partition("=") for w in args.weights)}
             scorers["bins"] = make_scorer("bins", looked)
             scores = {scorer: one.score(poses) for scorer, one in scorers.items()}
             limits: list[float | None] = [None, *(args.similarities if landmarks.features != "sift" else [])]

@@ -8,7 +8,7 @@ of locations anywhere, in directions all around. Keypoints are kept in --work, s
 other limits on the similarity (--similarities) are tried quickly. A table shows, for each extractor, the share of views
 that localize within 5 cm and 0.4 degrees; the scorer's AUC; and its regret: how much more often the best view of a
 location localizes than the one it chooses, over locations with any that does, in points. Beside it the same of `bins`,
-and of the scorer without the landmarks' ambiguity, and of --weights. Intervals are of 95 %, by a bootstrap over locations.
+of the scorer without the landmarks' ambiguity, and of --weights. Intervals are of 95 %, by a bootstrap over locations.
 """
 
 from __future__ import annotations

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -187,3 +188,9 @@ def test_one_warning_says_that_weights_have_learnt_from_other_features():
         scorer = load_scorer(LocalizationMap(landmarks, PinholeCamera()))
     assert len(said) == 1
     assert np.isfinite(scorer.score(pose[None])).all()
+    theirs = "data/release/weights/aliked/set.safetensors"
+    assert theirs in str(said[0].message)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", OutOfRangeWarning)
+        own = load_scorer(theirs, LocalizationMap(landmarks, PinholeCamera()))
+    assert own.name == "set" and np.isfinite(own.score(pose[None])).all()

@@ -249,4 +249,7 @@ def _warn_of_features(of_map: str, weights: Path) -> None:
     if of_map and of_map not in learnt:
         text = f"the weights {weights.name} have learnt from maps by {', '.join(learnt)}, and this one is by {of_map}"
         fix = "By ALIKED that cost 8 of 100 best views (docs/features.md); `wheretolook check` measures it on your map"
+        theirs = f"{WEIGHTS}/{of_map}/set.safetensors"
+        if or_shipped(theirs).is_file():
+            fix = f"Weights for it ship, {theirs}. {fix}"
         warnings.warn(f"{text}. {fix}.", OutOfRangeWarning, stacklevel=4)

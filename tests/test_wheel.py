@@ -93,10 +93,11 @@ def test_it_carries_all_modules_and_what_they_need(wheel: Path) -> None:
     configs = {f"{place}/configs/{path.name}" for path in (ROOT / "configs").glob("*.yaml")}
     weights = {
         f"{place}/data/release/weights/{name}.{suffix}"
-        for name in ("set", "matchability", "mlp-2d+z")
+        for name in ("set", "matchability", "mlp-2d+z", "aliked/set", "aliked/matchability")
         for suffix in ("json", "safetensors")
     }
-    assert files == {*modules, *configs, *weights, "wheretolook/py.typed"}
+    numbers = {"wheretolook/labelling/confidence.json", "wheretolook/looks/worth.json"}
+    assert files == {*modules, *configs, *weights, *numbers, "wheretolook/py.typed"}
     assert metadata["License-Expression"] == "Apache-2.0" and "wheretolook = wheretolook.cli:main" in points
 
 

@@ -32,6 +32,7 @@ from scipy.special import expit
 from tqdm.auto import tqdm
 
 from wheretolook.check.checking import check_map
+from wheretolook.check.figure import check_figure
 from wheretolook.check.learning import photographed_views
 from wheretolook.check.leave_out import left_out_blocks
 from wheretolook.check.numbers import measure
@@ -39,7 +40,6 @@ from wheretolook.check.report import place_radius
 from wheretolook.check.scores import Scoring
 from wheretolook.check.source import PhotographedMap, open_map, says_metric
 from wheretolook.evaluation.adaptation import compare_log_odds, gain_markdown
-from wheretolook.figures.check import check_figure
 from wheretolook.figures.style import save_figure
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import Float, camera_centers, invert_poses, pose_error

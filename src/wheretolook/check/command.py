@@ -83,8 +83,8 @@ def run(arguments: Sequence[str]) -> int:
     options, start = parser().parse_args(arguments), time.monotonic()
     _refuse(options)
     from wheretolook.check.checking import check_map
+    from wheretolook.check.figure import check_figure
     from wheretolook.check.scores import Scoring
-    from wheretolook.figures.check import check_figure
     from wheretolook.figures.style import save_figure
     from wheretolook.learning.weights import read_training
     from wheretolook.utils.devices import usable_device

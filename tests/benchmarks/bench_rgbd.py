@@ -1,15 +1,15 @@
 """How well views rendered from an RGB-D scan stand for photographs: both localized against the same map.
 
     python tests/benchmarks/bench_photographs.py --poses 7-scenes/redkitchen/seq-01 --work work/kitchen
-    python tests/benchmarks/bench_rgbd.py --recording 7-scenes/redkitchen/seq-01 --work work/kitchen
+    python tests/benchmarks/bench_rgbd.py --recording 7-scenes/redkitchen/seq-01 --work work/kitchen --blocks 4 6 7
 
-`bench_photographs.py` maps the photographs, leaves out blocks of neighbouring ones and localizes these on a map of the
-others. Here the frames that are not left out are fused to a mesh, the left-out poses are rendered, and the renders are
-localized on the same map. So neither map nor mesh knows the photograph that a render is compared with. The table has
-for each appearance (colours at vertices, textures from photographs) the share of views on which render and photograph
-agree whether they localize well, chance-corrected (Cohen's kappa), the rank correlation of their inliers, the median of
-rendered over photographed inliers, and, per method, AUC by the photographs' labels and by the renders' labels on the
-same views. `--out` keeps every view.
+Blocks of neighbouring photographs are left out as `wheretolook check` does, and localized on a map of the others. Here
+the frames that are not left out are fused to a mesh, the left-out poses are rendered, and the renders are localized on
+the same map. So neither map nor mesh knows the photograph that a render is compared with. The table has for each
+appearance (colours at vertices, textures from photographs), with depths as they were read and corrected by the map's
+landmarks, the share of views on which render and photograph agree whether they localize well, chance-corrected (Cohen's
+kappa), the rank correlation of their inliers, the median of rendered over photographed inliers, and, per method, AUC by
+the photographs' labels and by the renders' labels on the same views. `--out` keeps every view.
 """
 
 from __future__ import annotations
@@ -21,22 +21,28 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pandas as pd
-from bench_photographs import MAP, MAX_ERROR_DEG, MAX_ERROR_M
 from scipy.stats import spearmanr
 from sklearn.metrics import cohen_kappa_score, roc_auc_score
 from tqdm.auto import tqdm
 
+from wheretolook.check.checking import check_map
+from wheretolook.check.leave_out import LeftOut, left_out_blocks, without
+from wheretolook.check.scores import Scoring
+from wheretolook.check.source import MAX_ERROR_DEG, MAX_ERROR_M, PhotographedMap, open_map
 from wheretolook.geometry.poses import pose_error
 from wheretolook.labelling.localizer import Localizer
-from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
 from wheretolook.rendering.warp_renderer import WarpRenderer
+from wheretolook.scans.checks import landmark_readings
 from wheretolook.scans.config import RgbdConfig
+from wheretolook.scans.depth_correction import DepthCorrection, fit_depth_correction
 from wheretolook.scans.frames import RgbdFrame, RgbdFrames
 from wheretolook.scans.fusion import fuse
 from wheretolook.scans.textures import textured
 from wheretolook.viewpoints.table import LOCALIZED
 
 METHODS = ("set", "expected-inliers", "visible")
+APPEARANCES = ("colors", "texture")
 
 
 class Part:
@@ -67,40 +73,54 @@ def label(localizer: Localizer, rgb: np.ndarray, pose: np.ndarray, prefix: str) 
     return {f"{prefix} {name}": value for name, value in values.items()}
 
 
-def rendered_labels(frames: RgbdFrames, config: RgbdConfig, block: Path, shown: Path | None) -> pd.DataFrame:
+def map_without(source: PhotographedMap, left_out: LeftOut) -> tuple[Landmarks, object]:
+    """The landmarks, with descriptors, and the model that remain without a block."""
+    image_ids = np.array(sorted(number for number, image in source.model.images.items() if image.has_pose))
+    rest = without(source.model, image_ids[left_out.block.left_out].tolist())
+    return load_colmap_landmarks(source.path, source.features, None, "cpu", rest, progress=False), rest
+
+
+def rendered_labels(
+    frames: RgbdFrames, config: RgbdConfig, source: PhotographedMap, left_out: LeftOut, correct: bool, out: Path | None
+) -> pd.DataFrame:
     """The left-out photographs of a block with the labels of renders at their poses."""
-    labels = pd.read_csv(block / "labels.csv")
     row_of = {name: row for row, name in enumerate(frames.names)}
-    left_out = np.array([row_of[name] for name in labels["image"]])
-    rest = np.setdiff1d(np.arange(len(frames)), left_out)
-    part, poses = Part(frames, rest), frames.cam_from_world[rest]
-    start = time.perf_counter()
+    at = np.array([row_of[name] for name in left_out.views["image"]])
+    hidden = np.array([row_of[source.names[row]] for row in left_out.block.left_out])
+    landmarks, rest = map_without(source, left_out)
+    kept = np.setdiff1d(np.arange(len(frames)), hidden)
+    start, read_m = time.perf_counter(), frames.survey_m
+    if correct:  # by what is left of the map
+        frames.correct_depths(fit_depth_correction(*landmark_readings(frames, rest).T) or DepthCorrection())
+    part, poses, number = Part(frames, kept), frames.cam_from_world[kept], left_out.block.number
     colors = fuse(part, frames.camera, poses, config, progress=False)
-    fused = time.perf_counter()
     meshes = {"colors": colors, "texture": textured(colors, part, frames.camera, poses, progress=False)}
-    spent = f"fused in {fused - start:.0f} s, textured in {time.perf_counter() - fused:.0f} s"
-    print(f"{block.name}: {len(colors.triangles):,} triangles, {spent}")
-    localizer = Localizer(Landmarks.load(block / "landmarks.npz"), frames.camera, extractor=MAP.extractor)
+    spent = f"{time.perf_counter() - start:.0f} s"
+    print(
+        f"block {number}: depths {frames.depth_correction.describe()}; {len(colors.triangles):,} triangles in {spent}"
+    )
+    localizer = Localizer(landmarks, frames.camera)
     columns = []
     renderers = {name: WarpRenderer(mesh) for name, mesh in meshes.items()}
-    for row in left_out:
+    for row in at:
         pose, found = frames.cam_from_world[row], {}
-        images = {name: renderer.render(frames.camera, pose[None]).rgb[0] for name, renderer in renderers.items()}
-        for name, rgb in images.items():
-            found |= label(localizer, rgb, pose, name)
+        for name, renderer in renderers.items():
+            found |= label(localizer, renderer.render(frames.camera, pose[None]).rgb[0], pose, name)
         columns.append(found)
-    if shown is not None:
-        row = int(left_out[len(left_out) // 2])
+    if out is not None:
+        row = int(at[len(at) // 2])
         pose = frames.cam_from_world[row][None]
         pictures = [frames[row].rgb, *(one.render(frames.camera, pose).rgb[0] for one in renderers.values())]
-        cv2.imwrite(str(shown / f"{block.name}.png"), np.hstack(pictures)[:, :, ::-1])
-    return pd.concat([labels, pd.DataFrame(columns)], axis=1).assign(block=block.name)
+        name = f"block-{number:02}{'-corrected' if correct else ''}.png"
+        cv2.imwrite(str(out.parent / name), np.hstack(pictures)[:, :, ::-1])
+    frames.depth_correction, frames.survey_m = DepthCorrection(), read_m
+    return pd.concat([left_out.views, pd.DataFrame(columns)], axis=1).assign(block=number, corrected=correct)
 
 
-def summarize(views: pd.DataFrame, appearance: str) -> dict[str, object]:
+def summarize(views: pd.DataFrame, appearance: str, depths: str) -> dict[str, object]:
     """One row of the table."""
     good, rendered = views["good"].astype(bool), views[f"{appearance} good"].astype(bool)
-    row: dict[str, object] = {"appearance": appearance, "views": len(views), "good": int(good.sum())}
+    row: dict[str, object] = {"appearance": appearance, "depths": depths, "views": len(views), "good": int(good.sum())}
     row |= {"good_rendered": int(rendered.sum()), "agree": float((good == rendered).mean())}
     row["kappa"] = float(cohen_kappa_score(good, rendered))
     row["inliers_rank_correlation"] = float(spearmanr(views["n_inliers"], views[f"{appearance} n_inliers"])[0])
@@ -111,12 +131,9 @@ def summarize(views: pd.DataFrame, appearance: str) -> dict[str, object]:
         float(both["error_m"].median()),
     )
     for method in METHODS:
-        if method in views:
-            scores = views[method] * (views["n_landmarks"] if method != "set" else 1)
-            for name, truth in (("photographs", good), ("renders", rendered)):
-                row[f"auc_{method}_{name}"] = (
-                    float(roc_auc_score(truth, scores)) if truth.nunique() == 2 else float("nan")
-                )
+        for name, truth in (("photographs", good), ("renders", rendered)):
+            known = truth.nunique() == 2
+            row[f"auc_{method}_{name}"] = float(roc_auc_score(truth, views[method])) if known else float("nan")
     return row
 
 
@@ -128,7 +145,7 @@ def main() -> None:
     )
     parser.add_argument("--recording", type=Path, required=True, help="RGB-D recording of the photographs")
     parser.add_argument("--work", type=Path, required=True, help="what bench_photographs.py --work has kept")
-    parser.add_argument("--blocks", nargs="*", help="names of the blocks to take (default: all)")
+    parser.add_argument("--blocks", type=int, nargs="*", help="numbers of the blocks to take (default: all)")
     parser.add_argument("--voxel-m", type=float, default=0.01, help="of the fusion (default: %(default)s)")
     parser.add_argument("--depth-camera", type=float, nargs=4, help="fx, fy, cx, cy of the depth images")
     parser.add_argument("--color-from-depth-m", type=float, nargs=3, help="the depth camera in the colour camera")
@@ -143,23 +160,22 @@ def main() -> None:
     }
     config = RgbdConfig(args.recording, model=args.work / "map", voxel_m=args.voxel_m, appearance="colors", **given)
     frames = RgbdFrames(config)
-    blocks = [path for path in sorted((args.work / "blocks").iterdir()) if not args.blocks or path.name in args.blocks]
-    shown = args.out.parent if args.out else None
-    views = pd.concat([rendered_labels(frames, config, block, shown) for block in tqdm(blocks, "leave out")])
-    scores = pd.read_csv(args.work / "views.csv")
-    scores["block"] = [block_name(args.work, scores, number) for number in scores["block"]]
-    columns = ["row", "block", *(name for name in METHODS if name in scores)]
-    views = views.merge(scores[columns], on=["row", "block"], how="left")
+    source = open_map(args.work / "map", args.work / "photographs" / "database.db", True)
+    kept = args.work / "check" / "work"
+    blocks = [one for one in left_out_blocks(source, kept) if not args.blocks or one.block.number in args.blocks]
+    steps = [(one, correct) for one in blocks for correct in (False, True)]
+    made = [
+        rendered_labels(frames, config, source, one, correct, args.out)
+        for one, correct in tqdm(steps, "leave out", unit="scan")
+    ]
+    scores = check_map(source, kept, Scoring(also=METHODS[1:])).views.rename(columns={"score": METHODS[0]})
+    views = pd.concat(made).merge(scores[["row", "block", *METHODS]], on=["row", "block"], how="left")
     if args.out:
         views.to_csv(args.out, index=False)
-    table = pd.DataFrame([summarize(views, name) for name in ("colors", "texture")])
-    print(table.T.to_string(header=False, float_format="{:.3f}".format))
-
-
-def block_name(work: Path, scores: pd.DataFrame, number: int) -> str:
-    """The folder of a block's number in `views.csv`: its first row and one past its last."""
-    rows = scores.loc[scores["block"] == number, "row"]
-    return f"{rows.min()}-{rows.max() + 1}"
+    rows = []
+    for correct, depths in ((False, "as read"), (True, "corrected")):
+        rows += [summarize(views[views["corrected"] == correct], name, depths) for name in APPEARANCES]
+    print(pd.DataFrame(rows).T.to_string(header=False, float_format="{:.3f}".format))
 
 
 if __name__ == "__main__":

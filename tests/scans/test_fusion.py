@@ -296,6 +296,28 @@ def test_poses_of_a_model_serve_instead_and_tell_the_unit(seven_scenes, mesh, tm
         scan(folder, model=tmp_path)
 
 
+def test_depths_are_corrected_by_the_landmarks_of_a_model(seven_scenes, mesh, tmp_path):
+    folder = copied(seven_scenes, tmp_path / "off")
+    for path in folder.glob("*.depth.png"):
+        units = cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(float)
+        read = np.where(
+            units == 65535, 65535, 1 / (1.02 / np.maximum(units / 1000, 1e-3) - 0.025) * 1000
+        )  # +7 cm at 2 m
+        cv2.imwrite(str(path), np.rint(read).astype(np.uint16))
+    rng, names = np.random.default_rng(0), [f"frame-{i:06d}.color.png" for i in range(60)]
+    walls = rng.uniform(LOW, HIGH, (600, 3))
+    walls[:300, 0], walls[300:, 1] = LOW[0], HIGH[1]
+    model_of(names, turned(walk(), Y_DOWN), walls @ Y_DOWN, 1.0).write_binary(str(tmp_path))
+    found = scan(folder, model=tmp_path, appearance="colors")
+    correction = found.report()["depth_correction"]
+    assert correction["factor"] == pytest.approx(1 / 1.02, abs=5e-3)
+    assert correction["offset_per_m"] == pytest.approx(0.025 / 1.02, abs=4e-3)
+    assert "corrected by the model's landmarks: -" in found.describe()[-1]
+    to_room = Y_DOWN @ found.rotation.T
+    moved = replace(found.mesh, vertices=(found.mesh.vertices @ to_room.T).astype(np.float32))
+    assert np.median(off_m(moved, mesh)[0]) < VOXEL_M / 4
+
+
 def test_without_a_model_the_frames_are_written_as_one(seven_scenes, tmp_path):
     found = scan(seven_scenes, max_frames=30)
     found.save_model(tmp_path / "frames")

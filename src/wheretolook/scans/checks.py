@@ -35,7 +35,7 @@ def check_depth_unit(frames: RgbdFrames) -> None:
     """
     scale = frames.depth_scale
     if frames.model is not None:
-        factor = landmark_factor(frames, frames.model)
+        factor = landmark_factor(landmark_readings(frames, frames.model))
         if factor is not None and not 1 / _LANDMARK_OFF < factor < _LANDMARK_OFF:
             problem = "depths are in another unit than the model: its landmarks are "
             problem += f"{factor:.3g} times as far as the depth images say"
@@ -59,21 +59,24 @@ def check_depth_unit(frames: RgbdFrames) -> None:
         raise SceneError(problem, path=frames.folder, value=f"{scale:g} units a metre", fix=fix)
 
 
-def landmark_factor(frames: RgbdFrames, model: Any) -> float | None:
-    """Median of how many times as deep a model's landmarks are as the depth images say where they were observed.
+def landmark_readings(frames: RgbdFrames, model: Any) -> Float:
+    """Depths of a model's landmarks in the frames that observe them, and what the depth images say there, (N, 2).
 
-    Takes the `pycolmap.Reconstruction` that gave the poses. None if there are fewer than 20 of both.
+    Takes the `pycolmap.Reconstruction` that gave the poses.
     """
-    factors = []
+    found = [np.zeros((0, 2))]
     by_name = {image.name: image for image in model.images.values()}
     for name, depth, pose in zip(frames.names_in_model, frames.survey_m, frames.cam_from_world, strict=True):
         image: Any = by_name[name]
         points = [model.points3D[seen.point3D_id].xyz for seen in image.points2D if seen.has_point3D()]
         if points:
-            there = _readings_at(depth, frames.camera, np.array(points) @ pose[:, :3].T + pose[:, 3])
-            factors.append(there[:, 0] / there[:, 1])
-    found = np.concatenate(factors) if factors else np.zeros(0)
-    return float(np.median(found)) if len(found) >= 20 else None
+            found.append(_readings_at(depth, frames.camera, np.array(points) @ pose[:, :3].T + pose[:, 3]))
+    return np.concatenate(found)
+
+
+def landmark_factor(readings: Float) -> float | None:
+    """Median of how many times as deep landmarks are as read, of (N, 2); None of fewer than 20."""
+    return float(np.median(readings[:, 0] / readings[:, 1])) if len(readings) >= 20 else None
 
 
 def pose_factor(survey_m: NDArray[np.float32], camera: PinholeCamera, cam_from_world: Float) -> float | None:

@@ -27,6 +27,8 @@ class RgbdConfig:
         camera: fx, fy, cx, cy of the colour images in pixels; the layout's if empty.
         depth_camera: the same of the depth images, where they are not registered to the colour images.
         color_from_depth_m: where the depth camera is in the colour camera's frame; x right, y down, z forward.
+        correct_depth: with a model, bring depths to those of its landmarks: a structured-light camera reads far ones
+            wrong by centimetres.
         up: which way is up in its world. `auto`, x, y, z, one of these with a minus sign, or three numbers
             such as "0 -0.9 -0.4". `auto` finds it by how the camera was held and by the surfaces that it saw.
         voxel_m: distance between two samples of the distance field. Finer ones need more memory and triangles.
@@ -44,6 +46,7 @@ class RgbdConfig:
     camera: tuple[float, ...] = ()
     depth_camera: tuple[float, ...] = ()
     color_from_depth_m: tuple[float, ...] = ()
+    correct_depth: bool = True
     up: str = "auto"
     voxel_m: float = 0.01
     max_depth_m: float = 4.0

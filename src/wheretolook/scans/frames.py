@@ -18,6 +18,7 @@ from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import Float
 from wheretolook.mapping.colmap_model import camera_of_model, colmap_poses, read_model, registered_names
 from wheretolook.scans.config import RgbdConfig
+from wheretolook.scans.depth_correction import DepthCorrection
 from wheretolook.scans.layouts import FrameFiles, Skipped, find_layout, frame_files
 from wheretolook.utils.errors import ConfigError, SceneError
 
@@ -46,7 +47,8 @@ class RgbdFrames:
 
     `camera` is the pinhole that all are brought to, `cam_from_world` (F, 3, 4) its poses, `names` the paths of the
     colour images in the recording, `survey_m` (F, h, w) every 8th pixel of the depth images, `skipped` says which
-    frames were left out. `model` is the COLMAP model that poses were taken from, if any.
+    frames were left out. `model` is the COLMAP model that poses were taken from, if any. `depth_correction` is none
+    until `correct_depths`.
 
     Raises SceneError if the recording lacks something or its images are of another kind, MapError if the model cannot
     be read, ConfigError for intrinsics that no camera has.
@@ -64,6 +66,7 @@ class RgbdFrames:
         self.depth_scale = config.depth_scale or self.layout.depth_scale
         frames = self._of_one_size(frames)
         self._set_cameras(config)
+        self.depth_correction = DepthCorrection()
         self._frames: list[FrameFiles] = []
         survey = []
         for frame in tqdm(frames, desc="read frames", unit="frame", disable=not progress):
@@ -94,6 +97,11 @@ class RgbdFrames:
             across, down = self._undistort
             rgb = np.asarray(cv2.remap(rgb, across, down, cv2.INTER_LINEAR), dtype=np.uint8)
         return RgbdFrame(rgb, self._registered(depth))
+
+    def correct_depths(self, correction: DepthCorrection) -> None:
+        """Correct all depths that are read from now on, and the survey."""
+        self.depth_correction = correction
+        self.survey_m = correction.apply(self.survey_m)
 
     @cached_property
     def names(self) -> list[str]:
@@ -164,7 +172,8 @@ class RgbdFrames:
         if image.ndim != 2 or image.dtype != np.uint16:
             value, fix = f"{image.dtype}, shape {image.shape}", "Write depth as PNG of one channel of 16 bits."
             raise SceneError("this is no depth image", path=path, value=value, fix=fix)
-        return np.where(image == self.layout.no_reading, 0, image).astype(np.float32) / np.float32(self.depth_scale)
+        read_m = np.where(image == self.layout.no_reading, 0, image).astype(np.float32) / np.float32(self.depth_scale)
+        return self.depth_correction.apply(read_m)
 
     def _registered(self, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
         """Depth as the pinhole camera sees it: the nearest reading that falls into each pixel."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, overload
 
@@ -18,8 +18,9 @@ from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float
 from wheretolook.mapping.gravity import estimate_gravity, rotation_to_z
 from wheretolook.mapping.scale import Similarity
-from wheretolook.scans.checks import check_depth_unit
+from wheretolook.scans.checks import check_depth_unit, landmark_readings
 from wheretolook.scans.config import RgbdConfig
+from wheretolook.scans.depth_correction import DepthCorrection, fit_depth_correction
 from wheretolook.scans.frames import Frames, RgbdFrames
 from wheretolook.scans.textures import textured
 from wheretolook.scans.upright import find_up
@@ -45,10 +46,13 @@ class Scan:
         skipped = self.frames.skipped.describe()
         used = f"{len(self.frames)} frames of a recording of {self.frames.layout.name}'s layout"
         up = " ".join(f"{value:.2f}" for value in np.round(self.up, 2) + 0.0)
-        return [
+        lines = [
             f"{used}{f'; not used: {skipped}' if skipped else ''}",
             f"{self.frames.depth_scale:g} units of depth a metre; up is ({up}) in the recording's world, z here",
         ]
+        if self.frames.depth_correction != DepthCorrection():
+            lines.append(f"depths corrected by the model's landmarks: {self.frames.depth_correction.describe()}")
+        return lines
 
     def report(self) -> dict[str, Any]:
         """The same and more, as values of JSON."""
@@ -58,6 +62,7 @@ class Scan:
             "n_frames": len(frames),
             "skipped": frames.skipped.reasons,
             "depth_scale": frames.depth_scale,
+            "depth_correction": asdict(frames.depth_correction),
             "up": self.up.tolist(),
             "rotation": self.rotation.tolist(),
             "n_triangles": len(self.mesh.triangles),
@@ -95,6 +100,10 @@ def make_scan(config: RgbdConfig, device: str = "cpu", progress: bool = True) ->
     """
     frames = RgbdFrames(config, progress)
     check_depth_unit(frames)
+    if frames.model is not None and config.correct_depth:
+        correction = fit_depth_correction(*landmark_readings(frames, frames.model).T)
+        if correction is not None:
+            frames.correct_depths(correction)
     mesh = fuse(frames, frames.camera, frames.cam_from_world, config, device, progress)
     up = _up(config, frames, mesh)
     rotation = rotation_to_z(up)

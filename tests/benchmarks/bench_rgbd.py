@@ -15,6 +15,7 @@ the photographs' labels and by the renders' labels on the same views. `--out` ke
 from __future__ import annotations
 
 import argparse
+import tempfile
 import time
 from pathlib import Path
 
@@ -158,9 +159,11 @@ def main() -> None:
         "color_from_depth_m": tuple(args.color_from_depth_m or ()),
         "depth_scale": args.depth_scale,
     }
-    config = RgbdConfig(args.recording, model=args.work / "map", voxel_m=args.voxel_m, appearance="colors", **given)
-    frames = RgbdFrames(config)
     source = open_map(args.work / "map", args.work / "photographs" / "database.db", True)
+    with tempfile.TemporaryDirectory() as upright:  # as the check has turned it
+        source.model.write_binary(upright)
+        config = RgbdConfig(args.recording, model=Path(upright), voxel_m=args.voxel_m, appearance="colors", **given)
+        frames = RgbdFrames(config)
     kept = args.work / "check" / "work"
     blocks = [one for one in left_out_blocks(source, kept) if not args.blocks or one.block.number in args.blocks]
     steps = [(one, correct) for one in blocks for correct in (False, True)]

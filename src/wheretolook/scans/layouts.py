@@ -20,7 +20,7 @@ from wheretolook.utils.reading import read_text
 _MAX_APART_S = 0.02  # between a colour image and its depth image or pose: as TUM's own associate.py has it
 _RIGID = 1e-2  # by which a rotation's entries may be off
 _FAR_M = 1e9  # from the origin; no recording has such coordinates
-_MOST_FRAMES = 100_000  # in a list: an hour at 30 Hz
+_MOST_FRAMES, _MOST_POSES = 100_000, 400_000  # rows of a list: an hour at 30 Hz and at 100 Hz
 _IMAGES = (".png", ".jpg", ".jpeg")
 
 
@@ -137,15 +137,12 @@ def _checked(world_from_cam: Float) -> Float | None:
 
 
 def _tum_frames(folder: Path, skipped: Skipped, need_poses: bool) -> Iterator[FrameFiles]:
-    rgb, depth = (_read_list(folder / name, 1) for name in ("rgb.txt", "depth.txt"))
+    rgb, depth = (_read_list(folder / name, 1, _MOST_FRAMES) for name in ("rgb.txt", "depth.txt"))
     times, poses = list[float](), np.zeros((0, 7))
     if need_poses:
-        rows = _read_list(folder / "groundtruth.txt", 7)
+        rows = _read_list(folder / "groundtruth.txt", 7, _MOST_POSES)
         times = [time for time, _ in rows]
         poses = np.array([[_number(value) for value in values] for _, values in rows])
-    if len(rgb) > _MOST_FRAMES:
-        problem, fix = f"a recording has at most {_MOST_FRAMES:,} frames", "Take every tenth frame, or the first part."
-        raise SceneError(problem, path=folder / "rgb.txt", value=len(rgb), fix=fix)
     depth_of, pose_of = _Times([time for time, _ in depth]), _Times(times)
     for time, (name,) in rgb:
         at, pose = depth_of.nearest(time), pose_of.nearest(time)
@@ -200,10 +197,13 @@ def _number(text: str) -> float:
         return float("nan")
 
 
-def _read_list(path: Path, n_values: int) -> list[tuple[float, list[str]]]:
-    """Rows of a TUM list: a time, and so many values. Raises SceneError if it is missing or has other rows."""
+def _read_list(path: Path, n_values: int, at_most: int) -> list[tuple[float, list[str]]]:
+    """Rows of a TUM list: a time, and so many values. SceneError if it is missing, or has other rows or more of them."""
     try:
-        lines = [line.replace(",", " ").split() for line in read_text(path).splitlines()]
+        text = read_text(path)
+        if text.count("\n") > at_most:
+            raise ValueError(f"it has more than {at_most:,} rows")
+        lines = [line.replace(",", " ").split() for line in text.splitlines()]
     except (OSError, ValueError) as error:
         problem = f"a list of the recording cannot be read: {error}"
         raise SceneError(problem, path=path, fix="A recording of TUM's layout has it.") from error

@@ -149,14 +149,11 @@ def _within(value: float, low: float, high: float) -> float:
     return float(min(max(value, low), high))
 
 
-def check_value(handle: Any) -> None:
-    """Raise ConfigError if a client has set a control to what it does not offer, and set it to what it does."""
+def check_value(handle: Any, before: Any) -> None:
+    """Raise ConfigError if a client has set a control to what it does not offer, and set it to what it was before."""
     value = getattr(handle, "value", None)
     options, most = getattr(handle, "options", None), getattr(handle, "max", None)
-    if options is not None and value not in options:
-        handle.value = options[0]
-    elif most is not None and not handle.min <= value <= most:
-        handle.value = most if value > most else handle.min
-    else:
+    if (options is None or value in options) and (most is None or handle.min <= value <= most):
         return
+    handle.value = before
     raise ConfigError("this control has no such value", value=value, fix="Choose one that it offers.")

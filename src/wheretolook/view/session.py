@@ -70,8 +70,11 @@ class Session:
         What fails is told to this client, and to nobody else.
         """
 
+        before = [getattr(handle, "value", None)]
+
         def checked() -> None:
-            check_value(handle)
+            check_value(handle, before[0])
+            before[0] = getattr(handle, "value", None)
             then()
 
         getattr(handle, event)(lambda told: None if by_hand and told.client is None else self.safely(checked))

@@ -85,7 +85,7 @@ class WaypointList:
 
     def _saved(self) -> Iterator[None]:
         session = self.session
-        check_value(session.controls.format)
+        check_value(session.controls.format, next(iter(FILES)))
         format = str(session.controls.format.value)
         look = session.shared.look(session.state.method, session.state.occlusion)
         content = views_file(look, np.array(self.points), session.state.n, format)

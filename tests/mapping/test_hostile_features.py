@@ -84,9 +84,7 @@ def test_hostile_features_in_hdf5_are_refused(what: str, tmp_path: Path, monkeyp
 NANS = np.full((N, 2), np.nan, "<f4").tobytes().hex()
 AWAY = "ALTER TABLE keypoints RENAME TO away"
 ENDLESS = f"CREATE VIEW images AS {COUNT} x AS image_id, 'n' AS name FROM c"
-GIGABYTE = (
-    "CREATE VIEW keypoints AS SELECT image_id, 62500000 AS rows, 4 AS cols, zeroblob(1000000000) AS data FROM away"
-)
+GIGABYTE = "CREATE VIEW keypoints AS SELECT image_id, 62500000 AS rows, 4 AS cols, zeroblob(1000000000) data FROM away"
 COMPUTED = "CREATE TABLE keypoints (image_id INTEGER PRIMARY KEY, rows, cols, data BLOB AS (zeroblob(900000000)))"
 DATABASES = {
     "images without end": (["ALTER TABLE images RENAME TO away", ENDLESS], "images is a view"),

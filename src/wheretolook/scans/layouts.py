@@ -198,7 +198,7 @@ def _number(text: str) -> float:
 
 
 def _read_list(path: Path, n_values: int, at_most: int) -> list[tuple[float, list[str]]]:
-    """Rows of a TUM list: a time, and so many values. SceneError if it is missing, or has other rows or more of them."""
+    """Rows of a TUM list: a time, and so many values. SceneError if it is missing, or has other rows, or too many."""
     try:
         text = read_text(path)
         if text.count("\n") > at_most:

@@ -150,7 +150,7 @@ def test_looking_ahead_follows_the_path_and_keeps_on_where_it_stands() -> None:
     np.testing.assert_allclose(axes, [(1, 0, 0), (1, 0, 0), (0, 1, 0), (0, 1, 0), (0, 1, 0)], atol=1e-12)
 
 
-@pytest.mark.parametrize("text", ["", "1 2 3\n", "x,y\n1,2\n", "\0\0"])
+@pytest.mark.parametrize("text", ["", "1 2 3\n", "x,y\n1,2\n", "\0\0", "0 1 2 3 0 0 0 0\n" * 2])
 def test_what_is_no_path_is_refused(tmp_path: Path, text: str) -> None:
     for name in ("path.csv", "path.tum"):
         (tmp_path / name).write_text(text)
@@ -365,7 +365,7 @@ def test_paths_that_are_too_large_or_no_poses_are_refused(tmp_path: Path) -> Non
         if table is None:  # 40 million rows of nothing in a few kilobytes
             values = pa.array(np.zeros(40_000_000, dtype=np.int8))
             pq.write_table(pa.table({"pair": values}), path, compression="zstd")
-            assert path.stat().st_size < 100_000
+            assert path.stat().st_size < 400_000
         else:
             table.to_parquet(path)
         with pytest.raises(TableError, match=r"finite poses|at most 20 methods|would unfold|Found zero norm"):

@@ -154,7 +154,10 @@ def _trajectory(path: Path) -> Float:
         raise TableError(f"no trajectory: {error}", path=path, fix=_FIX) from error
     if rows.ndim != 2 or rows.shape[1] != 8:
         raise TableError("a TUM trajectory has eight columns", path=path, value=rows.shape[-1], fix=_FIX)
-    return _from_centers(rows[:, 1:4], rows[:, [7, 4, 5, 6]])
+    try:
+        return _from_centers(rows[:, 1:4], rows[:, [7, 4, 5, 6]])
+    except ValueError as error:  # a quaternion of zeros
+        raise TableError(f"no trajectory: {error}", path=path, fix=_FIX) from error
 
 
 def _from_centers(centers: Float, wxyz: Float) -> Float:

@@ -6,6 +6,7 @@ matched can be stored too, see `MATCH_FIELDS`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -53,6 +54,8 @@ number of the camera in the scene's `cameras.txt`."""
 
 (CAMERA_ID,) = CAMERA_FIELD.names
 (PIXELS,) = PIXEL_FIELD.names
+
+_AT_ONCE = 1 << 16  # rows that are read before what they unfold to is looked at
 
 CENTER_DECIMALS = 12  # of a metre; the centres of a location's viewpoints, each computed from its pose, differ by less
 
@@ -152,20 +155,25 @@ def read_parquet(path: Path) -> pd.DataFrame:
     """Read any table in a Parquet file. ValueError if it is none, or unfolds to far more than it has bytes."""
     try:
         with pq.ParquetFile(path) as file:
-            _check_size(file, path)
-            frame: pd.DataFrame = file.read().to_pandas()
+            frame: pd.DataFrame = _read(file, path, file.schema_arrow.names).to_pandas()
             return frame
-    except (pa.ArrowException, OSError) as error:
+    except (pa.ArrowException, OSError, KeyError) as error:
         raise ValueError(f"not a readable Parquet file: {error}") from error
 
 
-def _check_size(file: pq.ParquetFile, path: Path) -> None:
-    """ValueError if a table unfolds to far more than its file has bytes: repeated values take next to none."""
-    about, n_bytes = file.metadata, check_file(path).st_size
-    groups = [about.row_group(number) for number in range(about.num_row_groups)]
-    values = sum(group.column(number).num_values for group in groups for number in range(about.num_columns))
-    if 8 * max(values, about.num_rows) > max(FREE_BYTES, MAX_RATIO * n_bytes):
-        raise ValueError(f"its {n_bytes:,} bytes would unfold to {values:,} values")
+def _read(file: pq.ParquetFile, path: Path, names: Sequence[str]) -> pa.Table:
+    """Columns of a file, batch by batch: repeated values take next to none of it, and its own counts may lie.
+
+    ValueError if they unfold to far more than the file has bytes.
+    """
+    n_bytes, batches, unfolded = check_file(path).st_size, list[pa.RecordBatch](), 0
+    fields = [file.schema_arrow.field(name) for name in names]
+    for batch in file.iter_batches(_AT_ONCE, columns=list(names)):
+        batches.append(batch)
+        unfolded += batch.nbytes
+        if unfolded > max(FREE_BYTES, MAX_RATIO * n_bytes):
+            raise ValueError(f"its {n_bytes:,} bytes would unfold to more than {unfolded:,}")
+    return pa.Table.from_batches(batches, pa.schema(fields))
 
 
 def has_matches(path: Path, pixels: bool = False) -> bool:
@@ -187,11 +195,10 @@ def read_table(path: Path, matches: bool = False, pixels: bool = False) -> pd.Da
         raise TableError("there is no table of viewpoints", path=path, fix="Run the sample stage first.")
     try:
         with pq.ParquetFile(path, page_checksum_verification=True) as file:
-            _check_size(file, path)
             names = file.schema_arrow.names  # matches take long to read, so only if they are asked for
             unwanted = ([] if matches or pixels else MATCH_FIELDS.names) + ([] if pixels else PIXEL_FIELD.names)
-            table = file.read([name for name in names if name not in unwanted])
-    except (pa.ArrowException, OSError, ValueError) as error:
+            table = _read(file, path, [name for name in names if name not in unwanted])
+    except (pa.ArrowException, OSError, ValueError, KeyError) as error:
         fix = "It may be truncated: get it anew, or delete it and run the stage that writes it."
         raise TableError(f"not a readable Parquet file: {error}", path=path, fix=fix) from error
     compact = any(name in names for name in CENTER_COLUMNS)

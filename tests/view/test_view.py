@@ -362,8 +362,8 @@ def test_paths_that_are_too_large_or_no_poses_are_refused(tmp_path: Path) -> Non
         "bomb": None,
     }.items():
         path = tmp_path / f"{name}.parquet"
-        if table is None:  # 40 million rows of nothing in a few kilobytes
-            values = pa.array(np.zeros(40_000_000, dtype=np.int8))
+        if table is None:  # 160 MB of nothing in a few kilobytes
+            values = pa.array(np.zeros(20_000_000, dtype=np.int64))
             pq.write_table(pa.table({"pair": values}), path, compression="zstd")
             assert path.stat().st_size < 400_000
         else:

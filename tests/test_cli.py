@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import gc
+import json
+import os
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -98,3 +102,28 @@ def test_ctrl_c_stays_one_where_it_is_lost_or_made_another_error_of(
     assert main(["scenes"]) == 130
     assert "wheretolook: interrupted" in capsys.readouterr().err
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["check", "--scene", "cellar"], "There are hall."),
+        (["check", "--scene", "hall", "--name", "other"], "this folder is no dataset"),
+        (["view", "--scene", "cellar", "--port", "0"], "There are hall."),
+        (["release", "--name", "mine", "--release_name", "mine"], "the name of the dataset that it is a copy of"),
+    ],
+)
+def test_what_can_be_refused_is_before_long_imports(arguments: list[str], says: str, tmp_path: Path) -> None:
+    scenes = [{"name": "hall", "split": "test"}]
+    camera = {"width": 64, "height": 48, "focal_px": 32.0}
+    (tmp_path / "mine" / "hall").mkdir(parents=True)
+    (tmp_path / "mine" / "dataset.json").write_text(json.dumps({"camera": camera, "scenes": scenes}))
+    before = sorted(tmp_path.rglob("*"))
+    code = "import sys; from wheretolook.cli import main; end = main(sys.argv[1:]); "
+    code += "print(*({'pandas', 'torch', 'mlflow', 'lightning'} & {*sys.modules}), file=sys.stderr); "
+    code += "sys.exit(end)"
+    run = [sys.executable, "-c", code, *arguments, "--data", str(tmp_path)]
+    ended = subprocess.run(run, env={**os.environ, "PYTHONPATH": "src"}, capture_output=True, text=True, check=False)
+    lines = ended.stderr.splitlines()
+    assert ended.returncode == 2 and says in lines[0] and [line for line in lines[1:] if line] == []
+    assert sorted(tmp_path.rglob("*")) == before

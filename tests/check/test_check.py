@@ -20,7 +20,7 @@ from box_scenes import furnished_room
 from check.corridor import ALONE, N, corridor_poses, write_corridor
 from selection.room import WEIGHTS
 from wheretolook.check import leave_out
-from wheretolook.check.blocks import KEPT, LEAST_REST, choose_blocks, landmarks_kept, observation_matrix
+from wheretolook.check.blocks import KEPT, LEAST_REST, Block, choose_blocks, landmarks_kept, observation_matrix
 from wheretolook.check.command import run
 from wheretolook.check.leave_out import without
 from wheretolook.check.source import open_map
@@ -37,6 +37,7 @@ from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import save_glb
 from wheretolook.utils.errors import ConfigError, InUseError, MapError, WeightsError
 from wheretolook.utils.locks import hold
+from wheretolook.utils.npz_files import load_npz, save_npz
 
 
 @pytest.fixture(scope="module")
@@ -179,11 +180,34 @@ def test_an_interrupted_check_goes_on(checked: Path, corridor: tuple[Path, Path]
     (work,) = (tmp_path / "out" / "work").glob("blocks-*")
     (work / "02" / "views.csv").unlink()
     (work / "03" / "matches.npz").write_bytes(b"half a file")
+    flipped = (work / "04" / "views.csv").read_text()
+    (work / "04" / "views.csv").write_text(flipped.replace(",1", ",7"))
     kept = (work / "01" / "views.csv").stat().st_mtime_ns
     run(_arguments(*corridor, tmp_path / "out", "--metres", "--also", "bins"))
     for name in ("check.csv", "blocks.csv", "views.csv"):
         assert (tmp_path / "out" / name).read_bytes() == (checked / name).read_bytes(), name
     assert (work / "01" / "views.csv").stat().st_mtime_ns == kept
+
+
+@pytest.mark.parametrize("damage", ["a column", "a row", "landmarks"])
+def test_damaged_blocks_of_an_earlier_version_are_refused_by_name(
+    damage: str, checked: Path, corridor: tuple[Path, Path], tmp_path: Path
+) -> None:
+    (work,) = (checked / "work").glob("blocks-*")
+    shutil.copytree(work / "01", tmp_path / "01")
+    (tmp_path / "01" / "whole.json").unlink()
+    kept = load_npz(tmp_path / "01" / "matches.npz")
+    block = Block(1, kept["left_out"], kept["looked_at"], True)
+    assert len(leave_out._load(tmp_path / "01", block).views) == len(block.looked_at)
+    if damage == "landmarks":
+        save_npz(tmp_path / "01" / "matches.npz", {**kept, "matched_rows": kept["matched_rows"] + 10_000})
+    else:
+        text = (tmp_path / "01" / "views.csv").read_text()
+        text = text.replace("error_m", "error", 1) if damage == "a column" else text.rpartition("\n")[0][:-40]
+        (tmp_path / "01" / "views.csv").write_text(text)
+    with pytest.raises(MapError, match="damaged results of a block") as caught:
+        leave_out._load(tmp_path / "01", block)
+    assert caught.value.path == tmp_path / "01"
 
 
 def test_blocks_of_other_limits_or_versions_are_not_taken(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,8 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 
 from synthetic_dataset import make_dataset
 from wheretolook.evaluation.calibration import expected_calibration_error
+from wheretolook.evaluation.config import EvaluateConfig
+from wheretolook.evaluation.scoring import scorers_of
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import camera_centers, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
@@ -23,6 +26,8 @@ from wheretolook.methods.adapted.kernel import Correction, nearness
 from wheretolook.methods.adapted.network import AdaptedNetwork
 from wheretolook.methods.registry import load_scorer
 from wheretolook.methods.set.network import SetNetwork
+from wheretolook.planning.config import PlanConfig
+from wheretolook.planning.scene_map import planner_scorer
 from wheretolook.utils.errors import WeightsError
 from wheretolook.utils.shipped import WEIGHTS, shipped
 
@@ -199,3 +204,36 @@ def test_they_are_refused_in_another_place_unless_forced(place: tuple[Localizati
         load_scorer(path, elsewhere)
     assert caught.value.path == path
     assert load_scorer(path, elsewhere, anywhere=True).name == "adapted"
+
+
+def test_evaluations_and_planners_may_insist_on_another_place(place: tuple[LocalizationMap, Path]) -> None:
+    around, path = place
+    points = around.landmarks.points + np.array([0.5, 0, 0])
+    moved = Landmarks(**{**around.landmarks.__dict__, "points": points})
+    elsewhere = LocalizationMap(moved, around.camera)
+    options = {"methods": ("adapted",), "weights": (path,)}
+    with pytest.raises(WeightsError, match=r"--plan\.anywhere true, --evaluate\.anywhere true"):
+        scorers_of(elsewhere, EvaluateConfig(**options), {path: "adapted"})
+    assert [*scorers_of(elsewhere, EvaluateConfig(**options, anywhere=True), {path: "adapted"})] == ["adapted"]
+    scene = SimpleNamespace(localization_map=elsewhere)
+    with pytest.raises(WeightsError, match="adapted to another place"):
+        planner_scorer(scene, None, "adapted", path)
+    assert planner_scorer(scene, None, "adapted", path, PlanConfig(anywhere=True).anywhere).name == "adapted"
+
+
+@pytest.mark.parametrize(
+    ("part", "name", "value"),
+    [
+        ("base", "scale", "nan"),
+        ("base", "offset", "inf"),
+        ("kernel", "length_m", "inf"),
+        ("kernel", "sharpness", "nan"),
+    ],
+)
+def test_kernels_and_calibrations_are_finite(part: str, name: str, value: str) -> None:
+    network = TrainedNetwork.load(SET, SetNetwork, "set").network
+    stored = AdaptedNetwork(network, 1.0, 0.0, 1.0, 4.0, 1, 1).description()
+    AdaptedNetwork.of_description(stored)
+    stored[part][name] = float(value)
+    with pytest.raises(ValueError, match=r"finite|no length"):
+        AdaptedNetwork.of_description(stored)

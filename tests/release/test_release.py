@@ -18,7 +18,8 @@ from synthetic_dataset import CAMERA, make_dataset
 from wheretolook import stages
 from wheretolook.cli import main, parse_experiment
 from wheretolook.config import Experiment, MeshSource, ScenesConfig
-from wheretolook.dataset.folders import RELEASE, RELEASE_FILE, Dataset
+from wheretolook.dataset.folders import Dataset
+from wheretolook.dataset.names import RELEASE, RELEASE_FILE
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.report import score_markdown
 from wheretolook.learning.data import load_views

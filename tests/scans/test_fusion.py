@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import warnings
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -18,6 +19,7 @@ from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scans.config import RgbdConfig
 from wheretolook.scans.fusion import make_scan
+from wheretolook.scans.layouts import _Times, find_layout, frame_files
 from wheretolook.utils.errors import ConfigError, MapError, MapWarning, SceneError
 
 VOXEL_M = 0.03
@@ -325,3 +327,24 @@ def test_without_a_model_the_frames_are_written_as_one(seven_scenes, tmp_path):
     assert sorted(image.name for image in model.images.values()) == found.frames.names
     upright = colmap_poses(tmp_path / "frames")
     assert np.allclose(upright[:, :, :3] @ found.rotation, found.frames.cam_from_world[:, :, :3], atol=1e-6)
+
+
+def test_long_and_far_lists_of_a_recording_are_refused_at_once(tmp_path: Path) -> None:
+    (tmp_path / "depth.txt").write_text("2 a\n" * 1000)
+    (tmp_path / "groundtruth.txt").write_text("1 0 0 0 0 0 0 1\n" * 1000 + "2 1e300 0 0 0 0 0 1\n")
+    (tmp_path / "rgb.txt").write_text("2 a\n" + "1 b\n" * 1000)
+    (tmp_path / "a").write_text("")
+    with pytest.raises(SceneError, match="pose is lost"):
+        frame_files(tmp_path, find_layout(tmp_path))
+    (tmp_path / "rgb.txt").write_text("1 a\n" * 200_000)
+    with pytest.raises(SceneError, match="more than 100,000 rows"):
+        frame_files(tmp_path, find_layout(tmp_path))
+
+
+def test_the_nearest_time_is_that_of_a_plain_search() -> None:
+    rng = np.random.default_rng(0)
+    times = rng.permutation(np.concatenate([rng.uniform(0, 1, 60), np.repeat(0.5, 3)]))
+    for time_s in np.linspace(-0.1, 1.1, 200):
+        at = int(np.abs(times - time_s).argmin())
+        assert _Times(times).nearest(time_s) == (at if abs(times[at] - time_s) <= 0.02 else None)
+    assert _Times([]).nearest(0.0) is None

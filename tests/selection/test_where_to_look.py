@@ -87,7 +87,7 @@ def test_all_that_a_network_is_told_is_told_at_once(sparse: Path) -> None:
     network = SetNetwork(old.network.statistics, hidden=old.network.options["hidden"], told=TOLD)
     network.matchability.load_state_dict(old.network.matchability.state_dict())
     scorer = SetScorer(around, TrainedNetwork("set", network, None))
-    assert ScoresAround.serves(scorer)
+    assert ScoresAround.serves(scorer.network)
     slow, fast = all_scores(scorer, POINTS), scorer.score_around(POINTS, AXES)
     assert np.ptp(slow) > 0.1
     np.testing.assert_allclose(fast, slow, atol=1e-4)

@@ -16,7 +16,8 @@ import torch
 
 from learning_options import changed, train_config
 from synthetic_dataset import make_dataset
-from wheretolook.dataset.folders import RELEASE_FILE, Dataset
+from wheretolook.dataset.folders import Dataset
+from wheretolook.dataset.names import RELEASE_FILE
 from wheretolook.inputs.bins import InputStatistics
 from wheretolook.learning.data import BatchLoader, ViewpointDataModule, balance_classes, hold_out_locations
 from wheretolook.learning.fit import EpochRecord

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from wheretolook.benchmark.folder import BenchmarkScene
+from wheretolook.cli import main
 from wheretolook.config import Experiment
 from wheretolook.dataset.folders import Dataset, SceneFolder
 from wheretolook.geometry.camera import PinholeCamera
@@ -98,3 +99,20 @@ def test_images_of_a_benchmark_are_read_from_its_folder_alone(tmp_path: Path) ->
         path.write_bytes(b"")
     for name in ("0.png", "scene_reconstruction/images/0.png", str(tmp_path / "0.png"), "../../../0.png"):
         assert scene.image_file(name).resolve() == images / "0.png"
+
+
+@pytest.mark.parametrize("name", [name for name in OUTSIDE if "\0" not in name])
+@pytest.mark.parametrize("command", ["check", "view"])
+def test_the_scene_of_a_command_lies_in_its_dataset(
+    command: str, name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = tmp_path / "data" / "set"
+    write_json(root / "dataset.json", {"camera": PinholeCamera().record(), "scenes": []})
+    (tmp_path / "victim").mkdir()
+    before = sorted(tmp_path.rglob("*"))
+    port = ["--port", "0"] if command == "view" else []
+    for named in (["--scene", name], ["--scene", "room", "--name", name]):
+        if named[-1] or len(named) == 2:  # an empty --name stands for none
+            assert main([command, *named, "--data", str(tmp_path / "data"), *port]) == 2
+            assert "lead out of its folder" in capsys.readouterr().err
+    assert sorted(tmp_path.rglob("*")) == before

@@ -112,6 +112,17 @@ def test_another_programs_database_is_refused(tmp_path: Path) -> None:
     assert "not a database" in str(refused(TrackingConfig(str(tmp_path))))
 
 
+def test_another_programs_sqlite_database_is_refused_and_kept(tmp_path: Path) -> None:
+    database = tmp_path / "mlflow.db"
+    with sqlite3.connect(database) as connection:
+        connection.execute("CREATE TABLE recipes (name TEXT)")
+    connection.close()
+    content = database.read_bytes()
+    error = refused(TrackingConfig(str(tmp_path)))
+    assert "another program" in error.problem and error.path == database and error.value == "recipes"
+    assert database.read_bytes() == content
+
+
 def test_a_store_of_another_version_of_mlflow_is_refused(store: TrackingConfig) -> None:
     with sqlite3.connect(store.root / "mlflow.db") as connection:
         connection.execute("UPDATE alembic_version SET version_num = '451aebb31d03'")

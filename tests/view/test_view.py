@@ -8,9 +8,12 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from urllib.parse import quote
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 pytest.importorskip("viser")
@@ -22,11 +25,13 @@ from wheretolook.select.where_to_look import WhereToLook
 from wheretolook.utils.errors import ConfigError, InUseError, TableError
 from wheretolook.view import drawing
 from wheretolook.view.checks import check_port
+from wheretolook.view.controls import check_value
 from wheretolook.view.opened import open_map
 from wheretolook.view.played import FORWARD, looking_ahead, read_paths
 from wheretolook.view.server import Viewer, where_clicked
 from wheretolook.view.shared import Shared
 from wheretolook.view.state import ViewState
+from wheretolook.view.texts import plain
 from wheretolook.view.waypoints import views_file
 from wheretolook.view.worker import LATER, NOW, Worker
 from wheretolook.viewpoints.table import pose_columns
@@ -145,7 +150,7 @@ def test_looking_ahead_follows_the_path_and_keeps_on_where_it_stands() -> None:
     np.testing.assert_allclose(axes, [(1, 0, 0), (1, 0, 0), (0, 1, 0), (0, 1, 0), (0, 1, 0)], atol=1e-12)
 
 
-@pytest.mark.parametrize("text", ["", "1 2 3\n", "x,y\n1,2\n", "\0\0"])
+@pytest.mark.parametrize("text", ["", "1 2 3\n", "x,y\n1,2\n", "\0\0", "0 1 2 3 0 0 0 0\n" * 2])
 def test_what_is_no_path_is_refused(tmp_path: Path, text: str) -> None:
     for name in ("path.csv", "path.tum"):
         (tmp_path / name).write_text(text)
@@ -218,12 +223,13 @@ def test_pictures_show_scores_in_the_projects_colors() -> None:
     assert pose.shape == (3, 4)
 
 
-def _client(viewer: Viewer, view: str = ""):  # type: ignore[no-untyped-def]
+def _client(viewer: Viewer, view: str = "", headers=None):  # type: ignore[no-untyped-def]
     import viser
     from websockets.sync.client import connect
 
     address = f"ws://127.0.0.1:{viewer.port}/{view}"
-    return connect(address, subprotocols=[f"viser-v{viser.__version__}"], max_size=None)  # type: ignore[list-item]
+    protocols = [f"viser-v{viser.__version__}"]
+    return connect(address, subprotocols=protocols, max_size=None, additional_headers=headers)  # type: ignore[arg-type]
 
 
 def camera_message() -> bytes:
@@ -279,3 +285,91 @@ def test_nothing_but_the_page_is_served_and_no_client_opens_it_to_the_world(view
             urlopen(f"http://127.0.0.1:{viewer.port}{path}")
     assert viewer.server.request_share_url() is None
     assert viewer.server.get_host() == "127.0.0.1"
+
+
+def test_names_of_files_and_links_are_shown_letter_by_letter(viewer: Viewer) -> None:
+    from markdown_it import MarkdownIt
+
+    hostile = "<iframe srcdoc='<script>steal()</script>'> ![x](http://evil/x) **b** `c` &lt;a&gt; [l](javascript:x)"
+    shown = MarkdownIt().render(plain(hostile))
+    assert shown.count("<") == 2 and "<p>&lt;iframe" in shown and "![x](http://evil/x)" in shown  # the paragraph alone
+    with _client(viewer, "?view=" + quote("what=<img src=http://evil>")) as client:
+        client.send(camera_message())
+        _until(lambda: any("no state" in s.controls.told.content for s in viewer.sessions.values()))
+        (session,) = viewer.sessions.values()
+        assert "\\<img src" in session.controls.told.content
+
+
+@pytest.mark.parametrize(
+    ("origin", "forwarded", "may"),
+    [
+        ("http://localhost:8080", None, True),
+        ("http://[::1]:8080", None, True),
+        ("https://evil.example", None, False),
+        ("https://localhost.evil.example", None, False),
+        ("null", None, False),
+        ("http://[", None, False),
+        ("https://mine.example", "mine.example", True),
+    ],
+)
+def test_pages_of_other_sites_see_nothing(origin: str, forwarded: str | None, may: bool, viewer: Viewer) -> None:
+    headers = {"Origin": origin} | ({"X-Forwarded-Host": forwarded} if forwarded else {})
+    with _client(viewer, headers=headers) as client, _client(viewer) as other:
+        client.send(camera_message())
+        time.sleep(0.2)
+        other.send(camera_message())
+        _until(lambda: len(viewer.sessions) >= 1 + may)
+        time.sleep(0.1)
+        assert len(viewer.sessions) == 1 + may
+    viewer.host = "0.0.0.0"
+    assert viewer._may_look(headers)
+
+
+def test_values_that_no_control_offers_are_told_and_put_back(viewer: Viewer) -> None:
+    import msgspec
+
+    with _client(viewer) as client:
+        client.send(camera_message())
+        _until(lambda: viewer.sessions)
+        (session,) = viewer.sessions.values()
+        controls, told = session.controls, []
+        session.failed = told.append  # type: ignore[method-assign]
+        nonsense = {"method": "../../weights", "occlusion": "x", "n": 10**9, "height": float("nan"), "format": "/x"}
+        nonsense |= {"threshold": float("inf"), "cut": -1e300, "limits": "no", "yaw": 1e9}
+        for name, value in nonsense.items():
+            message = {
+                "type": "GuiUpdateMessage",
+                "uuid": getattr(controls, name)._impl.uuid,
+                "updates": {"value": value},
+            }
+            client.send(msgspec.msgpack.encode(message))
+        _until(lambda: len(told) >= len(nonsense) - 1)  # the format is looked at when it is needed
+        assert {type(error) for error in told} == {ConfigError}
+        assert controls.method.value in viewer.shared.opened.methods and 1 <= controls.n.value <= 20
+        assert session.state.method == "visible" and session.state.n == 5 and np.isfinite(session.state.height)
+        with pytest.raises(ConfigError, match="no such value"):
+            check_value(controls.format, "CSV")
+        assert controls.format.value == "CSV"
+
+
+def test_paths_that_are_too_large_or_no_poses_are_refused(tmp_path: Path) -> None:
+    poses = np.tile(np.eye(3, 4), (4, 1, 1))
+    row = {"method": "set", "pair": 0, "task": "planned", "waypoint": range(4)}
+    for name, table in {
+        "far": pd.DataFrame({**pose_columns(poses), **row, "tx": 1e300}),
+        "no turn": pd.DataFrame({**pose_columns(poses), **row, "qw": np.nan}),
+        "many": pd.concat([pd.DataFrame({**pose_columns(poses), **row, "method": f"m{i}"}) for i in range(30)]),
+        "bomb": None,
+    }.items():
+        path = tmp_path / f"{name}.parquet"
+        if table is None:  # 160 MB of nothing in a few kilobytes
+            values = pa.array(np.zeros(20_000_000, dtype=np.int64))
+            pq.write_table(pa.table({"pair": values}), path, compression="zstd")
+            assert path.stat().st_size < 400_000
+        else:
+            table.to_parquet(path)
+        with pytest.raises(TableError, match=r"finite poses|at most 20 methods|would unfold|Found zero norm"):
+            read_paths(path)
+    (tmp_path / "long.tum").write_bytes(b"0 0 0 0 0 0 0 1\n" * 1_100_000)
+    with pytest.raises(TableError, match="bytes"):
+        read_paths(tmp_path / "long.tum")

@@ -17,6 +17,7 @@ from wheretolook.mapping.colmap_model import colmap_poses, read_model, write_mod
 from wheretolook.mapping.config import MapConfig
 from wheretolook.mapping.triangulation import choose_pairs, shrink_depth, surface_overlap, triangulate_known_poses
 from wheretolook.utils.errors import MapError
+from wheretolook.utils.images import read_image as read_file
 from wheretolook.utils.processes import Processes
 
 if TYPE_CHECKING:
@@ -82,5 +83,7 @@ def read_image(path: Path) -> NDArray[np.uint8] | None:
     """An image (H, W, 3) uint8, RGB; None if it is missing or cannot be read."""
     import cv2
 
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    return None if image is None else np.asarray(image[:, :, ::-1], dtype=np.uint8)
+    try:
+        return np.asarray(read_file(path, cv2.IMREAD_COLOR)[:, :, ::-1], dtype=np.uint8)
+    except (OSError, ValueError):
+        return None

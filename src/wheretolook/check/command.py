@@ -6,15 +6,19 @@ import argparse
 import os
 import time
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from wheretolook.dataset.names import LOCK, check_scene_name
+from wheretolook.utils.confine import entry_of
 from wheretolook.utils.errors import ConfigError, MapError
 from wheretolook.utils.locks import hold
 from wheretolook.utils.options import CommandParser
 
 if TYPE_CHECKING:
     from wheretolook.check.source import PhotographedMap
+    from wheretolook.dataset.folders import SceneFolder
     from wheretolook.visibility.occlusion import OcclusionModel
 
 ABOUT = """\
@@ -82,6 +86,7 @@ def run(arguments: Sequence[str]) -> int:
     """Run the command. Returns the exit code 0; raises a WhereToLookError for bad input."""
     options, start = parser().parse_args(arguments), time.monotonic()
     _refuse(options)
+    from wheretolook.check import source as sources
     from wheretolook.check.checking import check_map
     from wheretolook.check.figure import check_figure
     from wheretolook.check.scores import Scoring
@@ -92,12 +97,17 @@ def run(arguments: Sequence[str]) -> int:
     device, workers = usable_device(options.device), options.workers or len(os.sched_getaffinity(0))
     scoring = Scoring(options.method, options.weights, tuple(options.also), options.anywhere)
     scoring.check()  # now, not after the work
-    out = options.out or options.data / "checks" / _name(options)
-    with hold(out / ".lock", "check"):
-        source, occlusion = _open(options, out, device, workers)
-        report = check_map(source, out / "work", scoring, occlusion, options.views, workers, device)
-        report.save(out)
-        save_figure(check_figure(report), out / "check.png")
+    out = options.out or entry_of(options.data / "checks", _name(options), "the name of a check")
+    scene = None if options.scene is None else sources.find_scene(options.data, options.scene, options.name)
+    try:
+        with _reading(scene), hold(out / ".lock", "check"):
+            source, occlusion = _open(options, scene, out, device, workers)
+            report = check_map(source, out / "work", scoring, occlusion, options.views, workers, device)
+            report.save(out)
+            save_figure(check_figure(report), out / "check.png")
+    finally:
+        with suppress(OSError):  # made for the lock of a check that then found nothing to work on
+            out.rmdir()
     print("\n".join(report.lines()))
     if scoring.chosen is not None and read_training(scoring.chosen).get("photographs"):
         print(
@@ -118,6 +128,8 @@ def _refuse(options: argparse.Namespace) -> None:
     if options.views < 1 or options.workers < 0:
         fix = "Give --views of at least 1, --workers of at least 0."
         raise ConfigError("not such numbers", value=(options.views, options.workers), fix=fix)
+    if options.scene is not None:
+        check_scene_name(options.data, options.scene, options.name)
     from wheretolook.mapping.colmap_model import model_suffix
     from wheretolook.methods.registry import check_method
     from wheretolook.select.weights import check_there
@@ -145,16 +157,22 @@ def _name(options: argparse.Namespace) -> str:
     return "-".join(filter(None, (options.name, options.scene)))
 
 
-def _open(options: argparse.Namespace, out: Path, device: str, workers: int) -> tuple[PhotographedMap, OcclusionModel]:
-    """The map, and what hides its landmarks; results go to a folder."""
+def _reading(scene: SceneFolder | None) -> AbstractContextManager[None]:
+    """Meanwhile no stage changes the dataset of a scene."""
+    return nullcontext() if scene is None else hold(scene.folder.parent / LOCK, "check", shared=True)
+
+
+def _open(
+    options: argparse.Namespace, scene: SceneFolder | None, out: Path, device: str, workers: int
+) -> tuple[PhotographedMap, OcclusionModel]:
+    """The map, of a scene if one was named, and what hides its landmarks; results go to a folder."""
     from wheretolook.check import source
     from wheretolook.features.keypoints import ExtractorConfig
     from wheretolook.mapping.config import ExistingModelConfig
     from wheretolook.select.surroundings import surroundings
 
-    mesh, metric, name, scene = options.mesh, options.metres, options.scene, None
-    if options.scene is not None:
-        scene = source.find_scene(options.data, options.scene, options.name)
+    mesh, metric, name = options.mesh, options.metres, options.scene
+    if scene is not None:
         model = scene.map
         metric = metric or not scene.is_photographed or source.says_metric(model)
         if mesh is None and scene.mesh.is_file():

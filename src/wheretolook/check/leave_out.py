@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -27,14 +27,17 @@ from wheretolook.mapping.colmap_model import read_model
 from wheretolook.mapping.descriptors import read_features
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
 from wheretolook.utils.errors import MapError, MapWarning
-from wheretolook.utils.files import write_text
+from wheretolook.utils.files import fingerprint, write_json, write_text
 from wheretolook.utils.npz_files import load_npz, save_npz
 from wheretolook.utils.processes import Processes
+from wheretolook.utils.reading import read_json_object
 from wheretolook.viewpoints.table import LOCALIZED
 
 MIN_ANGLE_DEG = 1.5  # COLMAP's own least angle between the rays of a landmark
 _FORMAT = 1  # raise it if what is stored of a block changes, or means something else
 _FILES = ("landmarks.npz", "matches.npz", "views.csv")
+_WHOLE = "whole.json"  # their fingerprints, so that a damaged one is made anew; written last
+_NUMBERS = ("row", "error_m", "error_deg", "limit_m", "n_matches", "n_inliers", "n_observed", "n_kept", "n_landmarks")
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,17 +211,23 @@ def _run(job: _Job) -> int:
         matches |= {f"{name}_rows": np.concatenate(parts).astype(np.int64)}
         matches |= {f"{name}_counts": np.array([len(part) for part in parts], dtype=np.int64)}
     save_npz(job.folder / "matches.npz", matches)
-    write_text(job.folder / "views.csv", pd.DataFrame(rows).to_csv(index=False))  # last: it says that all is there
+    write_text(job.folder / "views.csv", pd.DataFrame(rows).to_csv(index=False))
+    write_json(job.folder / _WHOLE, {name: fingerprint(job.folder / name) for name in _FILES})
     return block.number
 
 
 def _is_finished(folder: Path, block: Block) -> bool:
+    """Whether all files of a block are there, and whole; of an earlier version, as far as they tell themselves."""
     if not all((folder / name).is_file() for name in _FILES):
         return False
     try:
+        if (folder / _WHOLE).is_file():
+            whole = {name: fingerprint(folder / name) for name in _FILES}
+            if read_json_object(folder / _WHOLE) != whole:
+                return False
         kept = load_npz(folder / "matches.npz")
         return all(np.array_equal(kept[name], getattr(block, name)) for name in ("left_out", "looked_at"))
-    except (ValueError, KeyError):
+    except (OSError, ValueError, KeyError):
         return False
 
 
@@ -229,7 +238,23 @@ def _load(folder: Path, block: Block) -> LeftOut:
             name: np.split(kept[f"{name}_rows"], np.cumsum(kept[f"{name}_counts"])[:-1])
             for name in ("matched", "inliers", "kept")
         }
-    except (OSError, ValueError, KeyError) as error:
+        landmarks = Landmarks.load(folder / "landmarks.npz")
+        _check_rows(views, split, len(landmarks), block)
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise MapError(f"damaged results of a block: {error}", path=folder, fix="Remove the folder.") from error
-    landmarks = Landmarks.load(folder / "landmarks.npz")
     return LeftOut(block, landmarks, views, split["matched"], split["inliers"], split["kept"])
+
+
+def _check_rows(views: pd.DataFrame, split: Mapping[str, list[NDArray[Any]]], n_landmarks: int, block: Block) -> None:
+    """ValueError or KeyError unless views are those of a block, and what they matched is in its map."""
+    if not np.array_equal(views["row"], block.looked_at) or views["good"].dtype != bool:
+        raise ValueError("views.csv is of other photographs")
+    views[list(_NUMBERS)].to_numpy(np.float64)
+    for name, rows in split.items():
+        together = np.concatenate([*rows, np.zeros(0, dtype=np.int64)])
+        if (
+            len(rows) != len(views)
+            or together.dtype != np.int64
+            or not ((together >= 0) & (together < n_landmarks)).all()
+        ):
+            raise ValueError(f"matches.npz has no {name} landmarks of this map")

@@ -6,7 +6,6 @@ import hashlib
 import json
 import shutil
 import warnings
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wheretolook.dataset.folders import Dataset, SceneFolder
+from wheretolook.dataset.names import check_scene_name, no_such_scene
 from wheretolook.features.keypoints import ExtractorConfig
 from wheretolook.geometry.camera import Camera, cameras_by_id
 from wheretolook.geometry.poses import Float, camera_centers, transform
@@ -26,7 +26,7 @@ from wheretolook.mapping.descriptors import HDF5_SUFFIXES, read_descriptors
 from wheretolook.mapping.gravity import estimate_gravity
 from wheretolook.mapping.plausibility import axes_doubt
 from wheretolook.mapping.scale import REPORT_FILE, Similarity, read_scale
-from wheretolook.utils.errors import ConfigError, MapError, MapWarning, WhereToLookError
+from wheretolook.utils.errors import ConfigError, MapError, MapWarning
 from wheretolook.utils.files import fingerprint, write_text
 from wheretolook.utils.reading import read_json_object
 from wheretolook.viewpoints.thresholds import THRESHOLDS
@@ -155,6 +155,7 @@ def find_scene(data: Path, name: str, dataset: str = "") -> SceneFolder:
 
     Raises ConfigError if there is none, or several datasets have it; TableError if the dataset is damaged.
     """
+    check_scene_name(data, name, dataset)
     if dataset:
         return Dataset.load(data / dataset).scene(name)
     roots = [path.parent for path in sorted(data.glob("*/dataset.json"))]
@@ -166,12 +167,7 @@ def find_scene(data: Path, name: str, dataset: str = "") -> SceneFolder:
     if having:
         names = ", ".join(one.name for one in having)
         raise ConfigError("several datasets have such a scene", value=name, fix=f"Give --name: {names}.")
-    scenes = list[str]()
-    for root in roots:
-        with suppress(WhereToLookError):  # what is wrong there is not what was asked
-            scenes += [scene.name for scene in Dataset.load(root).scenes]
-    fix = f"There are {', '.join(scenes)}." if scenes else "Make one with `wheretolook map --name NAME --model SPARSE`."
-    raise ConfigError("there is no such scene", path=data, value=name, fix=fix)
+    no_such_scene(data, name, roots)
 
 
 def features_beside(model_dir: Path) -> Path | None:

@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from wheretolook.dataset.names import NO_DATASET
 from wheretolook.geometry.camera import Camera, PinholeCamera, camera_of_record, read_cameras
 from wheretolook.geometry.poses import Float
 from wheretolook.mapping.colmap_model import CAMERAS_FILE, colmap_poses, compact_poses, holds_model, load_mapping_poses
@@ -26,9 +27,6 @@ from wheretolook.viewpoints.table import CAMERA_ID, read_table
 if TYPE_CHECKING:
     from wheretolook.inputs.localization_map import LocalizationMap
     from wheretolook.mapping.landmarks import Landmarks
-
-RELEASE = "release"  # name of the dataset, beside all others, that ships with its weights
-RELEASE_FILE = "release.json"  # what a release was made from; the file that makes a dataset one
 
 MappedFloor = tuple[tuple[float, float, float, float], ...]
 """The floor that a map is made from: rectangles (x0, y0, x1, y1) in metres; empty for all of it."""
@@ -286,8 +284,7 @@ class Dataset:
                     raise ValueError(f"a scene's split is {', '.join(get_args(Split))}, not {entry['split']!r}")
                 scenes.append(SceneFolder(folder, entry["split"], camera, own))
         except FileNotFoundError as error:
-            fix = "Run the scenes stage first, or for a map of your own `wheretolook map --model SPARSE`."
-            raise TableError("this folder is no dataset", path=path, fix=fix) from error
+            raise TableError("this folder is no dataset", path=path, fix=NO_DATASET) from error
         except (OSError, ConfigError, ValueError, KeyError, TypeError, AttributeError) as error:
             problem, fix = f"damaged dataset description: {error}", "Run the scenes stage again."
             raise TableError(problem, path=path, fix=fix) from error

@@ -45,6 +45,7 @@ class EvaluateConfig:
             location.
         photographs: whether photographs that were left out of the scenes' maps are views, too, as by
             `wheretolook check`; in rows of their own, with "photographs" in the column `candidates`.
+        anywhere: let weights that are adapted to one place score in others, too.
         reference: method that every other is compared with, by its name, such as "bins" or "mlp-2d+z". Empty for
             "set", or else "mlp-2d+3d", or else the first learned one.
     """
@@ -61,6 +62,7 @@ class EvaluateConfig:
     block_m: float = 1.0
     heading: tuple[tuple[float, float, float], ...] = ()
     photographs: bool = False
+    anywhere: bool = False
     reference: str = ""
 
     def __post_init__(self) -> None:

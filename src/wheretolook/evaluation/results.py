@@ -195,7 +195,8 @@ def log_evaluation(
     """
     views, scenes = evaluation.views, evaluation.scenes
     params = evaluation_params(dataset, scenes, evaluation.weights)
-    params |= {name: value for name, value in asdict(config).items() if name not in ("weights", "methods")}
+    params |= {name: value for name, value in asdict(config).items() if name not in ("weights", "methods", "anywhere")}
+    params |= {"anywhere": True} if config.anywhere else {}
     if not config.photographs:
         del params["photographs"]  # as before there were any
     if config.occlusions:

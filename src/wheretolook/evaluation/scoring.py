@@ -138,12 +138,13 @@ def score_scenes(
 def scorers_of(
     localization_map: LocalizationMap, config: EvaluateConfig, weights: Weights, anywhere: bool = False
 ) -> dict[str, Scorer]:
-    """The scorers to compare, by the names of their rows; `anywhere` as of `make_scorer`."""
+    """The scorers to compare, by the names of their rows; `anywhere` as of `make_scorer`, or as the options say."""
     found: dict[str, Scorer] = {}
+    insists = anywhere or config.anywhere
     for method in methods_named(config.methods, scorers()):
         paths = [path for path, kind in weights.items() if kind == method.weights]
         for path in paths if method.weights else [None]:
-            scorer = make_scorer(method.name, localization_map, config.seed, path, config.heading, anywhere)
+            scorer = make_scorer(method.name, localization_map, config.seed, path, config.heading, insists)
             # two files of one method are told apart by their names
             which = SHIPPED if path is not None and path.parent == shipped(WEIGHTS) else path
             found[f"{method.name} {which}" if method.name in found else method.name] = scorer

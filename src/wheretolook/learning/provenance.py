@@ -8,7 +8,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from wheretolook.dataset.folders import RELEASE_FILE, Dataset, SceneFolder
+from wheretolook.dataset.folders import Dataset, SceneFolder
+from wheretolook.dataset.names import RELEASE_FILE
 from wheretolook.features.sift import SIFT
 from wheretolook.learning.config import DECIDING, SharedConfig
 from wheretolook.learning.old_names import with_name

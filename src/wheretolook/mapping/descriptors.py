@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 import sqlite3
 import warnings
@@ -18,9 +19,16 @@ from wheretolook.features.registry import all_kinds
 from wheretolook.features.sift import SIFT
 from wheretolook.mapping.colmap_model import ModelArrays
 from wheretolook.utils.errors import MapError, MapWarning
+from wheretolook.utils.npz_files import FREE_BYTES, MAX_RATIO
+from wheretolook.utils.reading import check_file
 
 HDF5_SUFFIXES = (".h5", ".hdf5")
 _TABLE = "wheretolook_features"  # of a database: the name of the kind of its descriptors
+_TABLES = ("images", "keypoints", "descriptors", _TABLE)  # that are read
+_LEAST_ROW = 4  # bytes that a row takes at least
+_STEPS = 10_000  # of SQLite's machine, between two looks at how many there were
+_FREE_STEPS, _STEPS_OF_BYTE = 20_000_000, 10  # that a database may take, and for each of its bytes; a row takes some 10
+_MOST = 1e15  # what no pixel and no number of a descriptor comes near
 # An image's keypoints (K, 2) in pixels, its descriptors (K, D) as `DescriptorKind.store` gives them, and their kind;
 # None where it has none, or of a kind that is not known.
 _Features = tuple[NDArray[np.float64], NDArray[Any] | None, DescriptorKind | None]
@@ -162,8 +170,11 @@ def _database(path: Path, mismatch: str) -> Iterator[Callable[[str], _Features]]
     # Where no writer has left a journal, SQLite need not make one, which it could not in a folder that is read only.
     mode = "mode=ro" if path.with_name(path.name + "-wal").exists() else "immutable=1"
     try:
+        n_bytes = check_file(path).st_size
         with closing(sqlite3.connect(f"{path.resolve().as_uri()}?{mode}", uri=True)) as database:
-            ids: dict[str, int] = dict(database.execute("SELECT name, image_id FROM images"))
+            _limit(database, n_bytes)
+            found = database.execute("SELECT name, image_id FROM images LIMIT ?", (n_bytes // _LEAST_ROW,))
+            ids: dict[str, int] = dict(found)
             named = _kind_written(database) or _kind_in_name(path)
             has_type = any(row[1] == "type" for row in database.execute("PRAGMA table_info(descriptors)"))
             query = f"SELECT rows, cols, data, {'type' if has_type else 0} FROM descriptors WHERE image_id = ?"
@@ -174,19 +185,45 @@ def _database(path: Path, mismatch: str) -> Iterator[Callable[[str], _Features]]
                 of_image = (ids[name],)
                 row = database.execute("SELECT rows, cols, data FROM keypoints WHERE image_id = ?", of_image).fetchone()
                 n, columns, data = row or (0, 2, b"")
-                keypoints = np.frombuffer(data or b"", dtype="<f4").reshape(n, columns)[:, :2].astype(np.float64)
+                keypoints = np.frombuffer(data or b"", dtype="<f4").reshape(n, columns if n else 2)[:, :2]
+                keypoints = _checked(keypoints.astype(np.float64), name)
                 n, columns, data, kind = database.execute(query, of_image).fetchone() or (0, 0, b"", 0)
                 its_kind = _kind_in_database(kind, columns, named, path)
                 if its_kind is None or (n == 0 and len(keypoints)):
                     return keypoints, None, None
                 values = np.frombuffer(data or b"", dtype=np.uint8).reshape(n, columns)
                 if not its_kind.in_bytes:
-                    values = its_kind.store(unit_descriptors(values.view("<f4")))
+                    values = its_kind.store(unit_descriptors(_checked(values.view("<f4"), name)))
                 return keypoints, values, its_kind
 
             yield read
     except (sqlite3.Error, ValueError, TypeError) as error:
         raise MapError(f"cannot read the database: {error}", path=path, fix=fix) from error
+
+
+def _limit(database: sqlite3.Connection, n_bytes: int) -> None:
+    """Let a database of so many bytes hold no more than that, nor keep us for ever.
+
+    ValueError if what is read is no plain table: a view or a computed column makes gigabytes of nothing, or rows
+    without end.
+    """
+    steps = itertools.count()
+    database.set_progress_handler(lambda: next(steps) * _STEPS > _FREE_STEPS + _STEPS_OF_BYTE * n_bytes, _STEPS)
+    database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max(n_bytes, 1_000_000))
+    for schema, name, kind, *_ in database.execute("PRAGMA table_list").fetchall():
+        if schema != "main" or str(name).lower() not in _TABLES:
+            continue
+        if kind != "table":
+            raise ValueError(f"{name} is a {kind}, no table")
+        if any(column[-1] for column in database.execute(f'PRAGMA table_xinfo("{name}")')):
+            raise ValueError(f"{name} has computed columns")
+
+
+def _checked(values: NDArray[Any], name: str) -> NDArray[Any]:
+    """Numbers (K, N) of an image. ValueError if they are none that an extractor gives."""
+    if values.ndim != 2 or values.dtype.kind not in "fiu" or not (np.abs(values) < _MOST).all():
+        raise ValueError(f"the keypoints or descriptors of {name} are no finite numbers")
+    return values
 
 
 def _kind_in_database(
@@ -210,15 +247,19 @@ def _hdf5(path: Path, mismatch: str) -> Iterator[Callable[[str], _Features]]:
         fix = "pip install h5py, or leave the features out."
         raise MapError("features in HDF5 are read with h5py, which is not installed", path=path, fix=fix) from error
     try:
+        check_file(path)
         with h5py.File(path, "r") as file:
+            elsewhere = file.visititems_links(lambda name, link: name if isinstance(link, h5py.ExternalLink) else None)
+            if elsewhere is not None:
+                raise ValueError(f"{elsewhere} leads to another file")
             named = _kind_in_name(path)
 
             def read(name: str) -> _Features:
                 if name not in file:
                     raise MapError("the features lack an image of the model", path=path, value=name, fix=mismatch)
                 # hloc counts pixels from the centre of the top-left one, COLMAP from its corner
-                keypoints = file[name]["keypoints"][()].astype(np.float64)[:, :2] + 0.5
-                descriptors = file[name]["descriptors"][()].T
+                keypoints = _stored(file[name]["keypoints"], name).astype(np.float64)[:, :2] + 0.5
+                descriptors = _stored(file[name]["descriptors"], name).T
                 may_be_sift = descriptors.shape[1] == SIFT.dimension and named in (None, SIFT)
                 if may_be_sift and not (len(descriptors) and descriptors.min() < 0):
                     return keypoints, SIFT.store(unit_descriptors(descriptors)), SIFT
@@ -234,3 +275,18 @@ def _hdf5(path: Path, mismatch: str) -> Iterator[Callable[[str], _Features]]:
         raise MapError(
             f"cannot read the features: {error}", path=path, fix="Give hloc's feats-*.h5, or none."
         ) from error
+
+
+def _stored(dataset: Any, name: str) -> NDArray[Any]:
+    """An array of an image in HDF5. ValueError if it lies in another file, or unfolds to far more than is stored."""
+    import h5py
+
+    if not isinstance(dataset, h5py.Dataset) or dataset.shape is None:
+        raise ValueError(f"{name} has no array of keypoints or descriptors")
+    if dataset.is_virtual or dataset.external:
+        raise ValueError(f"the keypoints or descriptors of {name} lie in another file")
+    n_bytes, n_stored = dataset.size * dataset.dtype.itemsize, dataset.id.get_storage_size()
+    chunk = int(np.prod(dataset.chunks, dtype=float)) * dataset.dtype.itemsize if dataset.chunks else 0
+    if max(n_bytes, chunk) > max(FREE_BYTES, MAX_RATIO * n_stored):
+        raise ValueError(f"the {n_stored:,} bytes of {name} would unfold to {max(n_bytes, chunk):,}")
+    return _checked(dataset[()], name)

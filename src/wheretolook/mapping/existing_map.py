@@ -33,8 +33,10 @@ from wheretolook.mapping.landmarks import load_colmap_landmarks
 from wheretolook.mapping.plausibility import warn_of_frame
 from wheretolook.mapping.scale import MapScale, Similarity
 from wheretolook.mapping.triangulation import choose_pairs, color_points, triangulate_model
+from wheretolook.utils.confine import path_within
 from wheretolook.utils.errors import ConfigError, MapError
 from wheretolook.utils.files import copy_file, write_text
+from wheretolook.utils.images import image_size
 from wheretolook.utils.processes import Processes
 
 _PROPORTIONS = 0.01  # by which a photograph's proportions may differ from those of its camera
@@ -106,6 +108,8 @@ def map_existing(
             with clock("extract"):
                 work.mkdir(parents=True, exist_ok=True)
                 names = list(registered_names(model).values())
+                for name in names:
+                    path_within(photographs.images, name, "the name of an image of the model")
                 turned = _are_turned(model, photographs.images)
                 how = (photographs.max_side_px, config.extractor, processes, device, progress, names, turned)
                 features = photograph_features(photographs.images, work, *how)
@@ -261,12 +265,12 @@ def _size(path: Path, turned: bool) -> tuple[int, int]:
     from PIL import Image
 
     try:
+        width, height = image_size(path)
         with Image.open(path) as photograph:
-            width, height = photograph.size
             is_aside = turned and photograph.getexif().get(_ORIENTATION, 1) in _ASIDE
     except FileNotFoundError as error:
         fix = "Give the folder that the names of the model's images are relative to."
         raise MapError("an image of the model is missing", path=path, fix=fix) from error
-    except OSError as error:
+    except (OSError, ValueError) as error:
         raise MapError(f"cannot read this photograph: {error}", path=path, fix="Copy it again.") from error
     return (height, width) if is_aside else (width, height)

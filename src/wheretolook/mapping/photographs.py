@@ -14,6 +14,7 @@ from wheretolook.geometry.camera import ColmapCamera
 from wheretolook.mapping.config import PhotographsConfig
 from wheretolook.utils.colmap import quiet_colmap
 from wheretolook.utils.errors import ConfigError, MapError
+from wheretolook.utils.images import read_image
 
 if TYPE_CHECKING:
     import pycolmap
@@ -41,11 +42,10 @@ def read_photograph(path: Path, turned: bool = True) -> NDArray[np.uint8]:
     import cv2
 
     try:
-        bgr = cv2.imread(str(path), cv2.IMREAD_COLOR if turned else cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    except cv2.error as error:
-        raise MapError(f"cannot read this photograph: {error.err}", path=path, fix="Remove it.") from error
-    if bgr is None:
-        raise MapError("cannot read this photograph", path=path, fix="Remove it, or copy it again.")
+        bgr = read_image(path, cv2.IMREAD_COLOR if turned else cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    except (OSError, ValueError) as error:
+        fix = "Remove it, or copy it again."
+        raise MapError(f"cannot read this photograph: {error}", path=path, fix=fix) from error
     return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 

@@ -154,6 +154,7 @@ class PlanConfig(MappedLattice):
         against: further methods to plan by, drawn beside it. Such as forward and fisher-trace-gp; in `methods.png`.
         film: kind of film to make: gif, mp4 or none.
         rerun: write a recording for the Rerun viewer too. Needs `pip install rerun-sdk`.
+        anywhere: let weights that are adapted to another place score here, too.
         planner: costs and limits of the path, time to plan.
     """
 
@@ -166,6 +167,7 @@ class PlanConfig(MappedLattice):
     against: tuple[str, ...] = ()
     film: Literal["gif", "mp4", "none"] = "gif"
     rerun: bool = False
+    anywhere: bool = False
     planner: PathConfig = field(default_factory=PathConfig)
 
     def __post_init__(self) -> None:

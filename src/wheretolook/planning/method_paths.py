@@ -47,7 +47,8 @@ def plan_by_methods(
         if method == FORWARD:
             name, path = method, plan_path(start, goal, space, space.bounds, None, config.planner)
         else:
-            scorer = planner_scorer(scene, dataset, method, weights_for(method, dataset, config.weights))
+            weights = weights_for(method, dataset, config.weights)
+            scorer = planner_scorer(scene, dataset, method, weights, config.anywhere)
             views = planner_map(scene, config, scorer)
             name, path = method or scorer.name, plan_path(start, goal, space, space.bounds, views, config.planner)
             path = replace(path, scores=scorer.score(poses_looking_along(path.positions, path.axes)))

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from wheretolook.dataset.folders import RELEASE, Dataset
+from wheretolook.dataset.folders import Dataset
+from wheretolook.dataset.names import RELEASE
 from wheretolook.dataset.scene import Scene
 from wheretolook.geometry.camera import camera_of_record
 from wheretolook.geometry.lattices import ViewLattice
@@ -97,14 +98,16 @@ def default_weights(dataset: Dataset, say: Callable[[str], None] = print, kinds:
     return None
 
 
-def planner_scorer(scene: Scene, dataset: Dataset, method: str = "", weights: Path | None = None) -> Scorer:
+def planner_scorer(
+    scene: Scene, dataset: Dataset, method: str = "", weights: Path | None = None, anywhere: bool = False
+) -> Scorer:
     """The scorer by which paths are planned in a scene of a dataset, with weights from `weights_for`.
 
-    Raises as `scene_scorer`; where weights are missing, the error names the dataset.
+    `anywhere` as of `scene_scorer`. Raises as that; where weights are missing, the error names the dataset.
     """
     if weights is None and any(known.weights for known in members(method, scorers())):
         raise ConfigError(f"{method} needs weights", path=dataset.root, fix="Train it, or name weights.")
-    return scene_scorer(scene, method, weights)
+    return scene_scorer(scene, method, weights, anywhere)
 
 
 def planner_map(scene: Scene, views: ViewLattice, scorer: Scorer) -> ViewpointMap:

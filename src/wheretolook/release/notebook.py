@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from wheretolook.dataset.folders import RELEASE, Dataset
+from wheretolook.dataset.folders import Dataset
+from wheretolook.dataset.names import RELEASE
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.tracking_config import TrackingConfig
 

@@ -14,7 +14,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.dataset.folders import RELEASE_FILE, Dataset
+from wheretolook.dataset.folders import Dataset
+from wheretolook.dataset.names import RELEASE_FILE
 from wheretolook.dataset.scene import Scene, SceneConfig
 from wheretolook.figures.house_image import Dollhouse, dollhouse
 from wheretolook.geometry.lattices import VoxelGrid

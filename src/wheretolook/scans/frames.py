@@ -11,7 +11,6 @@ from typing import Any, Protocol
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 from tqdm.auto import tqdm
 
 from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
@@ -21,6 +20,7 @@ from wheretolook.scans.config import RgbdConfig
 from wheretolook.scans.depth_correction import DepthCorrection
 from wheretolook.scans.layouts import FrameFiles, Skipped, find_layout, frame_files
 from wheretolook.utils.errors import ConfigError, SceneError
+from wheretolook.utils.images import MAX_DEPTH_PIXELS, MAX_PIXELS, image_size, read_image
 
 SURVEY_STRIDE = 8  # pixels between the readings that are kept of each depth image
 _LEAST_READINGS = 0.02  # share of a depth image's pixels; with fewer it counts as without depth
@@ -71,7 +71,7 @@ class RgbdFrames:
         survey = []
         for frame in tqdm(frames, desc="read frames", unit="frame", disable=not progress):
             depth = self._read_depth(frame.depth)
-            if depth is None or cv2.imread(str(frame.color), cv2.IMREAD_REDUCED_COLOR_8) is None:
+            if depth is None or _read(frame.color, cv2.IMREAD_REDUCED_COLOR_8) is None:
                 self.skipped.add("with an image that cannot be read")
             elif (depth > 0).mean() < _LEAST_READINGS:
                 self.skipped.add("without depth")
@@ -89,7 +89,7 @@ class RgbdFrames:
 
     def __getitem__(self, index: int) -> RgbdFrame:
         frame = self._frames[index]
-        image, depth = cv2.imread(str(frame.color), cv2.IMREAD_COLOR), self._read_depth(frame.depth)
+        image, depth = _read(frame.color, cv2.IMREAD_COLOR), self._read_depth(frame.depth)
         if image is None or depth is None:
             raise SceneError("an image has vanished while it was used", path=frame.color, fix="Run the stage again.")
         rgb = np.ascontiguousarray(image[:, :, ::-1], dtype=np.uint8)
@@ -166,7 +166,7 @@ class RgbdFrames:
 
     def _read_depth(self, path: Path) -> NDArray[np.float32] | None:
         """Metres along the depth camera's axis, 0 without a reading; None if the file is damaged."""
-        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        image = _read(path, cv2.IMREAD_UNCHANGED, MAX_DEPTH_PIXELS)
         if image is None:
             return None
         if image.ndim != 2 or image.dtype != np.uint16:
@@ -228,9 +228,16 @@ def _last(name: str) -> str:
 def _size(path: Path) -> tuple[int, int] | None:
     """Width and height of an image; None if it cannot be read."""
     try:
-        with Image.open(path) as image:
-            return image.size
-    except (OSError, ValueError, Image.DecompressionBombError):
+        return image_size(path)
+    except (OSError, ValueError):
+        return None
+
+
+def _read(path: Path, flags: int, at_most: int = MAX_PIXELS) -> NDArray[Any] | None:
+    """An image; None if it cannot be read."""
+    try:
+        return read_image(path, flags, at_most)
+    except (OSError, ValueError):
         return None
 
 

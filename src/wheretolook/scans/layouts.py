@@ -6,12 +6,11 @@ al., "A Benchmark for the Evaluation of RGB-D SLAM Systems", IROS 2012.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from wheretolook.geometry.poses import Float, invert_poses, rotation_from_quaternion
 from wheretolook.utils.confine import path_within
@@ -20,6 +19,8 @@ from wheretolook.utils.reading import read_text
 
 _MAX_APART_S = 0.02  # between a colour image and its depth image or pose: as TUM's own associate.py has it
 _RIGID = 1e-2  # by which a rotation's entries may be off
+_FAR_M = 1e9  # from the origin; no recording has such coordinates
+_MOST_FRAMES, _MOST_POSES = 100_000, 400_000  # rows of a list: an hour at 30 Hz and at 100 Hz
 _IMAGES = (".png", ".jpg", ".jpeg")
 
 
@@ -127,7 +128,7 @@ def _read_pose(path: Path) -> Float | None:
 def _checked(world_from_cam: Float) -> Float | None:
     """cam_from_world with an exact rotation; None if there is none."""
     rotation = world_from_cam[:, :3]
-    if not np.isfinite(world_from_cam).all() or not np.allclose(rotation @ rotation.T, np.eye(3), atol=_RIGID):
+    if not (np.abs(world_from_cam) < _FAR_M).all() or not np.allclose(rotation @ rotation.T, np.eye(3), atol=_RIGID):
         return None
     u, _, vt = np.linalg.svd(rotation)
     if np.linalg.det(u @ vt) < 0:
@@ -136,15 +137,15 @@ def _checked(world_from_cam: Float) -> Float | None:
 
 
 def _tum_frames(folder: Path, skipped: Skipped, need_poses: bool) -> Iterator[FrameFiles]:
-    rgb, depth = (_read_list(folder / name, 1) for name in ("rgb.txt", "depth.txt"))
-    times, poses = np.zeros(0), np.zeros((0, 7))
+    rgb, depth = (_read_list(folder / name, 1, _MOST_FRAMES) for name in ("rgb.txt", "depth.txt"))
+    times, poses = list[float](), np.zeros((0, 7))
     if need_poses:
-        rows = _read_list(folder / "groundtruth.txt", 7)
-        times = np.array([time for time, _ in rows])
+        rows = _read_list(folder / "groundtruth.txt", 7, _MOST_POSES)
+        times = [time for time, _ in rows]
         poses = np.array([[_number(value) for value in values] for _, values in rows])
-    depth_times = np.array([time for time, _ in depth])
+    depth_of, pose_of = _Times([time for time, _ in depth]), _Times(times)
     for time, (name,) in rgb:
-        at, pose = _nearest(depth_times, time), _nearest(times, time)
+        at, pose = depth_of.nearest(time), pose_of.nearest(time)
         color = path_within(folder, name, "the name of a colour image")
         distance = None if at is None else path_within(folder, depth[at][1][0], "the name of a depth image")
         if not color.is_file():
@@ -171,11 +172,22 @@ def _tum_pose(values: Float) -> Float | None:
     return _checked(np.column_stack([rotation, values[:3]]))
 
 
-def _nearest(times: NDArray[np.float64], time: float) -> int | None:
-    if len(times) == 0:
-        return None
-    at = int(np.abs(times - time).argmin())
-    return at if abs(times[at] - time) <= _MAX_APART_S else None
+class _Times:
+    """Times of a list, which need not be in order."""
+
+    def __init__(self, times: Iterable[float]) -> None:
+        self.times = np.array([*times], dtype=np.float64)
+        self.order = np.argsort(self.times, kind="stable")
+        self.times = self.times[self.order]
+
+    def nearest(self, time: float) -> int | None:
+        """The row of the nearest time, of equals the first; None if none is near."""
+        end = int(np.searchsorted(self.times, time))
+        near = [at for at in (end - 1, end) if 0 <= at < len(self.times)]
+        at = min(near, key=lambda at: abs(self.times[at] - time), default=None)
+        if at is None or abs(self.times[at] - time) > _MAX_APART_S:
+            return None
+        return int(self.order[np.searchsorted(self.times, self.times[at])])
 
 
 def _number(text: str) -> float:
@@ -185,10 +197,13 @@ def _number(text: str) -> float:
         return float("nan")
 
 
-def _read_list(path: Path, n_values: int) -> list[tuple[float, list[str]]]:
-    """Rows of a TUM list: a time, and so many values. Raises SceneError if it is missing or has other rows."""
+def _read_list(path: Path, n_values: int, at_most: int) -> list[tuple[float, list[str]]]:
+    """Rows of a TUM list: a time, and so many values. SceneError if it is missing, or has other rows, or too many."""
     try:
-        lines = [line.replace(",", " ").split() for line in read_text(path).splitlines()]
+        text = read_text(path)
+        if text.count("\n") > at_most:
+            raise ValueError(f"it has more than {at_most:,} rows")
+        lines = [line.replace(",", " ").split() for line in text.splitlines()]
     except (OSError, ValueError) as error:
         problem = f"a list of the recording cannot be read: {error}"
         raise SceneError(problem, path=path, fix="A recording of TUM's layout has it.") from error

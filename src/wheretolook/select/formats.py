@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
-from wheretolook.geometry.poses import quaternion_from_rotation
+from wheretolook.geometry.camera import Camera
+from wheretolook.geometry.poses import Float, quaternion_from_rotation
 from wheretolook.mapping.colmap_model import holds_model
-from wheretolook.select.views import SelectedViews
 from wheretolook.utils.errors import ConfigError, StorageError
 from wheretolook.utils.files import write_json, write_text
 
@@ -25,6 +26,42 @@ FORMATS = {
     "benchmark": "# id qw qx qy qz tx ty tz, world-to-camera: poses of the Active Localization Benchmark",
 }
 """Formats, and the frames in which they have poses."""
+
+
+class Views(Protocol):
+    """What is written of V views; see `wheretolook.select.views.SelectedViews`."""
+
+    def __len__(self) -> int: ...
+    @property
+    def waypoint_id(self) -> tuple[str, ...]: ...
+    @property
+    def rank(self) -> NDArray[np.int64]: ...
+    @property
+    def cam_from_world(self) -> Float: ...
+    @property
+    def score(self) -> Float: ...
+    @property
+    def set_score(self) -> Float | None: ...
+    @property
+    def expected_inliers(self) -> Float: ...
+    @property
+    def n_visible(self) -> NDArray[np.int64]: ...
+    @property
+    def in_range(self) -> NDArray[np.bool_]: ...
+    @property
+    def camera(self) -> Camera: ...
+    @property
+    def method(self) -> str: ...
+    @property
+    def positions(self) -> Float: ...
+    @property
+    def yaw_deg(self) -> Float: ...
+    @property
+    def pitch_deg(self) -> Float: ...
+    @property
+    def quaternions_wxyz(self) -> Float: ...
+    @property
+    def quaternions_xyzw(self) -> Float: ...
 
 
 def format_of(path: Path, format: str | None = None) -> str:
@@ -60,7 +97,7 @@ def check_format(path: Path, format: str | None, n: int) -> str:
     return found
 
 
-def save_views(views: SelectedViews, path: Path, format: str | None = None) -> None:
+def save_views(views: Views, path: Path, format: str | None = None) -> None:
     """Write views to a file, atomically; its folder is made if missing.
 
     Raises a ConfigError as `check_format`, a StorageError if the file cannot be written.
@@ -90,7 +127,7 @@ def _is_ours(folder: Path) -> bool:
     return images.is_file() and images.read_text(errors="replace").startswith(_MARK)
 
 
-def _rows(views: SelectedViews) -> list[dict[str, Any]]:
+def _rows(views: Views) -> list[dict[str, Any]]:
     """One record a view; None for expected inliers where the method does not tell them."""
     wxyz, positions = views.quaternions_wxyz, views.positions
     yaw, pitch = views.yaw_deg, views.pitch_deg
@@ -123,7 +160,7 @@ FAR_M = 1000.0  # of a camera from the origin
 _DIGITS = {"yaw_deg": ".3f", "pitch_deg": ".3f", "score": ".9g", "set_score": ".9g", "expected_inliers": ".2f"}
 
 
-def _csv(views: SelectedViews) -> str:
+def _csv(views: Views) -> str:
     lines: list[str] = []
     for row in _rows(views):
         cells = {name: _cell(name, value) for name, value in row.items()}
@@ -143,7 +180,7 @@ def _cell(name: str, value: Any) -> str:
     return format(value, _DIGITS.get(name, ".9f"))
 
 
-def _json(views: SelectedViews) -> dict[str, Any]:
+def _json(views: Views) -> dict[str, Any]:
     frames = "x, y, z: camera centre in the world, m; qw, qx, qy, qz: camera-to-world; world z up, camera z forward"
     about = {"frames": frames, "method": views.method, "camera": views.camera.colmap.record()}
     poses = zip(_rows(views), views.quaternions_xyzw.tolist(), views.cam_from_world.tolist(), strict=True)
@@ -151,7 +188,7 @@ def _json(views: SelectedViews) -> dict[str, Any]:
     return about | {"views": rows}
 
 
-def _tum(views: SelectedViews) -> str:
+def _tum(views: Views) -> str:
     lines = [
         "# t x y z qx qy qz qw, camera-to-world, metres; t is the waypoint's name if that is a number, else a count"
     ]
@@ -165,14 +202,14 @@ def _tum(views: SelectedViews) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _benchmark(views: SelectedViews) -> str:
+def _benchmark(views: Views) -> str:
     lines = ["# id qw qx qy qz tx ty tz"]
     for name, pose in zip(views.waypoint_id, _cam_from_world(views), strict=True):
         lines.append(" ".join([name.replace(" ", "_"), *pose]))
     return "\n".join(lines) + "\n"
 
 
-def _images(views: SelectedViews) -> str:
+def _images(views: Views) -> str:
     lines = [_MARK + ": world-to-camera; a name is that of the waypoint, and of several views the rank"]
     lines += ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "# an empty line follows: no points"]
     several = views.rank.max(initial=1) > 1
@@ -183,13 +220,13 @@ def _images(views: SelectedViews) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _cameras(views: SelectedViews) -> str:
+def _cameras(views: Views) -> str:
     record = views.camera.colmap.record()
     values = [1, record["model"], record["width"], record["height"], *record["params"]]
     return "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n" + " ".join(map(str, values)) + "\n"
 
 
-def _cam_from_world(views: SelectedViews) -> list[list[str]]:
+def _cam_from_world(views: Views) -> list[list[str]]:
     """qw qx qy qz tx ty tz of each view, world-to-camera.
 
     Far from the origin quaternions get more decimals, which decide where the camera is: its centre follows from both.

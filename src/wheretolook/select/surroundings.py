@@ -13,6 +13,7 @@ from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.select.waypoints import Waypoints
 from wheretolook.utils.errors import ConfigError, SceneError, TableError
+from wheretolook.utils.images import MAX_DEPTH_PIXELS, read_image
 from wheretolook.utils.npz_files import load_npy
 from wheretolook.visibility.config import OCCLUSION_NAMES, OcclusionConfig
 
@@ -111,7 +112,10 @@ def _read_depth(path: Path, scale: float) -> NDArray[np.float32]:
     else:
         import cv2
 
-        values = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        try:
+            values = read_image(path, cv2.IMREAD_UNCHANGED, MAX_DEPTH_PIXELS)
+        except (OSError, ValueError) as error:
+            raise SceneError(f"cannot read the depth image: {error}", path=path, fix="Export it again.") from error
     if values is None or values.ndim != 2 or values.dtype.kind not in "fui":
         shape = None if values is None else values.shape
         raise SceneError("not a depth image of one channel", path=path, value=shape, fix="Export it again.")

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float, camera_centers, quaternion_from_rotation
 from wheretolook.planning.turns import pan_tilt_angles
+from wheretolook.select.formats import save_views
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,8 +74,6 @@ class SelectedViews:
 
         Raises a ConfigError if there is no such format, or it holds one view of a waypoint and there are several.
         """
-        from wheretolook.select.formats import save_views
-
         save_views(self, Path(path), format)
 
 

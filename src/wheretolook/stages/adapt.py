@@ -25,6 +25,7 @@ from wheretolook.stages.left_out import CHECKS, check_name, knows_photographs, l
 from wheretolook.stages.one_at_a_time import reading
 from wheretolook.utils.errors import ConfigError, MapError, OutOfRangeWarning, SceneError, TableError, WeightsError
 from wheretolook.utils.files import fingerprint, write_text
+from wheretolook.utils.locks import hold
 from wheretolook.utils.reading import read_json_object
 from wheretolook.utils.shipped import WEIGHTS, shipped
 from wheretolook.utils.tracking_store import check_store, kept_if_not_logged
@@ -121,7 +122,8 @@ def _adapt_map(experiment: Experiment, model: Path, weights: Path, say: Say, tic
     hides, _ = surroundings(None, None, 1000.0, "none" if asked == "none" else "hidden-points", model, device)
     views = _left_out(experiment, model, hides, weights, name, say)
     _check_enough(views, model)
-    return _learn(experiment, _Place(name, "", model, weights, path), views, points, say, tick)
+    with hold(path.with_name(f".{path.name}.lock"), "adapt"):
+        return _learn(experiment, _Place(name, "", model, weights, path), views, points, say, tick)
 
 
 def _left_out(

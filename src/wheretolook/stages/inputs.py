@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from wheretolook.config import Experiment
-from wheretolook.dataset.folders import RELEASE_FILE, Dataset, SceneFolder
+from wheretolook.dataset.folders import Dataset, SceneFolder
+from wheretolook.dataset.names import RELEASE_FILE
 from wheretolook.dataset.scene import Scene, SceneConfig
 from wheretolook.dataset.stamps import read_stamp
 from wheretolook.geometry.camera import CameraConfig

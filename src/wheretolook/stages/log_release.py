@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from wheretolook.config import Experiment
-from wheretolook.dataset.folders import RELEASE_FILE, Dataset
+from wheretolook.dataset.folders import Dataset
+from wheretolook.dataset.names import RELEASE_FILE
 from wheretolook.figures.config import FiguresConfig
 from wheretolook.stages.inputs import Say
 from wheretolook.stages.one_at_a_time import reads_dataset

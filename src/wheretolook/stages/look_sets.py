@@ -75,9 +75,10 @@ def evaluate_looks(
     weights = evaluate.weights[0] if evaluate.weights else default_weights(dataset)
     if not scenes or weights is None:
         return None
+    maps = [scene.localization_map(device=device) for scene in scenes]
     found = [
-        compare_looks(scene, load_scorer(str(weights), scene.localization_map(device=device)), config, progress)
-        for scene in scenes
+        compare_looks(scene, load_scorer(str(weights), around, evaluate.anywhere), config, progress)
+        for scene, around in zip(scenes, maps, strict=True)
     ]
     sets = pd.concat(found, ignore_index=True)
     folder = results_folder(dataset, evaluate)

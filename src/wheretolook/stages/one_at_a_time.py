@@ -9,6 +9,7 @@ from functools import wraps
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
+from wheretolook.dataset.names import LOCK
 from wheretolook.utils.locks import hold
 
 P = ParamSpec("P")
@@ -31,7 +32,7 @@ def changing(root: Path, stage: str) -> Iterator[None]:
 
     What killed runs left half written is removed first: nobody writes it any more.
     """
-    with hold(root / _LOCK, stage):
+    with hold(root / LOCK, stage):
         _remove_leftovers(root)
         yield
 
@@ -42,19 +43,16 @@ def reading(root: Path, stage: str, makes: str = "") -> Iterator[None]:
 
     Raises InUseError if another stage changes the dataset, or makes the same: "weights", "results" or "paths".
     """
-    with hold(root / _LOCK, stage, shared=True):
+    with hold(root / LOCK, stage, shared=True):
         if not makes or not root.is_dir():  # without a dataset nothing is made
             yield
             return
-        with hold(root / f".{makes}{_LOCK}", stage):
+        with hold(root / f".{makes}{LOCK}", stage):
             yield
 
 
-_LOCK = ".lock"
-
-
 def _remove_leftovers(root: Path) -> None:
-    for pattern in (f".?*{_LOCK}", "*.partial", "*/*.partial", "*/*/*.partial", "*/*/*/*.partial"):
+    for pattern in (f".?*{LOCK}", "*.partial", "*/*.partial", "*/*/*.partial", "*/*/*/*.partial"):
         for path in root.glob(pattern):
             if not path.parent.resolve().is_relative_to(root.resolve()):
                 continue  # a link leads there, which the stage will refuse

@@ -12,7 +12,6 @@ from wheretolook.dataset.stamps import read_stamp, write_stamp
 from wheretolook.stages.evaluate import evaluate
 from wheretolook.stages.inputs import Say, Tick, dataset_after
 from wheretolook.stages.one_at_a_time import changing, reading, reads_dataset
-from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import copy_file
 from wheretolook.utils.tracking_store import check_store
 
@@ -31,14 +30,12 @@ def release(experiment: Experiment, say: Say = print, tick: Tick = lambda work: 
         InUseError: another stage changes the dataset, or is at work on the copy.
     """
     from wheretolook.release import copy as releases
+    from wheretolook.release import naming
 
     dataset = dataset_after(experiment, "label")
     if not releases.is_release(dataset):
         root = experiment.data / experiment.release_name
-        if root.resolve() == experiment.root.resolve():
-            fix = "Give --release_name another name: the copy is a dataset of its own, beside this one."
-            problem = "the release has the name of the dataset that it is a copy of"
-            raise ConfigError(problem, path=root, value=experiment.release_name, fix=fix)
+        naming.check(experiment)
         with changing(root, "release"):
             copy = releases.copy_dataset(dataset, root, release_settings(experiment))
             for scene, source in zip(copy.scenes, dataset.scenes, strict=True):

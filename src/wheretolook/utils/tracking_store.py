@@ -33,6 +33,7 @@ ROOM_BYTES = 2**20  # that are free before work starts; a new store takes as muc
 _MAKING_S = 60.0  # to wait for another process that makes the store, which takes it 4 s on two cores
 _CHECK_S = 2.0  # a large database is not checked to its end
 _FIX = "Mend or move it, or name another folder: --tracking.folder FOLDER."
+_VERSION_TABLE = "alembic_version"  # where MLflow keeps which version made the store
 _MISREAD = re.compile(r"\?|%[0-9a-fA-F]{2}")  # in the path of a database, which SQLAlchemy reads as an address
 
 
@@ -144,6 +145,7 @@ def _check_database(database: Path) -> None:
         connection.set_progress_handler(lambda: time.monotonic() > until, 10_000)
         try:
             found = str(connection.execute("PRAGMA quick_check(1)").fetchone()[0])
+            named = connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall()
         except sqlite3.OperationalError as error:
             if error.sqlite_errorcode in (sqlite3.SQLITE_INTERRUPT, sqlite3.SQLITE_BUSY):
                 return
@@ -154,6 +156,8 @@ def _check_database(database: Path) -> None:
         found = "the file is truncated"  # SQLite takes one of a few bytes for empty, and rounds
     if found != "ok":
         raise TrackingError(f"the database is damaged: {' '.join(found.split())}", path=database, fix=_FIX)
+    if named and (_VERSION_TABLE,) not in named:
+        raise TrackingError("this is another program's database", path=database, value=named[0][0], fix=_FIX)
 
 
 @contextmanager

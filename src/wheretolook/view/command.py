@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from wheretolook.dataset.names import check_scene_name
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.options import CommandParser
 
@@ -31,8 +32,8 @@ PATHS (--path)
   alone stands beside the same places seen by a camera that looks ahead.
 
 WHO CAN SEE IT
-  This machine alone, unless --host says otherwise: --host 0.0.0.0 for all who reach it. There is no password, and
-  nothing is served but the scene.
+  This machine alone, and no page of another site that is open in its browser, unless --host says otherwise:
+  --host 0.0.0.0 for all who reach it. There is no password, and nothing is served but the scene.
 
 EXAMPLES
   wheretolook view --scene apartment-000
@@ -133,6 +134,8 @@ def _refuse(options: argparse.Namespace) -> None:
         raise ConfigError("there is no such folder of photographs", path=options.images, fix="Correct the path.")
     if options.record is not None and options.film is not None:
         raise ConfigError("a recording and a film are made one at a time", value=str(options.film), fix="Give one.")
+    if options.scene is not None and options.data.is_dir():
+        check_scene_name(options.data, options.scene, options.name)
     if options.record is not None:
         require("rerun")
         if options.record.suffix != ".rrd":

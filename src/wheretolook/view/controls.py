@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from wheretolook.utils.errors import ConfigError
 from wheretolook.view.drawing import legend
 from wheretolook.view.shared import STEP_M, Shared
 from wheretolook.view.state import MOST_VIEWS, ViewState
+from wheretolook.view.texts import plain
 from wheretolook.viewpoints.thresholds import THRESHOLDS, threshold_key, threshold_label
 
 if TYPE_CHECKING:
@@ -110,7 +112,7 @@ def build(gui: GuiApi, shared: Shared, state: ViewState) -> Controls:
             made["play"] = gui.add_button("Play")
             made["step"] = gui.add_slider("step", 1, n, 1, 1)
             for name in shared.paths:
-                made["path_told"][name] = gui.add_markdown(f"**{name}**")
+                made["path_told"][name] = gui.add_markdown(f"**{plain(name)}**")
                 made["path_pictures"][name] = gui.add_image(blank)
     with tabs.add_tab("Waypoints"):
         made["placing"] = gui.add_checkbox("clicks set waypoints", False)
@@ -145,3 +147,13 @@ def _slider(gui: GuiApi, label: str, low: float, high: float, value: float | Non
 
 def _within(value: float, low: float, high: float) -> float:
     return float(min(max(value, low), high))
+
+
+def check_value(handle: Any, before: Any) -> None:
+    """Raise ConfigError if a client has set a control to what it does not offer, and set it to what it was before."""
+    value = getattr(handle, "value", None)
+    options, most = getattr(handle, "options", None), getattr(handle, "max", None)
+    if (options is None or value in options) and (most is None or handle.min <= value <= most):
+        return
+    handle.value = before
+    raise ConfigError("this control has no such value", value=value, fix="Choose one that it offers.")

@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.utils.confine import path_within
 from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.images import image_size
 
 AT_AN_ANGLE_M = 2.0  # metres that a right angle between two views counts for
+MOST_PROPORTION = 8  # of height to width, as which narrower photographs are shown
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,11 +52,13 @@ class Photographs:
         try:
             if path is None:
                 raise FileNotFoundError(self.names[number])
+            full_width, full_height = image_size(path)
+            height = min(max(1, round(full_height * width / full_width)), MOST_PROPORTION * width)
             with Image.open(path) as image:
-                image.draft("RGB", (width, width))
-                height = max(1, round(image.height * width / image.width))
-                return np.asarray(image.convert("RGB").resize((width, height)))
-        except (OSError, ValueError) as error:
+                image.draft("RGB", (width, height))
+                small = image if image.mode in ("P", "1") else image.resize((width, height))  # palettes do not mix
+                return np.asarray(small.convert("RGB").resize((width, height)))
+        except (OSError, ValueError, Image.DecompressionBombError) as error:
             problem = f"the photograph cannot be read: {error}"
             raise ConfigError(problem, path=self.folder, value=self.names[number]) from error
 

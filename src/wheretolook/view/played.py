@@ -20,10 +20,12 @@ from wheretolook.geometry.poses import (
 from wheretolook.planning.config import FORWARD, PathsConfig
 from wheretolook.planning.path_comparison import GIVEN, PLANNED
 from wheretolook.utils.errors import TableError
-from wheretolook.viewpoints.table import POSE_COLUMNS, UNLABELLED, is_good, poses
+from wheretolook.utils.reading import MAX_TEXT_BYTES
+from wheretolook.viewpoints.table import POSE_COLUMNS, UNLABELLED, is_good, poses, read_parquet
 
+FAR_M = 1e9  # from the origin; no map has such coordinates
 COMPARED = PathsConfig()  # its limits of errors, by which a view of a path counts as localized
-MOST_POSES = 5000
+MOST_POSES, MOST_METHODS = 5000, 20
 _FIX = """\
 Give the folder or path.csv of `wheretolook plan`, a scene's folder in results/paths of `wheretolook compare-paths`, a
 TUM trajectory (t x y z qx qy qz qw, camera-to-world), or a CSV of selected views."""
@@ -57,6 +59,8 @@ def read_paths(path: Path, pair: int = 0) -> Paths:
         raise TableError("no path lies in this folder", path=path, fix=_FIX)
     if not path.is_file():
         raise TableError("there is no such path", path=path, fix=_FIX)
+    if path.suffix != ".parquet" and path.stat().st_size > MAX_TEXT_BYTES:
+        raise TableError(f"a path has at most {MAX_TEXT_BYTES:,} bytes", path=path, value=path.stat().st_size, fix=_FIX)
     if path.suffix == ".parquet":
         found = _compared(path, pair)
     elif path.suffix == ".csv":
@@ -64,8 +68,10 @@ def read_paths(path: Path, pair: int = 0) -> Paths:
     else:
         found = {_name(path): Played(_trajectory(path))}
     for along in (played.cam_from_world for played in found.values()):
-        if not 2 <= len(along) <= MOST_POSES or not np.isfinite(along).all():
+        if not 2 <= len(along) <= MOST_POSES or not is_rigid(along):
             raise TableError(f"a path has 2 to {MOST_POSES} finite poses", path=path, value=len(along), fix=_FIX)
+    if len(found) > MOST_METHODS:
+        raise TableError(f"paths of at most {MOST_METHODS} methods are played", path=path, value=len(found), fix=_FIX)
     if len(found) == 1:
         name, told = next(iter(found.items()))
         return {FORWARD: Played(looking_ahead(camera_centers(told.cam_from_world))), name: told}
@@ -84,6 +90,12 @@ def looking_ahead(positions: Float) -> Float:
         last = np.maximum.accumulate(np.where(still, -1, np.arange(len(steps))))
         steps = steps[np.where(last < 0, moving[0], last)]
     return poses_looking_along(positions, steps)
+
+
+def is_rigid(poses: Float) -> bool:
+    """Whether poses (W, 3, 4) are turns and shifts of places that there are."""
+    turns = poses[:, :, :3]
+    return bool((np.abs(poses) < FAR_M).all() and np.allclose(turns @ np.swapaxes(turns, 1, 2), np.eye(3), atol=1e-3))
 
 
 def _name(path: Path) -> str:
@@ -116,11 +128,11 @@ def _labelled(path: Path) -> pd.DataFrame:
     """Compared paths of a scene, with their labels, which stand in the table of all scenes beside its folder."""
     everything = path.parent.parent / path.name
     if everything.is_file():
-        table = pd.read_parquet(everything)
+        table = read_parquet(everything)
         table = table[table["scene"] == path.parent.name]
         if len(table):
             return table
-    return pd.read_parquet(path)
+    return read_parquet(path)
 
 
 def _table(path: Path) -> Float:
@@ -142,7 +154,10 @@ def _trajectory(path: Path) -> Float:
         raise TableError(f"no trajectory: {error}", path=path, fix=_FIX) from error
     if rows.ndim != 2 or rows.shape[1] != 8:
         raise TableError("a TUM trajectory has eight columns", path=path, value=rows.shape[-1], fix=_FIX)
-    return _from_centers(rows[:, 1:4], rows[:, [7, 4, 5, 6]])
+    try:
+        return _from_centers(rows[:, 1:4], rows[:, [7, 4, 5, 6]])
+    except ValueError as error:  # a quaternion of zeros
+        raise TableError(f"no trajectory: {error}", path=path, fix=_FIX) from error
 
 
 def _from_centers(centers: Float, wxyz: Float) -> Float:

@@ -13,6 +13,7 @@ from wheretolook.methods.base import ViewReport
 from wheretolook.view.scores import landmarks_seen
 from wheretolook.view.seen import picture_of
 from wheretolook.view.session import PATH_COLORS, Session
+from wheretolook.view.texts import plain
 from wheretolook.view.worker import SOON
 
 STEP_S = 0.25  # between two steps, at least
@@ -104,7 +105,7 @@ class Player:
                 receive_shadow=False,
             )
             score = float(report.score[at])
-            told = f"**{name}**: score {score:.3g}, {report.n_visible[at]:,} landmarks"
+            told = f"**{plain(name)}**: score {score:.3g}, {report.n_visible[at]:,} landmarks"
             if played.localized is not None:
                 told += LOCALIZED if played.localized[at] else LOST
             elif session.shared.is_probability(state.method) and score < state.threshold:

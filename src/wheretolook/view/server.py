@@ -5,10 +5,13 @@ from __future__ import annotations
 import contextlib
 import io
 import logging
+import re
 import threading
 import warnings
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 
@@ -18,6 +21,8 @@ from wheretolook.view.shared import Shared
 from wheretolook.view.state import ViewState
 
 PORT, HOST = 8080, "127.0.0.1"
+LOCAL = ("localhost", "127.0.0.1", "::1")  # names of this machine alone
+HEADERS = ("Host", "Origin", "X-Forwarded-Host")
 
 _log = logging.getLogger(__name__)
 
@@ -85,7 +90,11 @@ class Viewer:
         from wheretolook.view.waypoints import WaypointList
 
         try:
-            path, host = _request(self.server, client.client_id)
+            path, headers = _request(self.server, client.client_id)
+            if not self._may_look(headers):
+                self._refuse(client, headers)
+                return
+            host = headers.get("Host", "") if re.fullmatch(r"[\w.:\[\]-]{1,255}", headers.get("Host", "")) else ""
             state, problem = self.state, None
             try:
                 state = ViewState.of_path(path) or state
@@ -109,6 +118,27 @@ class Viewer:
                 self._left(client)
         except Exception:
             _log.exception("a client could not be served")
+
+    def _may_look(self, headers: Mapping[str, str]) -> bool:
+        """Whether a client may look by its headers.
+
+        A page of any other site, open in a browser here, can reach a server of this machine alone: the browser tells
+        which it is. One that a proxy of ours brings here is that of the proxy's name.
+        """
+        if self.host not in LOCAL or "Origin" not in headers:
+            return True
+        try:
+            site = urlsplit(headers["Origin"])
+            return site.hostname in LOCAL or site.netloc == headers.get("X-Forwarded-Host")
+        except ValueError:
+            return False
+
+    def _refuse(self, client: Any, headers: Mapping[str, str]) -> None:
+        _log.warning(
+            "a page of another site was refused: %.100r. Serve it by --host, if it is yours", headers["Origin"]
+        )
+        body = f"This address is served to pages of {', '.join(LOCAL)} alone, unless --host says otherwise."
+        client.add_notification("Not shown", body, color="red")
 
     def _left(self, client: Any) -> None:
         with self._lock:
@@ -138,13 +168,13 @@ def where_clicked(origin: Any, direction: Any, height_m: float) -> np.ndarray | 
     return found if distance > 0 and np.isfinite(found).all() else None
 
 
-def _request(server: Any, client_id: int) -> tuple[str, str]:
-    """Path of a client's connection, in which a link's state stands, and the host it was asked for; or empty."""
+def _request(server: Any, client_id: int) -> tuple[str, Mapping[str, str]]:
+    """Path of a client's connection, in which a link's state stands, and its headers; or empty."""
     try:
         request = server._websock_server._live_connections[client_id].request
-        return request.path, request.headers.get("Host", "")
+        return request.path, {name: request.headers.get_all(name)[0] for name in HEADERS if name in request.headers}
     except (AttributeError, KeyError):  # another viser keeps them elsewhere: links then open without their state
-        return "", ""
+        return "", {}
 
 
 def _server(host: str, port: int, label: str) -> Any:
@@ -158,7 +188,8 @@ def _server(host: str, port: int, label: str) -> Any:
 
     # a client may leave while something is drawn for it
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
-    logging.getLogger("websockets.server").addFilter(_one_line)
+    for name in ("websockets.server", "asyncio"):
+        logging.getLogger(name).addFilter(_one_line)
     with contextlib.redirect_stdout(io.StringIO()):
         made = Server(host, port, label=label, verbose=False)
     made.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
@@ -166,9 +197,9 @@ def _server(host: str, port: int, label: str) -> Any:
 
 
 def _one_line(record: logging.LogRecord) -> bool:
-    """Tell of a connection that failed in a line: a client that sends nonsense is no fault of ours."""
+    """Tell of a connection or a message that failed in a line: a client that sends nonsense is no fault of ours."""
     if record.exc_info and record.exc_info[1] is not None:
         error = record.exc_info[1]
-        record.msg, record.args = f"a client's connection was closed: {type(error).__name__}: {error}", ()
+        record.msg, record.args = f"what a client sent was of no use: {type(error).__name__}: {error}", ()
         record.exc_info, record.exc_text = None, None
     return True

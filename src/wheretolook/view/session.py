@@ -16,12 +16,13 @@ from wheretolook.geometry.poses import Float, poses_looking_along, quaternion_fr
 from wheretolook.planning.turns import pan_tilt_angles
 from wheretolook.utils.errors import ConfigError, TableError, WhereToLookError
 from wheretolook.view import drawing
-from wheretolook.view.controls import build
+from wheretolook.view.controls import build, check_value
 from wheretolook.view.scenery import Scenery
 from wheretolook.view.scores import Place, landmarks_seen, look_around, report_of
 from wheretolook.view.seen import picture_of
 from wheretolook.view.shared import Shared
 from wheretolook.view.state import ViewState
+from wheretolook.view.texts import plain
 from wheretolook.view.worker import LATER, NOW, SOON
 
 if TYPE_CHECKING:
@@ -68,7 +69,15 @@ class Session:
 
         What fails is told to this client, and to nobody else.
         """
-        getattr(handle, event)(lambda told: None if by_hand and told.client is None else self.safely(then))
+
+        before = [getattr(handle, "value", None)]
+
+        def checked() -> None:
+            check_value(handle, before[0])
+            before[0] = getattr(handle, "value", None)
+            then()
+
+        getattr(handle, event)(lambda told: None if by_hand and told.client is None else self.safely(checked))
 
     def safely(self, then: Callable[[], None]) -> None:
         """Do something; an error becomes a notice."""
@@ -88,7 +97,8 @@ class Session:
             _log.error("the viewer failed", exc_info=error)
             body = f"{type(error).__name__}: {error}. The terminal tells more."
         self.client.add_notification("That did not work", body, color="red", auto_close_seconds=15)
-        self.controls.told.content = body if self.place is None else self.controls.told.content
+        if self.place is None:
+            self.controls.told.content = plain(body)
 
     def note(self, **changes: Any) -> None:
         """Change the state; callbacks come in several threads."""

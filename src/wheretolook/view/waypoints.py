@@ -11,7 +11,7 @@ import numpy as np
 from wheretolook.geometry.poses import Float
 from wheretolook.select.where_to_look import WhereToLook
 from wheretolook.utils.errors import ConfigError
-from wheretolook.view.controls import FILES
+from wheretolook.view.controls import FILES, check_value
 from wheretolook.view.session import Session
 from wheretolook.view.worker import SOON
 
@@ -84,7 +84,9 @@ class WaypointList:
         self.session.submit("save", SOON, self._saved())
 
     def _saved(self) -> Iterator[None]:
-        session, format = self.session, str(self.session.controls.format.value)
+        session = self.session
+        check_value(session.controls.format, next(iter(FILES)))
+        format = str(session.controls.format.value)
         look = session.shared.look(session.state.method, session.state.occlusion)
         content = views_file(look, np.array(self.points), session.state.n, format)
         session.client.send_file_download(f"views{FILES[format][1]}", content, save_immediately=True)

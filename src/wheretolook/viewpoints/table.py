@@ -6,6 +6,7 @@ matched can be stored too, see `MATCH_FIELDS`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,8 @@ from numpy.typing import NDArray
 from wheretolook.geometry.poses import Float, camera_centers, quaternion_from_rotation, rotation_from_quaternion
 from wheretolook.utils.errors import TableError
 from wheretolook.utils.files import replacing
+from wheretolook.utils.npz_files import FREE_BYTES, MAX_RATIO
+from wheretolook.utils.reading import check_file
 
 POSE_COLUMNS = ("qw", "qx", "qy", "qz", "tx", "ty", "tz")
 CENTER_COLUMNS = ("x_m", "y_m", "z_m")
@@ -51,6 +54,8 @@ number of the camera in the scene's `cameras.txt`."""
 
 (CAMERA_ID,) = CAMERA_FIELD.names
 (PIXELS,) = PIXEL_FIELD.names
+
+_AT_ONCE = 1 << 16  # rows that are read before what they unfold to is looked at
 
 CENTER_DECIMALS = 12  # of a metre; the centres of a location's viewpoints, each computed from its pose, differ by less
 
@@ -146,6 +151,31 @@ def _shared_centers(table: pd.DataFrame) -> Float:
     return np.round(np.where(apart, centers, shared), CENTER_DECIMALS) + 0.0  # no negative zero
 
 
+def read_parquet(path: Path) -> pd.DataFrame:
+    """Read any table in a Parquet file. ValueError if it is none, or unfolds to far more than it has bytes."""
+    try:
+        with pq.ParquetFile(path) as file:
+            frame: pd.DataFrame = _read(file, path, file.schema_arrow.names).to_pandas()
+            return frame
+    except (pa.ArrowException, OSError, KeyError) as error:
+        raise ValueError(f"not a readable Parquet file: {error}") from error
+
+
+def _read(file: pq.ParquetFile, path: Path, names: Sequence[str]) -> pa.Table:
+    """Columns of a file, batch by batch: repeated values take next to none of it, and its own counts may lie.
+
+    ValueError if they unfold to far more than the file has bytes.
+    """
+    n_bytes, batches, unfolded = check_file(path).st_size, list[pa.RecordBatch](), 0
+    fields = [file.schema_arrow.field(name) for name in names]
+    for batch in file.iter_batches(_AT_ONCE, columns=list(names)):
+        batches.append(batch)
+        unfolded += batch.nbytes
+        if unfolded > max(FREE_BYTES, MAX_RATIO * n_bytes):
+            raise ValueError(f"its {n_bytes:,} bytes would unfold to more than {unfolded:,}")
+    return pa.Table.from_batches(batches, pa.schema(fields))
+
+
 def has_matches(path: Path, pixels: bool = False) -> bool:
     """Whether a table holds `MATCH_FIELDS`, with `pixels` also `PIXEL_FIELD`; a file that cannot be read does not."""
     try:
@@ -167,8 +197,8 @@ def read_table(path: Path, matches: bool = False, pixels: bool = False) -> pd.Da
         with pq.ParquetFile(path, page_checksum_verification=True) as file:
             names = file.schema_arrow.names  # matches take long to read, so only if they are asked for
             unwanted = ([] if matches or pixels else MATCH_FIELDS.names) + ([] if pixels else PIXEL_FIELD.names)
-            table = file.read([name for name in names if name not in unwanted])
-    except (pa.ArrowException, OSError, ValueError) as error:
+            table = _read(file, path, [name for name in names if name not in unwanted])
+    except (pa.ArrowException, OSError, ValueError, KeyError) as error:
         fix = "It may be truncated: get it anew, or delete it and run the stage that writes it."
         raise TableError(f"not a readable Parquet file: {error}", path=path, fix=fix) from error
     compact = any(name in names for name in CENTER_COLUMNS)

@@ -9,6 +9,7 @@ import shutil
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from faults.fuzz.execution import Target
 from wheretolook.benchmark.files import read_errors, read_poses
@@ -17,10 +18,15 @@ from wheretolook.cli import _check_file, parse_experiment
 from wheretolook.config import Experiment
 from wheretolook.geometry.camera import Camera, camera_of_record, read_cameras
 from wheretolook.geometry.camera_text import camera_of_view, parse_camera, parse_size
+from wheretolook.geometry.poses import check_poses
+from wheretolook.scans.layouts import TUM, frame_files
 from wheretolook.select.command import _camera, parser
 from wheretolook.select.waypoints import parse_points, read_waypoints
 from wheretolook.utils.options import all_options
 from wheretolook.utils.reading import parse_json_object
+from wheretolook.view.played import read_paths
+from wheretolook.view.state import ViewState
+from wheretolook.viewpoints.table import pose_columns
 
 _CONFIGS = Path(__file__).parents[3] / "configs"
 _PARSER = parser()
@@ -115,6 +121,43 @@ def _read_benchmark(path: Path) -> None:
     Scores.of(poses, read_errors(path.with_name("errors.txt")))
 
 
+def _paths(folder: Path) -> None:
+    cam_from_world = np.tile(np.eye(3, 4), (3, 1, 1))
+    about = {"method": "set", "pair": 0, "task": "planned", "waypoint": range(3)}
+    table = pd.DataFrame({**about, **pose_columns(cam_from_world), "status": "localized", "error_m": 0.1})
+    table.assign(error_deg=0.1).to_parquet(folder / "views.parquet")
+    table.to_csv(folder / "path.csv", index=False)
+    (folder / "views.csv").write_text("x,y,z,qw,qx,qy,qz\n1,2,3,1,0,0,0\n2,2,3,0,1,0,0\n")
+    (folder / "a.tum").write_text("# t x y z\n0.5 1 2 3 0 0 0 1\n1.5 1 2 3 0 0 0 1\n")
+
+
+def _read_path(path: Path) -> None:
+    for played in read_paths(path).values():
+        check_poses(played.cam_from_world)
+
+
+def _recording(folder: Path) -> None:
+    (folder / "rgb.txt").write_text("# t name\n1.0 a.png\n2.0 a.png\n")
+    (folder / "depth.txt").write_text("1.01 a.png\n2.01 a.png\n")
+    (folder / "groundtruth.txt").write_text("1.0 1 2 3 0 0 0 1\n2.0 1 2 3 0 1 0 0\n")
+    (folder / "a.png").write_text("")
+
+
+def _read_recording(path: Path) -> None:
+    frames, _ = frame_files(path.parent, TUM)
+    check_poses(np.stack([frame.cam_from_world for frame in frames]))
+
+
+def _states(folder: Path) -> None:
+    (folder / "state").write_text("method=set;n=3;height=1.4;place=1,2,1.5;yaw=-30;eye=0,0,9")
+    (folder / "link").write_text("/?view=n=3;threshold=0.25;occlusion=none;cut=2")
+
+
+def _read_state(text: str) -> None:
+    state = ViewState.of_path(text) if text.startswith("/") else ViewState.parse(text)
+    assert state is None or ViewState.parse(state.text()) is not None
+
+
 TARGETS = (
     Target("yaml", _settings, ("demo.yaml", "paper.yaml", "alias.yaml"), lambda path: _check_file(path, _OPTIONS)),
     Target("settings", _settings, ("alias.yaml",), lambda path: parse_experiment("map", ["--config", str(path)])),
@@ -124,5 +167,8 @@ TARGETS = (
     Target("camera-texts", _camera_texts, ("pinhole", "radial"), lambda text: _use(parse_camera(text)), in_memory=True),
     Target("short-texts", _short_texts, ("size", "points", "json"), _read_short_text, in_memory=True),
     Target("select", _command, ("a.txt",), _read_command, in_memory=True),
+    Target("paths", _paths, ("views.parquet", "path.csv", "views.csv", "a.tum"), _read_path),
+    Target("recordings", _recording, ("rgb.txt", "depth.txt", "groundtruth.txt"), _read_recording),
+    Target("states", _states, ("state", "link"), _read_state, in_memory=True),
     Target("benchmark", _benchmark, ("poses.txt", "errors.txt"), _read_benchmark),
 )

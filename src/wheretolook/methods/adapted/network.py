@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import inf, isfinite
 from typing import Any, Self
 
 import torch
@@ -51,7 +52,10 @@ class AdaptedNetwork(StoredNetwork):
         if not all(0 <= size <= MAX_SUPPORT for size in sizes):
             raise ValueError(f"there are at most {MAX_SUPPORT:,} views and landmarks, not {sizes}")
         length_m, sharpness = float(kernel["length_m"]), float(kernel["sharpness"])
-        if not (length_m > 0 and sharpness >= 0):
+        if not (0 < length_m < inf and 0 <= sharpness < inf):
             raise ValueError(f"no length and sharpness of a kernel: {length_m}, {sharpness}")
+        scale, offset = float(base["scale"]), float(base["offset"])
+        if not (isfinite(scale) and isfinite(offset)):
+            raise ValueError(f"scale {scale} and offset {offset} are not finite")
         network = SetNetwork.of_description(base["network"])
-        return cls(network, float(base["scale"]), float(base["offset"]), length_m, sharpness, *sizes)
+        return cls(network, scale, offset, length_m, sharpness, *sizes)

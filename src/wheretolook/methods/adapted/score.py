@@ -95,7 +95,8 @@ def _check_place(place: Float, localization_map: LocalizationMap) -> None:
     if same < LEAST_SAME:
         fix = (
             "Adapt to this map, or use weights that are for any place, such as those that ship. To insist: --anywhere "
-            "(select, check), --viewpoint_map.anywhere true, in Python anywhere=True."
+            "(select, check), --viewpoint_map.anywhere true, --plan.anywhere true, --evaluate.anywhere true, in Python "
+            "anywhere=True."
         )
         problem = f"these weights are adapted to another place: of its landmarks this map has {same:.0%}"
         raise WeightsError(problem, fix=fix)

@@ -12,7 +12,7 @@ import warnings
 from concurrent.futures import ThreadPoolExecutor
 from math import log
 from threading import Lock
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,15 +20,14 @@ import warp as wp
 from torch import Tensor
 
 from wheretolook.geometry.poses import Float, check_locations, rotation_looking_along
+from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.learning.trained_network import TrainedNetwork
 from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 from wheretolook.methods.matchability.network import N_EXPECTED, bearing_precision
-from wheretolook.methods.set.network import expected_cells
+from wheretolook.methods.set.network import SetNetwork, expected_cells
 from wheretolook.visibility.listing import FrustumLister, ListedViews, Surroundings
 from wheretolook.visibility.occlusion import DevicePoints
 from wheretolook.visibility.sphere_cells import choose_size
-
-if TYPE_CHECKING:
-    from wheretolook.methods.set.score import SetScorer
 
 SERVED = {
     "log_expected_inliers",
@@ -61,9 +60,11 @@ class ScoresAround:
     a curve through space (`DevicePoints`), so that between half of `most` and `most` remain.
     """
 
-    def __init__(self, scorer: SetScorer, directions: Float, most: int) -> None:
-        self.scorer, self.directions, self.most = scorer, directions, most
-        around, matchability = scorer.localization_map, scorer.network.matchability
+    def __init__(
+        self, localization_map: LocalizationMap, trained: TrainedNetwork[SetNetwork], directions: Float, most: int
+    ) -> None:
+        self.localization_map, self.trained, self.directions, self.most = localization_map, trained, directions, most
+        around, matchability = localization_map, trained.network.matchability
         self.rotations = rotation_looking_along(directions)
         self.points = DevicePoints(around.landmarks.points, around.device)
         names = matchability.attributes
@@ -91,7 +92,7 @@ class ScoresAround:
             mapped = [MAP_ATTRIBUTES.index(name) for name in ("mapped_distance", "mapped_pixel_size")]
             mapped_from = torch.from_numpy(around.landmarks.mapping_direction[self.points.order]).to(self.device)
             self._mapped = torch.cat([mapped_from, of_map[:, mapped]], 1)
-        self._asks_for_cells = "log_expected_cells" in scorer.network.options["told"]
+        self._asks_for_cells = "log_expected_cells" in trained.network.options["told"]
         with warnings.catch_warnings():  # PyTorch says once that sparse matrices are young
             warnings.simplefilter("ignore")
             torch.sparse_csr_tensor(
@@ -101,9 +102,8 @@ class ScoresAround:
         self._lock = Lock()
 
     @staticmethod
-    def serves(scorer: SetScorer) -> bool:
-        """Whether a scorer's network is told of views only what is `SERVED`."""
-        network = scorer.network
+    def serves(network: SetNetwork) -> bool:
+        """Whether a network is told of views only what is `SERVED`."""
         return network.attention is None and {*network.options["told"]} <= SERVED
 
     @staticmethod
@@ -138,7 +138,7 @@ class ScoresAround:
 
     def _score(self, locations: Float) -> Float:
         n_directions, double = len(self.rotations), self.points.double
-        mask = self.scorer.localization_map.occlusion.unoccluded_on_device(locations, self.points)
+        mask = self.localization_map.occlusion.unoccluded_on_device(locations, self.points)
         pairs = np.stack(np.divmod(np.arange(len(locations) * n_directions), n_directions), axis=1)
         lister = self._lister(0)
         around = lister.surroundings(locations, double, mask)
@@ -164,7 +164,7 @@ class ScoresAround:
     def _lister(self, level: int) -> FrustumLister:
         with self._lock:
             if level not in self._listers:
-                camera, n_points = self.scorer.localization_map.camera, len(self.points) >> level
+                camera, n_points = self.localization_map.camera, len(self.points) >> level
                 options: dict[str, Any] = {
                     "scratch_bytes": SCRATCH_BYTES,
                     "size": max(LEAST_CELLS, choose_size(n_points)),
@@ -176,7 +176,7 @@ class ScoresAround:
         self, listed: ListedViews, around: Surroundings, stride: int, n_visible: Float, heights: Float
     ) -> Float:
         """Scores (V,) of listed views that see `n_visible` (V,) landmarks in all, and whose axes rise by `heights`."""
-        scorer, starts = self.scorer, listed.starts
+        network, starts = self.trained.network, listed.starts
         entries, image = wp.to_torch(listed.entries), wp.to_torch(listed.image)
         offsets, rows = wp.to_torch(around.offsets), wp.to_torch(around.rows)
         used = torch.zeros(len(rows), dtype=torch.bool, device=self.device)
@@ -206,8 +206,8 @@ class ScoresAround:
                 cells[views] = expected_cells(image[span], log_odds, of_view, each[views], IMAGE)
             begin = end
         spread = cells if self._asks_for_cells else None
-        logits = scorer.network.logits(sums * each[:, None], visible, height, spread).double()
-        return np.asarray(scorer.trained.calibrated(logits).sigmoid().cpu().numpy())
+        logits = network.logits(sums * each[:, None], visible, height, spread).double()
+        return np.asarray(self.trained.calibrated(logits).sigmoid().cpu().numpy())
 
     def _described(self, offsets: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
         """The first layer (M, W) of landmarks but for where they lie in the image, and what they add to sums (M, 16).
@@ -222,7 +222,7 @@ class ScoresAround:
         values = torch.stack([log_distance, angle, log_distance - mapped[:, 3], size_ratio], 1)
         base = self._first[rows].addmm_((values - self._mean).nan_to_num_(nan=0.0), self._of_location)
         weight = torch.ones_like(distance)
-        if "pixel_angle" in self.scorer.network.attributes:
+        if "pixel_angle" in self.trained.network.attributes:
             pixels = torch.stack([torch.full_like(size_ratio, self._pixel_angle), size_ratio], 1)
             precision = bearing_precision(pixels, ("pixel_angle", "pixel_size_ratio"))
             assert precision is not None

@@ -79,8 +79,9 @@ class SetScorer(LandmarkScorer):
 
     def score_around(self, locations: Float, directions: Float) -> Float:
         """(L, D) probabilities; where many landmarks are in view, by fewer of them than `score`."""
-        if not ScoresAround.serves(self):
+        if not ScoresAround.serves(self.network):
             return super().score_around(locations, directions)
         if self._around is None or not np.array_equal(self._around_axes, directions):
-            self._around, self._around_axes = ScoresAround(self, directions, MOST // 2), directions
+            self._around = ScoresAround(self.localization_map, self.trained, directions, MOST // 2)
+            self._around_axes = directions
         return self._around.score(locations)

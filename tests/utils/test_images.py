@@ -1,0 +1,77 @@
+"""Images that unfold to gigabytes are refused before they do."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from mapping.test_own_models import rig_model
+from wheretolook.mapping.config import ExistingModelConfig, MapConfig, PhotographsConfig
+from wheretolook.mapping.existing_map import map_existing
+from wheretolook.mapping.photographs import read_photograph
+from wheretolook.scans.frames import _size
+from wheretolook.select.surroundings import _read_depth
+from wheretolook.utils.errors import ConfigError, MapError, SceneError
+from wheretolook.utils.images import image_size, read_image
+from wheretolook.view.photographs import MOST_PROPORTION, Photographs
+
+
+def png(path: Path, width: int, height: int, written: int | None = None, bits: int = 8) -> Path:
+    """A black PNG of which but some rows are there."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    rows = zlib.compress(bytes((1 + (width * bits + 7) // 8) * (height if written is None else written)))
+    head = struct.pack(">IIBBBBB", width, height, bits, 0, 0, 0, 0)
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", rows) + chunk(b"IEND", b""))
+    return path
+
+
+@pytest.mark.parametrize("side", [12_500, 32_000, 60_000])
+def test_a_bomb_is_refused_by_its_size(side: int, tmp_path: Path) -> None:
+    path = png(tmp_path / "a.png", side, side, written=1)
+    with pytest.raises(MapError, match="pixels") as caught:
+        read_photograph(path)
+    assert caught.value.path == path
+    with pytest.raises(SceneError, match="pixels"):
+        _read_depth(path, 1000.0)
+    assert _size(path) is None
+    shown = Photographs(tmp_path, ("a.png",), np.eye(3, 4)[None])
+    with pytest.raises(ConfigError, match="pixels"):
+        shown.read(0, 360)
+
+
+def test_a_thin_photograph_is_not_shown_as_wide(tmp_path: Path) -> None:
+    png(tmp_path / "a.png", 1, 60_000)
+    assert Photographs(tmp_path, ("a.png",), np.eye(3, 4)[None]).read(0, 360).shape == (360 * MOST_PROPORTION, 360, 3)
+
+
+def test_images_are_read_as_they_are(tmp_path: Path) -> None:
+    depth = np.arange(12, dtype=np.uint16).reshape(3, 4) * 1000
+    cv2.imwrite(str(tmp_path / "a.png"), depth)
+    assert image_size(tmp_path / "a.png") == (4, 3)
+    np.testing.assert_array_equal(read_image(tmp_path / "a.png", cv2.IMREAD_UNCHANGED), depth)
+    (tmp_path / "b.png").write_bytes((tmp_path / "a.png").read_bytes()[:40])
+    for path in (tmp_path / "b.png", tmp_path, Path("/dev/zero"), tmp_path / "no.png", tmp_path / "n\0.png"):
+        with pytest.raises((ValueError, OSError)):
+            read_image(path, cv2.IMREAD_UNCHANGED)
+
+
+@pytest.mark.parametrize("name", ["../secret.png", "/secret.png", "n\0.png"])
+def test_a_models_image_lies_in_the_folder_of_photographs(name: str, tmp_path: Path) -> None:
+    model = rig_model()
+    next(iter(model.images.values())).name = name
+    if next(iter(model.images.values())).name != name:
+        pytest.skip("COLMAP itself cuts this name")
+    (tmp_path / "images").mkdir()
+    config = MapConfig(
+        existing=ExistingModelConfig(model=tmp_path), photographs=PhotographsConfig(images=tmp_path / "images")
+    )
+    with pytest.raises(ConfigError, match="lead out"):
+        map_existing(config, tmp_path / "map", tmp_path / "work", reconstruction=model)

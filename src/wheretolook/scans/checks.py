@@ -64,7 +64,7 @@ def landmark_readings(frames: RgbdFrames, model: Any) -> Float:
 
     Takes the `pycolmap.Reconstruction` that gave the poses.
     """
-    found = [np.zeros((0, 2))]
+    found: list[Float] = [np.zeros((0, 2))]
     by_name = {image.name: image for image in model.images.values()}
     for name, depth, pose in zip(frames.names_in_model, frames.survey_m, frames.cam_from_world, strict=True):
         image: Any = by_name[name]

@@ -36,8 +36,8 @@ class DepthCorrection:
 
     def describe(self) -> str:
         """What it does at 1, 2 and 3 m."""
-        moved = [float(self.apply(np.float32([z]))[0]) - z for z in (1.0, 2.0, 3.0)]
-        return ", ".join(f"{100 * by:+.1f} cm at {z} m" for by, z in zip(moved, (1, 2, 3), strict=True))
+        at = np.arange(1, 4, dtype=np.float32)
+        return ", ".join(f"{100 * by:+.1f} cm at {z:g} m" for z, by in zip(at, self.apply(at) - at, strict=True))
 
 
 def fit_depth_correction(true_m: Float, read_m: Float) -> DepthCorrection | None:

@@ -78,16 +78,37 @@ class Tab:
             self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, **button)
 
     def press(self, label: str) -> None:
-        """Click the first element whose whole text is this."""
-        found = self.evaluate(
+        """Click the first element whose whole text is this, once it is there."""
+        script = (
             "(() => { const e = [...document.querySelectorAll('button, [role=tab], label, span, p, div')]"
             f".filter(e => e.innerText && e.innerText.trim() === {json.dumps(label)}"
             " && e.getBoundingClientRect().width > 0).pop();"
             " if (!e) return null; e.scrollIntoView({block: 'center'}); const r = e.getBoundingClientRect();"
             " return [r.x + r.width / 2, r.y + r.height / 2]; })()"
         )
-        assert found, f"there is no {label!r} on the page:\n{self.text}"
-        self.click(*found)
+        self.wait(lambda tab: tab.evaluate(script) is not None, 20)
+        self.click(*self.evaluate(script))
+
+    def drag(self, start: tuple[float, float], end: tuple[float, float], steps: int = 10) -> None:
+        """Press the mouse at one pixel, move it in steps to another, and let go."""
+        ways = [tuple(a + (b - a) * k / steps for a, b in zip(start, end, strict=True)) for k in range(steps + 1)]
+        moves = [("mouseMoved", start), ("mousePressed", start), *(("mouseMoved", at) for at in ways)]
+        for kind, (x, y) in [*moves, ("mouseReleased", end)]:
+            held = (
+                {"button": "none"} if (kind, (x, y)) == moves[0] else {"button": "left", "clickCount": 1, "buttons": 1}
+            )
+            self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, **held)
+            time.sleep(0.03)
+
+    def downloads(self, folder: Path) -> None:
+        """Let the page save files in a folder."""
+        self.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(folder))
+
+    def frames_per_second(self, seconds: float = 3.0) -> float:
+        """How many pictures the page draws in a second."""
+        script = "new Promise(done => { let n = 0; const t = performance.now(); const count = () => { n++; const s = "
+        script += f"(performance.now() - t) / 1000; s > {seconds} ? done(n / s) : requestAnimationFrame(count); }}; "
+        return float(self.evaluate(script + "requestAnimationFrame(count); })"))
 
     def picture(self, path: Path) -> None:
         """Write a picture of the page, PNG."""

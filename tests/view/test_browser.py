@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 pytest.importorskip("viser")
 
@@ -16,9 +18,12 @@ from view.browser import Browser, Tab, chromium
 from wheretolook.geometry.poses import poses_looking_along, rotation_from_quaternion
 from wheretolook.view.opened import open_map
 from wheretolook.view.played import FORWARD, Played, looking_ahead
+from wheretolook.view.saving import views_file
 from wheretolook.view.server import Viewer
 from wheretolook.view.shared import Shared
 from wheretolook.view.state import ViewState
+
+RING = 0.65  # radius of the rings, of their size
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(chromium() is None, reason="there is no Chromium on the PATH")]
 
@@ -78,3 +83,45 @@ def _plays(tab: Tab) -> None:
     tab.wait(lambda tab: "● lost" in tab.text)
     tab.wait(lambda tab: "● localized" in tab.text)  # at the end
     tab.press("Look")
+
+
+def _until(what: Callable[[], bool], seconds: float = 60.0) -> None:
+    end = time.monotonic() + seconds
+    while not what():
+        assert time.monotonic() < end
+        time.sleep(0.1)
+
+
+def test_waypoints_and_a_picture_are_saved_and_rings_turn_the_camera(
+    viewer: Viewer, browser: Browser, tmp_path: Path
+) -> None:
+    known = {*viewer.sessions}
+    at = (1.6, 2.1, 1.5)
+    tab = browser.open(ViewState(occlusion="none", n=3, place=at).link(f"localhost:{viewer.port}"))
+    tab.downloads(tmp_path)
+    tab.wait(lambda tab: "landmarks in view" in tab.text)
+    session = viewer.sessions[next(iter({*viewer.sessions} - known))]
+    assert "weights given: set.safetensors" in tab.text
+    tab.press("Waypoints")
+    tab.press("Add the place looked at")
+    _until(lambda: "1.60, 2.10, 1.50" in session.controls.waypoints.content)
+    tab.press("Save with best views")
+    _until((tmp_path / "views.csv").is_file)
+    assert (tmp_path / "views.csv").read_bytes() == views_file(
+        session.shared.look("set", "none"), np.array([at]), 3, "CSV"
+    )
+    tab.press("Share")
+    tab.press("Save a picture")
+    _until((tmp_path / "wheretolook.png").is_file)
+    with Image.open(tmp_path / "wheretolook.png") as picture:
+        assert picture.width > 300 and len(picture.convert("RGB").getcolors(1 << 24)) > 50
+    tab.press("Look")
+    before, told = session.axis.copy(), session.controls.picture_told.content
+    turn = poses_looking_along(np.array(at), before)[:, :3].T  # the rings' axes are the camera's
+    reach = 3.0 * session.shared.mark_m * RING
+    yaw = [np.array(at) + reach * turn @ (np.sin(angle), 0, np.cos(angle)) for angle in np.radians((45, 10))]
+    start, end = (pixel_of(session.client.camera, point) for point in yaw)
+    tab.drag(start, end)
+    _until(lambda: session.controls.picture_told.content != told)
+    assert 10 < np.degrees(np.arccos(session.axis @ before)) < 80
+    assert tab.errors == []

@@ -28,11 +28,11 @@ from wheretolook.view.checks import check_port
 from wheretolook.view.controls import check_value
 from wheretolook.view.opened import open_map
 from wheretolook.view.played import FORWARD, looking_ahead, read_paths
+from wheretolook.view.saving import views_file
 from wheretolook.view.server import Viewer, where_clicked
 from wheretolook.view.shared import Shared
 from wheretolook.view.state import ViewState
 from wheretolook.view.texts import plain
-from wheretolook.view.waypoints import views_file
 from wheretolook.view.worker import LATER, NOW, Worker
 from wheretolook.viewpoints.table import pose_columns
 
@@ -208,6 +208,25 @@ def test_urgent_work_goes_first_and_what_fails_stops_nothing_else() -> None:
     names = [name for name, _ in done]
     assert names.count("first") == 3 and names.count("second") == 2 and "gone" not in names
     assert names.index("new") <= 1 and [str(error) for error in failed] == ["nonsense"]
+
+
+def test_floors_wait_while_a_view_is_turned_but_not_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("wheretolook.view.worker.PATIENCE_S", 1.0)
+    worker, when = Worker(), []  # type: ignore[var-annotated]
+
+    def step(name: str) -> Iterator[None]:
+        when.append((name, time.monotonic()))
+        yield
+
+    begun = time.monotonic()
+    while time.monotonic() < begun + 1.8:
+        worker.submit(1, "view", NOW, step("turned"), pytest.fail)
+        worker.submit(1, "floor", LATER, step("floor"), pytest.fail)
+        time.sleep(0.1)
+    worker.stop()
+    floors = [at for name, at in when if name == "floor"]
+    assert len(floors) == 2 and len(when) - len(floors) > 5
+    assert np.diff(floors)[0] >= 1.0
 
 
 def test_pictures_show_scores_in_the_projects_colors() -> None:

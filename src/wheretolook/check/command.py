@@ -168,6 +168,7 @@ def _open(
     """The map, of a scene if one was named, and what hides its landmarks; results go to a folder."""
     from wheretolook.check import source
     from wheretolook.features.keypoints import ExtractorConfig
+    from wheretolook.mapping.beside import features_beside, photographs_of
     from wheretolook.mapping.config import ExistingModelConfig
     from wheretolook.select.surroundings import surroundings
 
@@ -185,7 +186,7 @@ def _open(
         fix = "Say --metres if it is, or leave --mesh out."
         raise ConfigError("a mesh is of use only for a map in metres", value=str(mesh), fix=fix)
     hides, _ = surroundings(mesh, None, 1000.0, options.occlusion, model, device)
-    given = options.images or options.database or source.features_beside(model) or source.photographs_of(model)
+    given = options.images or options.database or features_beside(model) or photographs_of(model)
     if given is None and scene is not None and scene.mesh.is_file():  # its images were rendered, and are gone
         problem = "neither the features nor the photographs of this map are known"
         fix = "Map the scene again with `wheretolook map --map.keep_database true`, which keeps the features."

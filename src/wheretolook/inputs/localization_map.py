@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from wheretolook.geometry.camera import Camera, ColmapCamera
 from wheretolook.geometry.poses import Float, camera_centers, check_poses
 from wheretolook.inputs.bins import BinnedViews, bin_views, count_bins
-from wheretolook.mapping.colmap_model import camera_of_model, colmap_poses, compact_poses, read_model
-from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
-from wheretolook.mapping.plausibility import warn_of_frame
+from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.mapping.opened_map import open_colmap
 from wheretolook.utils.errors import ConfigError
 from wheretolook.visibility import frustum
 from wheretolook.visibility.frustum import LandmarkSets, PosedViews, landmarks_in_view
@@ -81,12 +80,7 @@ class LocalizationMap:
             raise ConfigError(
                 "the largest reprojection error is positive", value=worst_px, fix="Give pixels, such as 2."
             )
-        found = read_model(model)
-        landmarks = load_colmap_landmarks(Path(model), database, worst_px, device, found)
-        poses = colmap_poses(model, found)
-        warn_of_frame(model, landmarks.mapping_distance_m, poses)
-        if camera is None or isinstance(camera, int):
-            camera = camera_of_model(found, Path(model), camera)
+        landmarks, camera, poses = open_colmap(model, camera, database, worst_px, device)
         occlusion = occlusion or NoOcclusion()
         if mesh is not None:
             from wheretolook.scenes.loading import load_mesh
@@ -95,7 +89,7 @@ class LocalizationMap:
 
             space = FreeSpace(load_mesh(Path(mesh), colored=False), device=device)
             occlusion = MeshOcclusion(space.raycaster, two_sided=space.two_sided)
-        return cls(landmarks, camera, occlusion, device, compact_poses(poses))
+        return cls(landmarks, camera, occlusion, device, poses)
 
     def of_camera(self, camera: Camera) -> LocalizationMap:
         """The same map, looked at with another camera."""

@@ -5,16 +5,17 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
-from torch import Tensor
 
 from wheretolook.learning.old_names import name_of_header, with_name
 from wheretolook.utils.errors import WeightsError
 from wheretolook.utils.files import write_bytes
 from wheretolook.utils.reading import parse_json_object, read_json_object
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 FORMAT_VERSION = 1  # version of the layout of the metadata
 METADATA_KEY = "wheretolook"  # key of the JSON text in the header of the file
@@ -25,6 +26,8 @@ def write_weights(path: str | Path, method: str, tensors: Mapping[str, Tensor], 
 
     Of the description "camera" is that of the training views, "training" what is known of the training.
     """
+    from safetensors.torch import save
+
     text = json.dumps({"format_version": FORMAT_VERSION, **header, "method": method})
     # not by `save_file`, which makes a file that other users cannot read
     content = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
@@ -62,8 +65,8 @@ def read_record(path: str | Path) -> dict[str, Any]:
 
 
 def method_of_weights(path: str | Path) -> str:
-    """The name of the method that weights serve, such as "mlp-2d+z" or "set"; see `read_weights`."""
-    return name_of_header(read_weights(Path(path))[1])
+    """The name of the method that weights serve, such as "mlp-2d+z" or "set"; see `read_header`."""
+    return name_of_header(read_header(Path(path)))
 
 
 def preference(path: str | Path) -> tuple[bool, float]:
@@ -72,7 +75,7 @@ def preference(path: str | Path) -> tuple[bool, float]:
     Those that have learnt with many cameras come before all that know one: their precision is that on harder views.
     Raises a WeightsError if the file or its record cannot be read.
     """
-    many = read_weights(Path(path))[1].get("camera", "") is None
+    many = read_header(Path(path)).get("camera", "") is None
     return many, float(read_record(path)["metrics"]["val_average_precision"])
 
 
@@ -90,15 +93,35 @@ def read_weights(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
 
     Raises a WeightsError if the file is missing, damaged, foreign or of another version.
     """
-    if not path.is_file():
-        raise WeightsError("there are no weights", path=path, fix="Run the train stage first, or correct the path.")
+    header = read_header(path)
     try:
         with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
             names = file.keys()  # the file is no dict, whatever it looks like
             tensors = {name: file.get_tensor(name) for name in names}
     except (SafetensorError, OSError) as error:
-        raise WeightsError(f"not a readable safetensors file: {error}", path=path, fix="Train again.") from error
+        raise _unreadable(path, error) from error
+    unknown = next((name for name, x in tensors.items() if x.is_floating_point() and bool(x.isnan().any())), None)
+    if unknown is not None:
+        raise WeightsError("these weights are not numbers (NaN)", path=path, value=unknown, fix="Train again.")
+    return tensors, header
+
+
+def _unreadable(path: Path, error: Exception) -> WeightsError:
+    return WeightsError(f"not a readable safetensors file: {error}", path=path, fix="Train again.")
+
+
+def read_header(path: Path) -> dict[str, Any]:
+    """The description in the header of a weights file. Its tensors are not read, nor torch loaded.
+
+    Raises a WeightsError if the file is missing, damaged, foreign or of another version.
+    """
+    if not path.is_file():
+        raise WeightsError("there are no weights", path=path, fix="Run the train stage first, or correct the path.")
+    try:
+        with safe_open(path, framework="np") as file:
+            metadata = file.metadata() or {}
+    except (SafetensorError, OSError) as error:
+        raise _unreadable(path, error) from error
     if METADATA_KEY not in metadata:
         fix = "Give weights that the train stage wrote."
         raise WeightsError("these weights were not written by wheretolook", path=path, fix=fix)
@@ -113,7 +136,4 @@ def read_weights(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     if not isinstance(header.get("training", {}), dict):
         problem = "damaged description in the header: what is known of the training is no JSON object"
         raise WeightsError(problem, path=path, value=header["training"], fix="Train again.")
-    unknown = next((name for name, x in tensors.items() if x.is_floating_point() and bool(x.isnan().any())), None)
-    if unknown is not None:
-        raise WeightsError("these weights are not numbers (NaN)", path=path, value=unknown, fix="Train again.")
-    return tensors, header
+    return header

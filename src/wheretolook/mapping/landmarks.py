@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from numpy.typing import DTypeLike, NDArray
 from tqdm.auto import tqdm
 
@@ -229,6 +228,8 @@ def nearest_other_cosine(descriptors: NDArray[Any], device: str = "cpu", progres
 
     Sums of products of bytes are exact in float32, so that of SIFT the result does not depend on the machine.
     """
+    import torch  # takes seconds to load, and most maps are read without it
+
     n, threads = len(descriptors), torch.get_num_threads()
     values = torch.as_tensor(descriptors, dtype=torch.float32, device=device)
     lengths = torch.as_tensor(np.linalg.norm(descriptors.astype(np.float64), axis=1), device=device)

@@ -21,7 +21,7 @@ CHECKS = "checks"  # folder of the folders of checks, beside the datasets
 
 def knows_photographs(files: SceneFolder, images: Path | None = None, database: Path | None = None) -> bool:
     """Whether the features of the photographs that a scene's map was made from are known, or these themselves."""
-    from wheretolook.check.source import features_beside, photographs_of
+    from wheretolook.mapping.beside import features_beside, photographs_of
     from wheretolook.mapping.colmap_model import holds_model
 
     if not holds_model(files.map):

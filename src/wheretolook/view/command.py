@@ -55,7 +55,7 @@ def parser() -> argparse.ArgumentParser:
     add("--images", type=Path, metavar="FOLDER", help="its photographs, shown beside views")
     add("--path", type=Path, metavar="FILE", help="a path to play")
     add("--pair", type=int, default=0, metavar="N", help="which start and goal of compared paths (0)")
-    add("--weights", type=Path, metavar="FILE", help="weights, or a folder of them (those that ship)")
+    add("--weights", type=Path, metavar="FILE", help="weights, or a folder (the place's own, or those that ship)")
     add("--method", default="", metavar="NAME", help="method that scores at first (that of the weights)")
     add("--camera", metavar="TEXT", help="the camera that looks, COLMAP's MODEL,width,height,parameters (the map's)")
     add("--camera-id", type=int, metavar="ID", help="instead: the camera_id of one of the map's cameras")
@@ -108,6 +108,7 @@ def run(arguments: Sequence[str]) -> int:
     from wheretolook.view.server import Viewer
 
     viewer = Viewer(Shared(opened, paths), options.host, options.port, state, options.dark)
+    print(opened.weights.told(state.method or opened.methods[0]) or "a method without weights", flush=True)
     print(f"{told}, open after {time.monotonic() - start:.1f} s", flush=True)
     print(f"{viewer.url}    (Ctrl-C ends it)", flush=True)
     try:
@@ -156,7 +157,8 @@ def _open(options: argparse.Namespace) -> Opened:
 
     device, camera = usable_device(options.device), _camera(options)
     if options.map is not None:
-        return open_map(options.map, options.mesh, camera, options.images, options.weights, device)
+        given = options.map, options.mesh, camera, options.images, options.weights, device
+        return open_map(*given, options.data)
     if isinstance(camera, int):
         fix = "Describe it by --camera."
         raise ConfigError("--camera-id belongs to --map", value=camera, fix=fix)

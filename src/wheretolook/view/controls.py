@@ -36,6 +36,7 @@ class Controls:
     status: Any
     legend: Any
     method: Any
+    weights: Any
     occlusion: Any
     height: Any
     threshold: Any
@@ -78,6 +79,7 @@ def build(gui: GuiApi, shared: Shared, state: ViewState) -> Controls:
         made["status"] = gui.add_markdown("")
         made["legend"] = gui.add_html(legend(0, 1, "score"))
         made["method"] = gui.add_dropdown("method", opened.methods, initial_value=state.method)
+        made["weights"] = gui.add_markdown("")
         made["occlusion"] = gui.add_dropdown("hidden by", opened.occlusions, initial_value=state.occlusion)
         made["height"] = _slider(gui, "floor at, m", low, high, state.height)
         made["threshold"] = gui.add_slider(

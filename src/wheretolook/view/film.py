@@ -23,7 +23,6 @@ from wheretolook.utils.files import replacing
 from wheretolook.view import drawing
 from wheretolook.view.played import FORWARD, Played
 from wheretolook.view.scores import SeenLandmarks, landmarks_seen
-from wheretolook.view.seen import picture_of
 from wheretolook.view.shared import Shared
 from wheretolook.view.state import ViewState
 
@@ -84,7 +83,7 @@ def _frames(shared: Shared, state: ViewState) -> Iterator[drawing.Rgb]:
                 color = COLORS.get(name, BLUE)
                 _draw_way(above, house, played.cam_from_world, good, at, color, opened.camera, shared.mark_m)
                 seen = landmarks_seen(look.scorer, played.cam_from_world[at], shared.teller(state.occlusion))
-                image, _ = picture_of(opened, played.cam_from_world[at], SeenLandmarks(*_marked(seen)))
+                image, _ = opened.picture(played.cam_from_world[at], SeenLandmarks(*_marked(seen)))
                 _draw_view(figure.add_subplot(grid[row, 1]), image, name, bool(good[at]), good[: at + 1], color)
             canvas = FigureCanvasAgg(figure)
             canvas.draw()

@@ -12,22 +12,24 @@ import numpy as np
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.poses import Float
-from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.select.where_to_look import WhereToLook
 from wheretolook.utils.errors import ConfigError, MapError, SceneError, TableError
+from wheretolook.view import drawing
+from wheretolook.view.weights import KnownWeights, given_weights, map_weights, scene_weights
 from wheretolook.visibility.config import OcclusionConfig
-from wheretolook.visibility.occlusion import NoOcclusion, OcclusionModel
-from wheretolook.visibility.remembered import RememberedOcclusion
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # nothing that is imported here may load torch or Warp: the page is to be there before them
     import pandas as pd
 
     from wheretolook.dataset.folders import SceneFolder
     from wheretolook.geometry.mesh import TexturedMesh
+    from wheretolook.inputs.localization_map import LocalizationMap
     from wheretolook.mapping.landmarks import Landmarks
     from wheretolook.rendering.warp_renderer import WarpRenderer
+    from wheretolook.select.where_to_look import WhereToLook
     from wheretolook.space.free_space import FreeSpace
     from wheretolook.view.photographs import Photographs
+    from wheretolook.view.scores import SeenLandmarks
+    from wheretolook.visibility.occlusion import OcclusionModel
 
 MOST_SCORERS = 8  # that are kept: those of large maps take a hundred megabytes each
 DIRECTIONS = 500
@@ -45,11 +47,11 @@ class Opened:
     landmarks: Landmarks
     camera: Camera  # the one that looks
     mapping_poses: Float | None  # cam_from_world (M, 3, 4)
+    weights: KnownWeights
     mesh: TexturedMesh | None = None
     camera_space: Any = None  # where a camera can be, if not what mesh or map alone tell
     labels: pd.DataFrame | None = None  # labelled viewpoints, if there are any
     photographs: Photographs | None = None  # those that the map was made from, if they lie here
-    weights: Path | None = None  # file or folder of weights; None for those that ship
     device: str = "cpu"
     _maps: dict[str, LocalizationMap] = field(default_factory=dict, init=False)
     _looks: dict[tuple[str, str, int], WhereToLook] = field(default_factory=dict, init=False)
@@ -61,27 +63,8 @@ class Opened:
 
     @cached_property
     def methods(self) -> tuple[str, ...]:
-        """Names of the methods that can score here, that of the best weights first; see `_can_score`."""
-        from wheretolook.learning.weights import method_of_weights
-        from wheretolook.methods.registry import scorers
-        from wheretolook.select.weights import weights_of
-
-        best = weights_of("", self.weights)
-        first = [] if best is None else [method_of_weights(best)]
-        return tuple(dict.fromkeys([*first, *(name for name in scorers() if self._can_score(name))]))
-
-    def _can_score(self, name: str) -> bool:
-        """Whether a method needs nothing but this map, or there are weights of it."""
-        from wheretolook.methods.registry import scorers
-        from wheretolook.select.weights import weights_of
-
-        if scorers()[name].group == "probes" or name == "random":
-            return False
-        try:
-            weights_of(name, self.weights)
-        except Exception:  # whatever is wrong with its weights: it is not offered
-            return False
-        return True
+        """Names of the methods that can score here, that of the best weights first."""
+        return self.weights.methods
 
     @cached_property
     def _mesh_space(self) -> FreeSpace:
@@ -97,9 +80,9 @@ class Opened:
             return self.camera_space
         if self.mesh is not None:
             return self._mesh_space
-        from wheretolook.select.surroundings import map_space
+        from wheretolook.space.mapped_space import MappedSpace
 
-        return map_space(self.map_of("none"))
+        return MappedSpace(self.landmarks.points, centers_of(self))
 
     @cached_property
     def renderer(self) -> WarpRenderer | None:
@@ -110,8 +93,25 @@ class Opened:
 
         return WarpRenderer(self.mesh, self.device)
 
+    def picture(self, pose: Float, seen: SeenLandmarks) -> tuple[drawing.Rgb, str]:
+        """What a view (3, 4) shows, (H, W, 3), and what kind of picture it is: rendered, or the nearest photograph, or
+        the landmarks alone.
+
+        Landmarks in view are marked in the colours of their chances, but not on a photograph, which shows another view.
+        """
+        if self.renderer is not None:
+            rgb = self.renderer.render(drawing.small_camera(self.camera), pose[None]).rgb[0]
+            return drawing.picture(rgb, self.camera, seen.pixels, seen.chances), "rendered; landmarks by their chance"
+        if self.photographs is not None:
+            number = self.photographs.nearest(pose)
+            rgb = self.photographs.read(number, drawing.PICTURE_PX)
+            return rgb, f"nearest photograph, {self.photographs.names[number]}"
+        return drawing.picture(None, self.camera, seen.pixels, seen.chances), "landmarks in view by their chance"
+
     def map_of(self, occlusion: str) -> LocalizationMap:
         """The map with what hides landmarks. Raises ConfigError if there is no such occlusion here."""
+        from wheretolook.inputs.localization_map import LocalizationMap
+
         if occlusion not in self.occlusions:
             fix = f"There are {', '.join(self.occlusions)}."
             raise ConfigError("there is no such occlusion here", value=occlusion, fix=fix)
@@ -127,15 +127,14 @@ class Opened:
 
         Raises ConfigError if there is no such method or occlusion, WeightsError if its weights cannot be used.
         """
-        from wheretolook.methods.registry import load_scorer, make_scorer
-        from wheretolook.select.weights import weights_of
+        from wheretolook.methods.registry import check_method, make_scorer
+        from wheretolook.select.where_to_look import WhereToLook
 
         method, occlusion = method or self.methods[0], occlusion or self.occlusions[0]
         key = (method, occlusion, directions)
         if key not in self._looks:
-            around, weights = self.map_of(occlusion), weights_of(method, self.weights)
-            is_first = method == self.methods[0] and weights is not None
-            scorer = load_scorer(weights, around) if is_first else make_scorer(method, around, weights=weights)
+            weights = self.weights.files.get(check_method(method).weights)
+            scorer = make_scorer(method, self.map_of(occlusion), weights=weights)
             self._looks[key] = WhereToLook(scorer, direction_lattice(directions), self.space)
             if len(self._looks) > MOST_SCORERS:
                 del self._looks[next(iter(self._looks))]  # the one that was asked for longest ago
@@ -144,7 +143,8 @@ class Opened:
 
     def _occlusion(self, name: str) -> OcclusionModel:
         from wheretolook.visibility.hidden_points import HiddenPointRemoval
-        from wheretolook.visibility.occlusion import MeshOcclusion
+        from wheretolook.visibility.occlusion import MeshOcclusion, NoOcclusion
+        from wheretolook.visibility.remembered import RememberedOcclusion
 
         config = OcclusionConfig()
         if name == "none":
@@ -168,25 +168,27 @@ def open_map(
     images: Path | None = None,
     weights: Path | None = None,
     device: str = "cpu",
+    data: Path = Path("data"),
 ) -> Opened:
     """A COLMAP model in metres with z up, a mesh in its frame, and the folder of its photographs.
 
+    Unless weights are given, those adapted to it score, which lie in the folder `data`, or those that ship.
+
     Raises MapError if there is no usable model, SceneError if the mesh cannot be used, ConfigError without such a
-    camera.
+    camera, WeightsError if the weights cannot be used.
     """
-    from wheretolook.check.source import photographs_of
+    from wheretolook.mapping.beside import photographs_of
+    from wheretolook.mapping.opened_map import open_colmap
     from wheretolook.view.photographs import Photographs
 
-    around = LocalizationMap.from_colmap(path, camera, device=device)
-    if len(around.landmarks) == 0:
+    landmarks, camera, poses = open_colmap(path, camera)
+    if len(landmarks) == 0:
         raise MapError("the map has no landmarks", path=path, fix="Map it again.")
     folder = images or photographs_of(path)
     shown = None if folder is None else Photographs.of_model(path, folder)
     name = path.resolve().parent.name if path.resolve().name in ("0", "sparse", "map") else path.resolve().name
-    return Opened(
-        name, around.landmarks, around.camera, around.mapping_poses, _mesh(mesh), photographs=shown, weights=weights,
-        device=device,
-    )  # fmt: skip
+    known = map_weights(path, data, landmarks.points) if weights is None else given_weights(weights)
+    return Opened(name, landmarks, camera, poses, known, _mesh(mesh), photographs=shown, device=device)
 
 
 def open_scene(
@@ -194,10 +196,13 @@ def open_scene(
 ) -> Opened:
     """A scene of a dataset, as the map stage leaves it, with what later stages have added.
 
-    Raises MapError or TableError if it is half made: `wheretolook map` has not been run.
+    Unless weights are given, its own score if it has any (`scene_weights`), or those that ship.
+
+    Raises MapError or TableError if it is half made: `wheretolook map` has not been run; WeightsError if the weights
+    cannot be used.
     """
-    from wheretolook.check.source import photographs_of
     from wheretolook.dataset.scene import Scene, SceneConfig
+    from wheretolook.mapping.beside import photographs_of
     from wheretolook.mapping.colmap_model import holds_model
     from wheretolook.view.photographs import Photographs
     from wheretolook.viewpoints.table import CAMERA_ID, UNLABELLED
@@ -219,9 +224,10 @@ def open_scene(
     shown = Photographs.of_model(files.map, folder) if folder is not None and holds_model(files.map) else None
     if mesh is None and scene.mapping_poses is None:
         raise SceneError("neither a mesh nor the map's cameras are known", path=files.folder, fix="Map it again.")
+    known = scene_weights(files, scene.landmarks.points) if weights is None else given_weights(weights)
     return Opened(
-        files.name, scene.landmarks, scene.camera, scene.mapping_poses, mesh, space,
-        None if labels is None or labels.empty else labels, shown, weights, scene.device,
+        files.name, scene.landmarks, scene.camera, scene.mapping_poses, known, mesh, space,
+        None if labels is None or labels.empty else labels, shown, scene.device,
     )  # fmt: skip
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from wheretolook.geometry.poses import (
@@ -18,10 +18,11 @@ from wheretolook.geometry.poses import (
     rotation_from_quaternion,
 )
 from wheretolook.planning.config import FORWARD, PathsConfig
-from wheretolook.planning.path_comparison import GIVEN, PLANNED
 from wheretolook.utils.errors import TableError
 from wheretolook.utils.reading import MAX_TEXT_BYTES
-from wheretolook.viewpoints.table import POSE_COLUMNS, UNLABELLED, is_good, poses, read_parquet
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 FAR_M = 1e9  # from the origin; no map has such coordinates
 COMPARED = PathsConfig()  # its limits of errors, by which a view of a path counts as localized
@@ -105,6 +106,9 @@ def _name(path: Path) -> str:
 
 def _compared(path: Path, pair: int) -> Paths:
     """The paths of a pair, as each method planned them, or where one found none, its views along the given one."""
+    from wheretolook.planning.path_comparison import GIVEN, PLANNED
+    from wheretolook.viewpoints.table import UNLABELLED, is_good, poses
+
     try:
         table = _labelled(path)
         table = table[table["pair"] == pair].sort_values("waypoint", kind="stable")
@@ -126,6 +130,7 @@ def _compared(path: Path, pair: int) -> Paths:
 
 def _labelled(path: Path) -> pd.DataFrame:
     """Compared paths of a scene, with their labels, which stand in the table of all scenes beside its folder."""
+
     everything = path.parent.parent / path.name
     if everything.is_file():
         table = read_parquet(everything)
@@ -137,6 +142,10 @@ def _labelled(path: Path) -> pd.DataFrame:
 
 def _table(path: Path) -> Float:
     """Poses of a CSV: of a plan (cam_from_world), or of selected views (x, y, z, qw..., camera-to-world)."""
+    import pandas as pd
+
+    from wheretolook.viewpoints.table import POSE_COLUMNS, poses
+
     try:
         table = pd.read_csv(path, comment="#")
         if {*POSE_COLUMNS} <= {*table}:

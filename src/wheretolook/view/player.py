@@ -5,16 +5,18 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from wheretolook.geometry.poses import Float, camera_centers, quaternion_from_rotation
-from wheretolook.methods.base import ViewReport
 from wheretolook.view.scores import landmarks_seen
-from wheretolook.view.seen import picture_of
 from wheretolook.view.session import PATH_COLORS, Session
 from wheretolook.view.texts import plain
 from wheretolook.view.worker import SOON
+
+if TYPE_CHECKING:
+    from wheretolook.methods.base import ViewReport
 
 STEP_S = 0.25  # between two steps, at least
 
@@ -89,7 +91,7 @@ class Player:
             report, at = self._reports[key], min(step, len(played) - 1)
             pose: Float = played.cam_from_world[at]
             seen = landmarks_seen(look.scorer, pose, session.shared.teller(state.occlusion))
-            image, _ = picture_of(opened, pose, seen)
+            image, _ = opened.picture(pose, seen)
             session.scene.add_camera_frustum(
                 f"/path/{name}/camera",
                 session.fov,

@@ -15,7 +15,6 @@ from wheretolook.utils.errors import StorageError
 from wheretolook.utils.files import replacing
 from wheretolook.view import drawing
 from wheretolook.view.scores import landmarks_seen, look_around
-from wheretolook.view.seen import picture_of
 from wheretolook.view.shared import Shared
 from wheretolook.view.state import ViewState
 
@@ -113,7 +112,7 @@ def _view(rerun: Any, stream: Any, shared: Shared, state: ViewState, entity: str
     focal = (camera.fx, camera.fy) if isinstance(camera, PinholeCamera) else camera.mean_focal_px
     scorer = shared.look(state.method, state.occlusion).scorer
     seen = landmarks_seen(scorer, pose, shared.teller(state.occlusion))
-    image, _ = picture_of(opened, pose, seen)
+    image, _ = opened.picture(pose, seen)
     height, width = image.shape[:2]
     scale = width / camera.width
     stream.log(entity, rerun.Transform3D(translation=camera_centers(pose), mat3x3=pose[:, :3].T))

@@ -95,6 +95,7 @@ class Scenery:
         """Colour the floor, some places at each step."""
         assert state.height is not None
         self.controls.status.content = f"Scoring by **{state.method}** ..."
+        self.controls.weights.content = self.shared.opened.weights.told(state.method)
         floor, look = self.shared.floor(state.method, state.occlusion, state.height)
         if len(floor.cells) == 0:
             self.scene.remove_by_name("/floor")

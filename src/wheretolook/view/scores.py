@@ -5,17 +5,19 @@ from __future__ import annotations
 from collections.abc import Generator
 from dataclasses import dataclass, field
 from math import ceil
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from wheretolook.geometry.poses import Float, poses_looking_along
-from wheretolook.methods.base import Scorer, ViewReport
-from wheretolook.select.views import SelectedViews
-from wheretolook.select.where_to_look import WhereToLook
-from wheretolook.viewpoints.table import is_good, poses
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from wheretolook.methods.base import Scorer, ViewReport
+    from wheretolook.select.views import SelectedViews
+    from wheretolook.select.where_to_look import WhereToLook
 
 FLOOR_CELLS = 1200  # of a floor's rectangle, about
 LEAST_CELL_M = 0.1
@@ -23,7 +25,7 @@ FLOOR_DIRECTIONS = 96
 """Directions looked along at each place of a floor, 19 degrees apart: the best of them is as good as the best of 500
 to within a hundredth or two, and takes a third of the time."""
 
-COARSE = 8  # cells along each axis between the places of a floor that are scored first
+FIRST_PLACES = 12  # that are scored before a floor is drawn: fewer would say little of a house
 VIEWS_AT_ONCE = 1 << 10  # labelled views scored between two looks at what else is to be done
 
 
@@ -32,8 +34,8 @@ class Floor:
     """Free places at one height, on a grid, and the best score at each as it comes in.
 
     `lower` (2,) and `cell_m` place the grid of `shape` (rows along y, columns along x); `cells` (K,) are flat indices
-    of the free cells, coarse ones first; `ground_m` is the height of the ground below, where it is known; `scores` (K,)
-    and the best direction's `axes` (K, 3) are NaN until computed.
+    of the free cells, each as far as can be from those before it; `ground_m` is the height of the ground below, where
+    it is known; `scores` (K,) and the best direction's `axes` (K, 3) are NaN until computed.
     """
 
     height_m: float
@@ -63,8 +65,8 @@ class Floor:
 
     @property
     def n_first(self) -> int:
-        """How many places are scored first, evenly over the floor: with them all of it has a colour."""
-        return int((_level(self.cells, self.shape) == 0).sum())
+        """How many places are scored first, all over the floor: with them all of it has a colour."""
+        return min(FIRST_PLACES, len(self.cells))
 
     def score_next(self, look: WhereToLook, n: int = 1) -> bool:
         """Score the next n places in the directions of `look`. Returns whether any were left."""
@@ -100,21 +102,27 @@ def floor_at(space: Any, hides: Any, height_m: float) -> Floor:
     free = space.is_free(floor.points)
     free[free] = ~hides.inside_geometry(floor.points[free])
     cells = np.flatnonzero(free)
-    order = np.argsort(_level(cells, (rows, columns)), kind="stable")
+    order = farthest_first(np.stack(np.divmod(cells, columns), axis=1))
     ground = None
     if len(cells) and hasattr(space, "floor_below"):
         ground = float(np.median(space.floor_below(floor.points[cells])))
     return Floor(height_m, lower, cell, (rows, columns), cells[order], ground)
 
 
-def _level(cells: NDArray[np.int64], shape: tuple[int, int]) -> NDArray[np.int64]:
-    """How early a cell is scored: 0 for those on the coarsest grid, then each grid between."""
-    rows, columns = np.divmod(cells, shape[1])
-    level, step = np.zeros(len(cells), dtype=np.int64), COARSE
-    while step > 1:
-        level += (rows % step != 0) | (columns % step != 0)
-        step //= 2
-    return level
+def farthest_first(at: NDArray[np.int64]) -> NDArray[np.int64]:
+    """An order (K,) of places (K, 2), each the farthest from all before it, from one in the middle on.
+
+    However many of them are taken, no place is more than twice as far from these as it would be from the best choice
+    of as many (Gonzalez, "Clustering to minimize the maximum intercluster distance", 1985).
+    """
+    order = np.zeros(len(at), dtype=np.int64)
+    away = -((at - at.mean(axis=0)) ** 2).sum(1) if len(at) else np.empty(0)
+    for k in range(len(at)):
+        order[k] = away.argmax()
+        to_it = ((at - at[order[k]]) ** 2).sum(1)
+        away = to_it if k == 0 else np.minimum(away, to_it)
+        away[order[k]] = -1
+    return order
 
 
 def heights_of(space: Any, centers: Float) -> tuple[float, float, float]:
@@ -199,6 +207,8 @@ def judged_labels(
 
     A view is good if it localized with errors below limits in metres and degrees.
     """
+    from wheretolook.viewpoints.table import is_good, poses
+
     cam_from_world = poses(table)
     scores = np.empty(len(cam_from_world))
     for begin in range(0, len(scores), VIEWS_AT_ONCE):

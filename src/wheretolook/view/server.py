@@ -72,22 +72,21 @@ class Viewer:
 
     def _view_from(self, shared: Shared) -> None:
         """Clients begin above one corner, so that all of the floor is in the picture."""
-        low, high = (np.quantile(shared.opened.landmarks.points, q, axis=0) for q in (0.02, 0.98))
-        middle = (low + high) / 2
+        low, high = shared.seen_box
+        middle, size_m = (low + high) / 2, float(np.linalg.norm(high - low))
         camera = self.server.initial_camera
         camera.far = max(1000.0, 20 * shared.size_m)
         camera.near = min(0.01, shared.size_m / 1000)
         camera.fov = np.radians(50)
-        middle = middle + 0.07 * shared.size_m * np.array([0.82, -0.57, 0.0])  # the panel is on the right
+        middle = middle + 0.07 * size_m * np.array([0.82, -0.57, 0.0])  # the panel is on the right
         camera.look_at = self.state.target or tuple(middle)
-        camera.position = self.state.eye or tuple(middle + shared.size_m * np.array([-0.5, -0.72, 0.95]))
+        camera.position = self.state.eye or tuple(middle + size_m * np.array([-0.5, -0.72, 0.95]))
 
     def _joined(self, client: Any) -> None:
         """Whoever joins gets a session; if theirs fails, others do not notice."""
         from wheretolook.view.player import Player
+        from wheretolook.view.saving import PictureButton, WaypointList
         from wheretolook.view.session import Session
-        from wheretolook.view.share import Share
-        from wheretolook.view.waypoints import WaypointList
 
         try:
             path, headers = _request(self.server, client.client_id)
@@ -106,7 +105,7 @@ class Viewer:
             session.theme(self.dark)
             session.controls.dark.value = self.dark
             waypoints = WaypointList(session)
-            Share(session)
+            PictureButton(session)
             if self.shared.paths:
                 Player(session)
             if state.eye is not None and state.target is not None:

@@ -19,7 +19,6 @@ from wheretolook.view import drawing
 from wheretolook.view.controls import build, check_value
 from wheretolook.view.scenery import Scenery
 from wheretolook.view.scores import Place, landmarks_seen, look_around, report_of
-from wheretolook.view.seen import picture_of
 from wheretolook.view.shared import Shared
 from wheretolook.view.state import ViewState
 from wheretolook.view.texts import plain
@@ -337,7 +336,7 @@ class Session:
         else:
             self.scene.remove_by_name("/seen")
         yield
-        image, what = picture_of(self.opened, pose, seen)
+        image, what = self.opened.picture(pose, seen)
         c.picture.image, c.picture.visible = image, True
         c.picture.label = what
         self.tell_state()

@@ -5,16 +5,21 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable
 from threading import Lock
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
-from wheretolook.methods.base import Scorer
-from wheretolook.select.where_to_look import WhereToLook
+import numpy as np
+
+from wheretolook.geometry.poses import Float
 from wheretolook.utils.errors import WhereToLookError
 from wheretolook.view.drawing import mesh_glb, size_of
 from wheretolook.view.opened import Opened, centers_of
 from wheretolook.view.played import Paths
 from wheretolook.view.scores import FLOOR_DIRECTIONS, Floor, floor_at, heights_of
 from wheretolook.view.worker import Worker
+
+if TYPE_CHECKING:
+    from wheretolook.methods.base import Scorer
+    from wheretolook.select.where_to_look import WhereToLook
 
 KEPT_FLOORS, KEPT_MESHES = 64, 4
 STEP_M = 0.05  # heights of floors and cuts are multiples of this
@@ -32,6 +37,14 @@ class Shared:
         self._floors: OrderedDict[tuple[str, str, float], Floor] = OrderedDict()
         self._meshes: OrderedDict[float | None, bytes] = OrderedDict()
         self._lock = Lock()
+
+    @property
+    def seen_box(self) -> Float:
+        """The box (2, 3) m around the landmarks, without outliers, and all of the floor, that a page begins with."""
+        low, high = np.quantile(self.opened.landmarks.points, (0.02, 0.98), axis=0)
+        lower, upper = np.array(self.opened.space.bounds, dtype=np.float64)
+        lower[2] = upper[2] = self.usual_m
+        return np.stack([np.minimum(low, lower), np.maximum(high, upper)])
 
     @property
     def mark_m(self) -> float:

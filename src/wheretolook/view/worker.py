@@ -5,11 +5,16 @@ from __future__ import annotations
 import itertools
 import logging
 import threading
+import time
 from collections.abc import Callable, Hashable, Iterator
 from dataclasses import dataclass, field
 
 NOW, SOON, LATER = 0, 1, 2
 """Urgency of work: a view turned by hand, a place clicked, a floor that fills."""
+
+QUIET_S, PATIENCE_S = 0.4, 4.0
+"""So long after a view was turned nothing is begun that can wait, as the next turn would have to wait for its step;
+unless for so long nothing of that kind was done: where many look, somebody always turns."""
 
 _log = logging.getLogger(__name__)
 
@@ -27,13 +32,14 @@ class Worker:
     """Computes jobs, iterators each, one step at a time.
 
     Scorers are not for several threads, and two cores have no more to give. Between two steps a more urgent job goes
-    first; jobs as urgent take turns, so that nobody waits for all of another's floor. A job that raises is told so, by
-    `failed`, and ends; others go on.
+    first; jobs as urgent take turns, so that nobody waits for all of another's floor. While somebody turns a view,
+    floors wait. A job that raises is told so, by `failed`, and ends; others go on.
     """
 
     def __init__(self) -> None:
         self._jobs: dict[tuple[Hashable, str], _Job] = {}
         self._turns, self._wake, self._stopped = itertools.count(), threading.Condition(), False
+        self._turned = self._waited = -PATIENCE_S  # when a view was turned, and when what can wait was done last
         self._thread = threading.Thread(target=self._run, name="scores", daemon=True)
         self._thread.start()
 
@@ -66,7 +72,15 @@ class Worker:
                 if self._stopped:
                     return
                 job = min(self._jobs.values())
+                until = min(self._turned + QUIET_S, self._waited + PATIENCE_S) - time.monotonic()
+                if job.urgency == LATER and until > 0:
+                    self._wake.wait(until)
+                    continue
             self._step(job)
+            if job.urgency == NOW:
+                self._turned = time.monotonic()
+            elif job.urgency == LATER:
+                self._waited = time.monotonic()
 
     def _step(self, job: _Job) -> None:
         goes_on = False

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from scipy.special import expit, logit
 
 from wheretolook.geometry.poses import Float, camera_centers, check_locations, check_poses
@@ -14,15 +13,13 @@ from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.learning.trained_network import TrainedNetwork
 from wheretolook.methods.adapted.kernel import Correction
 from wheretolook.methods.adapted.network import AdaptedNetwork
+from wheretolook.methods.adapted.place import LEAST_SAME, share_of_place
 from wheretolook.methods.base import Scorer, ViewReport
 from wheretolook.methods.method import ScorerOptions
 from wheretolook.methods.set.score import SetScorer
 from wheretolook.utils.errors import WeightsError
 
 TINY = 1e-12  # chances are kept this far from 0 and 1, so that their log-odds are finite
-SAME_M, LEAST_SAME = 0.05, 0.5
-"""A map is of the place if so large a share of the landmarks that are known has one of the map's within this distance:
-a map with other filters, or made anew in the same frame, still is."""
 
 
 def adapted_scorer(localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
@@ -87,11 +84,7 @@ def log_odds_of(chance: Float) -> Float:
 
 
 def _check_place(place: Float, localization_map: LocalizationMap) -> None:
-    points = localization_map.landmarks.points
-    if len(place) == 0:
-        return
-    distance = cKDTree(points).query(place)[0] if len(points) else np.full(len(place), np.inf)
-    same = float((distance <= SAME_M).mean())
+    same = share_of_place(place, localization_map.landmarks.points)
     if same < LEAST_SAME:
         fix = (
             "Adapt to this map, or use weights that are for any place, such as those that ship. To insist: --anywhere "

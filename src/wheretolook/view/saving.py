@@ -1,22 +1,28 @@
-"""Waypoints that one who looks has placed, and the file of their best views, as `wheretolook select` writes it."""
+"""What one who looks takes along: the best views at waypoints placed by hand, and a picture of the scene."""
 
 from __future__ import annotations
 
+import io
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from wheretolook.geometry.poses import Float
-from wheretolook.select.where_to_look import WhereToLook
 from wheretolook.utils.errors import ConfigError
 from wheretolook.view.controls import FILES, check_value
 from wheretolook.view.session import Session
 from wheretolook.view.worker import SOON
 
-MOST = 500
+if TYPE_CHECKING:
+    from wheretolook.select.where_to_look import WhereToLook
+
+MOST = 500  # waypoints
 COLOR = (213, 94, 0)
+WAIT_S = 20.0  # for a browser to draw a picture
+LARGEST_PX = 2160
 
 
 def views_file(look: WhereToLook, points: Float, n: int, format: str) -> bytes:
@@ -91,3 +97,30 @@ class WaypointList:
         content = views_file(look, np.array(self.points), session.state.n, format)
         session.client.send_file_download(f"views{FILES[format][1]}", content, save_immediately=True)
         yield
+
+
+class PictureButton:
+    """Saves a picture of what is seen."""
+
+    def __init__(self, session: Session) -> None:
+        self.session = session
+        session.on(session.controls.photo, self._save_picture, "on_click")
+
+    def _save_picture(self) -> None:
+        client = self.session.client
+        height, width = client.camera.image_height or 1080, client.camera.image_width or 1920
+        scale = min(1.0, LARGEST_PX / max(height, width))
+        try:
+            size = max(1, round(height * scale)), max(1, round(width * scale))
+            image = client.get_render(*size, transport_format="png", timeout=WAIT_S)
+        except (TimeoutError, RuntimeError) as error:
+            raise ConfigError(f"the browser gave no picture: {error}", fix="Keep its window in front.") from error
+        client.send_file_download("wheretolook.png", _png(image), save_immediately=True)
+
+
+def _png(image: np.ndarray) -> bytes:
+    from PIL import Image
+
+    file = io.BytesIO()
+    Image.fromarray(image).save(file, format="PNG")
+    return file.getvalue()

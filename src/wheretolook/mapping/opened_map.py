@@ -1,0 +1,40 @@
+"""What is needed of a COLMAP model to localize against it: landmarks, the camera that looks, and who mapped."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+from wheretolook.geometry.camera import Camera
+from wheretolook.geometry.poses import Float
+from wheretolook.mapping.colmap_model import camera_of_model, colmap_poses, compact_poses, read_model
+from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
+from wheretolook.mapping.plausibility import warn_of_frame
+
+
+class OpenedMap(NamedTuple):
+    """Parts of a COLMAP model in metres with z up."""
+
+    landmarks: Landmarks
+    camera: Camera  # the one that will look
+    mapping_poses: Float  # cam_from_world (M, 3, 4) of its images
+
+
+def open_colmap(
+    model: str | Path,
+    camera: Camera | int | None = None,
+    database: str | Path | None = None,
+    max_reprojection_error_px: float | None = None,
+    device: str = "cpu",
+) -> OpenedMap:
+    """Read a COLMAP model; arguments, errors and warnings are those of `LocalizationMap.from_colmap`.
+
+    Without a database neither torch nor Warp is loaded, which takes longer than to read a map of 200,000 landmarks.
+    """
+    found = read_model(model)
+    landmarks = load_colmap_landmarks(Path(model), database, max_reprojection_error_px, device, found)
+    poses = colmap_poses(model, found)
+    warn_of_frame(model, landmarks.mapping_distance_m, poses)
+    if camera is None or isinstance(camera, int):
+        camera = camera_of_model(found, Path(model), camera)
+    return OpenedMap(landmarks, camera, compact_poses(poses))

@@ -19,13 +19,14 @@ from wheretolook.geometry.poses import Float, pose_error
 from wheretolook.labelling.confidence import Confidence
 from wheretolook.labelling.config import LocalizerConfig
 from wheretolook.labelling.estimation import PoseEstimator
-from wheretolook.labelling.joint import JointLocalizer, Look, rig_of
+from wheretolook.labelling.joint import JointLocalizer
+from wheretolook.labelling.look import Look, rig_of
 from wheretolook.utils.errors import TableError
 from wheretolook.viewpoints.table import CAMERA_ID, MATCH_FIELDS, PIXELS, poses
 
 SET_COLUMNS = (
-    "n_looks", "location_id", "status", "error_m", "error_deg", "n_matches", "n_inliers", "support", "elsewhere",
-    "deviation_m", "deviation_deg", "confidence", "seconds",
+    "n_looks", "location_id", "status", "error_m", "error_deg", "n_matches", "n_inliers", "support", "elsewhere", "own",
+    "rival_own", "deviation_m", "deviation_deg", "confidence", "seconds",
 )  # fmt: skip
 """What `label_sets` tells of each set; `status`, `error_m` and `error_deg` as of single viewpoints, so that
 `viewpoints.table.is_good` serves sets, too."""
@@ -81,7 +82,7 @@ def label_sets(
             error_m = error_deg = np.array([np.nan])
         else:
             error_m, error_deg = pose_error(found.cams_from_world, true[chosen])
-        numbers_of = (found.n_matches, found.n_inliers, found.support, found.elsewhere, *found.deviation)
+        numbers_of = (found.n_matches, found.n_inliers, found.support, found.elsewhere, *found.own, *found.deviation)
         values = (len(chosen), int(places[chosen[0]]), found.status, error_m.max(), error_deg.max(), *numbers_of)
         rows.append((*values, told.of(found), seconds))
     return pd.DataFrame(rows, columns=list(SET_COLUMNS))

@@ -10,7 +10,7 @@ evidence for both; where it has nothing, for the first alone.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from wheretolook.geometry.poses import Float
@@ -50,6 +50,11 @@ class Likeness:
         return len(np.unique(np.floor(self.points[rows] / PLACE_M), axis=0))
 
 
+def log_ratio(own: ArrayLike, others: ArrayLike) -> Float:
+    """Of places that only one pose explains and that only the other does, (...,) each: log of their ratio, damped."""
+    return np.log((np.asarray(own, dtype=np.float64) + NONE) / (np.asarray(others, dtype=np.float64) + NONE))
+
+
 def preference(own: tuple[int, int], support: tuple[float, float]) -> float:
     """By how much the first of two poses is to be preferred, by the places of their own and their support."""
-    return float(np.log((own[0] + NONE) / (own[1] + NONE)) + SUPPORT * np.log((support[0] + 1) / (support[1] + 1)))
+    return float(log_ratio(*own) + SUPPORT * np.log((support[0] + 1) / (support[1] + 1)))

@@ -48,6 +48,10 @@ looks of validation scenes, and 93.4 % with a scale of one pixel; a single look'
 Alone = tuple[tuple[Float, NDArray[np.bool_]], ...]
 """Poses (3, 4) that a look finds alone, in the estimator's world, and which of its matches agree with each."""
 
+LOSES = 0.9
+"""Share of its support that a pose keeps at least when it is refined: keypoints that are accurate count for more there
+than in the support, so it may fall a little as the pose gets better."""
+
 LEAST = 4
 """Matches, of all looks together, without which no pose is sought: one more than determine it."""
 
@@ -281,7 +285,7 @@ class _Rig:
             if not np.isfinite(pose.Rt).all():
                 break
             again = self._supported(pose.Rt)
-            if again.support < best.support:
+            if again.support < LOSES * best.support:
                 break
             same = all(np.array_equal(*masks) for masks in zip(best.inliers, again.inliers, strict=True))
             best = again

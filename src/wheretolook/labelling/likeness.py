@@ -33,7 +33,7 @@ class Likeness:
     """Of a map's landmarks (N, 3) m: what is alike as seen from two poses."""
 
     def __init__(self, points: Float) -> None:
-        self.points, self._tree = points, cKDTree(points)
+        self.points, self._tree = points, cKDTree(points[np.isfinite(points).all(axis=1)])
 
     def own_places(self, rows: NDArray[np.int64], pose: Float, other: Float) -> int:
         """How many places hold landmarks, of those that agree with a pose, that the other pose cannot explain.

@@ -9,7 +9,7 @@ from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import pose_error, poses_looking_along
 from wheretolook.labelling.estimation import PoseEstimator
 from wheretolook.labelling.joint import JointLocalizer
-from wheretolook.labelling.likeness import Likeness, preference
+from wheretolook.labelling.likeness import Likeness, most_likely, preference, strongest_rival
 from wheretolook.labelling.look import Look, rig_of
 
 CAMERA = PinholeCamera()
@@ -81,3 +81,13 @@ def test_preference_is_for_own_places_then_for_support():
     assert preference((0, 0), (100, 50)) > 0 > preference((0, 0), (50, 100))
     assert preference((8, 0), (50, 100)) > 0 and preference((0, 8), (100, 50)) < 0
     assert preference((3, 4), (90, 90)) == pytest.approx(-preference((4, 3), (90, 90)))
+
+
+def test_the_pose_is_taken_whose_strongest_rival_is_weakest():
+    """The second beats the first, the third beats the second, and the first beats the third by far."""
+    own = np.array([[0, 10, 50], [14, 0, 12], [12, 14, 0]])
+    support = [300.0, 230.0, 33.0]
+    assert [strongest_rival(own, support, k) for k in range(3)] == [1, 0, 0]
+    assert most_likely(own, support) == 1
+    assert most_likely(own[:1, :1], support[:1]) == 0 == most_likely(np.array([[0, 0], [50, 0]]), [300.0, 29.0])
+    assert most_likely(np.array([[0, 0], [50, 0]]), [300.0, 31.0]) == 1

@@ -20,7 +20,7 @@ from wheretolook.geometry.local_origin import poses_from
 from wheretolook.geometry.poses import Float, camera_centers, rotation_angle_deg
 from wheretolook.labelling.estimation import REFINEMENT, PoseEstimator, known_to_poselib
 from wheretolook.labelling.joint_refinement import refine_with_turns
-from wheretolook.labelling.likeness import Likeness, preference
+from wheretolook.labelling.likeness import Likeness, most_likely, strongest_rival
 from wheretolook.labelling.look import Look, check_looks
 from wheretolook.utils.errors import ConfigError, PoseError
 from wheretolook.viewpoints.table import LOCALIZED, NO_POSE, TOO_FEW_MATCHES
@@ -37,9 +37,6 @@ these agree on."""
 
 POSES_OF_ALL = 3
 """Poses that are sought in the matches of all looks, each among those that agree with none before it."""
-
-RIVAL = 0.1
-"""Support of a rival at least, as a share of the best supported pose's."""
 
 JOINT_REFINEMENT = {"loss_type": "CAUCHY", "loss_scale": 0.5}
 """Of several looks together, in pixels. Of poses near the right one, 96.2 % are then within 5 cm and 0.4 degrees by two
@@ -152,18 +149,20 @@ class JointLocalizer:
         found = rig.hypotheses()
         if not found:
             return JointLocalization(NO_POSE, None, None, none, n_matches)
-        best = self._chosen(rig, found)
-        rivals = [pose for pose in found if best.elsewhere(pose)]
-        # of several rivals the one against which least speaks for the pose
-        own = [self._own(rig, best, rival) for rival in rivals] or [(self.likeness.places(rig.inlier_rows(best)), 0)]
-        pairs = zip(own, [rival.support for rival in rivals] or [0.0], strict=True)
-        own_of, _ = min(pairs, key=lambda pair: preference(pair[0], (best.support, pair[1])))
+        own = self._own(rig, found)
+        support = [pose.support for pose in found]
+        number = most_likely(own, support) if len(looks) > 1 else 0
+        best, rivals = found[number], [k for k in range(len(found)) if k != number]
+        own_of = (self.likeness.places(rig.inlier_rows(best)), 0)
+        if rivals:
+            worst = strongest_rival(own, support, number)
+            own_of = int(own[number, worst]), int(own[worst, number])
         status = LOCALIZED if sum(mask.sum() for mask in best.inliers) >= config.min_inliers else NO_POSE
         origin = -self.estimator.origin
         poses = poses_from(best.cams_from_world, origin)
         return JointLocalization(
             status, poses_from(best.rig_from_world, origin), poses, best.inliers, n_matches, best.support,
-            max((rival.support for rival in rivals), default=0.0), own_of, rig.deviation(best),
+            max((support[k] for k in rivals), default=0.0), own_of, rig.deviation(best),
         )  # fmt: skip
 
     @cached_property
@@ -171,20 +170,15 @@ class JointLocalizer:
         """Of the map, made when it is first asked for."""
         return Likeness(self.estimator.points)
 
-    def _chosen(self, rig: _Rig, found: list[_Hypothesis]) -> _Hypothesis:
-        """Of poses by falling support that which has most of its own; of a single look the first."""
-        best = found[0]
-        for rival in found[1:] if len(rig.looks) > 1 else []:
-            supports = rival.support, best.support
-            if rival.support > RIVAL * found[0].support and preference(self._own(rig, rival, best), supports) > 0:
-                best = rival
-        return best
-
-    def _own(self, rig: _Rig, one: _Hypothesis, other: _Hypothesis) -> tuple[int, int]:
-        """Places that only one pose explains, and that only the other does."""
-        rows, poses = [rig.inlier_rows(pose) for pose in (one, other)], (one.rig_from_world, other.rig_from_world)
-        own, others = (self.likeness.own_places(rows[k], poses[k], poses[1 - k]) for k in (0, 1))
-        return own, others
+    def _own(self, rig: _Rig, found: Sequence[_Hypothesis]) -> NDArray[np.int64]:
+        """Places (K, K) that each of K poses explains and each other does not."""
+        own = np.zeros((len(found), len(found)), dtype=np.int64)
+        for k, one in enumerate(found):
+            rows = rig.inlier_rows(one)
+            for n, other in enumerate(found):
+                if n != k:
+                    own[k, n] = self.likeness.own_places(rows, one.rig_from_world, other.rig_from_world)
+        return own
 
 
 @dataclass(frozen=True, eq=False)

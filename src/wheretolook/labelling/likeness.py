@@ -9,6 +9,8 @@ evidence for both; where it has nothing, for the first alone.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
@@ -27,6 +29,10 @@ NONE = 10.0
 
 SUPPORT = 0.2
 """Power of the ratio of two poses' support that counts beside that of their own places."""
+
+
+RIVAL = 0.1
+"""Support of a rival at least, as a share of the best supported pose's."""
 
 
 class Likeness:
@@ -58,3 +64,26 @@ def log_ratio(own: ArrayLike, others: ArrayLike) -> Float:
 def preference(own: tuple[int, int], support: tuple[float, float]) -> float:
     """By how much the first of two poses is to be preferred, by the places of their own and their support."""
     return float(log_ratio(*own) + SUPPORT * np.log((support[0] + 1) / (support[1] + 1)))
+
+
+def strongest_rival(
+    own: NDArray[np.int64], support: Sequence[float], k: int, among: Sequence[int] | None = None
+) -> int:
+    """Which of K poses, two or more, speaks most against one of them; (K, K) places of each that another lacks."""
+    others = [n for n in (range(len(support)) if among is None else among) if n != k]
+    return min(others, key=lambda n: _against(own, support, k, n))
+
+
+def most_likely(own: NDArray[np.int64], support: Sequence[float]) -> int:
+    """Of K poses, by falling support, the one for which most speaks even against its strongest rival.
+
+    Not by one duel after the other: these may go round in a circle.
+    """
+    able = [k for k, of in enumerate(support) if of > RIVAL * support[0]]
+    if len(able) < 2:
+        return 0
+    return max(able, key=lambda k: _against(own, support, k, strongest_rival(own, support, k, able)))
+
+
+def _against(own: NDArray[np.int64], support: Sequence[float], k: int, n: int) -> float:
+    return preference((int(own[k, n]), int(own[n, k])), (support[k], support[n]))

@@ -92,11 +92,11 @@ class JointLocalizer:
     """Localizes looks together against points (N, 3) m; a single one exactly as `PoseEstimator` does.
 
     Hypotheses come from PoseLib's LO-RANSAC (generalized P3P) over all matches and over what agrees with none before,
-    and from each look alone. Each is refined on what all looks have that agrees with it. Taken is the best supported,
-    unless one elsewhere has more evidence of its own: where the map resembles itself, a wrong pose may have more
-    inliers, but mostly such as are explained by the likeness. Errors are measured in
-    pixels of the looks' own images: by angles, as of one spherical camera, keypoints near the border of an image, where
-    a pixel spans a smaller angle, would count for less than they tell, and RANSAC would be twice as lenient there.
+    and from each look alone. Each is refined on what all looks have that agrees with it. Taken is the one with most
+    evidence of its own (`likeness`): where the map resembles itself, a wrong pose may have more inliers, but mostly
+    such as the likeness explains. Errors are measured in pixels of the looks' own images: by angles, as of one
+    spherical camera, keypoints near the border of an image, where a pixel spans a smaller angle, would count for less
+    than they tell, and RANSAC would be twice as lenient there.
 
     `turn_noise_deg` is one standard deviation of the angle, about each axis, to which the looks' turns are known.
     """

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +44,6 @@ class LogisticRegression:
             raise WeightsError(f"a damaged file of {cls.about}: {error}", path=path, fix=fix) from error
         return made
 
-    def probabilities(self, told: NDArray[np.float64]) -> NDArray[np.float64]:
+    def probabilities(self, told: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
         """(...,) of the numbers it goes by, (..., K) in the order of their names."""
         return np.asarray(1 / (1 + np.exp(-np.clip(told @ np.asarray(self.weights) + self.bias, -60, 60))))

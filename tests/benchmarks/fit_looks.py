@@ -78,10 +78,10 @@ def main() -> None:
     scenes = [SceneFolder(folder, "val") for folder in options.scenes]
     sets = pd.concat([drawn_sets(scene, options.places, options.sets) for scene in scenes], ignore_index=True)
     accepted = sets[sets["n_inliers"] >= 10]
-    names = ("n_inliers", "n_matches", "elsewhere", "deviation_m", "deviation_deg")
+    names = ("n_inliers", "n_matches", "elsewhere", "own", "rival_own", "deviation_deg")
     fitted = report("confidence", confidence.told_numbers(*(accepted[name] for name in names)), accepted)
     weights = dict(zip(confidence.TOLD, fitted.coef_[0].round(4).tolist(), strict=True))
-    print(json.dumps({"weights": weights, "bias": round(float(fitted.intercept_[0]), 4), "min_inliers": 10}, indent=2))
+    print(json.dumps({"weights": weights, "bias": round(float(fitted.intercept_[0]), 4)}, indent=2))
     chance = np.clip(1 - sets["failed"].to_numpy(), worth.LEAST_CHANCE, 1 - worth.LEAST_CHANCE)
     mixed = np.log(chance / (1 - chance)) - VARIANCE * sets["log_position_variance"].to_numpy()
     fitted = report("worth", mixed[:, None], sets)

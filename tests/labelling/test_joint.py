@@ -10,7 +10,8 @@ from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import camera_centers, pose_error, poses_looking_along
 from wheretolook.labelling.config import LocalizerConfig
 from wheretolook.labelling.estimation import PoseEstimator
-from wheretolook.labelling.joint import JointLocalizer, Look, rig_of, turned_looks
+from wheretolook.labelling.joint import JointLocalizer
+from wheretolook.labelling.look import Look, rig_of, turned_looks
 from wheretolook.utils.errors import ConfigError, PoseError
 
 CAMERA = PinholeCamera()

@@ -159,12 +159,12 @@ def test_one_stops_when_sure_enough() -> None:
 
 def test_confidence_rises_with_inliers_and_falls_with_a_rival(tmp_path: Path) -> None:
     sure = Confidence.shipped()
-    plain = sure.of_numbers(100, 200, 10, 0.01, 0.1)
-    assert sure.of_numbers(9, 20, 0, 0.001, 0.01) == 0 and 0 < plain < 1
-    assert sure.of_numbers(300, 400, 10, 0.005, 0.05) > plain > sure.of_numbers(100, 200, 90, 0.1, 1.0)
-    told = told_numbers([99], [200], [0], [np.inf], [0.0])
-    np.testing.assert_allclose(told[0], [np.log(100), 0, np.log(99.5 / 201), np.log(10), np.log(1e-4)])
-    logits = float(told_numbers([100], [200], [10], [0.01], [0.1])[0] @ np.array(sure.weights) + sure.bias)
+    plain = sure.of_numbers(100, 200, 10, 40, 2, 0.1)
+    assert sure.of_numbers(9, 20, 0, 9, 0, 0.01) == 0 and 0 < plain < 1
+    assert sure.of_numbers(300, 400, 10, 150, 2, 0.05) > plain > sure.of_numbers(100, 200, 90, 40, 30, 1.0)
+    told = told_numbers([99], [200], [0], [30], [10], [np.inf])
+    np.testing.assert_allclose(told[0], [0, np.log(99.5 / 201), np.log(2), np.log(10)])
+    logits = float(told_numbers([100], [200], [10], [40], [2], [0.1])[0] @ np.array(sure.weights) + sure.bias)
     assert plain == pytest.approx(1 / (1 + np.exp(-logits))) and len(sure.weights) == len(TOLD)
     (tmp_path / "confidence.json").write_text('{"weights": {"log_inliers": 1}, "bias": 0}')
     with pytest.raises(WeightsError, match="damaged file of confidence"):

@@ -1,84 +1,61 @@
 """How sure it is that a joint pose is right: what a robot knows of it without knowing where it is.
 
-A wrong pose can have a hundred inliers where the map resembles itself. But then another place has nearly as many, and
-the pose that is right is the one that explains all looks much better than any pose elsewhere.
+A wrong pose can have a hundred inliers where the map resembles itself. But then another place has nearly as many, or
+has fewer that no likeness explains; and the pose that is right explains all looks much better than any pose elsewhere.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from wheretolook.geometry.poses import Float
-from wheretolook.utils.errors import WeightsError
-from wheretolook.utils.reading import read_json_object
+from wheretolook.labelling.likeness import log_ratio
+from wheretolook.utils.logistic import LogisticRegression
 
 if TYPE_CHECKING:
     from wheretolook.labelling.joint import JointLocalization
 
 SHIPPED = Path(__file__).with_name("confidence.json")
 
-TOLD = ("log_inliers", "log_elsewhere", "log_share", "log_deviation_m", "log_deviation_deg")
-"""What the confidence goes by: log(1 + inliers), log(1 + support of the best pose elsewhere), log of the share of
-matches that are inliers, log of one standard deviation of position (m) and of orientation (degrees)."""
+TOLD = ("log_elsewhere", "log_share", "log_own", "log_deviation_deg")
+"""What the confidence goes by: log(1 + support of the best pose elsewhere), log of the share of matches that are
+inliers, log of the ratio of what only this pose explains to what only its strongest rival does
+(`likeness.log_ratio`), log of one standard deviation of the orientation (degrees)."""
 
-LEAST_DEVIATION, MOST_DEVIATION = 1e-4, 10.0  # metres and degrees, beyond which it makes no difference
+MIN_INLIERS = 10  # with fewer the localizer itself refuses a pose
+
+LEAST_DEVIATION, MOST_DEVIATION = 1e-4, 10.0  # degrees, beyond which it makes no difference
 
 
 def told_numbers(
-    n_inliers: ArrayLike, n_matches: ArrayLike, elsewhere: ArrayLike, deviation_m: ArrayLike, deviation_deg: ArrayLike
-) -> Float:
-    """`TOLD` (B, 5) of B joint poses."""
-    inliers, matches, rival = (np.asarray(x, dtype=np.float64) for x in (n_inliers, n_matches, elsewhere))
-    off = [
-        np.clip(np.asarray(x, dtype=np.float64), LEAST_DEVIATION, MOST_DEVIATION) for x in (deviation_m, deviation_deg)
-    ]
-    share = np.log((inliers + 0.5) / (matches + 1))
-    return np.stack([np.log1p(inliers), np.log1p(rival), share, np.log(off[0]), np.log(off[1])], axis=-1)
+    n_inliers: ArrayLike, n_matches: ArrayLike, elsewhere: ArrayLike, own: ArrayLike, rival_own: ArrayLike,
+    deviation_deg: ArrayLike,
+) -> Float:  # fmt: skip
+    """`TOLD` (B, 4) of B joint poses."""
+    inliers, matches, rival, off = (
+        np.asarray(x, dtype=np.float64) for x in (n_inliers, n_matches, elsewhere, deviation_deg)
+    )
+    share, off = (inliers + 0.5) / (matches + 1), np.clip(off, LEAST_DEVIATION, MOST_DEVIATION)
+    return np.stack([np.log1p(rival), np.log(share), log_ratio(own, rival_own), np.log(off)], axis=-1)
 
 
-@dataclass(frozen=True)
-class Confidence:
-    """A logistic regression on `TOLD`: the probability that a pose is within 5 cm and 0.4 degrees."""
+class Confidence(LogisticRegression):
+    """The probability that a pose is within 5 cm and 0.4 degrees; 0 with fewer inliers than `MIN_INLIERS`."""
 
-    weights: tuple[float, ...]
-    bias: float
-    min_inliers: int = 10  # with fewer the localizer itself refuses a pose
-
-    @classmethod
-    @cache
-    def shipped(cls) -> Confidence:
-        """That which ships, fitted on validation scenes."""
-        return cls.load(SHIPPED)
-
-    @classmethod
-    def load(cls, path: Path) -> Confidence:
-        """Read a JSON file of weights by name and a bias. Raises a WeightsError if it is damaged."""
-        try:
-            stored: dict[str, Any] = read_json_object(path)
-            weights = tuple(float(stored["weights"][name]) for name in TOLD)
-            made = cls(weights, float(stored["bias"]), int(stored.get("min_inliers", 10)))
-            if not np.isfinite([*made.weights, made.bias]).all():
-                raise ValueError("a weight is not finite")
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            fix = "Install the package again, or fit it anew."
-            raise WeightsError(f"a damaged file of confidence: {error}", path=path, fix=fix) from error
-        return made
+    names, about, file = TOLD, "confidence", SHIPPED
 
     def of(self, found: JointLocalization) -> float:
         """The confidence in a joint pose, 0 where there is none."""
-        return float(self.of_numbers(found.n_inliers, found.n_matches, found.elsewhere, *found.deviation))
+        return float(self.of_numbers(found.n_inliers, found.n_matches, found.elsewhere, *found.own, found.deviation[1]))
 
     def of_numbers(
-        self, n_inliers: ArrayLike, n_matches: ArrayLike, elsewhere: ArrayLike, deviation_m: ArrayLike,
+        self, n_inliers: ArrayLike, n_matches: ArrayLike, elsewhere: ArrayLike, own: ArrayLike, rival_own: ArrayLike,
         deviation_deg: ArrayLike,
     ) -> Float:  # fmt: skip
         """Confidences (B,) from the numbers of `told_numbers`."""
-        logits = told_numbers(n_inliers, n_matches, elsewhere, deviation_m, deviation_deg) @ self.weights + self.bias
-        sure = 1 / (1 + np.exp(-np.clip(logits, -60, 60)))
-        return np.where(np.asarray(n_inliers) >= self.min_inliers, sure, 0.0)
+        sure = self.probabilities(told_numbers(n_inliers, n_matches, elsewhere, own, rival_own, deviation_deg))
+        return np.where(np.asarray(n_inliers) >= MIN_INLIERS, sure, 0.0)

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wheretolook.geometry.poses import Float
-
-if TYPE_CHECKING:
-    from wheretolook.labelling.joint import Look
+from wheretolook.labelling.look import Look
 
 STEPS = 20
 SMALL = 1e-9  # a step of the parameters, in metres and radians, below which the pose is found

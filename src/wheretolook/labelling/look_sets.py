@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -19,13 +18,14 @@ from wheretolook.geometry.poses import Float, pose_error
 from wheretolook.labelling.confidence import Confidence
 from wheretolook.labelling.config import LocalizerConfig
 from wheretolook.labelling.estimation import PoseEstimator
-from wheretolook.labelling.joint import JointLocalizer, Look, rig_of
+from wheretolook.labelling.joint import Alone, JointLocalizer
+from wheretolook.labelling.look import Look, rig_of
 from wheretolook.utils.errors import TableError
 from wheretolook.viewpoints.table import CAMERA_ID, MATCH_FIELDS, PIXELS, poses
 
 SET_COLUMNS = (
-    "n_looks", "location_id", "status", "error_m", "error_deg", "n_matches", "n_inliers", "support", "elsewhere",
-    "deviation_m", "deviation_deg", "confidence", "seconds",
+    "n_looks", "location_id", "status", "error_m", "error_deg", "n_matches", "n_inliers", "support", "elsewhere", "own",
+    "rival_own", "deviation_m", "deviation_deg", "confidence", "seconds",
 )  # fmt: skip
 """What `label_sets` tells of each set; `status`, `error_m` and `error_deg` as of single viewpoints, so that
 `viewpoints.table.is_good` serves sets, too."""
@@ -61,29 +61,36 @@ def label_sets(
     true, places = poses(table), table["location_id"].to_numpy()
     numbers = table[CAMERA_ID].to_numpy() if CAMERA_ID in table and isinstance(cameras, Mapping) else None
     rows: list[tuple[object, ...]] = []
-    alone: dict[int, Any] = {}  # what each view finds alone, which many sets ask for
+    alone: dict[int, Alone] = {}  # what each view finds alone, which many sets ask for
+    known: dict[tuple[int, ...], tuple[object, ...]] = {}  # sets that come again, where nothing is drawn for each
     for taken in tqdm(sets, desc=progress, unit="set", disable=progress is None):
         chosen = np.asarray(taken, dtype=np.int64)
         if len(chosen) == 0 or chosen.min() < 0 or chosen.max() >= len(table):
             raise TableError(f"a set of looks names no rows of the table's {len(table)}", value=chosen.tolist())
+        key = tuple(chosen.tolist())
+        if key in known:
+            rows.append(known[key])
+            continue
         mounts = _told_turns(rig_of(true[chosen]), turn_noise_deg, rng)
         looks = [
             _look(table, row, mount, cameras if numbers is None else cameras[int(numbers[row])], len(points))  # type: ignore[index, arg-type]
             for row, mount in zip(chosen, mounts, strict=True)
         ]
         start = time.perf_counter()
-        for row, look in zip(chosen.tolist(), looks, strict=True):
+        for row, look in zip(key, looks, strict=True):
             if row not in alone:
                 alone[row] = localizer.alone(look)
-        found = localizer.localize(looks, [alone[row] for row in chosen.tolist()])
+        found = localizer.localize(looks, [alone[row] for row in key])
         seconds = time.perf_counter() - start
         if found.cams_from_world is None:
             error_m = error_deg = np.array([np.nan])
         else:
             error_m, error_deg = pose_error(found.cams_from_world, true[chosen])
-        numbers_of = (found.n_matches, found.n_inliers, found.support, found.elsewhere, *found.deviation)
+        numbers_of = (found.n_matches, found.n_inliers, found.support, found.elsewhere, *found.own, *found.deviation)
         values = (len(chosen), int(places[chosen[0]]), found.status, error_m.max(), error_deg.max(), *numbers_of)
         rows.append((*values, told.of(found), seconds))
+        if turn_noise_deg == 0:
+            known[key] = rows[-1]
     return pd.DataFrame(rows, columns=list(SET_COLUMNS))
 
 

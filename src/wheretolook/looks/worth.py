@@ -7,16 +7,13 @@ to be found by all together leave, which falls more with landmarks elsewhere tha
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 
 from wheretolook.geometry.poses import Float
 from wheretolook.looks.union import log_position_variance
-from wheretolook.utils.errors import WeightsError
-from wheretolook.utils.reading import read_json_object
+from wheretolook.utils.logistic import LogisticRegression
 
 TOLD = ("log_odds_alone", "log_position_variance")
 
@@ -25,38 +22,16 @@ LEAST_CHANCE = 1e-3  # of localizing alone, or of not
 SHIPPED = Path(__file__).with_name("worth.json")
 
 
-@dataclass(frozen=True)
-class SetWorth:
-    """A logistic regression on `TOLD`: one model for sets of any size, single looks among them."""
+class SetWorth(LogisticRegression):
+    """One model for sets of any size, single looks among them; it ships fitted to sets of 1 to 5 drawn at random."""
 
-    weights: tuple[float, ...]
-    bias: float
-
-    @classmethod
-    @cache
-    def shipped(cls) -> SetWorth:
-        """That which ships, fitted on validation scenes to sets of 1 to 5 looks drawn at random."""
-        return cls.load(SHIPPED)
-
-    @classmethod
-    def load(cls, path: Path) -> SetWorth:
-        """Read a JSON file of weights by name and a bias. Raises a WeightsError if it is damaged."""
-        try:
-            stored = read_json_object(path)
-            made = cls(tuple(float(stored["weights"][name]) for name in TOLD), float(stored["bias"]))
-            if not np.isfinite([*made.weights, made.bias]).all():
-                raise ValueError("a weight is not finite")
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            fix = "Install the package again, or fit it anew."
-            raise WeightsError(f"a damaged file of what looks are worth: {error}", path=path, fix=fix) from error
-        return made
+    names, about, file = TOLD, "what looks are worth", SHIPPED
 
     def __call__(self, sums: Float, failed: Float) -> Float:
         """Probabilities (B,) of sets from their sums (B, N_SUMS), and the chances (B,) that no look localizes alone."""
         chance = np.clip(1 - np.asarray(failed, dtype=np.float64), LEAST_CHANCE, 1 - LEAST_CHANCE)
         told = np.stack([np.log(chance / (1 - chance)), log_position_variance(np.asarray(sums))], axis=-1)
-        logits = told @ np.asarray(self.weights) + self.bias
-        return np.asarray(1 / (1 + np.exp(-np.clip(logits, -60, 60))))
+        return self.probabilities(told)
 
 
 def fisher_worth(sums: Float, failed: Float) -> Float:

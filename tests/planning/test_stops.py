@@ -18,12 +18,12 @@ from wheretolook.planning.config import PathConfig, PathsConfig, StopConfig
 from wheretolook.planning.method_paths import path_views
 from wheretolook.planning.route_views import PlannedPath
 from wheretolook.planning.sequences import TurnLimit, best_sequence
-from wheretolook.planning.stops import stops_along
+from wheretolook.planning.stops import stops_along, within_pitch
 from wheretolook.utils.errors import ConfigError
 
 WEIGHTS = Path(__file__).parents[2] / "data" / "release" / "weights" / "set.safetensors"
-DIRECTIONS = direction_lattice(100)
 PLANNER = PathConfig(pitch_deg=(-30, 30))
+DIRECTIONS = within_pitch(direction_lattice(200), PLANNER)
 POSITIONS = np.linspace((0.8, 0.8, 1.4), (3.2, 0.8, 1.4), 5)
 
 
@@ -46,7 +46,7 @@ def test_a_place_that_scores_too_little_becomes_a_stop(scorer: Scorer, path: Pla
     config = StopConfig(3, asked)
     stops = stops_along(scorer, path.positions, path.axes, DIRECTIONS, config, PLANNER)
     low = np.flatnonzero(path.scores < asked)
-    assert 0 < len(stops) and {stop.place for stop in stops} <= {*low}
+    assert len(stops) > 0 and {stop.place for stop in stops} <= {*low}
     for stop in stops:
         assert 1 <= len(stop.axes) <= 2 and stop.together > path.scores[stop.place]
         own = path.axes[stop.place]

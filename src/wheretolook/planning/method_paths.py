@@ -17,7 +17,7 @@ from wheretolook.planning.config import FORWARD, PlanConfig
 from wheretolook.planning.path_planning import check_ends, plan_path
 from wheretolook.planning.route_views import PathView, PlannedPath
 from wheretolook.planning.scene_map import check_methods, planner_map, planner_scorer, weights_for
-from wheretolook.planning.stops import can_stop, check_stopping, stops_along
+from wheretolook.planning.stops import can_stop, check_stopping, stops_along, within_pitch
 from wheretolook.rendering.warp_renderer import WarpRenderer
 
 
@@ -60,10 +60,9 @@ def plan_by_methods(
             name, path = method or scorer.name, plan_path(start, goal, space, space.bounds, views, config.planner)
             path = replace(path, scores=scorer.score(poses_looking_along(path.positions, path.axes)))
             if stopping and can_stop(scorer.name):
-                found = stops_along(
-                    scorer, path.positions, path.axes, views.directions, config.stops, config.planner, "stops"
-                )
-                path = replace(path, stops=found)
+                around, about = within_pitch(views.directions, config.planner), (config.stops, config.planner)
+                stops = stops_along(scorer, path.positions, path.axes, around, *about, progress="stops")
+                path = replace(path, stops=stops)
         paths.pop(name, None)  # a method named twice stands where it was named last
         paths[name] = path
     return paths

@@ -40,11 +40,11 @@ def stops_along(
 ) -> tuple[Stop, ...]:
     """The stops of a path through positions (W, 3) m with views along unit axes (W, 3), such as `best_sequence` gives.
 
-    A place whose view scores below `config.least_score` becomes a stop with the fewest further looks, along some of the
-    directions (D, 3) within the planner's limits of pitch, by which all looks together reach that score, and of as many
-    those that turn least. Where no set of `config.looks` does, the stop is made if it gains more than it costs, and of
-    those that do the one that gains most: `planner.score_weight` for every metre of the path around the place times the
-    rise of its score, less `planner.turn_weight_m` for every radian there and back.
+    A place whose view scores below `config.least_score` becomes a stop with the fewest further looks, along some of
+    unit directions (D, 3), by which all looks together reach that score, and of as many those that turn least. Where no
+    set of `config.looks` does, the stop is made if it gains more than it costs, and of those that do the one that gains
+    most: `planner.score_weight` for every metre of the path around the place times the rise of its score, less
+    `planner.turn_weight_m` for every radian there and back.
 
     What several looks score is told from the score of the path's view: its odds rise as those of the shipped
     `SetWorth` do when the further looks are added. Raises a ConfigError if scores are no probabilities
@@ -54,18 +54,22 @@ def stops_along(
         return ()
     check_stopping(scorer.name)
     own = scorer.score(poses_looking_along(positions, axes))
-    low, high = np.sin(np.radians(planner.pitch_deg))
-    inside = directions[(directions[:, 2] >= low) & (directions[:, 2] <= high)]
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     metres = (np.append(steps, 0.0) + np.append(0.0, steps)) / 2
     found = []
     places = np.flatnonzero(own < config.least_score)
     for place in tqdm(places.tolist(), desc=progress, unit="stop", disable=progress is None):
         view = positions[place], axes[place], float(own[place])
-        stop = _stop(scorer, place, *view, inside, config, planner, float(metres[place]))
+        stop = _stop(scorer, place, *view, directions, config, planner, float(metres[place]))
         if stop is not None:
             found.append(stop)
     return tuple(found)
+
+
+def within_pitch(directions: Float, planner: PathConfig) -> Float:
+    """Those of unit directions (D, 3) that a planner's camera can look along."""
+    low, high = np.sin(np.radians(planner.pitch_deg))
+    return directions[(directions[:, 2] >= low) & (directions[:, 2] <= high)]
 
 
 def can_stop(method: str) -> bool:

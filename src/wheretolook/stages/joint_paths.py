@@ -65,7 +65,7 @@ def choose_further(
     stop), and the pose. Those kept in the folder, `stops.parquet`, if they were chosen for the same paths and settings.
     """
     from wheretolook.planning.scene_map import planner_scorer
-    from wheretolook.planning.stops import can_stop, stops_along
+    from wheretolook.planning.stops import can_stop, stops_along, within_pitch
 
     names = [*KEY, "waypoint", "look", "score", "together", "turn_deg"]
     if config.stops.looks < 2:
@@ -73,7 +73,7 @@ def choose_further(
     key = stage_key("stops 1", [planned_key, asdict(config.stops)])
     if (kept := _kept(folder / "stops.parquet", key)) is not None:
         return kept
-    directions, rows, looks = config.axes(), [], []
+    directions, rows, looks = within_pitch(config.axes(), config.planner), [], []
     scorers = {name: planner_scorer(scene, dataset, name, weights[name]) for name in config.methods if can_stop(name)}
     along = list(planned.views[planned.views["method"].isin(list(scorers))].groupby(KEY, sort=False))
     for (pair, task, method), path in tqdm(along, desc=f"stops {scene.name}", unit="path"):

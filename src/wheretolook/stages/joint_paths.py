@@ -156,8 +156,7 @@ def _with_stops(
     stops = [(row_of[key], rows) for key, rows in further.groupby([*KEY, "waypoint"], sort=False).indices.items()]
     sets, own = [[row, *(len(views) + rows)] for row, rows in stops], [row for row, _ in stops]
     outcome = label_sets(labels, sets, points, camera, localizer, progress=text)
-    for name in OUTCOME:
-        found.loc[own, name] = outcome[name].to_numpy(found[name].dtype)
+    _replace_outcome(found, own, outcome)
     found.loc[own, "score"] = [further["together"].iloc[rows[0]] for _, rows in stops]
     return found.assign(method=found["method"] + f" {WITH_STOPS}")
 
@@ -184,9 +183,14 @@ def _last(
             rigs.append(rig_of_last(steps, view, config.last_views))
             sets.append(rows[max(0, view - config.last_views + 1) : view + 1][::-1])
     outcome, now = label_sets(labels, sets, points, camera, localizer, progress=text, rigs=rigs), [s[0] for s in sets]
-    for name in OUTCOME:
-        found.loc[now, name] = outcome[name].to_numpy(found[name].dtype)
+    _replace_outcome(found, now, outcome)
     return found.assign(method=found["method"] + f" {LAST.format(config.last_views)}")
+
+
+def _replace_outcome(views: pd.DataFrame, rows: list[int], outcome: pd.DataFrame) -> None:
+    """Set what came of localizing the views of some rows."""
+    for name in OUTCOME:
+        views.loc[rows, name] = outcome[name].astype(views[name].dtype).to_numpy()
 
 
 def _paths_of(paths: pd.DataFrame, views: pd.DataFrame, further: pd.DataFrame) -> pd.DataFrame:

@@ -97,7 +97,7 @@ def test_stops_are_seen_in_film_and_picture() -> None:
     assert len(list(film_frames([stop, *further], LANDMARKS))) == 3
     figure = still_figure(stopping, LANDMARKS)
     titles = [axes.get_title() for axes in figure.axes if "landmarks" in axes.get_title()]
-    assert len(titles) == 5 and sum("stop, look 1 of 3" in title for title in titles) == 1
+    assert len(titles) == 5 and sum("look 1 of 3" in title for title in titles) == 1
     scores = next(axes for axes in figure.axes if axes.get_ylabel() == "score")
     np.testing.assert_allclose(scores.lines[0].get_ydata(), np.arange(6) / 6)  # not those of further looks
     (mark,) = (line for line in scores.lines if line.get_label() == "all looks of a stop")

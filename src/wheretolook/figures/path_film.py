@@ -138,7 +138,7 @@ def _draw_view(axes: Axes, view: PathView, before: str = "") -> None:
     axes.scatter(view.pixels[:, 0], view.pixels[:, 1], s=3, color=SEEN, linewidths=0)
     score = "" if np.isnan(view.score) else f", score {score_text(view.score)}"
     axes.set(xlim=(0, width), ylim=(height, 0), xticks=[], yticks=[], aspect="equal", anchor="N")
-    stop = f"stop, look {view.look} of {view.n_looks}: " if view.n_looks > 1 else ""
+    stop = f"look {view.look} of {view.n_looks}: " if view.n_looks > 1 else ""
     axes.set_title(f"{before}{stop}{len(view.pixels):,} landmarks{score}", fontsize=9)
     axes.grid(False)
     axes.spines[:].set_visible(True)

@@ -142,7 +142,7 @@ def _stops_told(path: PlannedPath) -> str:
     if not path.stops:
         return ", no stops"
     along = lengths_along(path.positions)[[stop.place for stop in path.stops]]
-    where = ", ".join(f"{at:.1f}" for at in along)
+    where = ", ".join(f"{at:.2f}" for at in along)
     stops = f"{len(path.stops)} stop{'s' if len(path.stops) > 1 else ''} at {where} m"
     looks = path.n_looks - len(path.positions)
     return f", {stops} with {looks} further looks: mean score {score_text(float(path.scores_with_stops.mean()))}"

@@ -142,7 +142,8 @@ def _localize(
     labelled: dict[Path, pd.DataFrame] = {}
     with closing(label_scenes(tasks, config, description="localize")) as results:
         for result in results:
-            labelled[result.task.shards] = result.table.reset_index(drop=True)
+            table = result.table.reset_index(drop=True)
+            labelled[result.task.shards] = table if joint else table[joint_paths.OUTCOME]
     shards_of: dict[Path, dict[str, Any]] = {}
     for task in tasks:  # views of paths that were planned with other settings
         current = shards_of[task.shards] = read_json_object(task.shards / MANIFEST)["shards"]

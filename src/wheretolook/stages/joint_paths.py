@@ -150,7 +150,8 @@ def _with_stops(
     from wheretolook.labelling.look_sets import label_sets
     from wheretolook.planning.stops import can_stop
 
-    found = views[views["method"].map(can_stop)].copy()
+    found = _by_no_rule(views)
+    found = found[found["method"].map(can_stop)].copy()
     places = found[[*KEY, "waypoint"]].itertuples(index=False, name=None)
     row_of = dict(zip(places, found.index, strict=True))
     stops = [(row_of[key], rows) for key, rows in further.groupby([*KEY, "waypoint"], sort=False).indices.items()]
@@ -174,7 +175,7 @@ def _last(
     from wheretolook.labelling.look_sets import label_sets
     from wheretolook.labelling.odometry import rig_of_last, told_steps
 
-    found, rng = views[~views["method"].str.contains(" ")].copy(), np.random.default_rng(config.seed)
+    found, rng = _by_no_rule(views), np.random.default_rng(config.seed)
     sets, rigs = [], []
     for _, path in found.groupby(KEY, sort=False):
         rows = path.sort_values("waypoint", kind="stable").index.to_numpy()
@@ -185,6 +186,11 @@ def _last(
     outcome, now = label_sets(labels, sets, points, camera, localizer, progress=text, rigs=rigs), [s[0] for s in sets]
     _replace_outcome(found, now, outcome)
     return found.assign(method=found["method"] + f" {LAST.format(config.last_views)}")
+
+
+def _by_no_rule(views: pd.DataFrame) -> pd.DataFrame:
+    """Without those along a given path that were chosen by another rule, whose name follows the method's."""
+    return views[~views["method"].str.contains(" ")].copy()
 
 
 def _replace_outcome(views: pd.DataFrame, rows: list[int], outcome: pd.DataFrame) -> None:

@@ -100,8 +100,8 @@ class StopConfig:
     """Stops: where one look will not do, the camera stops and looks further, and all looks are localized together.
 
     Args:
-        looks: looks at a stop at most, that of the path among them; 1 never to stop.
-        least_score: a place becomes a stop where its view's score, a probability, is below this.
+        looks: most looks at a stop; 1 for no stops. That of the path is among them.
+        least_score: a view that scores less gets a stop. A probability.
     """
 
     looks: int = 1
@@ -135,8 +135,8 @@ class PathsConfig(MappedLattice):
         resamples: of the pairs, for 95 % intervals.
         planner: costs and limits of the paths, time to plan each.
         stops: where one look will not do; adds rows "METHOD with stops" for methods whose scores are probabilities.
-        last_views: views along the way that are localized together as one rig, the present one and those before it;
-            adds rows "METHOD last N together". 1 for none.
+        last_views: views along the way localized as one rig. The present one and those before it; adds rows "METHOD
+            last N together". 1 for none.
         odometry_m_per_m: how well the rig knows how far it went from view to view. One standard deviation along each
             axis, in metres for each metre.
         odometry_deg_per_deg: and how far it turned. Degrees for each degree.

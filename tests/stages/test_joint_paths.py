@@ -162,3 +162,15 @@ def test_stops_are_refused_where_no_method_can(compared: tuple) -> None:
         check_joint(replace(CONFIG, methods=("forward", "visible")))
     assert {*KEY} <= {*compared[0].views}
     assert len(poses(compared[1])) == 1
+
+
+def test_where_no_place_is_a_stop_nothing_changes(scene: Scene, compared: tuple, tmp_path: Path) -> None:
+    single, further, labels, _ = compared
+    config = replace(CONFIG, last_views=1)
+    nothing = pd.DataFrame(columns=further.columns[:8])
+    found = localize_together(
+        single, nothing, labels, pd.DataFrame(), scene, config, LocalizerConfig(), tmp_path, ["a"]
+    )
+    own = single.views[single.views["method"] == "set"].reset_index(drop=True)
+    pd.testing.assert_frame_equal(found.views.drop(columns="method"), own.drop(columns="method"))
+    assert found.paths[["method", "turn_deg", "n_looks"]].to_numpy().tolist() == [["set with stops", 0.0, 6]]

@@ -28,7 +28,7 @@ def rig_of_last(steps: Float, view: int, n: int) -> Float:
 
     The rig's frame is the view's own camera.
     """
-    mounts = [np.eye(3, 4)]
+    mounts: list[Float] = [np.eye(3, 4)]
     for step in steps[max(0, view - n + 1) : view][::-1]:
         mounts.append(chained(step, mounts[-1]))
     return np.stack(mounts)

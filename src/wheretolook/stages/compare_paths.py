@@ -109,8 +109,10 @@ def _plan(
 MADE = "made.json"
 """File beside a scene's paths with the key of what they were made from."""
 
-_OF_THE_REPORT = ("scenes", "max_error_m", "max_error_deg", "resamples", "weights")
-_OF_THE_REPORT += ("stops", "last_views", "odometry_m_per_m", "odometry_deg_per_deg")
+_OF_THE_REPORT = (
+    "scenes", "max_error_m", "max_error_deg", "resamples", "weights",
+    "stops", "last_views", "odometry_m_per_m", "odometry_deg_per_deg",
+)  # fmt: skip
 """Settings that decide nothing about the paths of a scene."""
 
 

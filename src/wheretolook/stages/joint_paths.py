@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from wheretolook.dataset.folders import Dataset
@@ -153,12 +154,13 @@ def _with_stops(
     found = _by_no_rule(views)
     found = found[found["method"].map(can_stop)].copy()
     places = found[[*KEY, "waypoint"]].itertuples(index=False, name=None)
-    row_of = dict(zip(places, found.index, strict=True))
-    stops = [(row_of[key], rows) for key, rows in further.groupby([*KEY, "waypoint"], sort=False).indices.items()]
-    sets, own = [[row, *(len(views) + rows)] for row, rows in stops], [row for row, _ in stops]
+    row_of: dict[Any, int] = dict(zip(places, found.index, strict=True))
+    looks: dict[Any, NDArray[np.int64]] = further.groupby([*KEY, "waypoint"], sort=False).indices  # type: ignore[assignment]
+    own = [row_of[place] for place in looks]
+    sets = [[row, *(len(views) + rows)] for row, rows in zip(own, looks.values(), strict=True)]
     outcome = label_sets(labels, sets, points, camera, localizer, progress=text)
     _replace_outcome(found, own, outcome)
-    found.loc[own, "score"] = [further["together"].iloc[rows[0]] for _, rows in stops]
+    found.loc[own, "score"] = [further["together"].iloc[rows[0]] for rows in looks.values()]
     return found.assign(method=found["method"] + f" {WITH_STOPS}")
 
 
@@ -206,9 +208,10 @@ def _paths_of(paths: pd.DataFrame, views: pd.DataFrame, further: pd.DataFrame) -
     found = paths[paths["method"].isin(list(named))].set_index(KEY)
     found["promised"] = views.assign(method=plain).groupby(KEY)["score"].mean()
     found["n_looks"] = found["n_views"]
-    for key, looks in further.groupby(KEY):
-        found.loc[key, "turn_deg"] += looks.drop_duplicates("waypoint")["turn_deg"].sum()
-        found.loc[key, "n_looks"] += len(looks)
+    turns = further.drop_duplicates([*KEY, "waypoint"]).groupby(KEY)["turn_deg"].sum().to_dict()
+    counts = further.groupby(KEY).size().to_dict()
+    found["turn_deg"] += [turns.get(key, 0.0) for key in found.index]
+    found["n_looks"] += [counts.get(key, 0) for key in found.index]
     found = found.reset_index()
     return found.assign(method=found["method"].map(named))[[*paths.columns, "n_looks"]]
 

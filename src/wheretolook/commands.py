@@ -119,12 +119,13 @@ ship, score the views. The folder holds plain arrays and LAYOUT.txt, which says 
     "plan": Stage(
         "plan",
         "Plan a path on which the camera sees what it needs to know where it is; a table, a picture and a film of it.",
-        "scene start goal method weights out film plan.against plan.rerun plan.planner.time_s "
-        "plan.planner.score_weight occlusion.model",
+        "scene start goal method weights out film stops plan.stops.least_score plan.against plan.rerun "
+        "plan.planner.time_s plan.planner.score_weight occlusion.model",
         ("plan", *_SPACE, "tracking"),
         """--config configs/demo.yaml --scene apartment-000 --start '[-4, -3, 1.4]' --goal '[4, 3, 1.4]' \\
       --plan.against '[forward]' --film mp4 --out way""",
-        {f"--{name}": f"--plan.{name}" for name in ("scene", "start", "goal", "method", "weights", "out", "film")},
+        {f"--{name}": f"--plan.{name}" for name in ("scene", "start", "goal", "method", "weights", "out", "film")}
+        | {"--stops": "--plan.stops.looks"},
         notes="""\
 Reads a scene's map and its mesh, if it has one, as the scenes and map stages leave them.
 To plan in what depth images saw as free, without the mesh: --occlusion.model tsdf""",
@@ -132,8 +133,9 @@ To plan in what depth images saw as free, without the mesh: --occlusion.model ts
     "compare-paths": Stage(
         "compare_paths",
         "Plan paths between random places by several methods, render what the camera sees, localize it. Resumes.",
-        "paths.scenes paths.pairs paths.methods paths.weights paths.seed paths.min_distance_m paths.planner.time_s "
-        "paths.planner.score_weight occlusion.model label.workers tracking.folder",
+        "paths.scenes paths.pairs paths.methods paths.weights paths.seed paths.min_distance_m paths.stops.looks "
+        "paths.stops.least_score paths.last_views paths.planner.time_s paths.planner.score_weight occlusion.model "
+        "label.workers tracking.folder",
         ("paths", "occlusion", "scenes.free_space", "label", "tracking"),
         "--config configs/demo.yaml --paths.methods '[forward, set]' --paths.pairs 5",
     ),

@@ -87,3 +87,23 @@ def test_methods_stand_side_by_side() -> None:
     for axes, shown in zip(figure.axes, (views[:3], views), strict=True):
         np.testing.assert_allclose(axes.lines[0].get_xydata(), [view.position[:2] for view in shown])
         assert f"{np.mean([len(view.pixels) for view in shown]):,.0f} landmarks" in axes.get_title()
+
+
+def test_stops_are_seen_in_film_and_picture() -> None:
+    views = some_views(6)
+    stop = replace(views[2], n_looks=3, together=0.9)
+    further = [replace(stop, look=look, axis=np.array([0.0, 1.0, 0.0])) for look in (2, 3)]
+    stopping = [*views[:2], stop, *further, *views[3:]]
+    assert len(list(film_frames([stop, *further], LANDMARKS))) == 3
+    figure = still_figure(stopping, LANDMARKS)
+    titles = [axes.get_title() for axes in figure.axes if "landmarks" in axes.get_title()]
+    assert len(titles) == 5 and sum("look 1 of 3" in title for title in titles) == 1
+    scores = next(axes for axes in figure.axes if axes.get_ylabel() == "score")
+    np.testing.assert_allclose(scores.lines[0].get_ydata(), np.arange(6) / 6)  # not those of further looks
+    (mark,) = (line for line in scores.lines if line.get_label() == "all looks of a stop")
+    assert (mark.get_xdata(), mark.get_ydata()) == ([1.0], [0.9])
+    assert scores.get_ylim()[1] > 0.9
+    above = next(axes for axes in figure.axes if axes.get_ylabel() == "y (m)")
+    assert any(line.get_marker() == "o" and list(line.get_xdata()) == [1.0] for line in above.lines)
+    plain = next(axes for axes in still_figure(views, LANDMARKS).axes if axes.get_ylabel() == "score")
+    assert plain.get_legend() is None

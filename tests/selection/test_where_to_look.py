@@ -292,3 +292,33 @@ def test_looks_are_refused_where_they_make_no_sense(look: WhereToLook) -> None:
     for options, problem in refused:
         with pytest.raises(ConfigError, match=problem):
             look.best(POINTS, **options)
+
+
+def test_a_sequence_stops_where_one_look_will_not_do(look: WhereToLook, tmp_path: Path) -> None:
+    sequence = look.best(POINTS, max_turn_deg=10)
+    asked = float(np.median(sequence.score))
+    views = look.best(POINTS, max_turn_deg=10, looks=3, least_score=asked)
+    own = views.rank == 1
+    np.testing.assert_array_equal(views.cam_from_world[own], sequence.cam_from_world)
+    stops = {*views.waypoint[~own].tolist()}
+    assert stops and stops <= {*np.flatnonzero(sequence.score < asked).tolist()}
+    assert views.set_score is not None
+    for place in range(len(POINTS)):
+        rows = views.waypoint == place
+        assert views.rank[rows].tolist() == list(range(1, 1 + rows.sum())) and len({*views.set_score[rows]}) == 1
+        np.testing.assert_allclose(views.positions[rows], np.tile(POINTS[place], (rows.sum(), 1)), atol=1e-9)
+        if place in stops:
+            assert views.set_score[rows][0] > sequence.score[place]
+        else:
+            assert views.set_score[rows][0] == pytest.approx(sequence.score[place], rel=1e-5)
+    views.save(tmp_path / "views.csv")
+    with pytest.raises(ConfigError, match="one view of each waypoint"):
+        views.save(tmp_path / "views.tum")
+    for options, message in (
+        ({"looks": 3, "least_score": 0.5}, "along a path"),
+        ({"max_turn_deg": 10, "least_score": 0.5}, "along a path"),
+        ({"looks": 3, "max_turn_deg": 10, "least_score": 0.0}, "probability above 0"),
+        ({"looks": 3, "max_turn_deg": 10, "least_score": 0.5, "max_total_turn_deg": 90}, "not for looks along"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            look.best(POINTS, **options)

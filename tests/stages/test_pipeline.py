@@ -433,6 +433,40 @@ def test_planned_paths_are_rendered_and_localized(copy: Path, capsys: pytest.Cap
     assert "There are" in capsys.readouterr().err
 
 
+def test_views_along_paths_are_localized_together(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    options = ["--paths.pairs", "1", "--paths.methods", "[forward,set]", "--paths.grid", "[4, 4, 2]",
+               "--paths.directions", "40", "--paths.min_distance_m", "1", "--paths.planner.time_s", "1",
+               "--paths.planner.spacing_m", "0.5", "--paths.max_turn_deg", "60"]  # fmt: skip
+    assert run("compare-paths", copy, *options) == 0
+    root = copy / "data" / "tiny" / "results"
+    plain = pd.read_csv(root / "paths.csv")
+    assert "looks" not in plain
+    joint = ["--paths.stops.looks", "3", "--paths.stops.least_score", "0.95", "--paths.last_views", "2"]
+    assert run("compare-paths", copy, *options, *joint) == 0
+    assert "| set with stops" in capsys.readouterr().out
+    table = pd.read_csv(root / "paths.csv")
+    more = {"set with stops", "forward last 2 together", "set last 2 together"}
+    assert {*table["method"]} == {*plain["method"], *more}
+    single = table[~table["method"].isin(more)].reset_index(drop=True)
+    pd.testing.assert_frame_equal(single[plain.columns], plain)  # the same paths, localized as before
+    stopped = table[table["method"] == "set with stops"].set_index("task")
+    alone = table[table["method"] == "set"].set_index("task")
+    assert (stopped["looks"] > 1).any() and (alone["looks"] == 1).all()
+    assert (stopped["turn_deg_per_m"] > alone["turn_deg_per_m"]).any()
+    scene = next((root / "paths").glob("*/stops.parquet")).parent
+    further = pd.read_parquet(scene / "stops.parquet")
+    assert further["look"].between(2, 3).all() and (stopped["looks"] * stopped["views"]).sum() == pytest.approx(
+        stopped["views"].sum() + len(further), rel=1e-4
+    )
+    kept = {path: path.stat().st_mtime_ns for path in [*scene.glob("*shards/*.parquet"), *scene.glob("*.parquet")]}
+    assert run("compare-paths", copy, *options, *joint) == 0
+    assert run("compare-paths", copy, *options) == 0  # what was localized with more than is needed
+    assert {path: path.stat().st_mtime_ns for path in kept} == kept
+    pd.testing.assert_frame_equal(pd.read_csv(root / "paths.csv"), plain)
+    assert run("compare-paths", copy, *options, "--paths.methods", "[forward,visible]", *joint) == 2
+    assert "probabilities" in capsys.readouterr().err
+
+
 def test_a_path_is_planned_and_shown(
     copy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

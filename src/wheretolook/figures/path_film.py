@@ -49,7 +49,8 @@ def still_figure(views: Sequence[PathView], landmarks: Float, title: str = "") -
 
     There must be a view; `landmarks` are those of the map, (N, 3) metres; the title stands over the map.
     """
-    shown = np.unique(np.linspace(0, len(views) - 1, STILLS).round().astype(int))
+    own = np.array([number for number, view in enumerate(views) if view.look == 1])  # not further looks of stops
+    shown = own[np.unique(np.linspace(0, len(own) - 1, STILLS).round().astype(int))]
     with context(RC):
         figure = new_figure(2.5 * max(4, len(shown)), 5.8)
         grid = figure.add_gridspec(2, 1, height_ratios=(1.6, 1.0))
@@ -137,7 +138,8 @@ def _draw_view(axes: Axes, view: PathView, before: str = "") -> None:
     axes.scatter(view.pixels[:, 0], view.pixels[:, 1], s=3, color=SEEN, linewidths=0)
     score = "" if np.isnan(view.score) else f", score {score_text(view.score)}"
     axes.set(xlim=(0, width), ylim=(height, 0), xticks=[], yticks=[], aspect="equal", anchor="N")
-    axes.set_title(f"{before}{len(view.pixels):,} landmarks{score}", fontsize=9)
+    stop = f"look {view.look} of {view.n_looks}: " if view.n_looks > 1 else ""
+    axes.set_title(f"{before}{stop}{len(view.pixels):,} landmarks{score}", fontsize=9)
     axes.grid(False)
     axes.spines[:].set_visible(True)
 
@@ -150,6 +152,9 @@ def _draw_map(
     low, high = np.minimum(low, positions[:, :2].min(0)), np.maximum(high, positions[:, :2].max(0))
     axes.scatter(landmarks[:, 0], landmarks[:, 1], s=0.5, color="#9a9a9a", linewidths=0, rasterized=True)
     axes.plot(*positions[:, :2].T, color=PATH, linewidth=2.2, zorder=3)
+    stops = positions[[view.look == 1 < view.n_looks for view in views], :2]
+    if len(stops):
+        axes.plot(*stops.T, "o", color="white", markeredgecolor=PATH, markeredgewidth=1.6, markersize=7, zorder=3.5)
     xy = [(float(x), float(y)) for x, y in positions[:, :2]]
     reach = 0.07 * float(np.max(high - low))
     arrow: Look = {"arrowstyle": "-|>", "color": INK, "linewidth": 0.9, "shrinkA": 0, "shrinkB": 0, "mutation_scale": 8}
@@ -171,13 +176,22 @@ def _draw_scores(
     positions = np.array([view.position for view in views])
     along = lengths_along(positions)
     scores = np.array([view.score for view in views])
-    axes.plot(along, scores, color=PATH, linewidth=1.4)
+    own = np.array([view.look == 1 for view in views])
+    axes.plot(along[own], scores[own], color=PATH, linewidth=1.4)
+    together = np.array([view.together for view in views])
+    if np.isfinite(together).any():
+        stops = own & np.isfinite(together)
+        look: Look = {"color": "white", "markeredgecolor": PATH, "markeredgewidth": 1.6, "markersize": 6}
+        axes.vlines(along[stops], scores[stops], together[stops], color=PATH, linewidth=0.8, linestyle=":")
+        axes.plot(along[stops], together[stops], "o", label="all looks of a stop", **look)
+        axes.legend(loc="best", fontsize=8)
     if number is not None:
         axes.plot(along[number], scores[number], "o", color=INK, markersize=6)
     for column, at in enumerate(() if shown is None else shown, 1):
         side = "left" if at == 0 else "right" if at == len(views) - 1 else "center"
         axes.annotate(str(column), (along[at], scores[at]), (0, 6), textcoords="offset points", ha=side)
-    known = scores[np.isfinite(scores)]
+    known = np.concatenate([scores, together])
+    known = known[np.isfinite(known)]
     lowest, highest = (float(known.min()), float(known.max())) if len(known) else (0.0, 1.0)
     room = max(0.25 * (highest - lowest), 0.02 * max(1.0, abs(highest)))  # a flat score stays in the middle
     axes.set(xlim=(0, max(along[-1], 1e-6)), ylim=(lowest - room, highest + room))

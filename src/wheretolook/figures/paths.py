@@ -14,6 +14,9 @@ from wheretolook.figures.style import INK, RC, new_figure, scene_label
 from wheretolook.methods.styles import method_style
 from wheretolook.viewpoints.thresholds import ALL
 
+FILLED = {"greedy": "full", "with stops": "left"}
+"""How markers are filled, by what follows a method's name."""
+
 TITLES = {"planned": "places and views planned", "given": "views along a given path"}
 
 
@@ -21,7 +24,8 @@ def paths_figure(summary: pd.DataFrame) -> Figure:
     """Share of the views along paths that localize, from `wheretolook.planning.path_report.summarize_paths`.
 
     A panel for each task, in it a row for each scene, all of them together on top, and in each a mark for each method,
-    with 95 % intervals; open where views were chosen by ActLoc's rule.
+    with 95 % intervals; open where views were chosen by ActLoc's rule, half filled where several views were localized
+    together.
     """
     with context(RC):
         tasks = list(dict.fromkeys(summary["task"]))
@@ -38,8 +42,11 @@ def paths_figure(summary: pd.DataFrame) -> Figure:
                 style = method_style(name)
                 value, low, high = (100 * of_method[f"localized{end}"].to_numpy() for end in ("", "_low", "_high"))
                 axes.hlines(at, low, high, color=style.color, linewidth=1.2)
-                look: Look = {"markersize": 6, "markerfacecolor": "white" if rule else style.color}
-                label = f"{style.label}, greedy" if rule else style.label
+                fill = FILLED.get(rule, "bottom" if rule else "full")
+                face = "white" if rule == "greedy" else style.color
+                look: Look = {"markersize": 6, "fillstyle": fill, "markerfacecolor": face}
+                look["markerfacecoloralt"] = "white"
+                label = f"{style.label}, {rule}" if rule else style.label
                 axes.plot(value, at, style.marker, color=style.color, label=label, **look)
             axes.set_title(TITLES.get(task, task))
             axes.set_xlabel("views along the paths that localize (%)")

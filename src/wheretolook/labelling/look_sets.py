@@ -41,8 +41,11 @@ def label_sets(
     seed: int = 0,
     confidence: Confidence | None = None,
     progress: str | None = None,
+    rigs: Sequence[Float] | None = None,
 ) -> pd.DataFrame:
     """Localize sets of a table's views together, and measure the errors. Each set has rows of the table, of one place.
+    Or of several, if `rigs` tell for each set where its views are to one another: cam_from_rig (N, 3, 4), metres. The
+    error is then that of the first view of a set.
 
     Of a set of one the label is that of a single image, but for the order of its matches, which are stored by landmark.
     Turns between looks are those of the table's poses; with `turn_noise_deg` they are told wrong by as much, drawn from
@@ -63,7 +66,7 @@ def label_sets(
     rows: list[tuple[object, ...]] = []
     alone: dict[int, Alone] = {}  # what each view finds alone, which many sets ask for
     known: dict[tuple[int, ...], tuple[object, ...]] = {}  # sets that come again, where nothing is drawn for each
-    for taken in tqdm(sets, desc=progress, unit="set", disable=progress is None):
+    for number, taken in enumerate(tqdm(sets, desc=progress, unit="set", disable=progress is None)):
         chosen = np.asarray(taken, dtype=np.int64)
         if len(chosen) == 0 or chosen.min() < 0 or chosen.max() >= len(table):
             raise TableError(f"a set of looks names no rows of the table's {len(table)}", value=chosen.tolist())
@@ -71,7 +74,7 @@ def label_sets(
         if key in known:
             rows.append(known[key])
             continue
-        mounts = _told_turns(rig_of(true[chosen]), turn_noise_deg, rng)
+        mounts = _told_turns(rig_of(true[chosen]), turn_noise_deg, rng) if rigs is None else rigs[number]
         looks = [
             _look(table, row, mount, cameras if numbers is None else cameras[int(numbers[row])], len(points))  # type: ignore[index, arg-type]
             for row, mount in zip(chosen, mounts, strict=True)
@@ -85,11 +88,12 @@ def label_sets(
         if found.cams_from_world is None:
             error_m = error_deg = np.array([np.nan])
         else:
-            error_m, error_deg = pose_error(found.cams_from_world, true[chosen])
+            judged = slice(None) if rigs is None else slice(1)
+            error_m, error_deg = pose_error(found.cams_from_world[judged], true[chosen][judged])
         numbers_of = (found.n_matches, found.n_inliers, found.support, found.elsewhere, *found.own, *found.deviation)
         values = (len(chosen), int(places[chosen[0]]), found.status, error_m.max(), error_deg.max(), *numbers_of)
         rows.append((*values, told.of(found), seconds))
-        if turn_noise_deg == 0:
+        if turn_noise_deg == 0 and rigs is None:
             known[key] = rows[-1]
     return pd.DataFrame(rows, columns=list(SET_COLUMNS))
 

@@ -80,12 +80,13 @@ def choose_looks(
     max_turn_deg: float | None = None,
     first: ArrayLike | None = None,
     exchanges: int | None = None,
+    taken: int | None = None,
 ) -> ChosenLooks:
     """The n looks that are worth most together: greedily one after the other, then by exchange of single ones.
 
     `first` are single looks' own scores (D,): by them the first is chosen, the worth of one look unless given. The
     total turn keeps within `max_turn_deg`. There are `EXCHANGES` rounds of exchange unless told otherwise; a set is
-    never worth less than what greedy choice alone gives.
+    never worth less than what greedy choice alone gives. `taken` is a look that is in the set whatever it is worth.
 
     Raises a ConfigError for a number of looks that is none, or more than there are directions, and a PlanningError if
     no look can be reached.
@@ -93,9 +94,10 @@ def choose_looks(
     _check(n, len(seen), max_turn_deg)
     limit = np.inf if max_turn_deg is None else max_turn_deg + TOLERANCE_DEG
     single = _added(seen, worth, []) if first is None else np.asarray(first, dtype=np.float64)
-    looks = _greedy(seen, worth, n, turns, np.full(n, limit), single)
+    begun = [] if taken is None else [taken]
+    looks = _greedy(seen, worth, n, turns, np.full(n, limit), single, begun)
     if looks is None:  # the best look may lie so far off that no turn is left for the others
-        looks = _greedy(seen, worth, n, turns, limit * np.arange(1, n + 1) / n, single)
+        looks = _greedy(seen, worth, n, turns, limit * np.arange(1, n + 1) / n, single, begun)
     if looks is None:
         fix = "Raise the limit on turning, or look along more directions."
         raise PlanningError(f"no {n} looks can be reached", value=max_turn_deg, fix=fix)
@@ -103,7 +105,7 @@ def choose_looks(
     rounds = EXCHANGES if exchanges is None else exchanges
     for _ in range(rounds if n > 1 else 0):
         before = now
-        for k in range(n):
+        for k in range(len(begun), n):
             others = looks[:k] + looks[k + 1 :]
             value = _added(seen, worth, others)
             best = _best(value, turns.with_one_more(others) <= limit, others)
@@ -115,10 +117,12 @@ def choose_looks(
     return ChosenLooks(order, now, total)
 
 
-def _greedy(seen: SeenAround, worth: Worth, n: int, turns: Turns, limits: Float, single: Float) -> list[int] | None:
-    """n looks, one after the other, of which the first k keep within the k-th limit; None if there are no such."""
-    looks: list[int] = []
-    for limit in limits:
+def _greedy(
+    seen: SeenAround, worth: Worth, n: int, turns: Turns, limits: Float, single: Float, begun: list[int]
+) -> list[int] | None:
+    """n looks, added one by one to those begun with, the first k within the k-th limit; None if there are no such."""
+    looks = list(begun)
+    for limit in limits[len(begun) :]:
         best = _best(_added(seen, worth, looks) if looks else single, turns.with_one_more(looks) <= limit, looks)
         if best is None:
             return None

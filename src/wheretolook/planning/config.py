@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from wheretolook.geometry.lattices import ViewLattice
+from wheretolook.looks.choice import MOST_LOOKS
 from wheretolook.methods.forward import ForwardScorer
 from wheretolook.utils.errors import ConfigError
 
@@ -95,6 +96,26 @@ class PathConfig:
 
 
 @dataclass(frozen=True)
+class StopConfig:
+    """Stops: where one look will not do, the camera stops and looks further, and all looks are localized together.
+
+    Args:
+        looks: most looks at a stop; 1 for no stops. That of the path is among them.
+        least_score: a view that scores less gets a stop. A probability.
+    """
+
+    looks: int = 1
+    least_score: float = 0.7
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.looks <= MOST_LOOKS:
+            raise ConfigError(f"stops.looks is a whole number of 1 to {MOST_LOOKS}", value=self.looks)
+        if not 0 < self.least_score <= 1:
+            fix = "Give a probability above 0, such as 0.7."
+            raise ConfigError("stops.least_score is a probability", value=self.least_score, fix=fix)
+
+
+@dataclass(frozen=True)
 class PathsConfig(MappedLattice):
     """How methods are compared by planned paths.
 
@@ -113,6 +134,12 @@ class PathsConfig(MappedLattice):
         max_error_deg: and with a smaller error of its orientation.
         resamples: of the pairs, for 95 % intervals.
         planner: costs and limits of the paths, time to plan each.
+        stops: where one look will not do; adds rows "METHOD with stops" for methods whose scores are probabilities.
+        last_views: views along the way localized as one rig. The present one and those before it; adds rows "METHOD
+            last N together". 1 for none.
+        odometry_m_per_m: how well the rig knows how far it went from view to view. One standard deviation along each
+            axis, in metres for each metre.
+        odometry_deg_per_deg: and how far it turned. Degrees for each degree.
     """
 
     scenes: tuple[str, ...] = ()
@@ -127,6 +154,10 @@ class PathsConfig(MappedLattice):
     max_error_deg: float = 2.0
     resamples: int = 2000
     planner: PathConfig = field(default_factory=PathConfig)
+    stops: StopConfig = field(default_factory=StopConfig)
+    last_views: int = 1
+    odometry_m_per_m: float = 0.01
+    odometry_deg_per_deg: float = 0.01
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -135,6 +166,11 @@ class PathsConfig(MappedLattice):
                 raise ConfigError(f"{name} must be positive", value=getattr(self, name))
         if not 0 < self.height_m[0] <= self.height_m[1]:
             raise ConfigError("height_m needs a range above 0", value=self.height_m)
+        if self.last_views < 1:
+            raise ConfigError("last_views must be at least 1", value=self.last_views)
+        for name in ("odometry_m_per_m", "odometry_deg_per_deg"):
+            if not 0 <= getattr(self, name) < 1:
+                raise ConfigError(f"{name} must be at least 0 and below 1", value=getattr(self, name))
         if FORWARD not in self.methods or len(set(self.methods)) < len(self.methods):
             raise ConfigError(f'methods need "{FORWARD}" to compare with, and every name once', value=self.methods)
 
@@ -156,6 +192,7 @@ class PlanConfig(MappedLattice):
         rerun: write a recording for the Rerun viewer too. Needs `pip install rerun-sdk`.
         anywhere: let weights that are adapted to another place score here, too.
         planner: costs and limits of the path, time to plan.
+        stops: where one look will not do.
     """
 
     scene: str = ""
@@ -169,6 +206,7 @@ class PlanConfig(MappedLattice):
     rerun: bool = False
     anywhere: bool = False
     planner: PathConfig = field(default_factory=PathConfig)
+    stops: StopConfig = field(default_factory=StopConfig)
 
     def __post_init__(self) -> None:
         super().__post_init__()

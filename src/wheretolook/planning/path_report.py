@@ -41,7 +41,7 @@ def summarize_paths(paths: pd.DataFrame, views: pd.DataFrame, config: PathsConfi
         `localized`, the share of all views that localize; `times_forward` and `times_forward_length`, the ratios of
         this share and of the length to those of "forward", over the pairs that both could plan; 95 % intervals of the
         first two by resampling pairs within scenes; `failures` to plan, `turn_deg_per_m`, and `promised`, the mean
-        score.
+        score. Where `paths` tell `n_looks`, also `looks`, how many are taken at a place on average.
     """
     near = (views["error_m"] < config.max_error_m) & (views["error_deg"] < config.max_error_deg)
     good = near & (views["status"] == LOCALIZED)
@@ -104,7 +104,15 @@ def _row(of_method: pd.DataFrame, forward: pd.DataFrame, draws: NDArray[np.int64
         "length_m": float(of_method["length_m"].mean()),
         "turn_deg_per_m": float(of_method["turn_deg"].sum() / metres) if metres else float("nan"),
         "promised": float(of_method["promised"].mean()),
+        **_looks(of_method),
     }
+
+
+def _looks(of_method: pd.DataFrame) -> dict[str, float]:
+    if "n_looks" not in of_method:
+        return {}
+    places = float(of_method["n_views"].sum())
+    return {"looks": float(of_method["n_looks"].sum()) / places if places else float("nan")}
 
 
 def _interval(name: str, draws: NDArray[Any]) -> dict[str, float]:
@@ -121,12 +129,15 @@ def path_markdown(summary: pd.DataFrame, config: PathsConfig) -> str:
     titles = {"planned": "Places and views planned", "given": "Views along a given path"}
     for task, rows in summary.groupby("task", sort=False):
         header = ["scene", "method", "localized", "times forward", "length / forward's", "turn, °/m", "not found"]
+        told = "looks" in rows
+        header += ["looks a place"] if told else []
         lines = []
         for _, row in rows.iterrows():
             localized, low, high = (f"{100 * row[f'localized{end}']:.1f}" for end in ("", "_low", "_high"))
             times, least, most = (f"{row[f'times_forward{end}']:.2f}" for end in ("", "_low", "_high"))
             cells = [f"{localized} [{low}, {high}]", f"{times} [{least}, {most}]", f"{row['times_forward_length']:.2f}"]
             cells += [f"{row['turn_deg_per_m']:.0f}", f"{row['failures']}"]
+            cells += [f"{row['looks']:.2f}"] if told else []
             lines.append([str(row["scene"]), str(row["method"]), *cells])
         text += [f"{titles[str(task)]}:", markdown_table(header, lines)]
     return "\n\n".join(text) + "\n"

@@ -25,13 +25,30 @@ improving either."""
 
 
 @dataclass(frozen=True, eq=False)
+class Stop:
+    """A place of a path where the camera turns away from the path's view and back (`wheretolook.planning.stops`).
+
+    `place` is its row in the path; `axes` (K, 3) are the unit axes of the further looks in the world, in the order to
+    look along them, and `scores` (K,) of each one alone; `together` is the probability that they and the path's view
+    localize together; `turn_deg` is the sum of the angles between the axes from the path's view to them and back.
+    """
+
+    place: int
+    axes: Float
+    scores: Float
+    together: float
+    turn_deg: float
+
+
+@dataclass(frozen=True, eq=False)
 class PlannedPath:
     """A path of a camera, sampled at its corners and every `PathConfig.spacing_m` or a little less.
 
     `positions` (W, 3) m and unit optical `axes` (W, 3) are in the world; `scores` (W,) are what the planner read in the
     viewpoint map, 0 outside its free voxels, NaN without a map, or, from `plan_by_methods`, the scores of these very
     poses; `cost` is as `PathConfig` defines it, by the trapezoidal rule over the map's scores; `found_by` is
-    `SHORT_ROUTE`, `SEARCH` or `IMPROVEMENT`, empty if the path was not planned.
+    `SHORT_ROUTE`, `SEARCH` or `IMPROVEMENT`, empty if the path was not planned; `stops` are in the order of the path,
+    and not part of the cost.
     """
 
     positions: Float
@@ -39,6 +56,7 @@ class PlannedPath:
     scores: Float
     cost: float
     found_by: str = ""
+    stops: tuple[Stop, ...] = ()
 
     @property
     def length_m(self) -> float:
@@ -47,9 +65,49 @@ class PlannedPath:
 
     @property
     def turn_deg(self) -> float:
-        """Sum of the angles between consecutive axes."""
-        cosines = (self.axes[1:] * self.axes[:-1]).sum(1).clip(-1, 1)
-        return float(np.degrees(np.arccos(cosines)).sum())
+        """Sum of the angles between consecutive axes, those of further looks at stops among them."""
+        return turning_deg(self.axes) + sum(stop.turn_deg for stop in self.stops)
+
+    @property
+    def n_looks(self) -> int:
+        """Views of the path and further looks at its stops."""
+        return len(self.positions) + sum(len(stop.axes) for stop in self.stops)
+
+    @property
+    def looks(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Of all L looks in the order they are taken: the place (L,) in the path, and which look it is there (L,).
+
+        The path's own view is 1, further looks of a stop count from 2. `all_axes` and `all_scores` are in this order.
+        """
+        counts = np.ones(len(self.positions), dtype=np.int64)
+        for stop in self.stops:
+            counts[stop.place] += len(stop.axes)
+        places = np.repeat(np.arange(len(counts)), counts)
+        return places, np.arange(len(places)) - np.repeat(np.cumsum(counts) - counts, counts) + 1
+
+    @property
+    def all_axes(self) -> Float:
+        """Unit axes (L, 3) of all looks."""
+        return self._with_further(self.axes, [stop.axes for stop in self.stops])
+
+    @property
+    def all_scores(self) -> Float:
+        """Scores (L,) of all looks, each alone."""
+        return self._with_further(self.scores, [stop.scores for stop in self.stops])
+
+    def _with_further(self, own: Float, further: list[Float]) -> Float:
+        """Values (L, ...) of all looks, from those of the path's views (W, ...) and of each stop's further looks."""
+        if not further:
+            return own
+        after = np.repeat([stop.place + 1 for stop in self.stops], [len(values) for values in further])
+        return np.insert(own, after, np.concatenate(further), axis=0)
+
+    @property
+    def scores_with_stops(self) -> Float:
+        """The scores (W,), at stops those of all looks together."""
+        scores = self.scores.copy()
+        scores[[stop.place for stop in self.stops]] = [stop.together for stop in self.stops]
+        return scores
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +116,8 @@ class PathView:
 
     `position` (3,) m and unit optical `axis` (3,) are in the world; `score` is one of `PlannedPath.scores`, NaN if
     unknown; `pixels` (K, 2) are those of the landmarks in view, in an image of `size_px` (width, height); `rgb`
-    (H, W, 3) is None if the scene cannot be rendered.
+    (H, W, 3) is None if the scene cannot be rendered. At a stop the path's own view is `look` 1 of `n_looks`, the
+    further ones follow it as views of their own, and `together` is the score of all of them; NaN elsewhere.
     """
 
     position: Float
@@ -67,6 +126,9 @@ class PathView:
     pixels: Float
     size_px: tuple[int, int]
     rgb: NDArray[np.uint8] | None
+    look: int = 1
+    n_looks: int = 1
+    together: float = math.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,6 +212,12 @@ class RouteViews:
         if number not in self._limits:
             self._limits[number] = TurnLimit.of(self.map.directions, number * LIMIT_STEP_DEG, pan_tilt=True)
         return self._limits[number]
+
+
+def turning_deg(axes: Float) -> float:
+    """Sum of the angles between consecutive unit axes (W, 3)."""
+    cosines = (axes[1:] * axes[:-1]).sum(1).clip(-1, 1)
+    return float(np.degrees(np.arccos(cosines)).sum())
 
 
 def turned_evenly(knots: Float, axes: Float, at: Float) -> Float:

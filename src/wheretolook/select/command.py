@@ -45,6 +45,7 @@ EXAMPLES
   wheretolook select --map sparse/0 --at 1,2,1.5 -0.5,2,1.5 --n 3 --out views.json
   wheretolook select --map sparse/0 --at 1,2,1.5 --looks 3 --max-total-turn 180 --out looks.csv
   wheretolook select --map sparse/0 --at path.tum --max-turn 30 --pitch -30 30 --out views.tum
+  wheretolook select --map sparse/0 --at path.tum --max-turn 30 --looks 3 --least-score 0.7 --out views.csv
   wheretolook select --map sparse/0 --grid 0.5 --mesh house.glb --camera PINHOLE,640,480,320,320,320,240 --out views.csv
   wheretolook select --map sparse/0 --at waypoints.txt --fov 60 --format benchmark --out selected_poses.txt
 
@@ -66,6 +67,8 @@ def parser() -> argparse.ArgumentParser:
     add("--n", type=int, default=1, metavar="N", help="views of each waypoint, the best first (1)")
     add("--looks", type=int, metavar="N", help="instead: N looks of each waypoint, chosen to be localized together")
     add("--max-total-turn", type=float, metavar="DEG", help="how far the camera turns in all from look to look")
+    add("--least-score", type=float, metavar="P", help="with --max-turn and --looks: at waypoints whose view of the")
+    made._actions[-1].help += " sequence scores less, so many looks as are needed to reach it, N at most"  # type: ignore[operator]
     add("--pitch", nargs=2, type=float, metavar=("LOW", "HIGH"), help="limit on pitch in degrees, 90 straight up")
     add("--max-turn", type=float, metavar="DEG", help="greatest rotation between a view and the next, in the order of")
     made._actions[-1].help += " the waypoints: the sequence with the greatest sum of scores, exactly"  # type: ignore[operator]
@@ -136,9 +139,10 @@ def run(arguments: Sequence[str]) -> int:
         progress=True,
         looks=options.looks,
         max_total_turn_deg=options.max_total_turn,
+        least_score=options.least_score,
     )
     views.save(options.out, options.format)
-    _tell(look, views, waypoints, options.out, time.monotonic() - start)
+    _tell(look, views, waypoints, options.out, time.monotonic() - start, options.least_score is not None)
     return 0
 
 
@@ -151,7 +155,7 @@ def _check(options: argparse.Namespace) -> Waypoints | None:
     from wheretolook.select.weights import check_there
 
     check_format(options.out, options.format, max(options.n, options.looks or 1))
-    check_limits(options.n, options.pitch, options.max_turn, options.looks, options.max_total_turn)
+    check_limits(options.n, options.pitch, options.max_turn, options.looks, options.max_total_turn, options.least_score)
     if (options.at is None) == (options.grid is None):
         raise ConfigError("waypoints are given by --at or by --grid", fix="Give one of them.")
     _camera(options)
@@ -182,13 +186,18 @@ def _camera(options: argparse.Namespace):  # type: ignore[no-untyped-def]
     return options.camera_id
 
 
-def _tell(look: WhereToLook, views: SelectedViews, waypoints: Waypoints, out: Path, seconds: float) -> None:
+def _tell(
+    look: WhereToLook, views: SelectedViews, waypoints: Waypoints, out: Path, seconds: float, stopping: bool
+) -> None:
     around = look.localization_map
     n_seen = len({*views.waypoint.tolist()})
     skipped = f", {len(waypoints) - n_seen} left out" if n_seen < len(waypoints) else ""
     print(f"{len(around.landmarks):,} landmarks, occlusion: {around.occlusion.name}, method: {views.method}")
     scores = views.score[views.rank == 1]
     print(f"{n_seen} waypoints{skipped}; best scores {scores.min():.3g} to {scores.max():.3g}")
+    if stopping and (more := int((views.rank > 1).sum())):
+        stops = len({*views.waypoint[views.rank > 1].tolist()})
+        print(f"{stops} waypoints are stops, with {more} further looks")
     if blind := int((views.n_visible[views.rank == 1] == 0).sum()):
         print(f"{blind} of the best views see no landmark")
     if strange := int((~views.in_range[views.rank == 1]).sum()):

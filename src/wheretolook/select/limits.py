@@ -14,17 +14,34 @@ def check_limits(
     max_turn_deg: float | None,
     looks: int | None = None,
     max_total_turn_deg: float | None = None,
+    least_score: float | None = None,
 ) -> None:
     """Raise a ConfigError unless these are a number of views, limits on pitch and a limit on turns, in degrees.
 
-    And of looks chosen together, their number and the limit on their turns in all.
+    And of looks chosen together, their number and the limit on their turns in all; or, with a limit on turns between
+    waypoints, the score below which a waypoint becomes a stop with further looks.
     """
+    if least_score is not None:
+        if looks is None or max_turn_deg is None:
+            fix = "Give the most looks of a waypoint, and the limit on turns between waypoints."
+            raise ConfigError("a least score is for further looks along a path", value=least_score, fix=fix)
+        if not 0 < least_score <= 1:
+            raise ConfigError("a least score is a probability above 0", value=least_score)
     if looks is not None:
         if not isinstance(looks, Integral) or not 1 <= looks <= MOST_LOOKS:
             raise ConfigError(f"looks of a waypoint are a whole number of 1 to {MOST_LOOKS}", value=looks)
-        if n > 1 or max_turn_deg is not None:
+        if n > 1 or (max_turn_deg is not None and least_score is None):
             fix = "Leave out the number of best views, and the limit on turns between waypoints."
+            if n == 1:
+                fix = (
+                    "Give a least score, below which a waypoint of the path gets further looks; or leave the limit out."
+                )
             raise ConfigError("looks are chosen together, at each waypoint for itself", value=looks, fix=fix)
+        if least_score is not None and max_total_turn_deg is not None:
+            fix = "Leave it out: further looks turn no farther than they must."
+            raise ConfigError(
+                "a limit on turning in all is not for looks along a path", value=max_total_turn_deg, fix=fix
+            )
     elif max_total_turn_deg is not None:
         fix = "Say how many looks there are."
         raise ConfigError("a limit on turning in all is for looks chosen together", value=max_total_turn_deg, fix=fix)

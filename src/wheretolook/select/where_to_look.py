@@ -15,7 +15,10 @@ from wheretolook.geometry.lattices import Lattice, direction_lattice
 from wheretolook.geometry.poses import Float, check_poses, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.looks.around import best_looks
+from wheretolook.planning.config import StopConfig
+from wheretolook.planning.route_views import PlannedPath
 from wheretolook.planning.sequences import TurnLimit, best_sequence
+from wheretolook.planning.stops import check_stopping, stops_along
 from wheretolook.planning.turns import pan_tilt_angles
 from wheretolook.select.limits import check_limits
 from wheretolook.select.surroundings import grid_waypoints, map_space, surroundings, usable_waypoints
@@ -169,6 +172,7 @@ class WhereToLook:
         progress: bool = False,
         looks: int | None = None,
         max_total_turn_deg: float | None = None,
+        least_score: float | None = None,
     ) -> SelectedViews:
         """The best view, or the n best, or the best set of looks, at each of points (W, 3) metres in the world.
 
@@ -186,18 +190,28 @@ class WhereToLook:
                 localized together (`wheretolook.looks.around.best_looks`). Their rank is the order to look in, and
                 `set_score` the probability that they localize.
             max_total_turn_deg: how far the camera turns in all from the first look to the last.
+            least_score: with `max_turn_deg` and `looks`: where the sequence's view scores less, the waypoint becomes a
+                stop with the fewest further looks that reach it together, `looks` in all at most
+                (`wheretolook.planning.stops.stops_along`). The view of the sequence has rank 1.
 
         Raises:
             TableError: points of another shape, not finite, outside the map or inside geometry.
-            ConfigError: n or the limits are no such numbers, or no direction is within the limit on pitch.
+            ConfigError: n or the limits are no such numbers, no direction is within the limit on pitch, or a least
+                score is asked of scores that are no probabilities.
             PlanningError: no sequence, or no set of looks, keeps the limit on turns.
         """
-        check_limits(n, pitch_deg, max_turn_deg, looks, max_total_turn_deg)
+        check_limits(n, pitch_deg, max_turn_deg, looks, max_total_turn_deg, least_score)
+        if least_score is not None:
+            check_stopping(self.scorer.name)
         axes = self._allowed(looks or n, pitch_deg)
         waypoints = Waypoints.of(points, ids)
         rows = np.flatnonzero(usable_waypoints(self.localization_map, waypoints, skip))
         at = waypoints.points[rows]
         scores = self._scores_around(at, axes, progress)
+        if looks is not None and max_turn_deg is not None and least_score is not None:
+            stops = StopConfig(int(looks), least_score)
+            self.views = self._sequence_with_stops(waypoints, rows, axes, scores, max_turn_deg, stops, progress)
+            return self.views
         if looks is not None:
             self.views = self._looks(waypoints, rows, axes, scores, looks, max_total_turn_deg, progress)
             return self.views
@@ -246,12 +260,40 @@ class WhereToLook:
         at = waypoints.points[rows]
         pairs = tqdm(zip(at, scores, strict=True), total=len(at), desc="looks", unit="waypoint", disable=not progress)
         sets = [best_looks(self.scorer, place, axes, values, n, max_turn_deg) for place, values in pairs]
-        poses = poses_looking_along(np.repeat(at, n, axis=0), axes[[look for found in sets for look in found.looks]])
-        told, of_waypoint = self.scorer.report(poses), np.repeat(rows, n)
+        looked, rank = axes[[look for found in sets for look in found.looks]], np.tile(np.arange(1, n + 1), len(rows))
+        worths = np.repeat([found.worth for found in sets], n)
+        return self._reported(waypoints, np.repeat(rows, n), rank, looked, worths)
+
+    def _sequence_with_stops(
+        self,
+        waypoints: Waypoints,
+        rows: NDArray[np.int64],
+        axes: Float,
+        scores: Float,
+        max_turn_deg: float,
+        stops: StopConfig,
+        progress: bool,
+    ) -> SelectedViews:
+        """The best sequence at some of the waypoints, (R,) rows, with further looks where it scores too little."""
+        at = waypoints.points[rows]
+        chosen = axes[best_sequence(scores, TurnLimit.of(axes, max_turn_deg)).direction_ids]
+        alone = self.scorer.score(poses_looking_along(at, chosen))
+        text = "stops" if progress else None
+        found = stops_along(self.scorer, at, chosen, axes, stops, progress=text)
+        path = PlannedPath(at, chosen, alone, np.nan, stops=found)
+        places, rank = path.looks
+        return self._reported(waypoints, rows[places], rank, path.all_axes, path.scores_with_stops[places])
+
+    def _reported(
+        self, waypoints: Waypoints, rows: NDArray[np.int64], rank: NDArray[np.int64], axes: Float, set_score: Float
+    ) -> SelectedViews:
+        """Looks along axes (V, 3) from the waypoints of rows (V,), with all that is told of them."""
+        poses = poses_looking_along(waypoints.points[rows], axes)
+        told = self.scorer.report(poses)
         return SelectedViews(
-            waypoint=of_waypoint,
-            waypoint_id=tuple(waypoints.ids[row] for row in of_waypoint),
-            rank=np.tile(np.arange(1, n + 1), len(rows)),
+            waypoint=rows,
+            waypoint_id=tuple(waypoints.ids[row] for row in rows),
+            rank=rank,
             cam_from_world=poses,
             score=told.score,
             expected_inliers=told.expected_inliers,
@@ -259,7 +301,7 @@ class WhereToLook:
             in_range=told.in_range,
             camera=self.localization_map.camera,
             method=self.scorer.name,
-            set_score=np.repeat([found.worth for found in sets], n),
+            set_score=set_score,
         )
 
     def _scores_around(self, locations: Float, axes: Float, progress: bool) -> Float:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import closing
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,7 @@ from wheretolook.dataset.folders import Dataset, SceneFolder
 from wheretolook.dataset.scene import Scene
 from wheretolook.dataset.stamps import stage_key
 from wheretolook.planning.config import FORWARD, PathsConfig
+from wheretolook.stages import joint_paths
 from wheretolook.stages.inputs import Say, Tick, dataset_after, extractor_of, open_scene
 from wheretolook.stages.one_at_a_time import reading
 from wheretolook.utils.errors import ConfigError, SceneError
@@ -34,25 +36,29 @@ FOLDER = "paths"
 def compare_paths(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> pd.DataFrame:
     """Paths planned by several methods, rendered and localized: `<dataset>/results/paths.{csv,md,png}`, MLflow runs.
 
-    Needs the map stage only. What was planned and localized before is used again. Returns what
+    Needs the map stage only. What was planned and localized before is used again. With `paths.stops` and
+    `paths.last_views` views are also localized together (`stages/joint_paths.py`). Returns what
     `wheretolook.planning.path_report.summarize_paths` makes of it.
 
     Raises:
-        ConfigError: no such scene or method, or no weights. WeightsError: the weights cannot be used.
+        ConfigError: no such scene or method, no weights, or no method that can stop where stops are asked for.
+        WeightsError: the weights cannot be used.
         SceneError: a scene has no mesh, or too little room for starts and goals.
         TrackingError: the tracking store cannot be used.
     """
-    from wheretolook.planning.scene_map import check_methods
+    from wheretolook.planning.scene_map import check_methods, weights_for
 
     with reading(experiment.root, "compare-paths", FOLDER):
         dataset, config = dataset_after(experiment, "map"), experiment.paths
         check_methods(config.methods)
+        joint_paths.check_joint(config)
         check_store(experiment.tracking)
         scenes = [open_scene(experiment, dataset, files) for files in _chosen(dataset, config)]
-        planned = {scene.name: _plan(scene, dataset, config, say) for scene in scenes}
-        labelled = _localize(scenes, planned, dataset, experiment)
-        paths = pd.concat([found.paths.assign(scene=name) for name, found in planned.items()], ignore_index=True)
-        views = pd.concat([table.assign(scene=name) for name, table in labelled.items()], ignore_index=True)
+        weights = {method: weights_for(method, dataset, config.weights, say) for method in config.methods}
+        planned = {scene.name: _plan(scene, dataset, config, weights, say) for scene in scenes}
+        found = _localize(scenes, planned, dataset, weights, experiment)
+        paths = pd.concat([one.paths.assign(scene=name) for name, one in found.items()], ignore_index=True)
+        views = pd.concat([one.views.assign(scene=name) for name, one in found.items()], ignore_index=True)
         summary = _report(paths, views, dataset, config, experiment.tracking, say)
     tick(1)
     return summary
@@ -68,13 +74,14 @@ def _chosen(dataset: Dataset, config: PathsConfig) -> list[SceneFolder]:
     return scenes
 
 
-def _plan(scene: Scene, dataset: Dataset, config: PathsConfig, say: Say) -> ComparedPaths:
+def _plan(
+    scene: Scene, dataset: Dataset, config: PathsConfig, weights: Mapping[str, Path | None], say: Say
+) -> ComparedPaths:
     """The paths of a scene: those that are there if they were planned with the same settings."""
     from wheretolook.planning.path_comparison import ComparedPaths, draw_pairs, plan_pairs
-    from wheretolook.planning.scene_map import planner_map, planner_scorer, weights_for
+    from wheretolook.planning.scene_map import planner_map, planner_scorer
 
     files, folder = scene.files, _folder(dataset, scene)
-    weights = {method: weights_for(method, dataset, config.weights, say) for method in config.methods}
     settings = {name: value for name, value in asdict(config).items() if name not in _OF_THE_REPORT}
     looked_at = [asdict(scene.config.free_space), asdict(scene.config.occlusion), scene.camera.record()]
     poses = files.mapping_cameras if files.mapping_cameras.is_file() else None
@@ -82,7 +89,7 @@ def _plan(scene: Scene, dataset: Dataset, config: PathsConfig, say: Say) -> Comp
     used = [path and fingerprint(path) for path in weights.values()]
     key = stage_key("paths 2", [settings, *looked_at, *made_from, used])
     tables = {name: folder / f"{name}.parquet" for name in ("paths", "views")}
-    made = folder / "made.json"
+    made = folder / MADE
     if all(path.is_file() for path in tables.values()) and _holds(made, key):
         say(f"{scene.name}: reusing {folder}")
         return ComparedPaths(**{name: pd.read_parquet(path) for name, path in tables.items()})
@@ -99,35 +106,75 @@ def _plan(scene: Scene, dataset: Dataset, config: PathsConfig, say: Say) -> Comp
     return found
 
 
-_OF_THE_REPORT = ("scenes", "max_error_m", "max_error_deg", "resamples", "weights")
+MADE = "made.json"
+"""File beside a scene's paths with the key of what they were made from."""
+
+_OF_THE_REPORT = (
+    "scenes", "max_error_m", "max_error_deg", "resamples", "weights",
+    "stops", "last_views", "odometry_m_per_m", "odometry_deg_per_deg",
+)  # fmt: skip
 """Settings that decide nothing about the paths of a scene."""
 
 
 def _localize(
-    scenes: list[Scene], planned: dict[str, ComparedPaths], dataset: Dataset, experiment: Experiment
-) -> dict[str, pd.DataFrame]:
-    """The views of each scene with what came of localizing them."""
+    scenes: list[Scene],
+    planned: dict[str, ComparedPaths],
+    dataset: Dataset,
+    weights: Mapping[str, Path | None],
+    experiment: Experiment,
+) -> dict[str, ComparedPaths]:
+    """The paths and views of each scene, with what came of localizing the views: each alone, and together if asked."""
     from wheretolook.labelling.labeller import MANIFEST, LabelTask, label_scenes
     from wheretolook.labelling.shard import SceneJob
+    from wheretolook.planning.path_comparison import ComparedPaths
 
-    config, tasks = experiment.label, []
+    config, paths, tasks = experiment.label, experiment.paths, []
+    joint, further = joint_paths.is_joint(paths), {}
     for scene in scenes:
-        files, extractor = scene.files, extractor_of(scene.files)
+        name, files, extractor, folder = scene.name, scene.files, extractor_of(scene.files), _folder(dataset, scene)
+        shards = folder / "shards"
         job = SceneJob(files.mesh, files.landmarks, scene.camera, config.localizer, extractor, scene.device)
-        shards = _folder(dataset, scene) / "shards"
-        tasks.append(LabelTask(scene.name, job, _as_table(planned[scene.name].views), shards))
-    labelled: dict[str, pd.DataFrame] = {}
+        job = replace(job, store_pixels=joint or _holds_pixels(shards / MANIFEST))
+        tasks.append(LabelTask(name, job, _as_table(planned[name].views), shards))
+        if joint:
+            about = (planned[name], str(read_json(folder / MADE)), weights)
+            further[name] = joint_paths.choose_further(scene, dataset, *about, paths, folder)
+            if len(further[name]):
+                tasks.append(LabelTask(name, job, _as_table(further[name]), folder / "stop-shards"))
+    labelled: dict[Path, pd.DataFrame] = {}
     with closing(label_scenes(tasks, config, description="localize")) as results:
         for result in results:
-            name = result.task.name
-            outcome = result.table[["status", "error_m", "error_deg", "n_inliers"]].reset_index(drop=True)
-            labelled[name] = pd.concat([planned[name].views, outcome], axis=1)
+            table = result.table.reset_index(drop=True)
+            labelled[result.task.shards] = table if joint else table[joint_paths.OUTCOME]
+    shards_of: dict[Path, dict[str, Any]] = {}
     for task in tasks:  # views of paths that were planned with other settings
-        current = read_json_object(task.shards / MANIFEST)["shards"]
+        current = shards_of[task.shards] = read_json_object(task.shards / MANIFEST)["shards"]
         for path in task.shards.glob("*.parquet"):
             if path.name not in current:
                 path.unlink()
-    return labelled
+    found = {}
+    for scene in scenes:
+        name, folder, own = scene.name, _folder(dataset, scene), planned[scene.name]
+        labels, looks = labelled[folder / "shards"], labelled.get(folder / "stop-shards", pd.DataFrame())
+        views = pd.concat([own.views, labels[joint_paths.OUTCOME]], axis=1)
+        found[name] = ComparedPaths(own.paths, views)
+        if joint:
+            made_from = [sorted(shards_of.get(folder / part, {})) for part in ("shards", "stop-shards")]
+            more = joint_paths.localize_together(
+                found[name], further[name], labels, looks, scene, paths, config.localizer, folder, made_from
+            )
+            single = own.paths.assign(n_looks=own.paths["n_views"])
+            both = pd.concat([single, more.paths], ignore_index=True), pd.concat([views, more.views], ignore_index=True)
+            found[name] = ComparedPaths(*both)
+    return found
+
+
+def _holds_pixels(manifest: Path) -> bool:
+    """Whether views were localized before with what a joint pose needs: then they are used again, which it includes."""
+    try:
+        return bool(read_json_object(manifest).get("store_pixels"))
+    except (OSError, ValueError):
+        return False
 
 
 def _holds(path: Path, key: str) -> bool:
@@ -154,6 +201,11 @@ def _report(
     save_figure(paths_figure(summary), folder / report.PATHS_PNG)
     params = {"dataset": dataset.name, "pairs": config.pairs, "seed": config.seed, "time_s": config.planner.time_s}
     params |= {"score_weight": config.planner.score_weight, "max_turn_deg": config.max_turn_deg}
+    if config.stops.looks > 1:
+        params |= {f"stops.{name}": value for name, value in asdict(config.stops).items()}
+    if config.last_views > 1:
+        params |= {"last_views": config.last_views}
+        params |= {f"odometry_{unit}": getattr(config, f"odometry_{unit}") for unit in ("m_per_m", "deg_per_deg")}
     with kept_if_not_logged(f"the comparison in {folder}"):
         report.log_paths(params, summary, folder, tracking)
     say(markdown)

@@ -58,7 +58,8 @@ def plan(experiment: Experiment, say: Say = print, tick: Tick = lambda work: Non
     folder = (config.out or files.folder / "path").resolve()  # so that "." has a name too
     with hold(folder.with_name(f".{folder.name}.lock"), "plan", wait_s=WAIT_S):
         written = _draw(views, scene.landmarks.points, f"{scene.name}, {method}", folder, config.film)
-        write_text(folder / "path.csv", _table(path).to_csv(index=False, lineterminator="\n"))
+        table = _table(path, stopping=config.stops.looks > 1)
+        write_text(folder / "path.csv", table.to_csv(index=False, lineterminator="\n"))
         if rerun is not None:
             _record(rerun, views[method], scene.landmarks.points, scene.camera, folder / "path.rrd")
             written.append("path.rrd")
@@ -67,6 +68,8 @@ def plan(experiment: Experiment, say: Say = print, tick: Tick = lambda work: Non
             _log(experiment, dataset, scene.name, list(paths), path, [folder / name for name in written])
     score = "" if np.isnan(path.scores).any() else f", mean score {score_text(float(np.mean(path.scores)))}"
     found = f"{path.length_m:.2f} m, {path.turn_deg:.0f} degrees of turning, {len(path.positions)} views{score}"
+    if config.stops.looks > 1:
+        found += _stops_told(path)
     say(f"{scene.name}: {found} -> {folder}: {', '.join(written)}")
     tick(1)
     return path
@@ -101,6 +104,9 @@ def _log(
     params |= {"methods": " ".join(methods), "start": config.start, "goal": config.goal}
     params["score_weight"] = config.planner.score_weight
     metrics = {"length_m": path.length_m, "turn_deg": path.turn_deg, "score": float(path.scores.mean())}
+    if config.stops.looks > 1:
+        params |= {"stops.looks": config.stops.looks, "stops.least_score": config.stops.least_score}
+        metrics |= {"stops": len(path.stops), "score_with_stops": float(path.scores_with_stops.mean())}
     tags = {"dataset": dataset.name}
     with start_run(experiment.tracking, joined(scene, methods[-1]), "plan", params, tags=tags) as (client, run):
         log(client, run, metrics=metrics)
@@ -108,12 +114,38 @@ def _log(
             client.log_artifact(run, str(file))
 
 
-def _table(path: PlannedPath) -> pd.DataFrame:
-    """A row a view: position, axis, the pose's own score (empty if the method scores nothing), pose cam_from_world."""
-    positions = dict(zip(("x_m", "y_m", "z_m"), path.positions.T, strict=True))
-    axes = dict(zip(("axis_x", "axis_y", "axis_z"), path.axes.T, strict=True))
-    poses = pose_columns(poses_looking_along(path.positions, path.axes))
-    return pd.DataFrame({**positions, **axes, "score": path.scores, **poses})
+def _table(path: PlannedPath, stopping: bool) -> pd.DataFrame:
+    """A row a view: position, axis, the pose's own score (empty if the method scores nothing), pose cam_from_world.
+
+    Where stops were asked for, further looks are rows of the same place; `look` counts from 1, the path's own view, and
+    `together` is the score of all looks of the stop (empty elsewhere).
+    """
+    places, looks = path.looks
+    at, along = path.positions[places], path.all_axes
+    positions = dict(zip(("x_m", "y_m", "z_m"), at.T, strict=True))
+    axes = dict(zip(("axis_x", "axis_y", "axis_z"), along.T, strict=True))
+    poses = pose_columns(poses_looking_along(at, along))
+    table = pd.DataFrame({**positions, **axes, "score": path.all_scores, **poses})
+    if not stopping:
+        return table
+    together = np.full(len(path.positions), np.nan)
+    for stop in path.stops:
+        together[stop.place] = stop.together
+    return table.assign(look=looks, together=together[places])
+
+
+def _stops_told(path: PlannedPath) -> str:
+    """Where the path stops, in words."""
+    from wheretolook.figures.path_film import score_text
+    from wheretolook.planning.sequences import lengths_along
+
+    if not path.stops:
+        return ", no stops"
+    along = lengths_along(path.positions)[[stop.place for stop in path.stops]]
+    where = ", ".join(f"{at:.2f}" for at in along)
+    stops = f"{len(path.stops)} stop{'s' if len(path.stops) > 1 else ''} at {where} m"
+    looks = path.n_looks - len(path.positions)
+    return f", {stops} with {looks} further looks: mean score {score_text(float(path.scores_with_stops.mean()))}"
 
 
 def _rerun():  # type: ignore[no-untyped-def]  # the package is no dependency

@@ -1,0 +1,122 @@
+"""Stops: where one look will not do, the fewest further looks that reach what is asked, or that gain what they cost."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from planning.rooms import CAMERA, occlusion, room_landmarks
+from wheretolook.geometry.lattices import direction_lattice
+from wheretolook.geometry.poses import poses_looking_along
+from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.methods.base import Scorer
+from wheretolook.methods.registry import make_scorer
+from wheretolook.planning.config import PathConfig, PathsConfig, StopConfig
+from wheretolook.planning.method_paths import path_views
+from wheretolook.planning.route_views import PlannedPath
+from wheretolook.planning.sequences import TurnLimit, best_sequence
+from wheretolook.planning.stops import stops_along, within_pitch
+from wheretolook.utils.errors import ConfigError
+
+WEIGHTS = Path(__file__).parents[2] / "data" / "release" / "weights" / "set.safetensors"
+PLANNER = PathConfig(pitch_deg=(-30, 30))
+DIRECTIONS = within_pitch(direction_lattice(200), PLANNER)
+POSITIONS = np.linspace((0.8, 0.8, 1.4), (3.2, 0.8, 1.4), 5)
+
+
+@pytest.fixture(scope="module")
+def scorer() -> Scorer:
+    return make_scorer("set", LocalizationMap(room_landmarks(300), CAMERA, occlusion()), weights=WEIGHTS)
+
+
+@pytest.fixture(scope="module")
+def path(scorer: Scorer) -> PlannedPath:
+    """Level views along a given path, the worst at its end, which looks at a corner without landmarks."""
+    level = DIRECTIONS[np.abs(DIRECTIONS[:, 2]) < 0.3]
+    chosen = best_sequence(-scorer.score_around(POSITIONS, level), TurnLimit.of(level, 40.0))
+    axes = level[chosen.direction_ids]
+    return PlannedPath(POSITIONS, axes, scorer.score(poses_looking_along(POSITIONS, axes)), np.nan)
+
+
+def test_a_place_that_scores_too_little_becomes_a_stop(scorer: Scorer, path: PlannedPath) -> None:
+    asked = float(np.median(path.scores))
+    config = StopConfig(3, asked)
+    stops = stops_along(scorer, path.positions, path.axes, DIRECTIONS, config, PLANNER)
+    low = np.flatnonzero(path.scores < asked)
+    assert len(stops) > 0 and {stop.place for stop in stops} <= {*low}
+    for stop in stops:
+        assert 1 <= len(stop.axes) <= 2 and stop.together > path.scores[stop.place]
+        own = path.axes[stop.place]
+        np.testing.assert_allclose(np.linalg.norm(stop.axes, axis=1), 1)
+        assert (np.abs(stop.axes[:, 2]) <= np.sin(np.radians(30))).all() and (stop.axes @ own < np.cos(0.26)).all()
+        tour = np.array([own, *stop.axes, own])
+        angles = np.degrees(np.arccos((tour[1:] * tour[:-1]).sum(1).clip(-1, 1)))
+        assert stop.turn_deg == pytest.approx(angles.sum())
+        if len(stop.axes) == 2:  # one more look would not have done
+            two = stops_along(scorer, path.positions, path.axes, DIRECTIONS, StopConfig(2, asked), PLANNER)
+            assert all(other.together < asked for other in two if other.place == stop.place)
+
+
+def test_where_what_is_asked_is_out_of_reach_a_stop_must_gain_more_than_it_costs(
+    scorer: Scorer, path: PlannedPath
+) -> None:
+    config = StopConfig(2, 1.0)  # nothing is certain
+    free = replace(PLANNER, turn_weight_m=0.0)
+    stops = stops_along(scorer, path.positions, path.axes, DIRECTIONS, config, free)
+    assert len(stops) == len(path.positions)
+    dear = replace(PLANNER, turn_weight_m=100.0)
+    assert stops_along(scorer, path.positions, path.axes, DIRECTIONS, config, dear) == ()
+    priced = replace(PLANNER, turn_weight_m=0.02)
+    for stop in stops_along(scorer, path.positions, path.axes, DIRECTIONS, config, priced):
+        metres = 0.6 if 0 < stop.place < 4 else 0.3
+        gain = priced.score_weight * metres * (stop.together - path.scores[stop.place])
+        assert gain > priced.turn_weight_m * np.radians(stop.turn_deg)
+
+
+def test_stops_are_off_unless_asked_for(scorer: Scorer, path: PlannedPath) -> None:
+    assert stops_along(scorer, path.positions, path.axes, DIRECTIONS, StopConfig(), PLANNER) == ()
+    assert stops_along(scorer, path.positions, path.axes, DIRECTIONS, StopConfig(3, 1e-6), PLANNER) == ()
+
+
+def test_the_looks_of_a_path_are_in_the_order_they_are_taken(scorer: Scorer, path: PlannedPath) -> None:
+    plain = replace(path, stops=())
+    np.testing.assert_array_equal(plain.all_axes, path.axes)
+    stops = stops_along(
+        scorer, path.positions, path.axes, DIRECTIONS, StopConfig(3, 0.999), replace(PLANNER, turn_weight_m=0.0)
+    )
+    some = replace(path, stops=(stops[1], stops[3]))
+    places, looks = some.looks
+    first, second = len(stops[1].axes), len(stops[3].axes)
+    assert places.tolist() == [0, 1, *[1] * first, 2, 3, *[3] * second, 4]
+    assert looks.tolist() == [1, 1, *range(2, 2 + first), 1, 1, *range(2, 2 + second), 1]
+    np.testing.assert_array_equal(some.all_axes[looks == 1], path.axes)
+    np.testing.assert_array_equal(some.all_axes[2 : 2 + first], stops[1].axes)
+    np.testing.assert_allclose(
+        some.all_scores, scorer.score(poses_looking_along(path.positions[places], some.all_axes)), atol=0.05
+    )
+    assert some.turn_deg == pytest.approx(plain.turn_deg + stops[1].turn_deg + stops[3].turn_deg)
+    assert some.n_looks == 5 + first + second and some.scores_with_stops[3] == stops[3].together
+    views = path_views(some, scorer.localization_map)
+    assert [view.look for view in views] == looks.tolist()
+    assert [view.n_looks for view in views if view.look == 1] == [1, 1 + first, 1, 1 + second, 1]
+    assert [np.isfinite(view.together) for view in views] == [view.n_looks > 1 for view in views]
+
+
+def test_bad_input_is_refused(scorer: Scorer, path: PlannedPath) -> None:
+    for config, text in (
+        ((0, 0.7), "looks"),
+        ((7, 0.7), "looks"),
+        ((2, 0.0), "least_score"),
+        ((2, float("nan")), "least"),
+    ):
+        with pytest.raises(ConfigError, match=text):
+            StopConfig(*config)
+    for options in ({"last_views": 0}, {"odometry_m_per_m": -0.1}, {"odometry_deg_per_deg": float("nan")}):
+        with pytest.raises(ConfigError, match=next(iter(options))):
+            PathsConfig(**options)
+    rule = make_scorer("visible", scorer.localization_map)
+    with pytest.raises(ConfigError, match=r"probabilities.*visible"):
+        stops_along(rule, path.positions, path.axes, DIRECTIONS, StopConfig(2), PLANNER)

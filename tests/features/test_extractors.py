@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from wheretolook.features.config import ExtractorConfig
+from wheretolook.features.descriptors import quantize_descriptors, unit_descriptors
 from wheretolook.features.extraction import KeypointExtractor
-from wheretolook.features.keypoints import ExtractorConfig, quantize_descriptors, unit_descriptors
 from wheretolook.features.registry import all_extractors, all_kinds, kind_of, that_extract
 from wheretolook.features.similarity import SimilarityMatcher, mutual_plain
 from wheretolook.labelling.config import LocalizerConfig

@@ -10,8 +10,9 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
+from wheretolook.features.config import ExtractorConfig
 from wheretolook.features.extractor import Extraction
-from wheretolook.features.keypoints import ExtractorConfig, Keypoints
+from wheretolook.features.keypoints import Keypoints
 from wheretolook.features.registry import all_extractors
 from wheretolook.utils.processes import Processes
 

@@ -4,15 +4,42 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wheretolook.features.descriptors import DescriptorKind
+from wheretolook.features.keypoints import Keypoints
 
-if TYPE_CHECKING:
-    from wheretolook.features.keypoints import ExtractorConfig, Keypoints
+
+class ExtractorSettings(Protocol):
+    """What an extractor is told, see `wheretolook.features.config.ExtractorConfig`, which knows all extractors."""
+
+    @property
+    def first_octave(self) -> int:
+        """-1 to double the image first."""
+        ...
+
+    @property
+    def max_keypoints(self) -> int:
+        """Largest number of keypoints for each image."""
+        ...
+
+    @property
+    def peak_threshold(self) -> float:
+        """Least contrast of SIFT's keypoints."""
+        ...
+
+    @property
+    def edge_threshold(self) -> float:
+        """Largest ratio of principal curvatures of SIFT's keypoints."""
+        ...
+
+    @property
+    def weights(self) -> str:
+        """File of a network; empty for kornia's copy."""
+        ...
 
 
 class Extraction(Protocol):
@@ -39,6 +66,6 @@ class Extractor:
     name: str  # in options: `map.extractor.method`
     about: str  # one sentence
     descriptors: DescriptorKind
-    build: Callable[[ExtractorConfig, str], Extraction] | None = None  # from settings and a device, "cpu" or CUDA
+    build: Callable[[ExtractorSettings, str], Extraction] | None = None  # from settings and a device, "cpu" or CUDA
     weights: str = ""  # the file of a network's weights, as their authors call it; "" for none
     lightglue: str = ""  # what kornia's LightGlue calls it; "" where there is none for it

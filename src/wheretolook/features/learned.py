@@ -13,7 +13,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from wheretolook.features.keypoints import ExtractorConfig, Keypoints
+from wheretolook.features.extractor import ExtractorSettings
+from wheretolook.features.keypoints import Keypoints
 from wheretolook.utils.errors import ConfigError, WeightsError
 
 INSTALL = "pip install 'wheretolook[learned]'"
@@ -31,7 +32,7 @@ class LearnedExtraction(ABC):
 
     dimension: int
 
-    def __init__(self, config: ExtractorConfig, device: str) -> None:
+    def __init__(self, config: ExtractorSettings, device: str) -> None:
         self.config, self.device = config, torch.device(device)
         self.in_batches = self.device.type != "cpu"
         self._network = self.make().eval().to(self.device)

@@ -14,7 +14,7 @@ Matches = tuple[NDArray[np.int64], NDArray[np.int64]]
 """Rows of keypoints and rows of their landmarks, (M,) each, in ascending order of the keypoints."""
 
 GROUP = 32  # landmarks; the two best groups are found first, and in them the two best landmarks
-_PRODUCT_BYTES = {"cpu": 2**24, "cuda": 2**30}  # of a block of products; products of few queries are slow
+_PRODUCT_BYTES = {"cpu": 2**24, "cuda": 2**27}  # of a block of products; products of few queries are slow
 
 
 class DescriptorMatcher:

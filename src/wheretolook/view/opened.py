@@ -66,7 +66,7 @@ class Opened:
         from wheretolook.methods.registry import scorers
         from wheretolook.select.weights import weights_of
 
-        best = weights_of("", self.weights)
+        best = weights_of("", self.weights, self.landmarks.features)
         first = [] if best is None else [method_of_weights(best)]
         return tuple(dict.fromkeys([*first, *(name for name in scorers() if self._can_score(name))]))
 
@@ -133,7 +133,8 @@ class Opened:
         method, occlusion = method or self.methods[0], occlusion or self.occlusions[0]
         key = (method, occlusion, directions)
         if key not in self._looks:
-            around, weights = self.map_of(occlusion), weights_of(method, self.weights)
+            around = self.map_of(occlusion)
+            weights = weights_of(method, self.weights, around.landmarks.features)
             is_first = method == self.methods[0] and weights is not None
             scorer = load_scorer(weights, around) if is_first else make_scorer(method, around, weights=weights)
             self._looks[key] = WhereToLook(scorer, direction_lattice(directions), self.space)

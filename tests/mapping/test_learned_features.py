@@ -145,6 +145,37 @@ def test_features_that_do_not_fit(tmp_path):
         Localizer(landmarks, PinholeCamera(), extractor=ExtractorConfig())
 
 
+def _replaced(group, name, **made):
+    del group[name]
+    group.create_dataset(name, **made)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "told"),
+    [
+        # a few bytes that say they are terabytes of zeros, as keypoints and as descriptors
+        (lambda g: _replaced(g, "keypoints", shape=(2**37, 2), dtype="f4", chunks=(2**16, 2)), "would unfold"),
+        (lambda g: _replaced(g, "descriptors", shape=(128, 2**37), dtype="f4", chunks=(128, 64)), "would unfold"),
+        (lambda g: _replaced(g, "keypoints", shape=(1, 2), maxshape=(None, None), dtype="f4", chunks=(2**14, 2**15)),
+         "would unfold"),
+        (lambda g: _replaced(g, "descriptors", data=g["descriptors"][()].T), "aliked have 128 numbers"),  # not transposed
+        (lambda g: _replaced(g, "descriptors", data=g["descriptors"][0]), "no finite numbers"),
+        (lambda g: _replaced(g, "keypoints", data=np.zeros(4)), "no finite numbers"),
+        (lambda g: g["keypoints"].write_direct(np.full(g["keypoints"].shape, np.nan)), "no finite numbers"),
+        (lambda g: g["descriptors"].write_direct(np.full(g["descriptors"].shape, np.nan, "f2")), "no finite numbers"),
+        (lambda g: _replaced(g, "descriptors", data=np.full(g["descriptors"].shape, b"x")), "cannot read"),
+    ],
+)  # fmt: skip
+def test_hdf5_that_was_made_to_hurt(tmp_path, spoil, told):
+    h5py = pytest.importorskip("h5py", reason="hloc's features need h5py: pip install 'wheretolook[hloc]'")
+    _, folder, keypoints, stored = case(tmp_path, all_kinds()["aliked"])
+    path = hdf5_of(tmp_path / "feats-aliked.h5", keypoints, stored)
+    with h5py.File(path, "a") as file:
+        spoil(file["1.png"])
+    with pytest.raises(MapError, match=rf"feats-aliked\.h5: .*{told}"):
+        load_colmap_landmarks(folder, path)
+
+
 def room(kind, n: int = 300) -> tuple[Landmarks, np.ndarray]:
     """Landmarks on a wall at y = 4 with descriptors of a kind, and a pose that sees them."""
     rng = np.random.default_rng(0)

@@ -45,7 +45,7 @@ class ExtractorSettings(Protocol):
 class Extraction(Protocol):
     """An extractor that is ready on its device."""
 
-    in_batches: bool  # whether it works on several images at once, as on a GPU
+    batch: int  # images of 640 x 480 that it works on at once, as on a GPU; 1 where each is alone
 
     def extract_batch(self, images: Sequence[NDArray[np.uint8]]) -> list[Keypoints]:
         """At most `max_keypoints` keypoints of each of the images (H, W, 3) uint8 of one size.

@@ -19,7 +19,7 @@ SIFT = DescriptorKind("sift", 128, "uint8", colmap_type=0)
 class OpenCvSift:
     """OpenCV's SIFT on one CPU core."""
 
-    in_batches = False
+    batch = 1
 
     def __init__(self, config: ExtractorSettings) -> None:
         import cv2
@@ -51,7 +51,7 @@ class OpenCvSift:
 class ColmapSift:
     """COLMAP's SIFT on one CPU core; on a GPU it is not repeatable."""
 
-    in_batches = False
+    batch = 1
 
     def __init__(self, config: ExtractorSettings) -> None:
         import pycolmap
@@ -82,7 +82,7 @@ class ColmapSift:
 class GpuSift:
     """OpenCV's SIFT by Warp kernels, on a CUDA device."""
 
-    in_batches = True
+    batch = 8
 
     def __init__(self, config: ExtractorSettings, device: str) -> None:
         from wheretolook.features.warp_sift import WarpSift

@@ -145,13 +145,13 @@ def test_views_of_a_large_camera_go_in_smaller_batches(room: MappedRoom) -> None
     assert sizes == [2, 1]
 
 
-@pytest.mark.parametrize(("device", "cameras", "expected"), [("cpu", 5, 30), ("cuda", 5, 80), ("cuda", 0, 30)])
+@pytest.mark.parametrize(("where", "cameras", "expected"), [("cpu", 5, 30), ("cuda", 5, 80), ("cuda", 0, 30)])
 def test_a_gpu_gets_many_views_of_each_camera_at_once(
-    room: MappedRoom, tmp_path: Path, device: str, cameras: int, expected: int
+    room: MappedRoom, tmp_path: Path, where: str, cameras: int, expected: int
 ) -> None:
     """Only views of one camera go together: of forty, shards of 64 views made batches of one or two."""
     numbered = tuple((number, CAMERA) for number in range(cameras))
-    task = LabelTask("room", replace(room.job, device=device, cameras=numbered), facing(POSTER, 200, 1.5), tmp_path)
+    task = LabelTask("room", replace(room.job, device=where, cameras=numbered), facing(POSTER, 200, 1.5), tmp_path)
     shards = _SceneInProgress.of(task, 30).shards
     assert [len(shard.rows) for shard in shards[:-1]] == [expected] * (len(shards) - 1)
     assert sum(len(shard.rows) for shard in shards) == 200

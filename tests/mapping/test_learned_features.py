@@ -158,7 +158,7 @@ def _replaced(group, name, **made):
         (lambda g: _replaced(g, "descriptors", shape=(128, 2**37), dtype="f4", chunks=(128, 64)), "would unfold"),
         (lambda g: _replaced(g, "keypoints", shape=(1, 2), maxshape=(None, None), dtype="f4", chunks=(2**14, 2**15)),
          "would unfold"),
-        (lambda g: _replaced(g, "descriptors", data=g["descriptors"][()].T), "aliked have 128 numbers"),  # not transposed
+        (lambda g: _replaced(g, "descriptors", data=g["descriptors"][()].T), "aliked have 128 numbers"),
         (lambda g: _replaced(g, "descriptors", data=g["descriptors"][0]), "no finite numbers"),
         (lambda g: _replaced(g, "keypoints", data=np.zeros(4)), "no finite numbers"),
         (lambda g: g["keypoints"].write_direct(np.full(g["keypoints"].shape, np.nan)), "no finite numbers"),

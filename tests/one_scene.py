@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from wheretolook.features.keypoints import ExtractorConfig
+from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.labelling.config import LabelConfig
 from wheretolook.labelling.labeller import LabelTask, label_scenes

@@ -24,8 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
+from wheretolook.features.config import ExtractorConfig
 from wheretolook.features.extraction import KeypointExtractor
-from wheretolook.features.keypoints import ExtractorConfig, Keypoints
+from wheretolook.features.keypoints import Keypoints
 
 METHODS = ("opencv", "colmap", "warp")
 

@@ -25,8 +25,8 @@ import pandas as pd
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
+from wheretolook.features.config import ExtractorConfig
 from wheretolook.features.extraction import KeypointExtractor
-from wheretolook.features.keypoints import ExtractorConfig
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.labelling.config import LabelConfig
 from wheretolook.labelling.labeller import LabelTask, label_scenes

@@ -25,8 +25,9 @@ from numpy.typing import NDArray
 from sklearn.metrics import roc_auc_score
 from tqdm.auto import tqdm
 
+from wheretolook.features.config import ExtractorConfig
 from wheretolook.features.extraction import KeypointExtractor
-from wheretolook.features.keypoints import ExtractorConfig, Keypoints
+from wheretolook.features.keypoints import Keypoints
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import pose_error, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from wheretolook.features.keypoints import quantize_descriptors, unit_descriptors
+from wheretolook.features.descriptors import quantize_descriptors, unit_descriptors
 from wheretolook.features.matching import DescriptorMatcher
 
 

@@ -2,6 +2,7 @@
 
     python tests/benchmarks/bench_photographs.py --images fox --work work/fox --out photographs.csv
     python tests/benchmarks/bench_photographs.py --poses kitchen --work work/kitchen --out photographs.csv
+    python tests/benchmarks/bench_photographs.py --poses kitchen --work work/aliked --extractor aliked=aliked-n16rot.pth
 
 Photographs are mapped as `wheretolook map --images` does, or from the poses beside them (7-Scenes layout:
 frame-*.color.*, .depth.png, .pose.txt with world_from_cam in metres). Such poses choose the pairs to match and the
@@ -40,6 +41,8 @@ from wheretolook.check.report import place_radius
 from wheretolook.check.scores import Scoring
 from wheretolook.check.source import PhotographedMap, open_map, says_metric
 from wheretolook.evaluation.adaptation import compare_log_odds, gain_markdown
+from wheretolook.features.config import ExtractorConfig
+from wheretolook.features.registry import kind_of
 from wheretolook.figures.style import save_figure
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import Float, camera_centers, invert_poses, pose_error
@@ -91,7 +94,9 @@ def triangulate(model: Any, database: Path) -> Any:
     return model
 
 
-def map_known_poses(folder: Path, work: Path, focal_px: float) -> None:
+def map_known_poses(
+    folder: Path, work: Path, focal_px: float, extractor: ExtractorConfig, workers: int, device: str
+) -> None:
     """Map photographs in the layout of 7-Scenes into `work/map`, in the frame of their poses."""
     colors = sorted(path for path in folder.glob("*.color.*") if path.suffix in SUFFIXES)
     for name in ("images", "photographs"):
@@ -105,8 +110,8 @@ def map_known_poses(folder: Path, work: Path, focal_px: float) -> None:
     depth_m = np.stack(
         [np.where(one < 65535, one * np.float32(1e-3), np.float32(0)) for one in map(shrink_depth, depth)]
     )
-    with Processes(1) as processes:
-        features = photograph_features(work / "images", work / "photographs", 0, MAP.extractor, processes)
+    with Processes(workers) as processes:
+        features = photograph_features(work / "images", work / "photographs", 0, extractor, processes, device)
         names, stored = features.names, features.stored
         pinhole = PinholeCamera(*features.sizes[0].tolist(), focal_px)
         pairs = choose_pairs(surface_overlap(pinhole, poses, depth_m), PARTNERS)
@@ -114,8 +119,8 @@ def map_known_poses(folder: Path, work: Path, focal_px: float) -> None:
         model = posed_model(camera, names, dict(enumerate(poses)), stored)
         database = work / "photographs" / "database.db"
         database.unlink(missing_ok=True)
-        fill_database(database, model, stored)
-        found = match_pairs(stored, pairs, work, processes)
+        fill_database(database, model, stored, features.kind)
+        found = match_pairs(stored, pairs, work, processes, kind=features.kind)
         with pycolmap.Database.open(str(database)) as db:
             for (i, j), matches in zip(pairs.tolist(), found, strict=True):
                 db.write_matches(i + 1, j + 1, matches)
@@ -193,6 +198,10 @@ def main() -> None:
     source.add_argument("--images", type=Path, help="folder of photographs, to be mapped from nothing else")
     source.add_argument("--poses", type=Path, help="folder of photographs, depth images and poses, as of 7-Scenes")
     parser.add_argument("--name", help="what the table calls the place (that of the folder)")
+    parser.add_argument(
+        "--extractor", default="opencv", metavar="NAME[=WEIGHTS]", help="that maps (default: %(default)s)"
+    )
+    parser.add_argument("--device", default="cpu", help="where it does (default: %(default)s)")
     parser.add_argument("--weights", type=Path, help="file or folder of weights (those that ship)")
     parser.add_argument("--also", nargs="+", default=["expected-inliers", "bins"], help="other methods to compare")
     parser.add_argument("--views", type=int, default=60, help="of a block, at most (default: %(default)s)")
@@ -202,25 +211,30 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="write the table to this CSV file")
     parser.add_argument("--work", type=Path, help="keep maps and blocks in this folder; default: a temporary one")
     args = parser.parse_args()
+    method, _, network = args.extractor.partition("=")
+    extractor = ExtractorConfig(method, weights=network)
     with tempfile.TemporaryDirectory() as name:
         work, start, metric = args.work or Path(name), time.perf_counter(), True
         if args.poses and not holds_model(work / "map"):
-            map_known_poses(args.poses, work, args.focal_px)
+            map_known_poses(args.poses, work, args.focal_px, extractor, args.workers, args.device)
         if args.images:
             if not holds_model(work / "map"):
                 photographs = PhotographsConfig(images=args.images, max_side_px=args.max_side_px)
-                map_photographs(MapConfig(photographs=photographs), work / "map", work / "photographs")
+                settings = MapConfig(photographs=photographs, extractor=extractor)
+                places = work / "map", work / "photographs"
+                map_photographs(settings, *places, workers=args.workers, device=args.device)
             metric = says_metric(work / "map")
         mapped, scene = time.perf_counter(), args.name or (args.poses or args.images).resolve().name
         opened = open_map(work / "map", work / "photographs" / "database.db", metric, scene)
         scoring = Scoring(weights=args.weights, also=tuple(args.also))
-        found = check_map(opened, work / "check" / "work", scoring, views=args.views, workers=args.workers)
+        how = {"views": args.views, "workers": args.workers, "device": args.device}
+        found = check_map(opened, work / "check" / "work", scoring, **how)
         found.save(work / "check")
         save_figure(check_figure(found), work / "check" / "check.png")
         print("\n".join(found.lines()))
         print(f"mapped in {mapped - start:.0f} s, checked in {time.perf_counter() - mapped:.0f} s\n")
         lines = rows_of(scene, found.numbers, found.method)
-        chosen = scoring.chosen
+        chosen = scoring.chosen_for(kind_of(method).name)
         if found.method == "set" and chosen is not None:
             lines += adapted_rows(scene, opened, work / "check" / "work", chosen, args.views)
     rows = pd.DataFrame(lines)

@@ -36,8 +36,10 @@ import pycolmap
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
+from wheretolook.features.config import ExtractorConfig
+from wheretolook.features.descriptors import quantize_descriptors
 from wheretolook.features.extraction import KeypointExtractor
-from wheretolook.features.keypoints import ExtractorConfig, Keypoints, quantize_descriptors
+from wheretolook.features.keypoints import Keypoints
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import Float, camera_centers, pose_error
 from wheretolook.labelling.localizer import Localizer

@@ -6,8 +6,9 @@ import numpy as np
 import pycolmap
 import pytest
 
+from wheretolook.features.config import ExtractorConfig
+from wheretolook.features.descriptors import quantize_descriptors, unit_descriptors
 from wheretolook.features.extraction import KeypointExtractor
-from wheretolook.features.keypoints import ExtractorConfig, quantize_descriptors, unit_descriptors
 from wheretolook.utils.errors import ConfigError
 
 METHODS = ("colmap", "opencv")

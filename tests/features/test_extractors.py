@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from wheretolook.features.config import ExtractorConfig
+from wheretolook.features.descriptors import quantize_descriptors, unit_descriptors
 from wheretolook.features.extraction import KeypointExtractor
-from wheretolook.features.keypoints import ExtractorConfig, quantize_descriptors, unit_descriptors
 from wheretolook.features.registry import all_extractors, all_kinds, kind_of, that_extract
 from wheretolook.features.similarity import SimilarityMatcher, mutual_plain
 from wheretolook.labelling.config import LocalizerConfig
@@ -146,6 +147,26 @@ def test_learned_extractors_give_unit_descriptors_within_the_image(method, tmp_p
         assert (found.pixels > 0).all() and (found.pixels < (140, 100)).all()
     with pytest.raises(ValueError, match="expected an"):
         extractor.extract(image()[..., 0])
+    for height, width in ((0, 5), (1, 1), (15, 200)):
+        nothing = extractor.extract(np.full((height, width, 3), 90, np.uint8))
+        assert nothing.descriptors.shape == (0, kind_of(method).dimension)
+    assert len(extractor.extract(image()[:16, :40])) <= 50
+    assert extractor.extract_batch([]) == []
+
+
+def test_images_that_go_together_hold_as_much_as_their_pixels(tmp_path):
+    extractor = KeypointExtractor(ExtractorConfig("xfeat", max_keypoints=50, weights=str(untrained("xfeat", tmp_path))))
+    alone = list(extractor.extract_many(image(seed) for seed in range(5)))
+    network = extractor._extraction
+    network.batch, extractor.on_gpu, sizes = 2, True, []  # as on a GPU
+    detect = network.detect
+    network.detect = lambda images: sizes.append(len(images)) or detect(images)
+    assert (extractor.batch_of(640, 480), extractor.batch_of(1280, 480), extractor.batch_of(9999, 9999)) == (2, 1, 1)
+    together = list(extractor.extract_many(image(seed) for seed in range(5)))
+    assert sizes == [5]  # of 140 x 100, forty would go together
+    for a, b in zip(alone, together, strict=True):
+        assert len(a) and np.abs(a.pixels - b.pixels).max() < 0.01
+        np.testing.assert_allclose(a.descriptors, b.descriptors, atol=1e-3)
 
 
 @pytest.mark.parametrize("method", LEARNED)

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from wheretolook.features import matching
-from wheretolook.features.keypoints import quantize_descriptors, unit_descriptors
+from wheretolook.features.descriptors import quantize_descriptors, unit_descriptors
 from wheretolook.features.matching import DescriptorMatcher, match, nearest_two_plain
 
 Descriptors = NDArray[np.uint8]

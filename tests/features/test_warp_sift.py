@@ -9,8 +9,9 @@ import warp as wp
 from scipy.ndimage import gaussian_filter
 from scipy.spatial import KDTree
 
+from wheretolook.features.config import ExtractorConfig
 from wheretolook.features.extraction import KeypointExtractor
-from wheretolook.features.keypoints import ExtractorConfig, Keypoints
+from wheretolook.features.keypoints import Keypoints
 from wheretolook.features.warp_sift import WarpSift
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import poses_looking_along

@@ -16,6 +16,7 @@ from wheretolook.features.keypoints import Keypoints
 from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import pose_error, transform
 from wheretolook.labelling.config import LabelConfig, LocalizerConfig
+from wheretolook.labelling.labeller import LabelTask, _SceneInProgress
 from wheretolook.labelling.localizer import Localizer
 from wheretolook.labelling.shard import label_rows
 from wheretolook.mapping.landmarks import Landmarks
@@ -142,6 +143,18 @@ def test_views_of_a_large_camera_go_in_smaller_batches(room: MappedRoom) -> None
     localizer = Localizer(Landmarks.load(room.landmarks), camera)
     label_rows(facing(POSTER, 3, distance_m=1.5), Noting(load_mesh(room.mesh)), localizer, camera)
     assert sizes == [2, 1]
+
+
+@pytest.mark.parametrize(("where", "cameras", "expected"), [("cpu", 5, 30), ("cuda", 5, 80), ("cuda", 0, 30)])
+def test_a_gpu_gets_many_views_of_each_camera_at_once(
+    room: MappedRoom, tmp_path: Path, where: str, cameras: int, expected: int
+) -> None:
+    """Only views of one camera go together: of forty, shards of 64 views made batches of one or two."""
+    numbered = tuple((number, CAMERA) for number in range(cameras))
+    task = LabelTask("room", replace(room.job, device=where, cameras=numbered), facing(POSTER, 200, 1.5), tmp_path)
+    shards = _SceneInProgress.of(task, 30).shards
+    assert [len(shard.rows) for shard in shards[:-1]] == [expected] * (len(shards) - 1)
+    assert sum(len(shard.rows) for shard in shards) == 200
 
 
 def test_matches_with_one_landmark_determine_no_pose(room: MappedRoom) -> None:

@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 from labelling.rooms import CAMERA, PLAIN, POSTER, MappedRoom, facing, file_bytes, label, times
-from wheretolook.features.keypoints import ExtractorConfig
+from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.poses import transform
 from wheretolook.labelling.config import LocalizerConfig
 from wheretolook.labelling.labeller import LABELS, MANIFEST, versions

@@ -9,7 +9,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from wheretolook.features.keypoints import quantize_descriptors, unit_descriptors
+from wheretolook.features.descriptors import quantize_descriptors, unit_descriptors
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks, nearest_other_cosine
 from wheretolook.utils.errors import MapError, MapWarning

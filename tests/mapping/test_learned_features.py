@@ -12,8 +12,9 @@ import pytest
 
 from mapping.test_landmarks import hand_written_model
 from mapping.test_own_models import written
+from wheretolook.features.config import ExtractorConfig
 from wheretolook.features.descriptors import unit_descriptors
-from wheretolook.features.keypoints import ExtractorConfig, Keypoints
+from wheretolook.features.keypoints import Keypoints
 from wheretolook.features.registry import all_kinds
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import poses_looking_along, transform
@@ -24,8 +25,10 @@ from wheretolook.mapping.descriptors import read_features
 from wheretolook.mapping.landmarks import Landmarks, features_of, load_colmap_landmarks
 from wheretolook.mapping.triangulation import fill_database, match_pairs
 from wheretolook.methods.registry import load_scorer
+from wheretolook.select.weights import weights_of
 from wheretolook.utils.errors import MapError, MapWarning, OutOfRangeWarning
 from wheretolook.utils.processes import Processes
+from wheretolook.utils.shipped import shipped
 
 LEARNED = [kind for kind in all_kinds().values() if not kind.in_bytes]
 
@@ -142,6 +145,37 @@ def test_features_that_do_not_fit(tmp_path):
         Localizer(landmarks, PinholeCamera(), extractor=ExtractorConfig())
 
 
+def _replaced(group, name, **made):
+    del group[name]
+    group.create_dataset(name, **made)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "told"),
+    [
+        # a few bytes that say they are terabytes of zeros, as keypoints and as descriptors
+        (lambda g: _replaced(g, "keypoints", shape=(2**37, 2), dtype="f4", chunks=(2**16, 2)), "would unfold"),
+        (lambda g: _replaced(g, "descriptors", shape=(128, 2**37), dtype="f4", chunks=(128, 64)), "would unfold"),
+        (lambda g: _replaced(g, "keypoints", shape=(1, 2), maxshape=(None, None), dtype="f4", chunks=(2**14, 2**15)),
+         "would unfold"),
+        (lambda g: _replaced(g, "descriptors", data=g["descriptors"][()].T), "aliked have 128 numbers"),
+        (lambda g: _replaced(g, "descriptors", data=g["descriptors"][0]), "no finite numbers"),
+        (lambda g: _replaced(g, "keypoints", data=np.zeros(4)), "no finite numbers"),
+        (lambda g: g["keypoints"].write_direct(np.full(g["keypoints"].shape, np.nan)), "no finite numbers"),
+        (lambda g: g["descriptors"].write_direct(np.full(g["descriptors"].shape, np.nan, "f2")), "no finite numbers"),
+        (lambda g: _replaced(g, "descriptors", data=np.full(g["descriptors"].shape, b"x")), "cannot read"),
+    ],
+)  # fmt: skip
+def test_hdf5_that_was_made_to_hurt(tmp_path, spoil, told):
+    h5py = pytest.importorskip("h5py", reason="hloc's features need h5py: pip install 'wheretolook[hloc]'")
+    _, folder, keypoints, stored = case(tmp_path, all_kinds()["aliked"])
+    path = hdf5_of(tmp_path / "feats-aliked.h5", keypoints, stored)
+    with h5py.File(path, "a") as file:
+        spoil(file["1.png"])
+    with pytest.raises(MapError, match=rf"feats-aliked\.h5: .*{told}"):
+        load_colmap_landmarks(folder, path)
+
+
 def room(kind, n: int = 300) -> tuple[Landmarks, np.ndarray]:
     """Landmarks on a wall at y = 4 with descriptors of a kind, and a pose that sees them."""
     rng = np.random.default_rng(0)
@@ -182,15 +216,33 @@ def test_pairs_of_images_are_matched_by_similarity(tmp_path):
         np.testing.assert_array_equal(matches, np.column_stack([np.arange(40)] * 2))
 
 
-def test_one_warning_says_that_weights_have_learnt_from_other_features():
+def test_weights_that_have_learnt_by_the_features_of_the_map_score_it():
+    """Unless others are named: and then one warning says what that costs."""
     landmarks, pose = room(all_kinds()["aliked"])
-    with pytest.warns(OutOfRangeWarning, match=r"learnt from maps by sift, and this one is by aliked") as said:
-        scorer = load_scorer(LocalizationMap(landmarks, PinholeCamera()))
-    assert len(said) == 1
-    assert np.isfinite(scorer.score(pose[None])).all()
+    looked = LocalizationMap(landmarks, PinholeCamera())
     theirs = "data/release/weights/aliked/set.safetensors"
-    assert theirs in str(said[0].message)
     with warnings.catch_warnings():
         warnings.simplefilter("error", OutOfRangeWarning)
-        own = load_scorer(theirs, LocalizationMap(landmarks, PinholeCamera()))
-    assert own.name == "set" and np.isfinite(own.score(pose[None])).all()
+        own, by_folder = load_scorer(looked), load_scorer("data/release/weights", looked)
+        expected = load_scorer(theirs, looked).score(pose[None])
+    assert own.name == "set" and np.isfinite(expected).all()
+    np.testing.assert_array_equal(own.score(pose[None]), expected)
+    np.testing.assert_array_equal(by_folder.score(pose[None]), expected)
+    assert weights_of("", None, "aliked") == weights_of("set", None, "aliked") == shipped(theirs)
+    assert weights_of("", None, "sift") == weights_of("", None) == shipped("data/release/weights/set.safetensors")
+    assert weights_of("mlp-2d+z", None, "aliked") == shipped("data/release/weights/mlp-2d+z.safetensors")
+
+    with pytest.warns(OutOfRangeWarning, match=r"learnt from maps by sift, and this one is by aliked") as said:
+        other = load_scorer("data/release/weights/set.safetensors", looked)
+    assert len(said) == 1 and "data/release/weights/aliked: they are taken" in str(said[0].message)
+    assert (other.score(pose[None]) != expected).all()
+
+
+@pytest.mark.parametrize("name", ["xfeat", "disk", "superpoint"])
+def test_one_warning_says_that_weights_have_learnt_from_other_features(name):
+    landmarks, pose = room(all_kinds()[name])
+    with pytest.warns(OutOfRangeWarning, match=f"learnt from maps by sift, and this one is by {name}") as said:
+        scorer = load_scorer(LocalizationMap(landmarks, PinholeCamera()))
+    assert len(said) == 1 and said[0].filename == __file__
+    assert ("best views" if name != "superpoint" else "not known") in str(said[0].message)
+    assert np.isfinite(scorer.score(pose[None])).all()

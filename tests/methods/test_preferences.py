@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from wheretolook.features.keypoints import quantize_descriptors
+from wheretolook.features.descriptors import quantize_descriptors
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import Float, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap

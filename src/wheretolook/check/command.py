@@ -135,7 +135,7 @@ def _refuse(options: argparse.Namespace) -> None:
     from wheretolook.select.weights import check_there
 
     if options.extractor is not None or options.extractor_weights:
-        from wheretolook.features.keypoints import ExtractorConfig
+        from wheretolook.features.config import ExtractorConfig
 
         ExtractorConfig(options.extractor or "opencv", weights=options.extractor_weights)  # refuses what there is not
         if options.images is None:
@@ -167,7 +167,7 @@ def _open(
 ) -> tuple[PhotographedMap, OcclusionModel]:
     """The map, of a scene if one was named, and what hides its landmarks; results go to a folder."""
     from wheretolook.check import source
-    from wheretolook.features.keypoints import ExtractorConfig
+    from wheretolook.features.config import ExtractorConfig
     from wheretolook.mapping.beside import features_beside, photographs_of
     from wheretolook.mapping.config import ExistingModelConfig
     from wheretolook.select.surroundings import surroundings

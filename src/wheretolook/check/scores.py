@@ -49,12 +49,16 @@ class Scoring:
 
     @property
     def chosen(self) -> Path | None:
-        """The file of weights of the method that is checked."""
-        return weights_of(self.method, self.weights)
+        """The file of weights of the method that is checked, on a map by SIFT."""
+        return self.chosen_for("")
+
+    def chosen_for(self, features: str) -> Path | None:
+        """The file of weights of the method that is checked, on a map by some features."""
+        return weights_of(self.method, self.weights, features)
 
     def scorer(self, localization_map: LocalizationMap) -> Scorer:
         """The scorer that is checked."""
-        chosen = self.chosen
+        chosen = self.chosen_for(localization_map.landmarks.features)
         if self.method:
             return make_scorer(self.method, localization_map, weights=chosen, anywhere=self.anywhere)
         return load_scorer(str(chosen), localization_map, anywhere=self.anywhere)
@@ -126,7 +130,7 @@ def _score(around: LocalizationMap, poses: Float, scoring: Scoring) -> dict[str,
     found[VISIBLE] = told.n_visible
     for other in scoring.also:
         if other not in (VISIBLE, scorer.name):
-            beside = make_scorer(other, around, weights=weights_of(other, None))
+            beside = make_scorer(other, around, weights=weights_of(other, None, around.landmarks.features))
             found[other] = _quietly(beside.score, poses) * number_of(other, around)
     return found
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from wheretolook.dataset.folders import Dataset, SceneFolder
 from wheretolook.dataset.names import check_scene_name, no_such_scene
-from wheretolook.features.keypoints import ExtractorConfig
+from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.camera import Camera, cameras_by_id
 from wheretolook.geometry.poses import Float, camera_centers, transform
 from wheretolook.labelling.labeller import versions

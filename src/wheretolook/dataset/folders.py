@@ -224,6 +224,18 @@ class Dataset:
         return self.cameras[0]
 
     @property
+    def features(self) -> str:
+        """Name of the features that all its maps are by; "" if they differ, or there is no map.
+
+        Raises:
+            MapError: a file of landmarks is damaged.
+        """
+        from wheretolook.mapping.landmarks import features_of
+
+        found = {features_of(scene.landmarks) for scene in self.scenes if scene.landmarks.is_file()}
+        return found.pop() if len(found) == 1 else ""
+
+    @property
     def name(self) -> str:
         """Name of the dataset."""
         return self.root.name

@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from wheretolook.features.descriptors import DescriptorKind
-from wheretolook.features.extractor import Extraction, Extractor
-
-if TYPE_CHECKING:
-    from wheretolook.features.keypoints import ExtractorConfig
+from wheretolook.features.extractor import Extraction, Extractor, ExtractorSettings
 
 ALIKED = DescriptorKind("aliked", 128, "float16", min_similarity=0.8, colmap_type=1)
 
@@ -20,7 +15,7 @@ _URLS = (
 _LEAST_SCORE = 0.2  # of a keypoint, the authors' own
 
 
-def _build(config: ExtractorConfig, device: str) -> Extraction:
+def _build(config: ExtractorSettings, device: str) -> Extraction:
     from torch import Tensor, nn
 
     from wheretolook.features.learned import Found, LearnedExtraction, kornia_feature, load_state

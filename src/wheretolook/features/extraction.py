@@ -10,12 +10,11 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
+from wheretolook.features.config import ExtractorConfig
 from wheretolook.features.extractor import Extraction
-from wheretolook.features.keypoints import ExtractorConfig, Keypoints
+from wheretolook.features.keypoints import Keypoints
 from wheretolook.features.registry import all_extractors
 from wheretolook.utils.processes import Processes
-
-_GPU_BATCH = 8
 
 
 class KeypointExtractor:
@@ -29,7 +28,11 @@ class KeypointExtractor:
         build = all_extractors()[self.config.method].build
         assert build is not None  # the settings refuse what does not extract
         self._extraction: Extraction = build(self.config, device)
-        self.on_gpu = self._extraction.in_batches
+        self.on_gpu = self._extraction.batch > 1
+
+    def batch_of(self, width: int, height: int) -> int:
+        """How many images of a size it works on at once: of larger ones fewer, for a GPU holds what is made of each."""
+        return max(1, self._extraction.batch * 640 * 480 // (width * height))
 
     def extract(self, rgb: NDArray[np.uint8]) -> Keypoints:
         """At most `max_keypoints` keypoints of an image (H, W, 3) uint8, in an order that depends on the image alone.
@@ -52,8 +55,9 @@ class KeypointExtractor:
         """
         if self.on_gpu:
             source = iter(images)
-            while batch := list(islice(source, _GPU_BATCH)):
-                yield from self.extract_batch(batch)
+            for first in source:
+                more = self.batch_of(first.shape[1], first.shape[0]) - 1
+                yield from self.extract_batch([first, *islice(source, more)])
             return
         with nullcontext(workers) if isinstance(workers, Processes) else Processes(workers) as processes:
             if processes.workers <= 1:

@@ -1,70 +1,11 @@
-"""Settings of the keypoint extractor, and its result: keypoints with their descriptors."""
+"""What an extractor finds in an image: keypoints with their descriptors."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-
-from wheretolook.features.descriptors import quantize_descriptors, unit_descriptors
-from wheretolook.features.registry import all_extractors, that_extract
-from wheretolook.utils.errors import ConfigError
-from wheretolook.utils.files import sha256
-
-__all__ = ["ExtractorConfig", "Keypoints", "quantize_descriptors", "unit_descriptors"]
-
-
-@dataclass(frozen=True)
-class ExtractorConfig:
-    """Settings of the keypoint extractor.
-
-    Args:
-        method: what finds keypoints: SIFT by opencv or colmap, or one of the learned aliked, disk and xfeat, which need
-            `pip install 'wheretolook[learned]'`. `opencv` finds nearly the same keypoints as `colmap`, COLMAP's own
-            extraction on the CPU, in 40 % of the time; on a GPU, Warp kernels find OpenCV's up to rounding.
-        first_octave: of SIFT: -1 doubles the image first, which gives about three times as many (and smaller)
-            keypoints, for `colmap` at four times the cost; 0 starts at the image's own size. COLMAP's default is -1.
-        max_keypoints: largest number of keypoints for each image. `colmap` prefers large scales, `opencv` strong
-            contrast, learned ones high scores.
-        peak_threshold: of SIFT: least contrast (difference of Gaussians, grey values in [0, 1]). COLMAP's default is
-            0.02 / 3.
-        weights: file of a learned extractor's network as its authors give it (aliked-n16rot.pth, depth-save.pth of
-            DISK, xfeat.pt). Without one, kornia's copy: from its cache, or else downloaded, which is said.
-
-    Attributes:
-        edge_threshold: largest ratio of principal curvatures: the value of Lowe 2004 (section 4.1), COLMAP and OpenCV.
-    """
-
-    method: str = "opencv"
-    first_octave: int = -1
-    max_keypoints: int = 2048
-    peak_threshold: float = 0.02 / 3
-    weights: str = ""
-    edge_threshold: float = field(default=10.0, init=False)
-
-    def __post_init__(self) -> None:
-        if self.method not in that_extract():
-            fix = f"Choose one of {', '.join(that_extract())}."
-            raise ConfigError("unknown extractor method", value=self.method, fix=fix)
-        if self.weights and not all_extractors()[self.method].weights:
-            raise ConfigError("this extractor has no weights", value=self.weights, fix="Leave extractor.weights out.")
-        if self.first_octave not in (-1, 0):
-            raise ConfigError("first_octave must be -1 or 0", value=self.first_octave)
-        if self.max_keypoints < 1:
-            raise ConfigError("max_keypoints must be positive", value=self.max_keypoints)
-        if not self.peak_threshold > 0:
-            raise ConfigError("peak_threshold must be positive", value=self.peak_threshold)
-
-    def record(self) -> dict[str, Any]:
-        """What decides which keypoints come out, as JSON values: of weights what is in them, not where they lie."""
-        record = asdict(self)
-        path = record.pop("weights")
-        if path:
-            record["weights_sha256"] = sha256(Path(path)) if Path(path).is_file() else None
-        return record
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,9 @@ Matches = tuple[NDArray[np.int64], NDArray[np.int64]]
 """Rows of keypoints and rows of their landmarks, (M,) each, in ascending order of the keypoints."""
 
 GROUP = 32  # landmarks; the two best groups are found first, and in them the two best landmarks
-_PRODUCT_BYTES = {"cpu": 2**24, "cuda": 2**30}  # of a block of products; products of few queries are slow
+# of a block of products; products of few queries are slow. On a GPU each worker holds a block and what is made of it,
+# and blocks of 1 GiB are no faster
+_PRODUCT_BYTES = {"cpu": 2**24, "cuda": 2**27}
 
 
 class DescriptorMatcher:

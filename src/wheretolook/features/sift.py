@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wheretolook.features.descriptors import DescriptorKind, unit_descriptors
-from wheretolook.features.extractor import Extraction, Extractor
-from wheretolook.features.keypoints import ExtractorConfig, Keypoints
+from wheretolook.features.extractor import Extraction, Extractor, ExtractorSettings
+from wheretolook.features.keypoints import Keypoints
 from wheretolook.utils.colmap import quiet_colmap
 
 SIFT = DescriptorKind("sift", 128, "uint8", colmap_type=0)
@@ -19,9 +19,9 @@ SIFT = DescriptorKind("sift", 128, "uint8", colmap_type=0)
 class OpenCvSift:
     """OpenCV's SIFT on one CPU core."""
 
-    in_batches = False
+    batch = 1
 
-    def __init__(self, config: ExtractorConfig) -> None:
+    def __init__(self, config: ExtractorSettings) -> None:
         import cv2
 
         # OpenCV divides its contrast threshold by the number of layers. Without the precise upscale, keypoints are
@@ -51,9 +51,9 @@ class OpenCvSift:
 class ColmapSift:
     """COLMAP's SIFT on one CPU core; on a GPU it is not repeatable."""
 
-    in_batches = False
+    batch = 1
 
-    def __init__(self, config: ExtractorConfig) -> None:
+    def __init__(self, config: ExtractorSettings) -> None:
         import pycolmap
 
         self.config, options = config, pycolmap.FeatureExtractionOptions()
@@ -82,9 +82,9 @@ class ColmapSift:
 class GpuSift:
     """OpenCV's SIFT by Warp kernels, on a CUDA device."""
 
-    in_batches = True
+    batch = 8
 
-    def __init__(self, config: ExtractorConfig, device: str) -> None:
+    def __init__(self, config: ExtractorSettings, device: str) -> None:
         from wheretolook.features.warp_sift import WarpSift
 
         self._sift = WarpSift(config, device)
@@ -103,7 +103,7 @@ def grey_bitmap(rgb: NDArray[np.uint8]) -> Any:
     return pycolmap.Bitmap.from_array(np.ascontiguousarray(rgb)).clone_as_grey()
 
 
-def _opencv(config: ExtractorConfig, device: str) -> Extraction:
+def _opencv(config: ExtractorSettings, device: str) -> Extraction:
     return OpenCvSift(config) if device == "cpu" else GpuSift(config, device)
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from wheretolook.features.matching import Matches
 
-_PRODUCTS = {"cpu": 2**22, "cuda": 2**28}  # at a time: those of a CPU stay in its cache
+_PRODUCTS = {"cpu": 2**22, "cuda": 2**25}  # at a time: of a CPU they stay in its cache, on a GPU more are slower
 
 
 class SimilarityMatcher:

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from wheretolook.features import warp_sift_description_kernels as kernels
 from wheretolook.features import warp_sift_kernels as scale_kernels
-from wheretolook.features.keypoints import ExtractorConfig, Keypoints
+from wheretolook.features.extractor import ExtractorSettings
+from wheretolook.features.keypoints import Keypoints
 from wheretolook.features.warp_sift_kernels import BORDER, KEYS_OF_IMAGE, LAYERS, LEVELS, MAX_SIDE
 from wheretolook.utils.warp import start_warp
 
@@ -29,7 +30,7 @@ class WarpSift:
     "cpu" (one core and slow: for tests); ConfigError if there is none such.
     """
 
-    def __init__(self, config: ExtractorConfig, device: str = "cuda", block_bytes: int = 1 << 30) -> None:
+    def __init__(self, config: ExtractorSettings, device: str = "cuda", block_bytes: int = 1 << 30) -> None:
         self.config = config
         self.device = start_warp(device)
         self.block_bytes = block_bytes

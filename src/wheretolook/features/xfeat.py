@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from wheretolook.features.descriptors import DescriptorKind
-from wheretolook.features.extractor import Extraction, Extractor
-
-if TYPE_CHECKING:
-    from wheretolook.features.keypoints import ExtractorConfig
+from wheretolook.features.extractor import Extraction, Extractor, ExtractorSettings
 
 XFEAT = DescriptorKind("xfeat", 64, "float16", min_similarity=0.82)
 
@@ -16,7 +13,7 @@ _FILE = "xfeat.pt"
 _URLS = ("https://github.com/verlab/accelerated_features/raw/main/weights/xfeat.pt",)
 
 
-def _build(config: ExtractorConfig, device: str) -> Extraction:
+def _build(config: ExtractorSettings, device: str) -> Extraction:
     from torch import Tensor, nn
 
     from wheretolook.features.learned import Found, LearnedExtraction, kornia_feature, load_state

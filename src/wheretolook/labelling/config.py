@@ -86,7 +86,8 @@ class LabelConfig:
         ray_address: address of the Ray cluster; empty starts one on this machine. Such as "auto" on one of its
             machines, or "ray://head:10001" from elsewhere (which needs `pip install 'ray[client]'`).
         workers: worker processes on this machine; 0 for one on each CPU core that it may use.
-        shard_size: viewpoints in a shard. An interruption loses at most the shards that were being labelled.
+        shard_size: viewpoints in a shard; on a GPU at least 16 for each of several cameras. An interruption loses at
+            most the shards that were being labelled.
         store_matches: keep which landmarks each view matched; needed to learn matchability. Their rows are in
             the column matched_rows, those that agree with the view's pose in inlier_rows.
         store_pixels: keep also where in its image each view matched them, in the column matched_pixels; needed to

@@ -28,6 +28,9 @@ from wheretolook.viewpoints.table import CAMERA_ID, SCHEMA, read_table, write_ta
 MANIFEST = "manifest.json"
 """File in the folder of shards that says what the labels are made with; later `labels.json` beside the table."""
 
+VIEWS_OF_A_CAMERA = 16
+"""Least views of each of several cameras in a shard, as a mean, where a GPU labels it."""
+
 LABELS = ("status", "error_m", "error_deg", "n_inliers")
 """Columns of a table that labelling fills in."""
 
@@ -143,6 +146,8 @@ class _SceneInProgress:
         # a shard's file holds them all
         inputs = [name for name in (*SCHEMA.names, CAMERA_ID) if name not in LABELS and name in table]
         shards = []
+        if job.device != "cpu":  # a batch is of one camera, and a GPU wants large ones
+            shard_size = max(shard_size, VIEWS_OF_A_CAMERA * len(job.cameras))
         for begin in range(0, len(table), shard_size):
             rows = table.iloc[begin : begin + shard_size]
             content = pd.util.hash_pandas_object(rows[inputs], index=False).to_numpy()

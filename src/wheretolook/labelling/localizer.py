@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from wheretolook.features.config import ExtractorConfig
 from wheretolook.features.extraction import KeypointExtractor
-from wheretolook.features.keypoints import ExtractorConfig, Keypoints
+from wheretolook.features.keypoints import Keypoints
 from wheretolook.features.matching import DescriptorMatcher, Matches, match
 from wheretolook.features.registry import all_kinds, kind_of
 from wheretolook.features.similarity import SimilarityMatcher

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from wheretolook.features.keypoints import ExtractorConfig
+from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.camera import Camera, PinholeCamera
 from wheretolook.geometry.poses import Float, pose_error
 from wheretolook.labelling.config import LocalizerConfig
@@ -27,10 +27,10 @@ if TYPE_CHECKING:
     from wheretolook.rendering.types import Renderer
 
 BATCH = 8
-"""Number of viewpoints that are rendered, extracted and matched together."""
+"""Viewpoints of 640 x 480 that are rendered, extracted and matched together, unless the extractor wants more.
 
-BATCH_PIXELS = BATCH * 640 * 480
-"""Fewer of a larger camera: many workers share a GPU, and each holds its batches' images and scale spaces there."""
+Fewer of a larger camera: many workers share a GPU, and each holds its batches' images and scale spaces there.
+"""
 
 Tick = Callable[[int], None]
 
@@ -143,7 +143,8 @@ def label_rows(
     else:
         numbers = table[CAMERA_ID].to_numpy()
         groups = [(cameras[number], np.flatnonzero(numbers == number)) for number in np.unique(numbers).tolist()]
-    batches = [(camera, part) for camera, rows in groups for part in _batches(camera, rows)]
+    together = max(BATCH, localizer.extractor.batch_of(640, 480))
+    batches = [(camera, part) for camera, rows in groups for part in _batches(camera, rows, together)]
 
     def poses_of(batch: tuple[Camera, list[tuple[Keypoints, Matches]]]) -> list[Localization]:
         camera, matched = batch
@@ -181,7 +182,7 @@ def label_rows(
     return labelled.assign(**ragged)
 
 
-def _batches(camera: Camera, rows: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    """Rows of views of one camera that go together."""
-    size = min(BATCH, max(1, BATCH_PIXELS // (camera.width * camera.height)))
+def _batches(camera: Camera, rows: NDArray[np.int64], together: int) -> list[NDArray[np.int64]]:
+    """Rows of views of one camera that go together, so many of 640 x 480."""
+    size = min(together, max(1, together * 640 * 480 // (camera.width * camera.height)))
     return [rows[i : i + size] for i in range(0, len(rows), size)]

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from math import inf
 from pathlib import Path
 
-from wheretolook.features.keypoints import ExtractorConfig
+from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.camera import CameraConfig
 from wheretolook.utils.errors import ConfigError
 

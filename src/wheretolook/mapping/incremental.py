@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
+from wheretolook.features.config import ExtractorConfig
 from wheretolook.features.descriptors import DescriptorKind, Stored
 from wheretolook.features.extraction import KeypointExtractor
-from wheretolook.features.keypoints import ExtractorConfig
 from wheretolook.features.registry import kind_of
 from wheretolook.mapping import photographs
 from wheretolook.mapping.building import extract_with_colors

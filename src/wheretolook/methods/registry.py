@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable
 from functools import cache
 from importlib import import_module
@@ -11,8 +10,9 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, overload
 
+from wheretolook.methods.features_learnt import folder_for, warn_of_features
 from wheretolook.methods.method import Method, ScorerOptions
-from wheretolook.utils.errors import CameraError, ConfigError, OutOfRangeWarning, WeightsError
+from wheretolook.utils.errors import CameraError, ConfigError, WeightsError
 from wheretolook.utils.shipped import WEIGHTS, or_shipped, shipped
 
 if TYPE_CHECKING:
@@ -171,8 +171,9 @@ def load_scorer(
 ) -> Scorer:
     """The learned scorer of a map: `load_scorer(map).score(cam_from_world)`, or with `load_scorer(weights, map)`.
 
-    Without weights, or with None, the best of those that ship score. Else they are a file that the train stage wrote,
-    in which stands what method it is; or a folder of such files, of which `best_weights` takes one; what ships is found
+    Without weights, or with None, the best of those that ship score, for the features of the map. Else they are a file
+    that the train stage wrote, in which stands what method it is; or a folder of such files, of which `best_weights`
+    takes one; what ships is found
     under its name, such as `data/release/weights`, from any folder. With `anywhere`, weights that are adapted to one
     place score in another, too.
 
@@ -185,19 +186,25 @@ def load_scorer(
         fix = "Call load_scorer(localization_map), or load_scorer(weights, localization_map)."
         raise ConfigError("a scorer needs a map", fix=fix)
     path = shipped(WEIGHTS) if weights is None else or_shipped(weights)
-    path = best_weights(path) if path.is_dir() else path
+    path = best_weights(path, localization_map.landmarks.features) if path.is_dir() else path
     method = _of_weights("a scorer", [method for method in scorers().values() if method.name == method.weights], path)
     return _build(method, localization_map, ScorerOptions(weights=path, anywhere=anywhere))
 
 
-def best_weights(folder: str | Path) -> Path:
+def best_weights(folder: str | Path, features: str = "") -> Path:
     """The best weights of a folder that score views by themselves, see `wheretolook.learning.weights.preference`.
+
+    For a map by some features (`Landmarks.features`) they are those in `<folder>/<features>/` if there are any.
 
     Raises a WeightsError if there are none, or a record of training is missing or damaged.
     """
     from wheretolook.learning.weights import preference
 
-    paths = [path for path in sorted(Path(folder).glob("*.safetensors")) if not _scores_nothing(path.stem)]
+    paths = [
+        path
+        for path in sorted(folder_for(Path(folder), features).glob("*.safetensors"))
+        if not _scores_nothing(path.stem)
+    ]
     if not paths:
         raise WeightsError("there are no weights of a scorer", path=folder, fix="Run the train stage first.")
     return max(paths, key=preference)
@@ -237,19 +244,5 @@ def _build(method: Method, localization_map: LocalizationMap, options: ScorerOpt
         raise WeightsError(error.problem, path=options.weights, value=error.value, fix=error.fix) from None
     scorer.name = method.name
     if options.weights is not None:
-        _warn_of_features(localization_map.landmarks.features, options.weights)
+        warn_of_features(localization_map.landmarks.features, options.weights, stacklevel=3)
     return scorer
-
-
-def _warn_of_features(of_map: str, weights: Path) -> None:
-    """Warn if the landmarks of a map are of other features than weights have learnt from."""
-    from wheretolook.learning.weights import features_of_weights
-
-    learnt = features_of_weights(weights)
-    if of_map and of_map not in learnt:
-        text = f"the weights {weights.name} have learnt from maps by {', '.join(learnt)}, and this one is by {of_map}"
-        fix = "By ALIKED that cost 8 of 100 best views (docs/features.md); `wheretolook check` measures it on your map"
-        theirs = f"{WEIGHTS}/{of_map}/set.safetensors"
-        if or_shipped(theirs).is_file():
-            fix = f"Weights for it ship, {theirs}. {fix}"
-        warnings.warn(f"{text}. {fix}.", OutOfRangeWarning, stacklevel=4)

@@ -16,6 +16,7 @@ from wheretolook.geometry.lattices import ViewLattice
 from wheretolook.learning.provenance import was_trained_on
 from wheretolook.learning.weights import method_of_weights, preference, read_training, read_weights
 from wheretolook.methods.base import Scorer, same_field_of_view
+from wheretolook.methods.features_learnt import folder_for
 from wheretolook.methods.registry import fallback, find, load_scorer, make_scorer, members, methods_named, scorers
 from wheretolook.planning.map_building import build_viewpoint_map
 from wheretolook.planning.path_planning import Space
@@ -72,11 +73,13 @@ def weights_for(
 def default_weights(dataset: Dataset, say: Callable[[str], None] = print, kinds: Collection[str] = ()) -> Path | None:
     """The best weights of a dataset, or else of the release beside it, or else that ship, that serve its cameras.
 
-    They are of one of the methods named by `kinds`; empty for all that score views by themselves.
+    They are of one of the methods named by `kinds`; empty for all that score views by themselves. Of folders that hold
+    some for the features of the dataset's maps, these are taken.
     """
     kinds = kinds or {name for name, method in scorers().items() if method.weights == name}
     own = dataset.root / "weights"
-    for folder in (own, dataset.root.parent / RELEASE / "weights", shipped(WEIGHTS)):
+    others, features = (dataset.root.parent / RELEASE / "weights", shipped(WEIGHTS)), dataset.features
+    for folder in dict.fromkeys((own, *(folder_for(other, features) for other in others), *others)):
         fitting: dict[Path, tuple[bool, float]] = {}
         for path in sorted(folder.glob("*.safetensors")):
             try:

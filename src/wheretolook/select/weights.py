@@ -14,13 +14,17 @@ def check_there(given: str | Path | None) -> None:
         raise WeightsError("there are no weights", path=or_shipped(given), fix="Correct the path.")
 
 
-def weights_of(method: str, given: str | Path | None) -> Path | None:
+def weights_of(method: str, given: str | Path | None, features: str = "") -> Path | None:
     """The file of weights that a method scores with, of the file or folder given or of those that ship.
 
-    An empty method stands for that of the best weights; None for a method without any. Raises a ConfigError if there
-    is no such method, a WeightsError if there are no weights of it, or they cannot be read.
+    An empty method stands for that of the best weights; None for a method without any. Of a folder those are preferred
+    that have learnt by the features of the map (`wheretolook.methods.features_learnt.folder_for`).
+
+    Raises a ConfigError if there is no such method, a WeightsError if there are no weights of it, or they cannot be
+    read.
     """
     from wheretolook.learning.weights import method_of_weights
+    from wheretolook.methods.features_learnt import folder_for
     from wheretolook.methods.registry import best_weights, check_method, members, scorers
 
     kinds = {known.weights for known in members(method, scorers()) or ([check_method(method)] if method else [])}
@@ -32,9 +36,10 @@ def weights_of(method: str, given: str | Path | None) -> Path | None:
             raise WeightsError("there are no weights", path=place, fix="Correct the path.")
         return place
     if not method:
-        return best_weights(place)
-    fitting = [path for path in sorted(place.glob("*.safetensors")) if method_of_weights(path) in kinds]
-    if not fitting:
-        fix = "Give a file of weights (--weights), or another method."
-        raise WeightsError(f"there are no weights of {method} here", path=place, fix=fix)
-    return fitting[0]
+        return best_weights(place, features)
+    for folder in dict.fromkeys((folder_for(place, features), place)):
+        for path in sorted(folder.glob("*.safetensors")):
+            if method_of_weights(path) in kinds:
+                return path
+    fix = "Give a file of weights (--weights), or another method."
+    raise WeightsError(f"there are no weights of {method} here", path=place, fix=fix)

@@ -121,7 +121,7 @@ class WhereToLook:
             camera = parse_camera(camera)
         elif fov_deg is not None:
             camera = camera_of_view(fov_deg)
-        weights = weights_of(method, weights)
+        weights_of(method, weights)  # so that one that cannot be had is known before anything is read
         hides, space = surroundings(
             None if mesh is None else Path(mesh), None if depth is None else Path(depth), depth_scale, occlusion, model,
             device,
@@ -134,6 +134,7 @@ class WhereToLook:
         if hides.name != "none":
             hides = RememberedOcclusion(hides)
         around = LocalizationMap.from_colmap(model, camera, occlusion=hides, device=device, **options)
+        weights = weights_of(method, weights, around.landmarks.features)
         if method:
             scorer = make_scorer(method, around, weights=weights, anywhere=anywhere)
         else:

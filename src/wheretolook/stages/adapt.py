@@ -20,6 +20,7 @@ from wheretolook.dataset.scene import Scene
 from wheretolook.dataset.stamps import read_stamp
 from wheretolook.geometry.poses import Float
 from wheretolook.mapping.config import ExistingModelConfig
+from wheretolook.methods.features_learnt import folder_for
 from wheretolook.stages.inputs import Say, Tick, extractor_of, open_scene, refuse_release
 from wheretolook.stages.left_out import CHECKS, check_name, knows_photographs, leave_photographs_out
 from wheretolook.stages.one_at_a_time import reading
@@ -72,13 +73,15 @@ def adapt(experiment: Experiment, say: Say = print, tick: Tick = lambda work: No
         MapError: the map is not in metres, or lies on its side, or its photographs' features are not known.
     """
     config = experiment.adapt
-    weights = config.weights or shipped(WEIGHTS) / "set.safetensors"
+    weights = config.weights or _to_start_from("")
     if config.map is not None:
         return _adapt_map(experiment, config.map, weights, say, tick)
     refuse_release(experiment.root)
     with reading(experiment.root, "adapt", FOLDER):
         dataset = Dataset.load(experiment.root)
         files = _scene(dataset, config.scene)
+        if config.weights is None:
+            weights = _to_start_from(dataset.features)
         path = config.out or dataset.root / FOLDER / f"{files.name}.safetensors"
         _check_out(path, weights)
         check_store(experiment.tracking)
@@ -101,6 +104,11 @@ def adapt(experiment: Experiment, say: Say = print, tick: Tick = lambda work: No
         _check_enough(views, files.table if table is not None else files.map)
         place = _Place(files.name, dataset.name, files.table, weights, path)
         return _learn(experiment, place, views, files.read_landmarks().points, say, tick)
+
+
+def _to_start_from(features: str) -> Path:
+    """The set scorer that ships, for maps by some features."""
+    return folder_for(shipped(WEIGHTS), features) / "set.safetensors"
 
 
 def _adapt_map(experiment: Experiment, model: Path, weights: Path, say: Say, tick: Tick) -> Path | None:

@@ -21,6 +21,7 @@ from wheretolook.evaluation.report import best_in_words
 from wheretolook.evaluation.results import SCORES_CSV, SCORES_MD, SCORES_PNG, results_folder
 from wheretolook.evaluation.scores import read_scores
 from wheretolook.geometry.poses import camera_centers, poses_looking_along
+from wheretolook.methods.features_learnt import folder_for
 from wheretolook.methods.registry import best_weights, load_scorer, methods_named, scorers
 from wheretolook.stages.evaluate import not_logged
 from wheretolook.stages.inputs import Say, Tick, dataset_after, open_scene
@@ -78,7 +79,7 @@ def compare(experiment: Experiment, say: Say, tick: Tick) -> None:
     """
     dataset, config, tracking = dataset_after(experiment, "label"), experiment.evaluate, experiment.tracking
     results, stamp = results_folder(dataset, config), experiment.root / STAMP
-    folders = (experiment.root / "weights", shipped(WEIGHTS))
+    folders = (experiment.root / "weights", folder_for(shipped(WEIGHTS), dataset.features))
     files = config.weights or [path for folder in folders for path in sorted(folder.glob("*.safetensors"))]
     made_from: list[Any] = [dataset.fingerprint(), [fingerprint(path) for path in files if path.is_file()]]
     made_from += [asdict(config), asdict(experiment.occlusion), VERSION]
@@ -97,7 +98,7 @@ def compare(experiment: Experiment, say: Say, tick: Tick) -> None:
         from wheretolook.evaluation.scoring import own_weights
         from wheretolook.stages.evaluate import evaluate_methods
 
-        models = list(config.weights) or [*own_weights(dataset), best_weights(shipped(WEIGHTS))]
+        models = list(config.weights) or [*own_weights(dataset), best_weights(shipped(WEIGHTS), dataset.features)]
         (results / OVERVIEW).unlink(missing_ok=True)
         device, occlusion = experiment.warp_device, experiment.occlusion
         evaluate_methods(dataset, config, tracking, models, device=device, occlusion=occlusion, show=False)

@@ -19,7 +19,7 @@ from wheretolook.utils.options import recorded
 from wheretolook.utils.reading import read_json_object
 
 if TYPE_CHECKING:
-    from wheretolook.features.keypoints import ExtractorConfig
+    from wheretolook.features.config import ExtractorConfig
 
 Say = Callable[[str], None]  # told in a line what a stage has done
 
@@ -82,7 +82,7 @@ def extractor_of(scene: SceneFolder) -> ExtractorConfig:
 
     Raises MapError without the map's report, or if its landmarks have no descriptors to match queries with.
     """
-    from wheretolook.features.keypoints import ExtractorConfig
+    from wheretolook.features.config import ExtractorConfig
 
     path = scene.map / "report.json"
     try:

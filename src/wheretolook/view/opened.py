@@ -187,7 +187,11 @@ def open_map(
     folder = images or photographs_of(path)
     shown = None if folder is None else Photographs.of_model(path, folder)
     name = path.resolve().parent.name if path.resolve().name in ("0", "sparse", "map") else path.resolve().name
-    known = map_weights(path, data, landmarks.points) if weights is None else given_weights(weights)
+    features = landmarks.features
+    if weights is None:
+        known = map_weights(path, data, landmarks.points, features)
+    else:
+        known = given_weights(weights, features)
     return Opened(name, landmarks, camera, poses, known, _mesh(mesh), photographs=shown, device=device)
 
 
@@ -224,7 +228,8 @@ def open_scene(
     shown = Photographs.of_model(files.map, folder) if folder is not None and holds_model(files.map) else None
     if mesh is None and scene.mapping_poses is None:
         raise SceneError("neither a mesh nor the map's cameras are known", path=files.folder, fix="Map it again.")
-    known = scene_weights(files, scene.landmarks.points) if weights is None else given_weights(weights)
+    points, features = scene.landmarks.points, scene.landmarks.features
+    known = scene_weights(files, points, features) if weights is None else given_weights(weights, features)
     return Opened(
         files.name, scene.landmarks, scene.camera, scene.mapping_poses, known, mesh, space,
         None if labels is None or labels.empty else labels, shown, scene.device,

@@ -46,15 +46,18 @@ class KnownWeights:
         return tuple(sorted(able, key=lambda name: (scorers()[name].weights != first, name != first)))
 
 
-def given_weights(path: Path) -> KnownWeights:
-    """A file, or a folder of them, before those that ship. Raises a WeightsError if they cannot be used."""
-    return _known([(or_shipped(path), GIVEN)])
+def given_weights(path: Path, features: str = "") -> KnownWeights:
+    """A file, or a folder of them, before those that ship, for a map by these features.
+
+    Raises a WeightsError if they cannot be used.
+    """
+    return _known([(or_shipped(path), GIVEN)], features)
 
 
-def scene_weights(files: SceneFolder, landmarks: Float) -> KnownWeights:
+def scene_weights(files: SceneFolder, landmarks: Float, features: str = "") -> KnownWeights:
     """Those of a scene of a dataset: adapted to it, or else those its dataset has trained (`default_weights`).
 
-    `landmarks` (N, 3) m are those of the scene's map.
+    `landmarks` (N, 3) m are those of the scene's map, by these features.
     """
     own, root = [], files.folder.parent
     if _are_of(adapted := root / "adapted" / f"{files.name}.safetensors", landmarks):
@@ -66,23 +69,26 @@ def scene_weights(files: SceneFolder, landmarks: Float) -> KnownWeights:
         trained = default_weights(Dataset.load(root))
         if trained is not None and trained.is_relative_to(root):
             own.append((trained, TRAINED))
-    return _known(own)
+    return _known(own, features)
 
 
-def map_weights(model: Path, data: Path, landmarks: Float) -> KnownWeights:
+def map_weights(model: Path, data: Path, landmarks: Float, features: str = "") -> KnownWeights:
     """Those that `wheretolook adapt --map` has adapted to a COLMAP model with landmarks (N, 3) m, if it has."""
     from wheretolook.mapping.config import ExistingModelConfig
 
     adapted = data / "checks" / ExistingModelConfig(model=model).scene_name / "adapted.safetensors"
-    return _known([(adapted, ADAPTED)] if _are_of(adapted, landmarks) else [])
+    return _known([(adapted, ADAPTED)] if _are_of(adapted, landmarks) else [], features)
 
 
-def _known(own: Iterable[tuple[Path, str]]) -> KnownWeights:
+def _known(own: Iterable[tuple[Path, str]], features: str) -> KnownWeights:
     from wheretolook.learning.weights import method_of_weights
+    from wheretolook.methods.features_learnt import folder_for
     from wheretolook.methods.registry import best_weights
 
-    known = KnownWeights({}, {})
-    for place, source in (*own, (shipped(WEIGHTS), SHIPPED)):
+    known, all_places = KnownWeights({}, {}), [*own, (shipped(WEIGHTS), SHIPPED)]
+    # of a folder first those that have learnt from such features
+    places = [(part, source) for place, source in all_places for part in (folder_for(place, features), place)]
+    for place, source in dict.fromkeys(places):
         best = best_weights(place) if place.is_dir() else place
         files = {method_of_weights(best): best}
         for path in sorted(place.glob("*.safetensors")):

@@ -1,0 +1,41 @@
+"""Which weights fit a map by its features, and what is said where none that have learnt from such maps are given."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+from wheretolook.utils.errors import OutOfRangeWarning
+from wheretolook.utils.shipped import WEIGHTS, or_shipped
+
+_LOST = {
+    "aliked": "Of 100 best views by ALIKED they lose 16, weights learnt by ALIKED 8, bins 29",
+    "disk": "Of 100 best views by DISK they lose 14, bins 23",
+    "xfeat": "Of 100 best views by XFeat they lose 10, bins 15",
+}
+"""What the default scorer learnt from SIFT costs on maps by other features, as measured (docs/features.md)."""
+
+
+def folder_for(folder: Path, features: str) -> Path:
+    """Of a folder of weights, the one in it for maps by these features, `<folder>/<features>`; itself if none is there.
+
+    The weights that lie in it directly are those for all maps, learnt by SIFT if they ship.
+    """
+    own = folder / features
+    return own if features and next(own.glob("*.safetensors"), None) is not None else folder
+
+
+def warn_of_features(of_map: str, weights: Path, stacklevel: int) -> None:
+    """Warn if the landmarks of a map are of other features than weights have learnt from."""
+    from wheretolook.learning.weights import features_of_weights
+
+    learnt = features_of_weights(weights)
+    if not of_map or of_map in learnt:
+        return
+    text = f"the weights {weights.name} have learnt from maps by {', '.join(learnt)}, and this one is by {of_map}"
+    lost = _LOST.get(of_map, "") if learnt == ["sift"] else ""
+    fix = f"{lost or 'How much is lost is not known'} (docs/features.md); `wheretolook check` measures it on your map"
+    theirs = f"{WEIGHTS}/{of_map}"
+    if or_shipped(theirs).is_dir():
+        fix = f"Weights for it ship, {theirs}: they are taken if none are named. {fix}"
+    warnings.warn(f"{text}. {fix}.", OutOfRangeWarning, stacklevel=stacklevel + 1)

@@ -164,7 +164,7 @@ def read_parquet(path: Path) -> pd.DataFrame:
 def _read(file: pq.ParquetFile, path: Path, names: Sequence[str]) -> pa.Table:
     """Columns of a file, batch by batch: repeated values take next to none of it, and its own counts may lie.
 
-    ValueError if they unfold to far more than the file has bytes.
+    ValueError if they unfold to far more than the file has bytes, or do not have as many rows as it says.
     """
     n_bytes, batches, unfolded = check_file(path).st_size, list[pa.RecordBatch](), 0
     fields = [file.schema_arrow.field(name) for name in names]
@@ -173,7 +173,11 @@ def _read(file: pq.ParquetFile, path: Path, names: Sequence[str]) -> pa.Table:
         unfolded += batch.nbytes
         if unfolded > max(FREE_BYTES, MAX_RATIO * n_bytes):
             raise ValueError(f"its {n_bytes:,} bytes would unfold to more than {unfolded:,}")
-    return pa.Table.from_batches(batches, pa.schema(fields))
+    table = pa.Table.from_batches(batches, pa.schema(fields))
+    told = {file.metadata.num_rows, sum(file.metadata.row_group(i).num_rows for i in range(file.num_row_groups))}
+    if told != {table.num_rows}:
+        raise ValueError(f"it says that it has {max(told):,} rows, and has {table.num_rows:,}")
+    return table
 
 
 def has_matches(path: Path, pixels: bool = False) -> bool:

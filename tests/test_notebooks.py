@@ -32,6 +32,7 @@ OF_THE_RELEASE = {
     "04_training": 6,
     "07_planning": 3,
     "09_your_own_map": 2,
+    "10_looks": 2,
 }
 """Notebooks that need the release that ships, and how many pictures each draws."""
 

@@ -11,13 +11,14 @@ import pytest
 from synthetic_dataset import CAMERA, make_scene
 from wheretolook.dataset.folders import Dataset, SceneFolder
 from wheretolook.evaluation.config import EvaluateConfig
+from wheretolook.evaluation.looks import look_table, stopping_table
 from wheretolook.geometry.poses import pose_error
 from wheretolook.labelling.confidence import TOLD, Confidence, told_numbers
 from wheretolook.labelling.estimation import PoseEstimator
 from wheretolook.labelling.look_sets import SET_COLUMNS, label_sets
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.methods.registry import load_scorer
-from wheretolook.stages.look_sets import LookConfig, compare_looks, evaluate_looks, look_table, stopping_table
+from wheretolook.stages.look_sets import LookConfig, compare_looks, evaluate_looks
 from wheretolook.utils.errors import ConfigError, PoseError, TableError, WeightsError
 from wheretolook.utils.tracking import newest_run
 from wheretolook.utils.tracking_config import TrackingConfig

@@ -84,7 +84,7 @@ class Localizer:
             from wheretolook.labelling.lightglue import LightGlueMatcher
 
             self._guided = LightGlueMatcher(landmarks, map_dir, self.config.lightglue, device)
-        self._camera, self._estimator = camera, PoseEstimator(landmarks.points, self.config)
+        self._camera, self.estimator = camera, PoseEstimator(landmarks.points, self.config)
 
     @cached_property
     def extractor(self) -> KeypointExtractor:
@@ -145,7 +145,7 @@ class Localizer:
         matched: dict[str, Any] = {"matched_rows": landmark_rows, "matched_pixels": matched_pixels}
         if n_matches < self.config.min_matches:
             return Localization(TOO_FEW_MATCHES, None, n_matches, **matched)
-        found = self._estimator.estimate(matched_pixels, landmark_rows, camera or self._camera)
+        found = self.estimator.estimate(matched_pixels, landmark_rows, camera or self._camera)
         if found is None:
             return Localization(NO_POSE, None, n_matches, **matched)
         cam_from_world, inliers = found

@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 
 from wheretolook.dataset.folders import Dataset
 from wheretolook.evaluation.calibration import read_calibration
+from wheretolook.evaluation.looks import LOOKS_CSV
 from wheretolook.evaluation.report import score_markdown
 from wheretolook.evaluation.results import CALIBRATION_CSV, SCORES_CSV
 from wheretolook.evaluation.scores import read_scores
@@ -25,6 +26,7 @@ from wheretolook.figures.config import FiguresConfig
 from wheretolook.figures.inputs import inputs_figure
 from wheretolook.figures.lattices import fibonacci_figure
 from wheretolook.figures.learning import learning_figure
+from wheretolook.figures.looks import looks_figure
 from wheretolook.figures.occlusion import occlusion_figure
 from wheretolook.figures.path_film import methods_figure
 from wheretolook.figures.paths import paths_figure
@@ -268,6 +270,8 @@ ITEMS: tuple[Item, ...] = (
     Item("occlusion", "", "what seeing through walls changes", "05_tables", _of_scores(occlusion_figure)),
     Item("regret_interiors", "", "what each loses on scenes by others", "05_tables", _of_scores(regret_figure),
          command=_LOG_RELEASE, params=(("dataset", "interiors"),), of_release=True),
+    Item("looks", "", "several looks localized together", "10_looks", _of(looks_figure, LOOKS_CSV), "looks", LOOKS_CSV,
+         "wheretolook evaluate --config {config} # of labels made with --label.store_pixels true"),
     Item("visibility_scaling", "", "how time and memory grow", "08_runtimes", _of(scaling_figure, SCALING_CSV),
          "benchmark", SCALING_CSV, _BENCH.format(" --scaling"), ()),
 )  # fmt: skip

@@ -14,6 +14,7 @@ from typing import Any
 import pandas as pd
 
 from wheretolook.dataset.folders import Dataset
+from wheretolook.evaluation.looks import LOOKS_CSV, log_looks
 from wheretolook.evaluation.results import SCORES_CSV, best_of, evaluation_params, runs_of_rows
 from wheretolook.evaluation.scores import read_scores
 from wheretolook.learning.runs import (
@@ -57,6 +58,7 @@ class ReleaseRuns:
     train: dict[str, str] = field(default_factory=dict)  # by the method
     learners: str | None = None
     paths: str | None = None
+    looks: str | None = None
     benchmark: str | None = None
     new: int = 0  # how many of all these were logged now
 
@@ -112,7 +114,8 @@ def _log_missing(dataset: Dataset, tracking: TrackingConfig, say: Say) -> Releas
         found = _train_run(tracking, path, record, history is not None)
         runs.train[method] = keep(f"the training of {method}", found, _log_training, dataset, path, record, history)
     learners, paths = (LEARNERS_CSV, "learners", _log_learners), (PATHS_CSV, "paths", _log_paths)
-    for file, stage, log_file in (learners, paths, (RUNTIMES_CSV, "benchmark", _log_benchmark)):
+    looks, times = (LOOKS_CSV, "looks", _log_looks), (RUNTIMES_CSV, "benchmark", _log_benchmark)
+    for file, stage, log_file in (learners, paths, looks, times):
         if (results / file).is_file():
             found = _found(tracking, stage, file, (results / file).read_bytes())
             setattr(runs, stage, keep(file, found, log_file, dataset))
@@ -237,6 +240,14 @@ def _log_learners(dataset: Dataset, tracking: TrackingConfig) -> str:
 def _log_paths(dataset: Dataset, tracking: TrackingConfig) -> str:
     results = dataset.root / "results"
     return log_paths({"dataset": dataset.name}, pd.read_csv(results / PATHS_CSV), results, tracking, TAGS)
+
+
+def _log_looks(dataset: Dataset, tracking: TrackingConfig) -> str:
+    """The comparison of looks on the test scenes, with a nested run for each way to choose and number of looks."""
+    file = dataset.root / "results" / LOOKS_CSV
+    table = pd.read_csv(file)
+    params = {"dataset": dataset.name, "split": "test"}
+    return log_looks(tracking, table[table["split"] == "test"], params, [file], TAGS)
 
 
 def _log_benchmark(dataset: Dataset, tracking: TrackingConfig) -> str:

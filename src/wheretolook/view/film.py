@@ -5,21 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.style import context
 from tqdm.auto import tqdm
 
 from wheretolook.figures.config import Look
 from wheretolook.figures.house_image import Dollhouse, dollhouse, draw_house, draw_segments, frustum_segments
+from wheretolook.figures.moving import pixels_of, save_moving
 from wheretolook.figures.style import BLUE, GREEN, RC, VERMILION, new_figure
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.utils.errors import ConfigError
-from wheretolook.utils.files import replacing
 from wheretolook.view import drawing
 from wheretolook.view.played import FORWARD, Played
 from wheretolook.view.scores import SeenLandmarks, landmarks_seen
@@ -30,7 +28,6 @@ SIZE_IN, DPI = (7.6, 4.3), 100
 FRAME_MS, LAST_MS = 220, 2500  # how long a picture stands, and the last
 MOST_FRAMES = 60
 COLORS = {FORWARD: VERMILION}
-QUALITY = 55  # of WebP, of 100
 
 
 def film(shared: Shared, path: Path, state: ViewState = ViewState()) -> int:
@@ -39,8 +36,6 @@ def film(shared: Shared, path: Path, state: ViewState = ViewState()) -> int:
     Each view says whether it localized, if that was tried, or else whether its score is at least the threshold. Raises
     ConfigError without a mesh or with fewer than two paths.
     """
-    from PIL import Image
-
     try:
         if shared.opened.mesh is None or len(shared.paths) < 2:
             fix = "Give --path of a scene with a mesh."
@@ -50,16 +45,10 @@ def film(shared: Shared, path: Path, state: ViewState = ViewState()) -> int:
             method=state.method or shared.opened.methods[0],
             occlusion=state.occlusion or shared.opened.occlusions[0],
         )
-        frames = [Image.fromarray(frame) for frame in _frames(shared, state)]
+        frames = list(_frames(shared, state))
     finally:
         shared.worker.stop()
-    times = [FRAME_MS] * (len(frames) - 1) + [LAST_MS]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path, path.with_name(f".partial-{path.name}")) as partial:
-        if path.suffix == ".gif":
-            frames = [frame.quantize(128) for frame in frames]
-        more: dict[str, Any] = {"quality": QUALITY, "method": 6} if path.suffix == ".webp" else {}
-        frames[0].save(partial, save_all=True, append_images=frames[1:], duration=times, loop=0, **more)
+    save_moving(frames, [FRAME_MS] * (len(frames) - 1) + [LAST_MS], path)
     return len(frames)
 
 
@@ -85,9 +74,7 @@ def _frames(shared: Shared, state: ViewState) -> Iterator[drawing.Rgb]:
                 seen = landmarks_seen(look.scorer, played.cam_from_world[at], shared.teller(state.occlusion))
                 image, _ = opened.picture(played.cam_from_world[at], SeenLandmarks(*_marked(seen)))
                 _draw_view(figure.add_subplot(grid[row, 1]), image, name, bool(good[at]), good[: at + 1], color)
-            canvas = FigureCanvasAgg(figure)
-            canvas.draw()
-            yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
+            yield pixels_of(figure)
 
 
 def _marked(seen: SeenLandmarks) -> tuple[Float, Float, Float]:

@@ -32,6 +32,7 @@ def make_release(root: Path) -> Dataset:
     runtimes().to_csv(results / "runtimes.csv", index=False)
     learners().to_csv(results / "learners.csv", index=False)
     paths().to_csv(results / "paths.csv", index=False)
+    looks().to_csv(results / "looks.csv", index=False)
     config = {"bins": 30, "hidden": [300, 300], "dropout": 0.5, "seed": 0}
     about = {"method": "mlp-2d+3d", "dataset": dataset.name, "dataset_fingerprint": "0", "config": config}
     metrics = {"epoch": 1.0, "val_average_precision": 0.75, "val_roc_auc": 0.8}
@@ -53,6 +54,12 @@ def calibration() -> pd.DataFrame:
     bins = {"bin_low": [0.0, 0.5], "bin_high": [0.5, 1.0], "mean_predicted": [0.2, 0.8], "share_good": [0.1, 0.9]}
     about = {"method": "mlp-2d+z", "temperature": 1.2, "n_val": 10, "n_views": 30, "when": "before"}
     return pd.DataFrame({**bins, "n": [10, 20], "ece": 0.1, "nll": 0.3}).assign(**about)
+
+
+def looks() -> pd.DataFrame:
+    rows = [("together", 1, 0.7, 0.7), ("together", 2, 0.8, 0.75), ("random", 2, 0.5, None)]
+    table = pd.DataFrame(rows, columns=["strategy", "n_looks", "good", "any_good"]).assign(n_locations=8)
+    return pd.concat([table.assign(split=split) for split in ("val", "test")])
 
 
 def runtimes() -> pd.DataFrame:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 import shutil
@@ -65,10 +66,10 @@ def children(tracking: TrackingConfig, parent: str) -> dict[str, tuple[dict[str,
 def test_every_kind_of_result_becomes_a_run_once(logged: tuple[Dataset, TrackingConfig, ReleaseRuns]) -> None:
     release, tracking, runs = logged
     assert [*runs.evaluate] == ["release", "interiors"] and [*runs.train] == ["mlp-2d+3d"]
-    ids = [*runs.evaluate.values(), *runs.train.values(), runs.learners, runs.paths, runs.benchmark]
-    assert None not in ids and len({*ids}) == runs.new == 6
+    ids = [*runs.evaluate.values(), *runs.train.values(), runs.learners, runs.paths, runs.looks, runs.benchmark]
+    assert None not in ids and len({*ids}) == runs.new == 7
     again = log_release(release, tracking)
-    assert again == ReleaseRuns(runs.evaluate, runs.train, runs.learners, runs.paths, runs.benchmark, new=0)
+    assert again == dataclasses.replace(runs, new=0)
     pd.testing.assert_frame_equal(
         latest_scores(tracking, "release"), read_scores(release.root / "results" / "scores.csv")
     )
@@ -102,6 +103,9 @@ def test_rows_over_all_scenes_are_nested(logged: tuple[Dataset, TrackingConfig, 
     assert children(tracking, str(runs.paths)).keys() == {
         f"{method}, {task} (paths release)" for task in ("planned", "given") for method in ("forward", "bins")
     }
+    looks = children(tracking, str(runs.looks))
+    assert {*looks} == {f"{name} looks (looks release)" for name in ("together, 1", "together, 2", "random, 2")}
+    assert looks["together, 2 looks (looks release)"][1] == {"good": 0.8, "any_good": 0.75}
 
 
 def test_each_dataset_and_purpose_has_an_experiment_that_says_what_to_look_at(
@@ -109,13 +113,13 @@ def test_each_dataset_and_purpose_has_an_experiment_that_says_what_to_look_at(
 ) -> None:
     tracking = logged[1]
     found = {experiment.name: experiment for experiment in experiments(client(tracking), tracking)}
-    released = ("evaluation", "learners", "paths", "training")
+    released = ("evaluation", "learners", "looks", "paths", "training")
     assert found.keys() == {"interiors: evaluation", "benchmarks", *(f"release: {purpose}" for purpose in released)}
     for experiment in found.values():
         note, ids = experiment.tags["mlflow.note.content"], [experiment.experiment_id]
         logged_here = client(tracking).search_runs(ids, max_results=1000)
         metrics = {name for run in logged_here for name in run.data.metrics}
-        named = {*re.findall(r"`((?:1|regret|kept|average_precision|times)_[a-z_]+|localized)`", note)}
+        named = {*re.findall(r"`((?:1|regret|kept|average_precision|times)_[a-z_]+|localized|good|any_good)`", note)}
         assert (named and named <= metrics) or experiment.name == "benchmarks", (experiment.name, named - metrics)
         for query in re.findall(r"`(params\.[^`]*)`", note):
             assert client(tracking).search_runs(ids, query), query

@@ -6,14 +6,18 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
+import warp as wp
 
 import wheretolook
 from selection.room import POINTS, WEIGHTS
 from wheretolook.cli import main
+from wheretolook.visibility.listing import compile_kernels
 
 SOURCE = {**os.environ, "PYTHONPATH": str(Path(wheretolook.__file__).parents[1])}  # for other processes
 QUICK = ["--weights", str(WEIGHTS), "--directions", "60", "--device", "cpu"]
@@ -119,3 +123,36 @@ def test_a_first_score_loads_no_training(sparse: Path) -> None:
     code += "print([m for m in ('lightning', 'mlflow', 'sklearn', 'open3d', 'matplotlib') if m in sys.modules])"
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=SOURCE)
     assert ran.stdout.splitlines()[-1] == "[]"
+
+
+def test_kernels_are_compiled_beside_the_start(sparse: Path, at: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    loaded: set[str] = set()
+    launched: set[str] = set()
+    load, launch = wp.load_module, wp.launch
+
+    def note_load(module: ModuleType, **options: Any) -> None:
+        loaded.add(module.__name__)
+        load(module, **options)
+
+    def note_launch(kernel: Any, *arguments: Any, **options: Any) -> Any:
+        assert kernel.module.name in loaded, kernel.key  # it would be compiled now, while nothing else is done
+        launched.add(kernel.module.name)
+        return launch(kernel, *arguments, **options)
+
+    monkeypatch.setattr(wp, "launch", note_launch)
+    for camera in ([], ["--camera", "SIMPLE_RADIAL,640,480,320,320,240,0.01"]):
+        loaded.clear()
+        launched.clear()
+        with monkeypatch.context() as patch:
+            patch.setattr(wp, "load_module", note_load)
+            compile_kernels("cpu")
+        assert main(["select", "--map", str(sparse), "--at", "at.csv", "--out", "v.csv", *camera, *QUICK]) == 0
+        assert "wheretolook.visibility.listing_kernel" in launched
+
+
+def test_as_a_module(at: Path) -> None:
+    command = [sys.executable, "-m", "wheretolook"]
+    ran = subprocess.run([*command, "--version"], capture_output=True, text=True, check=True, env=SOURCE)
+    assert ran.stdout == f"wheretolook {wheretolook.__version__}\n"
+    ran = subprocess.run([*command, "selct"], capture_output=True, text=True, env=SOURCE)
+    assert ran.returncode == 2 and "Did you mean select?" in ran.stderr

@@ -10,7 +10,7 @@ import warp as wp
 from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 from wheretolook.visibility.frustum_kernel import Views, dot, entry_offset, in_view, pixel_of
 
-wp.set_module_options({"fuse_fp": False})  # for `pixel_of`
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})  # the latter for `pixel_of`
 
 MAPPED_DISTANCE = wp.constant(MAP_ATTRIBUTES.index("mapped_distance"))
 

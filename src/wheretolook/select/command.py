@@ -6,6 +6,7 @@ import argparse
 import re
 import time
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -109,24 +110,33 @@ def run(arguments: Sequence[str]) -> int:
     options = parser().parse_args(given)
     start = time.monotonic()
     waypoints = _check(options)
-    from wheretolook.select.where_to_look import WhereToLook
+    from wheretolook.utils.devices import usable_device
+    from wheretolook.utils.warp import start_warp
+    from wheretolook.visibility.listing import compile_kernels
 
-    look = WhereToLook.from_colmap(
-        options.map,
-        weights=options.weights,
-        method=options.method,
-        camera=_camera(options),
-        mesh=options.mesh,
-        depth=options.depth,
-        depth_scale=options.depth_scale,
-        occlusion=options.occlusion,
-        database=options.database,
-        directions=options.directions,
-        lattice=options.lattice,
-        max_reprojection_error_px=options.max_error,
-        device=options.device,
-        anywhere=options.anywhere,
-    )
+    device = usable_device(options.device)
+    # the first time on a machine kernels are compiled, for as long as PyTorch is imported and the map is read
+    with ThreadPoolExecutor(1) as beside:
+        compiled = beside.submit(compile_kernels, start_warp(device))
+        from wheretolook.select.where_to_look import WhereToLook
+
+        look = WhereToLook.from_colmap(
+            options.map,
+            weights=options.weights,
+            method=options.method,
+            camera=_camera(options),
+            mesh=options.mesh,
+            depth=options.depth,
+            depth_scale=options.depth_scale,
+            occlusion=options.occlusion,
+            database=options.database,
+            directions=options.directions,
+            lattice=options.lattice,
+            max_reprojection_error_px=options.max_error,
+            device=device,
+            anywhere=options.anywhere,
+        )
+        compiled.result()
     if waypoints is None:
         waypoints = look.grid(options.grid)
     pitch = None if options.pitch is None else tuple(options.pitch)

@@ -52,7 +52,7 @@ class FrustumCounter:
         if size is not None and (size < 2 or size % 2):
             raise ConfigError("the sphere's map needs an even number of cells along a side", value=size)
         self.device = start_warp(device)
-        for module in (counting_kernel, pixel_kernel):
+        for module in (counting_kernel, *([pixel_kernel] if distinct_pixels else [])):
             wp.load_module(module, device=self.device)  # only one thread may do that
         self.lanes = GPU_LANES if wp.get_device(self.device).is_cuda else 1
         on_host = isinstance(camera, ColmapCamera) and distinct_pixels

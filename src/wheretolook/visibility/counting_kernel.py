@@ -9,6 +9,8 @@ import warp as wp
 
 from wheretolook.visibility.frustum_kernel import in_view, inside_sides, least_product, offset_from, rounding_error
 
+wp.set_module_options({"enable_backward": False})
+
 FAR = wp.constant(1.0e15)  # beyond this many metres single precision may overflow
 INSIDE = wp.constant(1)
 BORDER = wp.constant(2)

@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import warp as wp
 
+wp.set_module_options({"enable_backward": False})
+
 
 @wp.struct
 class Views:

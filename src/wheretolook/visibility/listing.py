@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.geometry.camera import Camera, ColmapCamera
 from wheretolook.geometry.poses import Float, split_poses
-from wheretolook.visibility import frustum, listing_kernel
+from wheretolook.visibility import counting_kernel, frustum, frustum_kernel, listing_kernel
 from wheretolook.visibility.counting import ASKED_AT_ONCE, FrustumCounter
 from wheretolook.visibility.field_of_view import tabulate
 from wheretolook.visibility.frustum import LandmarkSets, PosedViews
@@ -78,6 +78,16 @@ def in_view_by_table(posed: PosedViews, points: Any, device: str = "cpu") -> Lan
         kept[part] = posed.camera.sees(frustum.rotate(single[views], offsets))
     lengths = np.diff(starts) - np.bincount(of_view[~kept[unsure]], minlength=len(single))
     return LandmarkSets(np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32), indices[kept])
+
+
+def compile_kernels(device: str) -> None:
+    """Compile the kernels that scoring around places launches, or load them from Warp's cache.
+
+    Compiling takes seconds of one core, once on a machine; other threads can work meanwhile. One of them only may load
+    kernels at a time, so this has to end before a `FrustumLister` is made. The device is Warp's, of `start_warp`.
+    """
+    for module in (counting_kernel, listing_kernel, frustum_kernel):
+        wp.load_module(module, device=device)
 
 
 class FrustumLister(FrustumCounter):

@@ -18,6 +18,8 @@ from wheretolook.visibility.counting_kernel import (
 )
 from wheretolook.visibility.frustum_kernel import in_view, inside_sides, least_product, offset_from, rounding_error
 
+wp.set_module_options({"enable_backward": False})
+
 
 @wp.kernel
 def rows_kernel(places: wp.array2d[wp.vec2i], starts: wp.array[wp.int32], n_cells: wp.int32, rows: wp.array[wp.int32]):

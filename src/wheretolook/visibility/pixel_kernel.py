@@ -10,7 +10,7 @@ import warp as wp
 from wheretolook.visibility.counting_kernel import SortedLandmarks, border_runs, entries_of, inside_runs, near_entries
 from wheretolook.visibility.frustum_kernel import in_view, pixel_of
 
-wp.set_module_options({"fuse_fp": False})  # for `pixel_of`
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})  # the latter for `pixel_of`
 
 
 @wp.func

@@ -7,6 +7,8 @@
 
 import warp as wp
 
+wp.set_module_options({"enable_backward": False})
+
 _R2_U, _R2_V = wp.constant(wp.uint32(3242174889)), wp.constant(wp.uint32(2447445414))
 
 

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from box_scenes import furnished_room
 from check.corridor import ALONE, N, corridor_poses, write_corridor
+from check.rendered_room import write_rendered_room
 from selection.room import WEIGHTS
 from wheretolook.check import leave_out
 from wheretolook.check.blocks import KEPT, LEAST_REST, Block, choose_blocks, landmarks_kept, observation_matrix
@@ -26,14 +27,12 @@ from wheretolook.check.leave_out import without
 from wheretolook.check.source import open_map
 from wheretolook.cli import main
 from wheretolook.dataset.folders import Dataset, SceneFolder
-from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.geometry.poses import camera_centers, poses_looking_along
+from wheretolook.geometry.poses import camera_centers
 from wheretolook.learning.trained_network import TrainedNetwork
 from wheretolook.mapping.colmap_model import model_arrays, read_model
 from wheretolook.mapping.descriptors import read_features
 from wheretolook.methods.adapted.network import AdaptedNetwork
 from wheretolook.methods.set.network import SetNetwork
-from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import save_glb
 from wheretolook.utils.errors import ConfigError, InUseError, MapError, WeightsError
 from wheretolook.utils.locks import hold
@@ -393,23 +392,9 @@ def test_another_dataset_that_is_damaged_is_not_in_the_way(
 
 @pytest.mark.slow
 def test_photographs_without_features_are_extracted_anew(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A room rendered from 24 places, of which nothing is known but the poses."""
-    angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)
-    outward = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(24)])
-    poses = poses_looking_along((3.0, 2.5, 1.4) - 0.9 * outward, outward)
-    camera = PinholeCamera(320, 240, 200.0)
-    model = pycolmap.Reconstruction()
-    model.add_camera_with_trivial_rig(pycolmap.Camera(camera_id=1, **camera.colmap.record()))
-    (tmp_path / "photos").mkdir()
-    for row, (pose, rgb) in enumerate(
-        zip(poses, WarpRenderer(furnished_room()).render(camera, poses).rgb, strict=True)
-    ):
-        cv2.imwrite(str(tmp_path / "photos" / f"{row:02}.png"), rgb[..., ::-1])
-        image = pycolmap.Image(name=f"{row:02}.png", camera_id=1, image_id=row + 1)
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
-    (tmp_path / "sparse").mkdir()
-    model.write_binary(str(tmp_path / "sparse"))
-    arguments = ["--map", str(tmp_path / "sparse"), "--images", str(tmp_path / "photos"), "--metres", "--workers", "1"]
+    write_rendered_room(tmp_path)
+    arguments = ["--map", str(tmp_path / "sparse"), "--images", str(tmp_path / "photographs")]
+    arguments += ["--metres", "--workers", "1"]
     run([*arguments, "--out", str(tmp_path / "out"), "--views", "8"])
     assert "of two views" in capsys.readouterr().out
     table = pd.read_csv(tmp_path / "out" / "check.csv")

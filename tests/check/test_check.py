@@ -15,6 +15,7 @@ import pycolmap
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from tests.disks import file_limit
 
 from box_scenes import furnished_room
 from check.corridor import ALONE, N, corridor_poses, write_corridor
@@ -34,7 +35,7 @@ from wheretolook.mapping.descriptors import read_features
 from wheretolook.methods.adapted.network import AdaptedNetwork
 from wheretolook.methods.set.network import SetNetwork
 from wheretolook.scenes.loading import save_glb
-from wheretolook.utils.errors import ConfigError, InUseError, MapError, WeightsError
+from wheretolook.utils.errors import ConfigError, InUseError, MapError, StorageError, WeightsError
 from wheretolook.utils.locks import hold
 from wheretolook.utils.npz_files import load_npz, save_npz
 
@@ -228,6 +229,12 @@ def test_two_checks_do_not_write_the_same_results(corridor: tuple[Path, Path], t
     with hold(tmp_path / "out" / ".lock", "check"), pytest.raises(InUseError, match=rf"process {os.getpid()}"):
         run(_arguments(*corridor, tmp_path / "out"))
     assert [path.name for path in (tmp_path / "out").iterdir()] == []
+
+
+def test_a_disk_that_is_full_is_told_not_a_damaged_model(corridor: tuple[Path, Path], tmp_path: Path) -> None:
+    with file_limit(100_000), pytest.raises(StorageError, match="is the disk full") as raised:
+        run(_arguments(*corridor, tmp_path / "out"))
+    assert Path(raised.value.path).name == "points3D.bin" and "model" in Path(raised.value.path).parts
 
 
 def _adapted(folder: Path, place: np.ndarray) -> Path:

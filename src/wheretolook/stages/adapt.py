@@ -200,6 +200,8 @@ def _scene(dataset: Dataset, name: str) -> SceneFolder:
 def _check_out(path: Path, weights: Path) -> None:
     if path.suffix != ".safetensors" or path.is_dir():
         raise ConfigError("weights are a file", path=path, fix="Give --out a name that ends in .safetensors.")
+    if (within := next(folder for folder in path.absolute().parents if folder.exists())).is_file():
+        raise ConfigError("this is a file, no folder", path=within, fix="Give --out another folder.")
     if path.resolve() == weights.resolve():
         fix = "Give --out another name."
         raise ConfigError("the adapted weights would replace those that they start from", path=path, fix=fix)

@@ -15,9 +15,11 @@ import pycolmap
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from tests.disks import file_limit
 
 from box_scenes import furnished_room
 from check.corridor import ALONE, N, corridor_poses, write_corridor
+from check.rendered_room import write_rendered_room
 from selection.room import WEIGHTS
 from wheretolook.check import leave_out
 from wheretolook.check.blocks import KEPT, LEAST_REST, Block, choose_blocks, landmarks_kept, observation_matrix
@@ -26,16 +28,14 @@ from wheretolook.check.leave_out import without
 from wheretolook.check.source import open_map
 from wheretolook.cli import main
 from wheretolook.dataset.folders import Dataset, SceneFolder
-from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.geometry.poses import camera_centers, poses_looking_along
+from wheretolook.geometry.poses import camera_centers
 from wheretolook.learning.trained_network import TrainedNetwork
 from wheretolook.mapping.colmap_model import model_arrays, read_model
 from wheretolook.mapping.descriptors import read_features
 from wheretolook.methods.adapted.network import AdaptedNetwork
 from wheretolook.methods.set.network import SetNetwork
-from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import save_glb
-from wheretolook.utils.errors import ConfigError, InUseError, MapError, WeightsError
+from wheretolook.utils.errors import ConfigError, InUseError, MapError, StorageError, WeightsError
 from wheretolook.utils.locks import hold
 from wheretolook.utils.npz_files import load_npz, save_npz
 
@@ -231,6 +231,12 @@ def test_two_checks_do_not_write_the_same_results(corridor: tuple[Path, Path], t
     assert [path.name for path in (tmp_path / "out").iterdir()] == []
 
 
+def test_a_disk_that_is_full_is_told_not_a_damaged_model(corridor: tuple[Path, Path], tmp_path: Path) -> None:
+    with file_limit(100_000), pytest.raises(StorageError, match="is the disk full") as raised:
+        run(_arguments(*corridor, tmp_path / "out"))
+    assert Path(raised.value.path).name == "points3D.bin" and "model" in Path(raised.value.path).parts
+
+
 def _adapted(folder: Path, place: np.ndarray) -> Path:
     """Weights that are adapted to a place with these landmarks, and change nothing."""
     base = TrainedNetwork.load(WEIGHTS / "set.safetensors", SetNetwork, "set")
@@ -393,23 +399,9 @@ def test_another_dataset_that_is_damaged_is_not_in_the_way(
 
 @pytest.mark.slow
 def test_photographs_without_features_are_extracted_anew(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A room rendered from 24 places, of which nothing is known but the poses."""
-    angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)
-    outward = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(24)])
-    poses = poses_looking_along((3.0, 2.5, 1.4) - 0.9 * outward, outward)
-    camera = PinholeCamera(320, 240, 200.0)
-    model = pycolmap.Reconstruction()
-    model.add_camera_with_trivial_rig(pycolmap.Camera(camera_id=1, **camera.colmap.record()))
-    (tmp_path / "photos").mkdir()
-    for row, (pose, rgb) in enumerate(
-        zip(poses, WarpRenderer(furnished_room()).render(camera, poses).rgb, strict=True)
-    ):
-        cv2.imwrite(str(tmp_path / "photos" / f"{row:02}.png"), rgb[..., ::-1])
-        image = pycolmap.Image(name=f"{row:02}.png", camera_id=1, image_id=row + 1)
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
-    (tmp_path / "sparse").mkdir()
-    model.write_binary(str(tmp_path / "sparse"))
-    arguments = ["--map", str(tmp_path / "sparse"), "--images", str(tmp_path / "photos"), "--metres", "--workers", "1"]
+    write_rendered_room(tmp_path)
+    arguments = ["--map", str(tmp_path / "sparse"), "--images", str(tmp_path / "photographs")]
+    arguments += ["--metres", "--workers", "1"]
     run([*arguments, "--out", str(tmp_path / "out"), "--views", "8"])
     assert "of two views" in capsys.readouterr().out
     table = pd.read_csv(tmp_path / "out" / "check.csv")
@@ -418,3 +410,25 @@ def test_photographs_without_features_are_extracted_anew(tmp_path: Path, capsys:
     made = database.stat().st_mtime_ns
     run([*arguments, "--out", str(tmp_path / "out"), "--views", "8"])
     assert database.stat().st_mtime_ns == made
+
+
+@pytest.mark.parametrize(
+    "link", ["data/checks", "data/checks/corridor", "out/work", "out/work/blocks-0", "out/check.csv"]
+)
+def test_results_are_not_written_where_a_link_leads(
+    link: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sparse, database = write_corridor(tmp_path / "corridor")
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (tmp_path / link).parent.mkdir(parents=True)
+    (tmp_path / link).symlink_to(elsewhere)
+    of, data = ["--map", str(sparse), "--database", str(database)], ["--data", str(tmp_path / "data")]
+    out = ["--out", str(tmp_path / "out")] if link.startswith("out") else []
+    assert main(["check", *of, *data, *out, "--workers", "1"]) == 2
+    assert f"{tmp_path / link}: this link leads out" in capsys.readouterr().err
+    if not out:
+        tracking = ["--tracking.folder", str(tmp_path / "mlruns"), "--device", "cpu"]
+        assert main(["adapt", *of, *data, *tracking]) == 2
+        assert f"{tmp_path / link}: this link leads out" in capsys.readouterr().err
+    assert not [*elsewhere.iterdir()]

@@ -31,6 +31,7 @@ def main(arguments: list[str] | None = None) -> int:
     add("--damages", type=int, default=0, help="how many damaged files")
     add("--disks", type=int, default=0, help="how many full disks")
     add("--only", nargs="*", default=[], help="names of cases to disturb, instead of all")
+    add("--readers", nargs="*", default=[], help="names of readers to damage files of, instead of all")
     add("--seed", type=int, default=0)
     add("--jobs", type=int, default=1, help="how many at the same time; more than 1 needs root")
     add("--report", type=Path, help="where to write what came of it, as JSON lines")
@@ -43,10 +44,13 @@ def main(arguments: list[str] | None = None) -> int:
     root = Path(tempfile.mkdtemp(prefix="faults-", dir="/dev/shm" if Path("/dev/shm").is_dir() else None))
     try:
         workshop, rng = cases.Workshop(root, _say), random.Random(options.seed)
-        workshop.make(chosen if not options.damages else dict.fromkeys([*cases.LINE, *chosen]))
+        readers = [name for name in damage.READERS if not options.readers or name in options.readers]
+        read = {damage.READERS[name][0] for name in readers if options.damages}
+        read_cases = [case for case in everything if not case.again and (case.after or case.name) in read]
+        workshop.make([*dict.fromkeys([*read_cases, *chosen])])
         chosen = [case for case in chosen if case.name in workshop.events]
         disturb = [("kill", pair) for pair in kills.planned(chosen, options.kills, rng)]
-        disturb += [("damage", one) for one in damage.planned(workshop, options.damages, rng)]
+        disturb += [("damage", one) for one in damage.planned(workshop, readers, options.damages, rng)]
         fresh = [case for case in chosen if not case.again and "train" not in case.name]
         disturb += [("disk", (fresh[number % len(fresh)],)) for number in range(options.disks)]
         rng.shuffle(disturb)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import json
 import os
+import re
 import shutil
 import subprocess
 import time
@@ -84,6 +85,10 @@ def stage(name: str, *options: str, of: str = "tiny.yaml") -> list[str]:
     return [name, "--config", of, "--data", "data", "--tracking.folder", "mlruns", "--device", "cpu", *options]
 
 
+CORRIDOR = ("--map", "corridor/sparse", "--database", "corridor/features.db")
+CHECK = ["check", *CORRIDOR, "--metres", "--views", "6", "--device", "cpu", "--workers", "2"]
+SYNTHETIC = ("--name", "synthetic", "--scene", "scene-1", "--camera.width", "160", "--camera.height", "120",
+             "--camera.focal_px", "80")  # fmt: skip
 TWO = ("--label.workers", "2")
 ONE = ("--label.workers", "1")
 
@@ -118,6 +123,14 @@ OTHERS = (
     Case("select", "evaluate", ["select", "--map", MAP, "--at", "1,1,1.2", "2,1,1.2", "--out", "views.csv",
                                 "--directions", "20"]),
     Case("export", "evaluate", ["export", "--map", MAP, "--out", "robot"]),
+    Case("check", "corridor", CHECK, workers=True),
+    Case("check --images", "photographs", [
+        "check", "--map", "sparse", "--images", "photographs", "--metres", "--views", "4", "--device", "cpu",
+        "--workers", "2"], workers=True),
+    Case("adapt --map", "corridor", stage("adapt", *CORRIDOR, *TWO), workers=True),
+    Case("adapt, labels that are there", "labelled", stage("adapt", *SYNTHETIC)),
+    Case("sample, more", "map", stage("sample", "--sample.max_locations", "12", "--sample.max_directions", "10")),
+    Case("adapt, labels of its own", "sample, more", stage("adapt", "--scene", "two", *TWO), workers=True),
 )  # fmt: skip
 """What comes beside or after the line."""
 
@@ -169,8 +182,7 @@ class Workshop:
         if os.waitstatus_to_exitcode(os.waitpid(self._fork(self._begin), 0)[1]) != 0:
             raise RuntimeError("the meshes and the MLflow store could not be made")
         wanted = {case.before for case in cases} | {case.after for case in cases}
-        if "viewpoint-map" in wanted:
-            cases = [*(case for case in OTHERS if case.name == "viewpoint-map"), *cases]
+        cases = [*(case for case in OTHERS if case.name in wanted), *cases]
         wanted |= {case.before for case in cases}
         last = max((number for number, case in enumerate(LINE) if case.after in wanted), default=-1)
         for case in dict.fromkeys([*LINE[: last + 1], *cases]):
@@ -212,6 +224,9 @@ class Workshop:
             ]
             save_glb(replace(mesh, textures=tuple(textures)), first / f"{name}.glb")
         client(TrackingConfig(str(first / "mlruns")))
+        for name, make in (("corridor", _corridor), ("photographs", _photographs), ("labelled", _labelled)):
+            shutil.copytree(first, self.state(name))
+            make(self.state(name))
 
     def _undisturbed(self, case: Case) -> None:
         """Run a case; count its changes of files, at which it may be killed."""
@@ -239,7 +254,7 @@ class Workshop:
 
     def differences(self, case: Case) -> list[str]:
         """In which files the folder differs from what an undisturbed run leaves."""
-        found, expected = contents(self.folder), self.expected[case.after or case.name]
+        found, expected = _one_name(contents(self.folder)), _one_name(self.expected[case.after or case.name])
         if case.before == "map" and case.after == "map":  # which holds photographs for others
             found = {path: digest for path, digest in found.items() if not path.startswith("photographs/")}
         made = [
@@ -252,6 +267,37 @@ class Workshop:
         other = [f"other: {path}" for path in fixed if found.get(path, expected[path]) != expected[path]]
         counts = [_counts(folder) for folder in (self.folder, self.state(case.after or case.name))]
         return missing + left + other + [f"other counts: {counts}"] * (counts[0] != counts[1])
+
+
+def _one_name(files: dict[str, str]) -> dict[str, str]:
+    """Files with one name for the only folder of blocks, which tells when features were made: of photographs, now."""
+    blocks = [found[0] for path in files if (found := re.search(r"(?<=/work/blocks-)\w+(?=/)", path))]
+    if len({*blocks}) != 1:
+        return files
+    return {path.replace(blocks[0], "key"): digest for path, digest in files.items()}
+
+
+def _corridor(folder: Path) -> None:
+    """A map of 30 photographs, and their features."""
+    from check.corridor import write_corridor
+
+    write_corridor(folder / "corridor")
+
+
+def _photographs(folder: Path) -> None:
+    """A model of poses alone, and its photographs: 24, rendered."""
+    from check.rendered_room import write_rendered_room
+
+    write_rendered_room(folder)
+
+
+def _labelled(folder: Path) -> None:
+    """A dataset of two labelled scenes, whose labels are made up."""
+    from synthetic_dataset import make_dataset
+    from wheretolook.dataset.stamps import write_stamp
+
+    for scene in make_dataset(folder / "data" / "synthetic", ("train", "test")).scenes:
+        write_stamp(scene, "label", "key")
 
 
 def _counts(folder: Path) -> dict[str, Any]:

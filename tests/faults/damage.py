@@ -7,9 +7,10 @@ import re
 import shutil
 import subprocess
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
-from faults.cases import SPACE, Case, Workshop, stage
+from faults.cases import CHECK, CORRIDOR, SPACE, SYNTHETIC, Case, Workshop, stage
 from faults.kills import Outcome, _labels_here
 from faults.runs import Run, contents
 
@@ -28,17 +29,22 @@ READERS = {
     "release": ("evaluate", stage("release")),
     "select": ("evaluate", ["select", "--map", "data/tiny/two/map", "--at", "1,1,1.2", "--out", "views.csv",
                             "--directions", "20"]),
+    "check": ("check", [*CHECK, "--workers", "1"]),
+    "adapt --map": ("adapt --map", stage("adapt", *CORRIDOR, "--label.workers", "1")),
+    "adapt, labels that are there": ("labelled", stage("adapt", *SYNTHETIC)),
+    "adapt, labels of its own": ("adapt, labels of its own", stage("adapt", "--scene", "two", "--label.workers", "1")),
 }  # fmt: skip
 """From which state, and what is run that reads the files."""
 
 NOT_READ = ("/images/", "photographs/", ".csv", ".md", ".png", ".txt")
 
 
-def planned(workshop: Workshop, n: int, rng: random.Random) -> list[tuple[str, str, str]]:
+def planned(workshop: Workshop, readers: Sequence[str], n: int, rng: random.Random) -> list[tuple[str, str, str]]:
     """Readers, files and ways to damage them: every kind of file in every way, as often as any other."""
     chosen = []
-    for reader, (state, _) in READERS.items():
-        files = [path for path in contents(workshop.state(state)) if not any(part in path for part in NOT_READ)]
+    for reader in readers:
+        paths = contents(workshop.state(READERS[reader][0]))
+        files = [path for path in paths if "/work/" in path or not any(part in path for part in NOT_READ)]
         chosen += [(reader, file, way) for file in files for way in WAYS if not file.endswith("/")]
     rng.shuffle(chosen)
     return (chosen * (n // max(1, len(chosen)) + 1))[:n]

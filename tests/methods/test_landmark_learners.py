@@ -123,6 +123,11 @@ def test_expected_cells_in_closed_form() -> None:
     np.testing.assert_allclose(found, [1 - 0.7 * 0.4 + 0.25 + 0.5, 1 - 0.1**2, 0], rtol=1e-12)
 
 
+def test_weights_that_give_no_numbers_are_told() -> None:
+    with pytest.raises(WeightsError, match="these weights give no numbers"):
+        expected_statistics(torch.full((1, 21), torch.nan), torch.tensor([50]))
+
+
 def test_more_landmarks_leave_less_error_to_expect() -> None:
     few, many = (attributes_of(np.tile(some_offsets(20), (n, 1))) for n in (1, 10))
     likely = [torch.full((len(values),), 2.0).double() for values in (few, many)]

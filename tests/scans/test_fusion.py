@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from tests.disks import file_limit
 
 from scans.recordings import COLOR, HIGH, LOW, room, turned, walk, write_seven_scenes, write_tum
 from wheretolook.geometry.poses import camera_centers, transform
@@ -20,7 +21,7 @@ from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scans.config import RgbdConfig
 from wheretolook.scans.fusion import make_scan
 from wheretolook.scans.layouts import _Times, find_layout, frame_files
-from wheretolook.utils.errors import ConfigError, MapError, MapWarning, SceneError
+from wheretolook.utils.errors import ConfigError, MapError, MapWarning, SceneError, StorageError
 
 VOXEL_M = 0.03
 Y_DOWN = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # takes a world with y down to the room's
@@ -287,6 +288,8 @@ def test_poses_of_a_model_serve_instead_and_tell_the_unit(seven_scenes, mesh, tm
         model_of(names, poses, y @ Y_DOWN, scale).write_binary(str(tmp_path / f"{scale}"))
     found = scan(folder, model=tmp_path / "1.0")
     assert found.frames.skipped.reasons == {"without a pose in the model": 10}
+    with file_limit(100), pytest.raises(StorageError, match="is the disk full"):
+        found.save_model(tmp_path / "frames")
     found.save_model(tmp_path / "frames")
     upright = colmap_poses(tmp_path / "frames")
     assert np.allclose(upright[:, :, :3] @ found.rotation, poses[:, :, :3], atol=1e-6)

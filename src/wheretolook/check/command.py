@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from wheretolook.dataset.names import LOCK, check_scene_name
-from wheretolook.utils.confine import entry_of
 from wheretolook.utils.errors import ConfigError, MapError
 from wheretolook.utils.locks import hold
 from wheretolook.utils.options import CommandParser
@@ -97,7 +96,8 @@ def run(arguments: Sequence[str]) -> int:
     device, workers = usable_device(options.device), options.workers or len(os.sched_getaffinity(0))
     scoring = Scoring(options.method, options.weights, tuple(options.also), options.anywhere)
     scoring.check()  # now, not after the work
-    out = options.out or entry_of(options.data / "checks", _name(options), "the name of a check")
+    out = options.out or sources.folder_of_check(options.data, _name(options))
+    sources.check_links_of(out)
     scene = None if options.scene is None else sources.find_scene(options.data, options.scene, options.name)
     try:
         with _reading(scene), hold(out / ".lock", "check"):

@@ -23,7 +23,7 @@ from wheretolook.geometry.poses import Float, pose_error
 from wheretolook.labelling.config import LocalizerConfig
 from wheretolook.labelling.labeller import versions
 from wheretolook.labelling.localizer import Localizer
-from wheretolook.mapping.colmap_model import read_model
+from wheretolook.mapping.colmap_model import read_model, write_model
 from wheretolook.mapping.descriptors import read_features
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
 from wheretolook.utils.errors import MapError, MapWarning
@@ -113,8 +113,7 @@ def leave_out(
             jobs.append(_Job(model, source.features, block, [source.names[row] for row in rows], cameras, *about))
             open_blocks.add(block.number)
     if jobs:
-        model.mkdir(parents=True, exist_ok=True)
-        source.model.write_binary(str(model))
+        write_model(source.model, model)
     with Processes(max(1, min(workers, len(jobs)))) as processes:
         # the largest first, so that no process works alone at the end
         jobs.sort(key=lambda job: -len(job.block.looked_at))

@@ -27,6 +27,7 @@ from wheretolook.mapping.descriptors import read_descriptors
 from wheretolook.mapping.gravity import estimate_gravity
 from wheretolook.mapping.plausibility import axes_doubt
 from wheretolook.mapping.scale import Similarity, read_scale
+from wheretolook.utils.confine import check_links, entry_of
 from wheretolook.utils.errors import ConfigError, MapError, MapWarning
 from wheretolook.utils.files import fingerprint, write_text
 from wheretolook.utils.reading import read_json_object
@@ -37,6 +38,7 @@ MAX_ERROR_OF_DEPTH = 0.01  # instead, of the median depth of what the photograph
 DEPTH_M = MAX_ERROR_M / MAX_ERROR_OF_DEPTH
 """Median depth that a map without metres is brought to. There the two limits on the position agree, and scorers, which
 have learnt in rooms, see distances as in rooms."""
+CHECKS = "checks"  # folder of the folders of checks, beside the datasets
 LEAST_PHOTOGRAPHS = 20  # of fewer, blocks are too small to tell anything
 LEAST_OBSERVED = 10  # landmarks that the median photograph observes; fewer are accidents
 
@@ -149,6 +151,20 @@ def open_map(
         depth_m=_median_depths(arrays, poses),
         key=digest_of(parts),
     )
+
+
+def folder_of_check(data: Path, name: str) -> Path:
+    """Where the results of a check go, of this name and without a folder given, there already or not.
+
+    Raises ConfigError if it would lie elsewhere, by its name or by a link.
+    """
+    return entry_of(entry_of(data, CHECKS, "the folder of all checks"), name, "the name of a check")
+
+
+def check_links_of(out: Path) -> None:
+    """Raise ConfigError if a link in a folder of results, or in the folders of its blocks, leads out of it."""
+    if out.is_dir():
+        check_links(out, 4)
 
 
 def find_scene(data: Path, name: str, dataset: str = "") -> SceneFolder:

@@ -16,6 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float
+from wheretolook.mapping.colmap_model import write_model
 from wheretolook.mapping.gravity import estimate_gravity, rotation_to_z
 from wheretolook.mapping.scale import Similarity
 from wheretolook.scans.checks import check_depth_unit, landmark_readings
@@ -77,7 +78,6 @@ class Scan:
         """
         import pycolmap
 
-        folder.mkdir(parents=True, exist_ok=True)
         model = self.frames.model
         if model is not None:
             model = pycolmap.Reconstruction(model)
@@ -88,7 +88,7 @@ class Scan:
             for number, (name, pose) in enumerate(zip(self.frames.names, self.frames.cam_from_world, strict=True), 1):
                 turned = pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:, :3] @ self.rotation.T), pose[:, 3])
                 model.add_image_with_trivial_frame(pycolmap.Image(name=name, camera_id=1, image_id=number), turned)
-        model.write_binary(str(folder))
+        write_model(model, folder)
 
 
 def make_scan(config: RgbdConfig, device: str = "cpu", progress: bool = True) -> Scan:

@@ -22,7 +22,7 @@ from wheretolook.geometry.poses import Float
 from wheretolook.mapping.config import ExistingModelConfig
 from wheretolook.methods.features_learnt import folder_for
 from wheretolook.stages.inputs import Say, Tick, extractor_of, open_scene, refuse_release
-from wheretolook.stages.left_out import CHECKS, check_name, knows_photographs, leave_photographs_out
+from wheretolook.stages.left_out import check_name, knows_photographs, leave_photographs_out
 from wheretolook.stages.one_at_a_time import reading
 from wheretolook.utils.errors import ConfigError, MapError, OutOfRangeWarning, SceneError, TableError, WeightsError
 from wheretolook.utils.files import fingerprint, write_text
@@ -113,12 +113,13 @@ def _to_start_from(features: str) -> Path:
 
 def _adapt_map(experiment: Experiment, model: Path, weights: Path, say: Say, tick: Tick) -> Path | None:
     """Adapt to a COLMAP map by its photographs alone."""
+    from wheretolook.check.source import folder_of_check
     from wheretolook.mapping.colmap_model import model_arrays, read_model
     from wheretolook.mapping.scale import read_scale
     from wheretolook.select.surroundings import surroundings
 
     name = ExistingModelConfig(model=model).scene_name
-    path = experiment.adapt.out or experiment.data / CHECKS / name / "adapted.safetensors"
+    path = experiment.adapt.out or folder_of_check(experiment.data, name) / "adapted.safetensors"
     _check_out(path, weights)
     check_store(experiment.tracking)
     scale = read_scale(model)
@@ -199,6 +200,8 @@ def _scene(dataset: Dataset, name: str) -> SceneFolder:
 def _check_out(path: Path, weights: Path) -> None:
     if path.suffix != ".safetensors" or path.is_dir():
         raise ConfigError("weights are a file", path=path, fix="Give --out a name that ends in .safetensors.")
+    if (within := next(folder for folder in path.absolute().parents if folder.exists())).is_file():
+        raise ConfigError("this is a file, no folder", path=within, fix="Give --out another folder.")
     if path.resolve() == weights.resolve():
         fix = "Give --out another name."
         raise ConfigError("the adapted weights would replace those that they start from", path=path, fix=fix)

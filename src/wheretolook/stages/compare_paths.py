@@ -24,7 +24,7 @@ from wheretolook.utils.files import fingerprint, replacing, write_json, write_te
 from wheretolook.utils.reading import read_json, read_json_object
 from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.utils.tracking_store import check_store, kept_if_not_logged
-from wheretolook.viewpoints.table import SCHEMA, UNLABELLED
+from wheretolook.viewpoints.table import SCHEMA, UNLABELLED, read_parquet
 
 if TYPE_CHECKING:
     from wheretolook.planning.path_comparison import ComparedPaths
@@ -91,15 +91,19 @@ def _plan(
     tables = {name: folder / f"{name}.parquet" for name in ("paths", "views")}
     made = folder / MADE
     if all(path.is_file() for path in tables.values()) and _holds(made, key):
-        say(f"{scene.name}: reusing {folder}")
-        return ComparedPaths(**{name: pd.read_parquet(path) for name, path in tables.items()})
+        try:
+            kept = ComparedPaths(**{name: read_parquet(path) for name, path in tables.items()})
+            say(f"{scene.name}: reusing {folder}")
+            return kept
+        except ValueError as error:
+            say(f"{scene.name}: its paths are damaged, and planned anew: {error}")
     mapped = [name for name in config.methods if name != FORWARD]
     maps = {name: planner_map(scene, config, planner_scorer(scene, dataset, name, weights[name])) for name in mapped}
     found = plan_pairs(draw_pairs(scene.space, config), scene.space, maps, config, f"plan {scene.name}")
     made.unlink(missing_ok=True)
     for name, path in tables.items():
         with replacing(path) as partial:
-            getattr(found, name).to_parquet(partial, index=False)
+            getattr(found, name).to_parquet(partial, index=False, write_page_checksum=True)
     write_json(made, key)
     failed, total = int((~found.paths["planned"]).sum()), len(found.paths)
     say(f"{scene.name}: {total - failed} of {total} paths found, {len(found.views):,} views -> {folder}")

@@ -22,7 +22,7 @@ from wheretolook.planning.config import PathsConfig
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import replacing, write_json
 from wheretolook.utils.reading import read_json
-from wheretolook.viewpoints.table import pose_columns, poses
+from wheretolook.viewpoints.table import pose_columns, poses, read_parquet
 
 if TYPE_CHECKING:
     from wheretolook.planning.path_comparison import ComparedPaths
@@ -220,7 +220,7 @@ def _kept(path: Path, key: str) -> pd.DataFrame | None:
     """A table that was kept, if it is of this key."""
     try:
         if read_json(path.with_suffix(".json")) == key:
-            return pd.read_parquet(path)
+            return read_parquet(path)
     except (OSError, ValueError):
         pass
     return None
@@ -229,5 +229,5 @@ def _kept(path: Path, key: str) -> pd.DataFrame | None:
 def _keep(table: pd.DataFrame, path: Path, key: str) -> None:
     path.with_suffix(".json").unlink(missing_ok=True)
     with replacing(path) as partial:
-        table.to_parquet(partial, index=False)
+        table.to_parquet(partial, index=False, write_page_checksum=True)
     write_json(path.with_suffix(".json"), key)

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from wheretolook.check.leave_out import LeftOut
     from wheretolook.check.source import PhotographedMap
 
-CHECKS = "checks"  # folder of the folders of checks, beside the datasets
-
 
 def knows_photographs(files: SceneFolder, images: Path | None = None, database: Path | None = None) -> bool:
     """Whether the features of the photographs that a scene's map was made from are known, or these themselves."""
@@ -32,6 +30,8 @@ def knows_photographs(files: SceneFolder, images: Path | None = None, database: 
 
 def check_name(experiment: Experiment, files: SceneFolder) -> str:
     """What the folder of a scene's check is called: as by `check --name`, unless there is one as by `check` alone."""
+    from wheretolook.check.source import CHECKS
+
     names = f"{experiment.name}-{files.name}", files.name
     return next((name for name in names if (experiment.data / CHECKS / name).is_dir()), names[0])
 
@@ -54,9 +54,10 @@ def leave_photographs_out(
     model's cameras seem to lie on their side.
     """
     from wheretolook.check.leave_out import left_out_blocks
-    from wheretolook.check.source import features_of, open_map
+    from wheretolook.check.source import check_links_of, features_of, folder_of_check, open_map
 
-    out, workers, device = experiment.data / CHECKS / name, experiment.n_workers, experiment.warp_device
+    out, workers, device = folder_of_check(experiment.data, name), experiment.n_workers, experiment.warp_device
+    check_links_of(out)
     try:
         with hold(out / ".lock", stage):
             folder, features = features_of(model, images, database, out / "work", workers, device)

@@ -6,7 +6,6 @@ matched can be stored too, see `MATCH_FIELDS`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +17,7 @@ from numpy.typing import NDArray
 from wheretolook.geometry.poses import Float, camera_centers, quaternion_from_rotation, rotation_from_quaternion
 from wheretolook.utils.errors import TableError
 from wheretolook.utils.files import replacing
-from wheretolook.utils.npz_files import FREE_BYTES, MAX_RATIO
-from wheretolook.utils.reading import check_file
+from wheretolook.utils.parquet_files import open_parquet, read_columns
 
 POSE_COLUMNS = ("qw", "qx", "qy", "qz", "tx", "ty", "tz")
 CENTER_COLUMNS = ("x_m", "y_m", "z_m")
@@ -54,8 +52,6 @@ number of the camera in the scene's `cameras.txt`."""
 
 (CAMERA_ID,) = CAMERA_FIELD.names
 (PIXELS,) = PIXEL_FIELD.names
-
-_AT_ONCE = 1 << 16  # rows that are read before what they unfold to is looked at
 
 CENTER_DECIMALS = 12  # of a metre; the centres of a location's viewpoints, each computed from its pose, differ by less
 
@@ -154,37 +150,19 @@ def _shared_centers(table: pd.DataFrame) -> Float:
 def read_parquet(path: Path) -> pd.DataFrame:
     """Read any table in a Parquet file. ValueError if it is none, or unfolds to far more than it has bytes."""
     try:
-        with pq.ParquetFile(path) as file:
-            frame: pd.DataFrame = _read(file, path, file.schema_arrow.names).to_pandas()
+        with open_parquet(path, page_checksum_verification=True) as file:
+            frame: pd.DataFrame = read_columns(file, path, file.schema_arrow.names).to_pandas()
             return frame
-    except (pa.ArrowException, OSError, KeyError) as error:
+    except ValueError as error:
         raise ValueError(f"not a readable Parquet file: {error}") from error
-
-
-def _read(file: pq.ParquetFile, path: Path, names: Sequence[str]) -> pa.Table:
-    """Columns of a file, batch by batch: repeated values take next to none of it, and its own counts may lie.
-
-    ValueError if they unfold to far more than the file has bytes, or do not have as many rows as it says.
-    """
-    n_bytes, batches, unfolded = check_file(path).st_size, list[pa.RecordBatch](), 0
-    fields = [file.schema_arrow.field(name) for name in names]
-    for batch in file.iter_batches(_AT_ONCE, columns=list(names)):
-        batches.append(batch)
-        unfolded += batch.nbytes
-        if unfolded > max(FREE_BYTES, MAX_RATIO * n_bytes):
-            raise ValueError(f"its {n_bytes:,} bytes would unfold to more than {unfolded:,}")
-    table = pa.Table.from_batches(batches, pa.schema(fields))
-    told = {file.metadata.num_rows, sum(file.metadata.row_group(i).num_rows for i in range(file.num_row_groups))}
-    if told != {table.num_rows}:
-        raise ValueError(f"it says that it has {max(told):,} rows, and has {table.num_rows:,}")
-    return table
 
 
 def has_matches(path: Path, pixels: bool = False) -> bool:
     """Whether a table holds `MATCH_FIELDS`, with `pixels` also `PIXEL_FIELD`; a file that cannot be read does not."""
     try:
-        return {*MATCH_FIELDS.names, *(PIXEL_FIELD.names if pixels else [])} <= {*pq.read_schema(path).names}
-    except (pa.ArrowException, OSError, ValueError):
+        with open_parquet(path) as file:
+            return {*MATCH_FIELDS.names, *(PIXEL_FIELD.names if pixels else [])} <= {*file.schema_arrow.names}
+    except ValueError:
         return False
 
 
@@ -198,11 +176,11 @@ def read_table(path: Path, matches: bool = False, pixels: bool = False) -> pd.Da
     if not path.is_file():
         raise TableError("there is no table of viewpoints", path=path, fix="Run the sample stage first.")
     try:
-        with pq.ParquetFile(path, page_checksum_verification=True) as file:
+        with open_parquet(path, page_checksum_verification=True) as file:
             names = file.schema_arrow.names  # matches take long to read, so only if they are asked for
             unwanted = ([] if matches or pixels else MATCH_FIELDS.names) + ([] if pixels else PIXEL_FIELD.names)
-            table = _read(file, path, [name for name in names if name not in unwanted])
-    except (pa.ArrowException, OSError, ValueError, KeyError) as error:
+            table = read_columns(file, path, [name for name in names if name not in unwanted])
+    except ValueError as error:
         fix = "It may be truncated: get it anew, or delete it and run the stage that writes it."
         raise TableError(f"not a readable Parquet file: {error}", path=path, fix=fix) from error
     compact = any(name in names for name in CENTER_COLUMNS)

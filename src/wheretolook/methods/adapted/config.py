@@ -42,3 +42,5 @@ class AdaptConfig:
             raise ConfigError("features come from a database or from images", value=str(self.images), fix=fix)
         if not 0 < self.minutes < float("inf"):
             raise ConfigError("the time to label views in is above 0 minutes", value=self.minutes)
+        if self.seed < 0:
+            raise ConfigError("seed must not be negative", value=self.seed)

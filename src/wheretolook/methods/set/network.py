@@ -20,6 +20,7 @@ from wheretolook.methods.matchability.network import (
     expected_parts,
 )
 from wheretolook.methods.set.config import SetConfig
+from wheretolook.utils.errors import WeightsError
 
 PRIOR = 1e-3
 """Information on every coordinate of a pose before anything is seen: keeps the covariance finite (1/m^2 and 1/rad^2
@@ -226,7 +227,11 @@ def expected_statistics(sums: Tensor, n_visible: Tensor) -> Tensor:
     inliers, moments = sums[:, 0], sums[:, 16:] / (sums[:, :1] + 1e-6)
     # in double precision: the covariance is an inverse
     information = information_matrices(sums[:, 1:16].double()) + PRIOR * torch.eye(6, device=sums.device).double()
-    factor = torch.linalg.cholesky(information)
+    try:
+        factor = torch.linalg.cholesky(information)
+    except torch.linalg.LinAlgError as error:  # chances that are not numbers, by weights that are too large
+        problem = "these weights give no numbers: they are damaged, or the map is"
+        raise WeightsError(problem, fix="Give other weights, or train again.") from error
     unit = torch.eye(6, dtype=factor.dtype, device=factor.device).expand_as(factor)
     # not by `cholesky_inverse`, which takes the matrices of a batch one by one on a GPU
     variances = torch.linalg.solve_triangular(factor, unit, upper=False).square().sum(-2)

@@ -18,7 +18,8 @@ _AGREE = 0.03  # by which two depths of the same point may differ, of the depth
 _PAIRS = 40  # pairs of frames that are compared
 _LEAST_PAIRS, _LEAST_SHARED = 3, 50  # of them, and readings that the two of a pair share
 _FACING = np.cos(np.radians(40.0))  # of the optical axes of a pair
-_FACTORS = np.geomspace(1 / 12, 12, 83)  # that depths are multiplied with, in steps of 6 %
+_STEPS = 83
+_FACTORS = np.geomspace(1 / 12, 12, _STEPS)  # that depths are multiplied with, in steps of 6 %
 _FACTORS = np.concatenate([_FACTORS, *(power * np.geomspace(0.8, 1.25, 7) for power in (0.001, 0.01, 100, 1000))])
 _ONE = 41  # where among them is 1
 _LEAST_AGREEMENT = 0.2  # share of the readings, or poses and depths have nothing to do with each other
@@ -106,7 +107,17 @@ def pose_factor(survey_m: NDArray[np.float32], camera: PinholeCamera, cam_from_w
     near_one = agreement[np.abs(np.log(_FACTORS)) < np.log(_OFF)].max()
     if agreement[best] < _LEAST_AGREEMENT:
         return float("nan")
-    return float(_FACTORS[best]) if agreement[best] > near_one + _CLEARLY else float(_FACTORS[_ONE])
+    return _peak(agreement, best) if agreement[best] > near_one + _CLEARLY else float(_FACTORS[_ONE])
+
+
+def _peak(agreement: Float, best: int) -> float:
+    """Where a parabola through the best of `_FACTORS` and two on either side has its top: the peak is flat."""
+    if not 2 <= best < _STEPS - 2:
+        return float(_FACTORS[best])
+    steps = np.arange(-2, 3)
+    curve, slope, _ = np.polyfit(steps, agreement[best + steps], 2)
+    top = float(np.clip(-slope / (2 * curve), -1, 1)) if curve < 0 else 0.0
+    return float(_FACTORS[best] * (_FACTORS[1] / _FACTORS[0]) ** top)
 
 
 def _pairs(cam_from_world: Float) -> list[tuple[int, int]]:

@@ -153,7 +153,7 @@ def _pages(file: int, n_bytes: int, chunk: Any, at_most: int) -> list[_Page]:
     start, length, dictionary = (told.get(field) for field in (9, 7, 11)) if isinstance(told, dict) else [None] * 3
     if not isinstance(start, int) or not isinstance(length, int):
         raise ValueError(_DAMAGED)
-    if isinstance(dictionary, int) and 0 < dictionary < start:
+    if isinstance(dictionary, int) and (0 < dictionary < start or start == 0 < dictionary):  # without rows, no data
         start = dictionary
     end, found = start + length, list[_Page]()
     if not 0 <= start <= end <= n_bytes:

@@ -16,7 +16,7 @@ from wheretolook.geometry.poses import Float, poses_looking_along, quaternion_fr
 from wheretolook.planning.turns import pan_tilt_angles
 from wheretolook.utils.errors import ConfigError, TableError, WhereToLookError
 from wheretolook.view import drawing
-from wheretolook.view.controls import build, check_value
+from wheretolook.view.controls import build, check_value, value_of
 from wheretolook.view.scenery import Scenery
 from wheretolook.view.scores import Place, landmarks_seen, look_around, report_of
 from wheretolook.view.shared import Shared
@@ -133,7 +133,8 @@ class Session:
 
     def _chosen(self) -> None:
         c = self.controls
-        self.note(method=c.method.value, occlusion=c.occlusion.value)
+        known = self.state
+        self.note(method=value_of(c.method, known.method), occlusion=value_of(c.occlusion, known.occlusion))
         self.fill_floor()
         if self.place is not None:
             self.go_to(self.place.position, self._angles())
@@ -148,7 +149,8 @@ class Session:
     def _slid(self) -> None:
         c = self.controls
         before = self.state
-        self.note(height=float(c.height.value), threshold=float(c.threshold.value))
+        height, threshold = value_of(c.height, before.height), value_of(c.threshold, before.threshold)
+        self.note(height=height, threshold=float(threshold))
         self.fill_floor()
         if before.threshold != self.state.threshold:
             self.judge()
@@ -158,10 +160,13 @@ class Session:
         self.submit("scene", SOON, _once(self.draw_scene))
 
     def _turned(self) -> None:
-        self.turn_to(axes_of_angles((self.controls.yaw.value, self.controls.pitch.value)), sliders=True)
+        self.turn_to(
+            axes_of_angles((value_of(self.controls.yaw, 0.0), value_of(self.controls.pitch, 0.0))), sliders=True
+        )
 
     def _angles(self) -> tuple[float, float] | None:
-        return None if self.axis is None else (float(self.controls.yaw.value), float(self.controls.pitch.value))
+        c = self.controls
+        return None if self.axis is None else (float(value_of(c.yaw, 0.0)), float(value_of(c.pitch, 0.0)))
 
     def _look_through(self) -> None:
         """Stand at the place with the camera's field of view, or look from outside again."""

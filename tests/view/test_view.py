@@ -437,6 +437,18 @@ def test_values_that_no_control_offers_are_told_and_put_back(viewer: Viewer) -> 
         assert np.isfinite(session.state.height)
 
 
+def test_the_ground_of_the_dark_is_no_darker_than_low_scores(viewer: Viewer) -> None:
+    with _client(viewer) as client:
+        client.send(camera_message())
+        _until(lambda: viewer.sessions)
+        (session,) = viewer.sessions.values()
+        grounds: list[object] = []
+        session.client.scene.set_background_image = lambda image, **_: grounds.append(image)
+        session.theme(True)
+        session.theme(False)
+        assert grounds[0].min() > drawing.score_colors(np.zeros(1)).mean() and grounds[1] is None  # type: ignore[attr-defined]
+
+
 def test_paths_that_are_too_large_or_no_poses_are_refused(tmp_path: Path) -> None:
     poses = np.tile(np.eye(3, 4), (4, 1, 1))
     row = {"method": "set", "pair": 0, "task": "planned", "waypoint": range(4)}

@@ -128,7 +128,8 @@ class Session:
         self.client.camera.on_update(lambda _: self.safely(self._camera_moved))
 
     def theme(self, dark: bool) -> None:
-        """Light or dark."""
+        """Light or dark; the ground of the dark scene is grey, since low scores are dark themselves."""
+        self.client.scene.set_background_image(drawing.DARK_GROUND if dark else None, format="png")
         self.client.gui.configure_theme(dark_mode=dark, show_logo=False, show_share_button=False, control_width="large")
 
     def _chosen(self) -> None:
@@ -362,8 +363,14 @@ class Session:
 def _told(place: Place, state: ViewState) -> str:
     x, y, z = place.position
     share = np.mean(place.scores >= state.threshold)
-    told = f"At {x:.2f}, {y:.2f}, {z:.2f} m: best {place.best.score[0]:.3g}, median {np.median(place.scores):.3g}"
+    median = _brief(float(np.median(place.scores)))
+    told = f"At {x:.2f}, {y:.2f}, {z:.2f} m: best {place.best.score[0]:.3g}, median {median}"
     return f"{told}; {100 * share:.0f} % of directions are good." if place.scores.max() <= 1 else f"{told}."
+
+
+def _brief(score: float) -> str:
+    """A score in few letters: of a probability two decimals, since 5.26e-05 tells nobody anything."""
+    return f"{score:.2f}" if 0 <= score <= 1 else f"{score:.3g}"
 
 
 def _once(then: Callable[[], None]) -> Iterator[None]:

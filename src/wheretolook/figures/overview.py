@@ -54,7 +54,7 @@ def overview_figure(overview: Overview) -> Figure:
     """
     with context(RC):
         figure = new_figure(13.5, 4.7)
-        left, middle, right = figure.subfigures(1, 3, width_ratios=(1.1, 1.45, 0.8))
+        left, middle, right = figure.subfigures(1, 3, squeeze=False, width_ratios=(1.1, 1.45, 0.8))[0]
         axes = left.add_subplot()
         points = _draw_plan(axes, overview)
         axes.set_title(f"{overview.scene}, from above", loc="left")
@@ -82,7 +82,8 @@ def _draw_plan(axes: Axes, overview: Overview):  # type: ignore[no-untyped-def]
     pixels, place = plan.pixels(overview.locations), plan.pixels(overview.place)
     order = np.argsort(overview.share_good, kind="stable")
     look: Look = {"s": 46, "cmap": "cividis", "vmin": 0, "vmax": 1, "edgecolors": "white", "linewidths": 0.8}
-    points = axes.scatter(*pixels[order].T, c=overview.share_good[order], zorder=2, **look)
+    x, y = pixels[order].T
+    points = axes.scatter(x, y, c=overview.share_good[order], zorder=2, **look)
     ring: Look = {"markersize": 14, "markerfacecolor": "none", "markeredgecolor": VERMILION, "markeredgewidth": 2.4}
     axes.plot(*place, "o", zorder=3, path_effects=[withStroke(linewidth=4.5, foreground="white")], **ring)
     low, high = plan.pixels(np.stack([overview.place, overview.place + np.array([1.0, 0.0, 0.0])]))
@@ -94,8 +95,15 @@ def _draw_plan(axes: Axes, overview: Overview):  # type: ignore[no-untyped-def]
 
 def _draw_sphere(axes: Axes, overview: Overview):  # type: ignore[no-untyped-def]
     azimuth, elevation = pan_tilt_angles(overview.directions)
-    look: Look = {"s": 20_000 / max(len(azimuth), 1), "cmap": "cividis", "vmin": 0, "vmax": 1, "linewidths": 0}
-    points = axes.scatter(azimuth, elevation, c=overview.scores, **look)
+    look: Look = {
+        "s": 20_000 / max(len(azimuth), 1),
+        "c": overview.scores,
+        "cmap": "cividis",
+        "vmin": 0,
+        "vmax": 1,
+        "linewidths": 0,
+    }
+    points = axes.scatter(azimuth, elevation, **look)
     for view, name, color in ((overview.best, "best", BLUE), (overview.worst, "worst", VERMILION)):
         x, y = (float(angle) for angle in pan_tilt_angles(view.direction))
         disc: Look = {"boxstyle": "round,pad=0.25", "facecolor": "white", "edgecolor": color}

@@ -5,6 +5,8 @@
 #     text_representation:
 #       extension: .py
 #       format_name: percent
+#       format_version: '1.3'
+#       jupytext_version: 1.19.6
 #   kernelspec:
 #     display_name: Python 3
 #     language: python
@@ -73,9 +75,10 @@ display(training_figure(curves) if curves else Markdown(f"No run has a history y
 # ## Calibration
 #
 # Of all test viewpoints with about the same predicted probability, how many localize? On the dashed line as many as
-# predicted. The paper's network promises too much, and dividing its logits by a temperature T, fitted on the validation
-# scene, does not mend it; the set of landmarks keeps nearer to the line, and promises too little. Below, how many
-# viewpoints there are.
+# predicted. The paper's network promises too much here, the set of landmarks a little too little. The reason is not
+# that either is too sure in general: the temperature T that divides its logits is fitted on the validation scene, and
+# comes out near 1. What is off is the difference between that scene and these two, which no single number mends; on a
+# map of one's own, `wheretolook adapt` learns it from the map's photographs. Below, how many viewpoints there are.
 
 # %%
 from wheretolook.evaluation.calibration import read_calibration

@@ -5,6 +5,8 @@
 #     text_representation:
 #       extension: .py
 #       format_name: percent
+#       format_version: '1.3'
+#       jupytext_version: 1.19.6
 #   kernelspec:
 #     display_name: Python 3
 #     language: python
@@ -71,14 +73,14 @@ display(methods_figure(views, localization_map.landmarks.points))
 # `wheretolook plan --film gif`.
 
 # %%
-display(still_figure(views["set"], localization_map.landmarks.points, "apartment-210, set of landmarks"))
+display(still_figure(views["set"], localization_map.landmarks.points, "apartment 210, set of landmarks"))
 
 # %% [markdown]
 # ## Does it help?
 #
-# Views that localize within 0.25 m and 2°, with 95 % intervals over pairs of starts and goals. Above, each method chose
-# places and views; below, it chose the views along a path that was given, under the limit of 30° between waypoints,
-# exactly and by the greedy rule of the Active Localization Benchmark (hatched); looking ahead keeps to no limit.
+# Views that localize within 0.25 m and 2°, with 95 % intervals over pairs of starts and goals. Left, each method chose
+# places and views; right, it chose the views along a path that was given, under the limit of 30° between waypoints,
+# exactly (filled) and by the greedy rule of the Active Localization Benchmark (open); looking ahead keeps to no limit.
 
 # %%
 summary = pd.read_csv(newest_artifact(open_store(release), "paths", "paths.csv", release.name))

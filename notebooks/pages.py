@@ -20,12 +20,15 @@ from typing import Any
 from PIL import Image
 
 _STYLE = """\
-body { max-width: 75rem; margin: 2rem auto; padding: 0 1rem; color: #333; font: 16px/1.5 system-ui, sans-serif }
+body { max-width: 80rem; margin: 2rem auto; padding: 0 1rem; color: #333; font: 16px/1.5 system-ui, sans-serif }
 pre { padding: .5rem .8rem; overflow-x: auto; font-size: 13px; line-height: 1.4; background: #f6f8fa }
 pre.output { background: none; border-left: 3px solid #ddd }
 img { max-width: 100%; height: auto }
-div.output { overflow: auto; max-height: 36rem; font-size: 13px }
+div.output { overflow: auto; max-height: 36rem; font-size: 12.5px }
+div.output td, div.output th { padding: 2px 3px; font-size: 11.5px }
 div.output th { position: sticky; top: 0; background: #fff }
+ol.pages h2 { font-size: 1.15rem; margin: .4rem 0 }
+ol.pages p { margin: 0 }
 ol.pages { padding: 0; list-style: none; display: grid; gap: 1.5rem; \
 grid-template-columns: repeat(auto-fill, minmax(min(20rem, 100%), 1fr)) }
 ol.pages img { max-height: 12rem; object-fit: contain; object-position: left }

@@ -36,21 +36,24 @@ def summary(tmp_path_factory: pytest.TempPathFactory) -> LabelSummary:
     return summary_of(tmp_path_factory.mktemp("labels"), 4)
 
 
-def by_shade(axes: Axes, size: str) -> list[list[float]]:
-    """Sizes of an axes' bars, a list for each threshold."""
+ENDS = (POSITIVE[0], POSITIVE[-1])  # the finest and the coarsest, which are drawn
+
+
+def widths_by_shade(axes: Axes) -> list[list[float]]:
+    """Widths of an axes' bars, a list for each threshold."""
     shades = [to_hex(patch.get_facecolor()) for patch in axes.patches]
-    return [[getattr(patch, size)() for patch, color in zip(axes.patches, shades, strict=True) if color == shade]
+    return [[patch.get_width() for patch, color in zip(axes.patches, shades, strict=True) if color == shade]  # type: ignore[attr-defined]
             for shade in SHADES]  # fmt: skip
 
 
 def test_bars_of_scenes_are_their_shares(summary: LabelSummary) -> None:
     axes = label_figure(summary).axes[0]
     names = [label.get_text() for label in axes.get_yticklabels()]
-    assert names == ["scene-0 (test)", "scene-1 (train)", "scene-2 (train)", "scene-3 (val)", ALL]
+    assert names == ["scene 0 (test)", "scene 1 (train)", "scene 2 (train)", "scene 3 (val)", "all scenes"]
     rows = summary.shares.iloc[[0, 1, 2, 3, -1]]
-    for widths, name in zip(by_shade(axes, "get_width"), POSITIVE, strict=True):
+    for widths, name in zip(widths_by_shade(axes), ENDS, strict=True):
         np.testing.assert_allclose(widths, 100 * rows[name])
-    np.testing.assert_allclose(axes.lines[0].get_xdata(), 100 * rows["locations_positive"])
+    assert [text.get_text() for text in axes.texts] == [f"{100 * share:.0f}" for share in rows[ENDS[0]]]
     order = [to_hex(patch.get_facecolor()) for patch in axes.patches[::5]]
     assert order == list(SHADES[::-1])  # the finer are drawn over the coarser
     assert np.diff(axes.get_ylim())[0] < 0
@@ -59,42 +62,24 @@ def test_bars_of_scenes_are_their_shares(summary: LabelSummary) -> None:
 def test_scenes_are_ordered_by_split(summary: LabelSummary) -> None:
     mixed = summary.shares.assign(split=["train", "test", "train", "test", *summary.shares["split"].iloc[4:]])
     axes = label_figure(LabelSummary(**{**vars(summary), "shares": mixed})).axes[0]
-    names = [label.get_text().split()[0] for label in axes.get_yticklabels()]
-    assert names == ["scene-0", "scene-2", "scene-1", "scene-3", ALL]
-    widths = by_shade(axes, "get_width")[0]
-    np.testing.assert_allclose(widths, 100 * mixed[POSITIVE[0]].iloc[[0, 2, 1, 3, -1]])
+    names = [label.get_text().split(" (")[0] for label in axes.get_yticklabels()]
+    assert names == ["scene 0", "scene 2", "scene 1", "scene 3", "all scenes"]
+    np.testing.assert_allclose(widths_by_shade(axes)[0], 100 * mixed[POSITIVE[0]].iloc[[0, 2, 1, 3, -1]])
 
 
-def test_error_panels_add_up_and_mark_the_thresholds(summary: LabelSummary) -> None:
-    figure = label_figure(summary)
-    found = [summary.errors_m, summary.errors_deg]
-    for axes, errors, unit, name in zip(figure.axes[1:3], found, (0, 1), ("position", "rotation"), strict=True):
-        heights = [patch.get_height() for patch in axes.patches]  # type: ignore[attr-defined]
-        assert sum(heights) == pytest.approx(100)
-        n_views = summary.overall["n_views"]
-        drawn = np.array(heights[:-1]).reshape(2, -1)
-        np.testing.assert_allclose(drawn, 100 * errors[["localized", "disbelieved"]].to_numpy().T / n_views)
-        assert heights[-1] == pytest.approx(100 * summary.overall["without_pose"])
-        assert axes.patches[-1].get_x() > errors["high"].iloc[-1]  # type: ignore[attr-defined]
-        upright = [line.get_xdata()[0] for line in axes.lines if line.get_marker() == "None"]  # type: ignore[index]
-        assert upright == [threshold[unit] for threshold in THRESHOLDS]
-        assert axes.get_xscale() == "log"
-        assert (axes.get_xlabel(), axes.get_ylabel()) == (f"{name} error", "viewpoints (%)")
-    assert [text.get_text() for text in figure.axes[1].texts] == ["5 cm", "25 cm", "0.5 m", "5 m"]
-    assert [text.get_text() for text in figure.axes[2].texts] == ["0.4°", "2°", "5°", "10°"]
-
-
-def test_band_panels_draw_the_bands(summary: LabelSummary) -> None:
-    figure = label_figure(summary)
-    for axes, bands in zip(figure.axes[3:], (summary.by_height, summary.by_visible), strict=True):
-        for heights, name in zip(by_shade(axes, "get_height"), POSITIVE, strict=True):
-            np.testing.assert_allclose(heights, 100 * bands[name].fillna(0))
-        assert [text.get_text() for text in axes.texts] == [f"{number:,}" for number in bands["n_views"]]
-        ends = [float(label.get_text().replace(",", "")) for label in axes.get_xticklabels()]
-        assert ends == [*bands["low"], bands["high"].iloc[-1]]
-        np.testing.assert_allclose(axes.get_xticks(), np.arange(len(bands) + 1) - 0.5)
-    assert figure.axes[3].get_xlabel().endswith("(m)")
-    assert figure.axes[4].get_xlabel() == "visible landmarks"
+def test_errors_add_up_and_the_thresholds_are_marked(summary: LabelSummary) -> None:
+    axes = label_figure(summary).axes[1]
+    heights = [patch.get_height() for patch in axes.patches]  # type: ignore[attr-defined]
+    assert sum(heights) == pytest.approx(100)
+    n_views = summary.overall["n_views"]
+    drawn = np.array(heights[:-1]).reshape(2, -1)
+    np.testing.assert_allclose(drawn, 100 * summary.errors_m[["localized", "disbelieved"]].to_numpy().T / n_views)
+    assert heights[-1] == pytest.approx(100 * summary.overall["without_pose"])
+    assert axes.patches[-1].get_x() > summary.errors_m["high"].iloc[-1]  # type: ignore[attr-defined]
+    upright = [line.get_xdata()[0] for line in axes.lines]  # type: ignore[index]
+    assert upright == [THRESHOLDS[0][0], THRESHOLDS[-1][0]]
+    assert axes.get_xscale() == "log"
+    assert [text.get_text() for text in axes.texts] == ["5 cm", "5 m"]
 
 
 @pytest.mark.parametrize("n_scenes", list(SPLITS))
@@ -102,9 +87,11 @@ def test_figure_says_it_in_words_and_nothing_overlaps(n_scenes: int, tmp_path: P
     summary = summary_of(tmp_path / "data", n_scenes)
     figure = label_figure(summary)
     assert str(figure.get_supxlabel()).replace("\n", " ") == threshold_sentence(summary)
-    texts = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert texts[:2] == ["positive within 5 cm, 0.4°", "positive within 25 cm, 2°"]
-    assert len(texts) == 8
+    legends = [[text.get_text() for text in axes.get_legend().get_texts()] for axes in figure.axes]  # type: ignore[union-attr]
+    assert legends == [
+        ["within 5 cm, 0.4°", "within 5 m, 10°"],
+        ["pose believed", "pose with too few inliers", "no pose"],
+    ]
     save_figure(figure, tmp_path / "figure.png")
     assert_apart(figure)
 
@@ -120,12 +107,13 @@ def test_figure_without_any_positive() -> None:
 
 
 def assert_apart(figure: Figure) -> None:
-    """Names of scenes, ticks, and texts in panels do not touch each other, and the legend touches no panel."""
+    """Names of scenes, ticks, and texts in panels do not touch one another, nor do legends touch their panels."""
     figure.canvas.draw()
-    legend = figure.legends[0].get_window_extent()
     for axes in figure.axes:
-        assert not legend.overlaps(axes.get_tightbbox())  # type: ignore[arg-type]
-    texts = [figure.axes[0].get_yticklabels(), *(axes.get_xticklabels() for axes in figure.axes[1:])]
+        legend = axes.get_legend().get_window_extent()  # type: ignore[union-attr]
+        assert not any(legend.overlaps(text.get_window_extent()) for text in axes.texts)
+        assert not legend.overlaps(axes.get_window_extent())
+    texts = [figure.axes[0].get_yticklabels(), *(axes.get_xticklabels() for axes in figure.axes)]
     for labels in [*texts, *(axes.texts for axes in figure.axes)]:
         boxes = [label.get_window_extent() for label in labels]
         for index, box in enumerate(boxes):

@@ -196,7 +196,7 @@ def test_occlusion_figure_draws_every_method_by_model(scores: pd.DataFrame, tmp_
     assert [label.get_text() for label in left.get_yticklabels()] == [method_style(one).label for one in best_first]
     (legend,) = figure.legends
     names = [text.get_text() for text in legend.get_texts()]
-    assert names == ["mesh rays", "hidden-point removal", "none", "random", "oracle"]
+    assert names == ["mesh rays", "hidden-point removal", "none: through walls", "random", "oracle"]
     for method in METHODS[1:3]:
         rows = first[first["method"] == method]
         style = method_style(method)

@@ -7,6 +7,7 @@ from itertools import combinations
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PatchCollection, PathCollection
@@ -17,7 +18,7 @@ from box_scenes import ROOM, furnished_room
 from wheretolook.figures.house_image import dollhouse, frustum_corners, frustum_segments
 from wheretolook.figures.inputs import BinnedImage, inputs_figure
 from wheretolook.figures.learning import learning_figure
-from wheretolook.figures.overview import View
+from wheretolook.figures.overview import Overview, View, overview_figure
 from wheretolook.figures.peaks import peaks_figure, spread_extrema
 from wheretolook.figures.pipeline import Pipeline, pipeline_figure, ranked_figure
 from wheretolook.figures.sampling import Sampling, sampling_figure
@@ -25,6 +26,9 @@ from wheretolook.figures.style import TWO_COLUMNS_IN, save_figure
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import VoxelGrid, fibonacci_sphere
 from wheretolook.geometry.poses import poses_looking_along, transform
+from wheretolook.planning.turns import pan_tilt_angles
+from wheretolook.stages.demo import _ends
+from wheretolook.viewpoints.table import pose_columns
 
 CAMERA = PinholeCamera(64, 48, 32.0)
 HOUSE = dollhouse(furnished_room(), width_px=240)
@@ -223,6 +227,48 @@ def test_peaks_figure_marks_views_where_they_look(tmp_path: Path) -> None:
     assert [axes.get_xlabel() for axes in views] == ["0.2 cm, 0.05° off"] * 2 + ["too few matches"] * 3
     _assert_draws(figure, tmp_path)
     assert len(peaks_figure(directions, scores, peaks[:1], pits[:1]).axes) == 4  # nothing is known of what came of them
+
+
+def test_overview_draws_places_scores_and_both_views(tmp_path: Path) -> None:
+    plan = dollhouse(furnished_room(), elevation_deg=90, cut_m=1.5, one_sided=False, width_px=240)
+    locations = np.array([[1.0, 2.0, 1.4], [2.0, 3.0, 1.4], [3.0, 1.0, 1.4]])
+    directions = fibonacci_sphere(80)
+    scores, shares = np.linspace(0, 1, 80), np.array([0.2, 0.9, 0.5])
+    rgb = np.full((48, 64, 3), 90, np.uint8)
+    best, worst = (View(rgb, directions[row], float(scores[row]), f"outcome {row}") for row in (79, 30))
+    what = Overview(
+        "a room", "set of landmarks", plan, locations, shares, locations[1], directions, scores, best, worst
+    )
+    figure = overview_figure(what)
+    above, sphere = figure.axes[0], next(axes for axes in figure.axes if axes.name == "hammer")
+    (dots,) = [one for one in above.collections if isinstance(one, PathCollection)]
+    order = np.argsort(shares)
+    np.testing.assert_allclose(dots.get_offsets(), plan.pixels(locations)[order])  # good ones lie on top
+    np.testing.assert_allclose(dots.get_array(), shares[order])
+    ring = next(line for line in above.lines if line.get_marker() == "o")
+    np.testing.assert_allclose(np.ravel(ring.get_xydata()), plan.pixels(locations[1]))
+    metre = next(line for line in above.lines if line.get_marker() == "None")
+    apart = plan.pixels(np.array([[1.0, 1, 1.4], [2.0, 1, 1.4]]))
+    assert np.ptp(metre.get_xdata()) == pytest.approx(np.ptp(apart[:, 0]))
+    assert "set of landmarks" in sphere.get_title(loc="left") and "a room" in above.get_title(loc="left")
+    np.testing.assert_allclose(_dots(sphere)[0], np.transpose(pan_tilt_angles(directions)))
+    for text, view in zip(sphere.texts, (best, worst), strict=True):
+        np.testing.assert_allclose(text.get_position(), np.ravel(pan_tilt_angles(view.direction)))
+    labels = [axes.get_xlabel() for axes in figure.axes]
+    assert "outcome 79" in labels and "outcome 30" in labels
+    save_figure(figure, tmp_path / "figure.png")
+
+
+def test_the_worst_view_shown_is_a_level_one() -> None:
+    """Not the bare ceiling, which is nearly always the worst."""
+    axes = np.array([[0, 0.1, 1.0], [1, 0, 0.2], [0, 1, -0.3], [1, 1, 0.0]])
+    looked = poses_looking_along(np.zeros((4, 3)), axes / np.linalg.norm(axes, axis=1, keepdims=True))
+    table = pd.DataFrame(pose_columns(looked))
+    scores = np.array([0.0, 0.6, 0.2, 0.9])
+    rows, ends = _ends(table, scores)
+    assert [*rows.index] == [3, 2] and [*ends] == [0.9, 0.2]
+    rows, ends = _ends(table.iloc[:1], scores[:1])  # where all look up, one of these
+    assert [*rows.index] == [0, 0]
 
 
 def _dots(axes: Axes) -> list[np.ndarray]:

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.style import context
 
 from wheretolook.figures.config import KINDS
-from wheretolook.figures.style import ONE_COLUMN_IN, PRINT, new_figure, note_of, save_figure
+from wheretolook.figures.style import ONE_COLUMN_IN, PRINT, new_figure, note_of, save_figure, scene_label
 from wheretolook.utils.errors import ConfigError
 
 
@@ -45,3 +45,9 @@ def test_other_kinds_of_files_are_refused(tmp_path: Path) -> None:
         with pytest.raises(ConfigError, match=r"figure\.bmp"):
             work(tmp_path / "figure.bmp")
     assert not list(tmp_path.iterdir())
+
+
+def test_scenes_have_names_for_people() -> None:
+    names = {"apartment-210": "apartment 210", "aws_house": "furnished house", "my_house": "my house"}
+    names |= {"nexuiz_aggressor_b": "game level aggressor b", "nexuiz": "game level"}
+    assert {name: scene_label(name) for name in names} == names

@@ -14,6 +14,7 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
+import pycolmap
 import pytest
 
 pytest.importorskip("viser")
@@ -22,12 +23,12 @@ from selection.room import POINTS, WEIGHTS, write_room
 from wheretolook.cli import main
 from wheretolook.geometry.poses import camera_centers, poses_looking_along
 from wheretolook.select.where_to_look import WhereToLook
-from wheretolook.utils.errors import ConfigError, InUseError, TableError
+from wheretolook.utils.errors import ConfigError, InUseError, MapWarning, TableError
 from wheretolook.view import drawing
 from wheretolook.view.checks import check_port
-from wheretolook.view.controls import check_value
+from wheretolook.view.controls import check_value, value_of
 from wheretolook.view.opened import open_map
-from wheretolook.view.played import FORWARD, looking_ahead, read_paths
+from wheretolook.view.played import FORWARD, Played, looking_ahead, read_paths
 from wheretolook.view.saving import views_file
 from wheretolook.view.server import Viewer, where_clicked
 from wheretolook.view.shared import Shared
@@ -293,6 +294,43 @@ def test_each_client_has_its_own_state_and_nonsense_hurts_nobody(viewer: Viewer)
         _until(lambda: len(viewer.sessions) == 2)
 
 
+def test_a_flood_of_messages_is_outlived_and_a_path_is_played_by_one_thread(sparse: Path) -> None:
+    import msgspec
+
+    paths = {FORWARD: Played(looking_ahead(np.tile(POINTS, (20, 1))))}
+    shared = Shared(open_map(sparse, weights=WEIGHTS), paths)
+    flooded = Viewer(shared, port=0, state=ViewState(method="visible", occlusion="none"))
+    try:
+        with _client(flooded) as bad, _client(flooded) as good:
+            bad.send(camera_message())
+            _until(lambda: len(flooded.sessions) == 1)
+            (session,) = flooded.sessions.values()
+
+            def set_to(name: str, value: object) -> bytes:
+                about = {"uuid": getattr(session.controls, name)._impl.uuid, "updates": {"value": value}}
+                return msgspec.msgpack.encode({"type": "GuiUpdateMessage", **about})
+
+            ray = {"ray_origin": [1.5, 2.0, 9.0], "ray_direction": [0.01, 0, -1]}
+            click = {"type": "ScenePointerMessage", "event_type": "click", "screen_pos": [[0.5, 0.5]], "modifier": None}
+            all_at_once = [
+                msgspec.msgpack.encode({**click, **ray}), camera_message(), set_to("yaw", 12.5), set_to("step", 3),
+                set_to("threshold", 0.7), set_to("play", True), set_to("height", 1e308), set_to("state", "x" * 1000),
+            ]  # fmt: skip
+            before = threading.active_count()
+            for _ in range(300):
+                for message in all_at_once:
+                    bad.send(message)
+            good.send(camera_message())
+            _until(lambda: len(flooded.sessions) == 2, 60)
+            good.send(msgspec.msgpack.encode({**click, **ray}))
+            joined = max(flooded.sessions.items())[1]
+            _until(lambda: joined.place is not None, 60)
+            playing = [thread for thread in threading.enumerate() if "_play" in thread.name]
+            assert len(playing) <= 1 and threading.active_count() < before + 60
+    finally:
+        flooded.stop()
+
+
 def test_nothing_but_the_page_is_served_and_no_client_opens_it_to_the_world(viewer: Viewer) -> None:
     from urllib.error import HTTPError
     from urllib.request import urlopen
@@ -344,6 +382,29 @@ def test_pages_of_other_sites_see_nothing(origin: str, forwarded: str | None, ma
     assert viewer._may_look(headers)
 
 
+def test_a_map_that_lies_is_told_on_the_page(sparse: Path, viewer: Viewer, tmp_path: Path) -> None:
+    """Not in the terminal alone, which nobody reads who has the page before them."""
+    model = pycolmap.Reconstruction(sparse)
+    turn = pycolmap.Rotation3d(np.array([np.sin(np.pi / 4), 0, 0, np.cos(np.pi / 4)]))  # a quarter, about x: y is up
+    model.transform(pycolmap.Sim3d(100.0, turn, np.zeros(3)))
+    model.write(tmp_path)
+    with pytest.warns(MapWarning):
+        opened = open_map(tmp_path, weights=WEIGHTS)
+    lying = Viewer(Shared(opened), port=0, state=ViewState(method="visible", occlusion="none"))
+    try:
+        for shown, doubted in ((viewer, False), (lying, True)):
+            with _client(shown) as client:
+                client.send(camera_message())
+                _until(lambda shown=shown: shown.sessions)  # type: ignore[misc]
+                doubts = next(iter(shown.sessions.values())).controls.doubts
+                assert doubts.visible == doubted and bool(doubts.content) == doubted
+        said = doubts.content.replace("\\", "")
+        assert "seems not to be in metres" in said and "The cameras lie on their side" in said
+        assert str(tmp_path) not in said
+    finally:
+        lying.stop()
+
+
 def test_values_that_no_control_offers_are_told_and_put_back(viewer: Viewer) -> None:
     import msgspec
 
@@ -363,12 +424,29 @@ def test_values_that_no_control_offers_are_told_and_put_back(viewer: Viewer) -> 
             }
             client.send(msgspec.msgpack.encode(message))
         _until(lambda: len(told) >= len(nonsense) - 1)  # the format is looked at when it is needed
-        assert {type(error) for error in told} == {ConfigError}
+        assert {type(error) for error in told} == {ConfigError}, told
         assert controls.method.value in viewer.shared.opened.methods and 1 <= controls.n.value <= 20
         assert session.state.method == "visible" and session.state.n == 5 and np.isfinite(session.state.height)
         with pytest.raises(ConfigError, match="no such value"):
             check_value(controls.format, "CSV")
         assert controls.format.value == "CSV"
+        # until it has been put back, others take what was known
+        controls.height._impl.value = float("nan")
+        assert value_of(controls.height, 1.5) == 1.5 and value_of(controls.n, 7) == controls.n.value
+        session._slid()
+        assert np.isfinite(session.state.height)
+
+
+def test_the_ground_of_the_dark_is_no_darker_than_low_scores(viewer: Viewer) -> None:
+    with _client(viewer) as client:
+        client.send(camera_message())
+        _until(lambda: viewer.sessions)
+        (session,) = viewer.sessions.values()
+        grounds: list[object] = []
+        session.client.scene.set_background_image = lambda image, **_: grounds.append(image)
+        session.theme(True)
+        session.theme(False)
+        assert grounds[0].min() > drawing.score_colors(np.zeros(1)).mean() and grounds[1] is None  # type: ignore[attr-defined]
 
 
 def test_paths_that_are_too_large_or_no_poses_are_refused(tmp_path: Path) -> None:

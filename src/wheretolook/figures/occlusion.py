@@ -18,7 +18,7 @@ from wheretolook.figures.style import INK, RC, new_figure
 from wheretolook.methods.styles import ORACLE, method_style
 from wheretolook.viewpoints.thresholds import ALL, threshold_label
 
-_LABELS = {"mesh": "mesh rays", "tsdf": "TSDF", "hidden-points": "hidden-point removal", "none": "none"}
+_LABELS = {"mesh": "mesh rays", "tsdf": "TSDF", "hidden-points": "hidden-point removal", "none": "none: through walls"}
 _MARKERS = ("o", "s", "^", "D")
 
 
@@ -27,9 +27,9 @@ def occlusion_figure(scores: pd.DataFrame) -> Figure:
 
     The share is that at the finest threshold, in % of the oracle's, with bootstrap intervals. A row for each method, a
     mark for each occlusion model; the random choice and the oracle are lines. Shown are the methods that
-    `figures.scores.methods_to_show` chooses, on axes that begin where the marks do. `scores` are tables of
-    `wheretolook.evaluation.scores.score_table`, one below the other, with a column `occlusion`; the rows over all
-    scenes, of the first N and the first set of candidates, are drawn.
+    `figures.scores.methods_to_show` chooses and that occlusion changes, on axes that begin where the marks do.
+    `scores` are tables of `wheretolook.evaluation.scores.score_table`, one below the other, with a column `occlusion`;
+    the rows over all scenes, of the first N and the first set of candidates, are drawn.
     """
     scores = main_rows(scores, ("candidates",))
     key, n = threshold_keys(scores)[0], scores["top_n"].iloc[0]
@@ -38,6 +38,7 @@ def occlusion_figure(scores: pd.DataFrame) -> Figure:
     chosen = "best view" if n == 1 else f"best {n} views"
     first = pooled[pooled["occlusion"] == models[0]]
     methods = [method for method in methods_to_show(first, key) if not by_chance(method)]
+    methods = [method for method in methods if _depends(pooled[pooled["method"] == method])] or methods
     y = {method: float(row) for row, method in enumerate(methods)}
     with context(RC):
         figure = new_figure(8.0, 1.5 + 0.3 * (max(y.values(), default=0) + 1))
@@ -61,6 +62,11 @@ def occlusion_figure(scores: pd.DataFrame) -> Figure:
         handles += [line for line in right.lines if line.get_label() in labels]
         figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), columnspacing=1.4)
         return figure
+
+
+def _depends(rows: pd.DataFrame) -> bool:
+    """Whether a method's scores are others with another occlusion model: those of some know no landmarks in view."""
+    return rows["average_precision"].nunique(dropna=False) > 1
 
 
 def _begin(axes: Axes, step: float) -> float:

@@ -6,17 +6,17 @@ from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 from matplotlib.style import context
 from numpy.typing import NDArray
 
 from wheretolook.figures.config import Look
-from wheretolook.figures.style import INK, RC, VERMILION, new_figure
+from wheretolook.figures.house_image import Dollhouse, draw_house
+from wheretolook.figures.inputs import frame
+from wheretolook.figures.style import BLUE, INK, RC, VERMILION, new_figure
 from wheretolook.geometry.poses import Float
 from wheretolook.planning.turns import pan_tilt_angles
-
-STAR = VERMILION
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,59 +30,84 @@ class View:
     outcome: str
 
 
-def overview_figure(
-    landmarks: Float,
-    locations: Float,
-    share_good: Float,
-    place: Float,
-    directions: Float,
-    scores: Float,
-    best: View,
-    worst: View,
-) -> Figure:
-    """Draw a scene's map, the scores of all directions at one place, and the views they favour and avoid.
+@dataclass(frozen=True, eq=False)
+class Overview:
+    """What `overview_figure` draws."""
 
-    There are landmarks (N, 3) m; labelled locations (L, 3) m, and the share of each one's viewpoints that localize; one
-    of them, `place`, and the predicted probabilities (D,) of unit directions (D, 3) there; and the labelled views there
-    with the highest and the lowest score.
+    scene: str  # its name for people
+    method: str  # the name for people of what scores
+    plan: Dollhouse  # the scene from straight above
+    locations: Float  # (L, 3) metres, labelled locations, none above another
+    share_good: Float  # (L,) share of each one's viewpoints that localize
+    place: Float  # (3,) metres, one of them
+    directions: Float  # (D, 3) unit axes at the place
+    scores: Float  # (D,) their predicted probabilities to localize
+    best: View  # the labelled view there with the highest score
+    worst: View  # and the level one with the lowest
+
+
+def overview_figure(overview: Overview) -> Figure:
+    """Draw a scene's labels from above, the scores of all directions at one place, and what a good and a bad one see.
+
+    Columns: the plan, with the share of views that localized at each location; the sphere of directions around the
+    ringed place; two of its views, with what came of localizing them.
     """
     with context(RC):
-        figure = new_figure(14.0, 3.9)
-        grid = figure.add_gridspec(1, 4, width_ratios=(1.05, 1.5, 1.25, 1.25), wspace=0.1)
-        _draw_map(figure, figure.add_subplot(grid[0]), landmarks, locations, share_good, place)
-        axes = figure.add_subplot(grid[1], projection="hammer")
-        _draw_sphere(figure, axes, directions, scores, best, worst)
-        for column, (title, view, mark) in enumerate((("best", best, "*"), ("worst", worst, "X")), 2):
-            axes = figure.add_subplot(grid[column])
+        figure = new_figure(13.5, 4.7)
+        left, middle, right = figure.subfigures(1, 3, squeeze=False, width_ratios=(1.1, 1.45, 0.8))[0]
+        axes = left.add_subplot()
+        points = _draw_plan(axes, overview)
+        axes.set_title(f"{overview.scene}, from above", loc="left")
+        bar = left.colorbar(points, ax=axes, orientation="horizontal", shrink=0.8, pad=0.03, aspect=28)
+        bar.set_label("share of a place's views that localize", color=INK)
+        axes = middle.add_subplot(projection="hammer")
+        points = _draw_sphere(axes, overview)
+        axes.set_title(f'every direction from the ringed place,\nscored by "{overview.method}"', loc="left")
+        bar = middle.colorbar(points, ax=axes, orientation="horizontal", shrink=0.8, pad=0.06, aspect=28)
+        bar.set_label("predicted probability to localize", color=INK)
+        pictures = right.subplots(2, 1)
+        for axes, name, view, color in zip(
+            pictures, ("best view", "worst level view"), (overview.best, overview.worst), (BLUE, VERMILION), strict=True
+        ):
             axes.imshow(view.rgb)
-            axes.plot(0.06, 0.92, mark, transform=axes.transAxes, markersize=14, color=STAR, markeredgecolor="white")
-            axes.set_title(f"{title} view: predicted {view.score:.2f}")
-            axes.set_xlabel(view.outcome)
-            axes.set(xticks=[], yticks=[], anchor="N")
-            axes.grid(False)
+            frame(axes, color, 2.0)
+            axes.set_title(f"{name}: predicted {view.score:.2f}", loc="left", fontsize=10)
+            axes.set_xlabel(view.outcome, fontsize=9)
         return figure
 
 
-def _draw_map(figure: Figure, axes: Axes, landmarks: Float, locations: Float, share_good: Float, place: Float) -> None:
-    low, high = np.percentile(landmarks[:, :2], (0.5, 99.5), axis=0)
-    axes.scatter(landmarks[:, 0], landmarks[:, 1], s=0.6, color="#9a9a9a", linewidths=0, rasterized=True)
-    order = np.argsort(share_good, kind="stable")
-    look: Look = {"s": 34, "cmap": "cividis", "vmin": 0, "vmax": 1, "edgecolors": "white", "linewidths": 0.6}
-    points = axes.scatter(locations[order, 0], locations[order, 1], c=share_good[order], **look)
-    axes.plot(*place[:2], "o", markersize=11, markerfacecolor="none", markeredgecolor=STAR, markeredgewidth=2)
-    axes.set_aspect("equal")
-    axes.set(xlim=(low[0] - 0.3, high[0] + 0.3), ylim=(low[1] - 0.3, high[1] + 0.3), xlabel="x (m)", ylabel="y (m)")
-    axes.set_title("map from above, sampled locations")
-    bar = figure.colorbar(points, ax=axes, shrink=0.9, pad=0.17, orientation="horizontal")
-    bar.set_label("share of views that localize", color=INK)
+def _draw_plan(axes: Axes, overview: Overview):  # type: ignore[no-untyped-def]
+    plan = overview.plan
+    draw_house(axes, plan, 0.2)
+    pixels, place = plan.pixels(overview.locations), plan.pixels(overview.place)
+    order = np.argsort(overview.share_good, kind="stable")
+    look: Look = {"s": 46, "cmap": "cividis", "vmin": 0, "vmax": 1, "edgecolors": "white", "linewidths": 0.8}
+    x, y = pixels[order].T
+    points = axes.scatter(x, y, c=overview.share_good[order], zorder=2, **look)
+    ring: Look = {"markersize": 14, "markerfacecolor": "none", "markeredgecolor": VERMILION, "markeredgewidth": 2.4}
+    axes.plot(*place, "o", zorder=3, path_effects=[withStroke(linewidth=4.5, foreground="white")], **ring)
+    low, high = plan.pixels(np.stack([overview.place, overview.place + np.array([1.0, 0.0, 0.0])]))
+    metre_px, (width, height) = float(high[0] - low[0]), (plan.rgb.shape[1], plan.rgb.shape[0])
+    axes.plot([width - metre_px, width], [height * 1.03] * 2, color=INK, linewidth=2, clip_on=False)
+    axes.text(width - 1.1 * metre_px, height * 1.03, "1 m", ha="right", va="center")
+    return points
 
 
-def _draw_sphere(figure: Figure, axes: Axes, directions: Float, scores: Float, best: View, worst: View) -> None:
-    azimuth, elevation = pan_tilt_angles(directions)
-    points = axes.scatter(azimuth, elevation, s=30, c=scores, cmap="cividis", norm=Normalize(0, 1), linewidths=0)
-    for view, mark in ((best, "*"), (worst, "X")):
-        axes.plot(*pan_tilt_angles(view.direction), mark, markersize=15, color=STAR, markeredgecolor="white")
-    axes.set(xticklabels=[], yticklabels=[], anchor="N")
-    axes.set_title("every direction from the ringed place")
-    bar = figure.colorbar(points, ax=axes, shrink=0.6, pad=0.06, orientation="horizontal")
-    bar.set_label("predicted probability to localize", color=INK)
+def _draw_sphere(axes: Axes, overview: Overview):  # type: ignore[no-untyped-def]
+    azimuth, elevation = pan_tilt_angles(overview.directions)
+    look: Look = {
+        "s": 20_000 / max(len(azimuth), 1),
+        "c": overview.scores,
+        "cmap": "cividis",
+        "vmin": 0,
+        "vmax": 1,
+        "linewidths": 0,
+    }
+    points = axes.scatter(azimuth, elevation, **look)
+    for view, name, color in ((overview.best, "best", BLUE), (overview.worst, "worst", VERMILION)):
+        x, y = (float(angle) for angle in pan_tilt_angles(view.direction))
+        disc: Look = {"boxstyle": "round,pad=0.25", "facecolor": "white", "edgecolor": color}
+        axes.text(x, y, name, color=color, fontsize=9, fontweight="bold", ha="center", va="center", bbox=disc, zorder=4)
+    axes.set(xticklabels=[], yticklabels=[])
+    axes.grid(False)
+    return points

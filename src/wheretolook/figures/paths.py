@@ -17,7 +17,9 @@ from wheretolook.viewpoints.thresholds import ALL
 FILLED = {"greedy": "full", "with stops": "left"}
 """How markers are filled, by what follows a method's name."""
 
-TITLES = {"planned": "places and views planned", "given": "views along a given path"}
+TITLES = {"planned": "each method plans places and views", "given": "each method turns the camera along given paths"}
+NAMES = {"forward": "looking ahead", "greedy": "by ActLoc's greedy rule"}
+"""What is called otherwise here than in tables: methods, and what follows their names."""
 
 
 def paths_figure(summary: pd.DataFrame) -> Figure:
@@ -46,7 +48,8 @@ def paths_figure(summary: pd.DataFrame) -> Figure:
                 face = "white" if rule == "greedy" else style.color
                 look: Look = {"markersize": 6, "fillstyle": fill, "markerfacecolor": face}
                 look["markerfacecoloralt"] = "white"
-                label = f"{style.label}, {rule}" if rule else style.label
+                label = NAMES.get(name, style.label)
+                label += f", {NAMES.get(rule, rule)}" if rule else ""
                 axes.plot(value, at, style.marker, color=style.color, label=label, **look)
             axes.set_title(TITLES.get(task, task))
             axes.set_xlabel("views along the paths that localize (%)")

@@ -60,7 +60,7 @@ def pipeline_figure(pipeline: Pipeline) -> Figure:
         width = pipeline.house.rgb.shape[1]
         figure = new_figure(TWO_COLUMNS_IN, TWO_COLUMNS_IN * (bottom - top) / width + 0.6)
         panels = figure.subplots(2, 2).ravel()
-        for panel, fade in zip(panels, (0.25, 0.45, 0.5, 0.15), strict=True):
+        for panel, fade in zip(panels, (0.1, 0.15, 0.2, 0.0), strict=True):
             draw_house(panel, pipeline.house, fade)
             panel.set_ylim(bottom, top)
         _draw_map(panels[0], pipeline)
@@ -75,7 +75,8 @@ def _draw_map(axes: Axes, pipeline: Pipeline) -> None:
     shown = pipeline.landmarks[pipeline.house.shows(pipeline.landmarks)]
     draw_points(axes, pipeline.house, shown, s=0.9, color=ORANGE, rasterized=True)
     frusta = frustum_segments(pipeline.camera, pipeline.mapping_poses, 0.16)
-    draw_segments(axes, pipeline.house, frusta, color=BLUE, linewidth=0.5)
+    draw_segments(axes, pipeline.house, frusta, color="white", linewidth=1.3)
+    draw_segments(axes, pipeline.house, frusta, color=BLUE, linewidth=0.6)
     axes.set_title(f"a  Map: {len(pipeline.landmarks):,} landmarks, {len(pipeline.mapping_poses)} cameras", loc="left")
 
 
@@ -83,8 +84,9 @@ def _draw_samples(axes: Axes, pipeline: Pipeline) -> None:
     spacing = _spacing(pipeline.locations)
     ends = pipeline.locations[:, None] + 0.42 * spacing * fibonacci_sphere(_GLYPH)
     segments = np.stack([np.broadcast_to(pipeline.locations[:, None], ends.shape), ends], axis=-2)
-    draw_segments(axes, pipeline.house, segments, color=BLUE, linewidth=0.35, alpha=0.8)
-    draw_points(axes, pipeline.house, pipeline.locations, s=4, color=INK)
+    draw_segments(axes, pipeline.house, segments, color="white", linewidth=1.1)
+    draw_segments(axes, pipeline.house, segments, color=BLUE, linewidth=0.5)
+    draw_points(axes, pipeline.house, pipeline.locations, s=5, color=INK)
     part = f"{len(pipeline.locations)} of {pipeline.n_locations}"
     axes.set_title(f"b  Sampled: {part} locations × {pipeline.n_directions} directions", loc="left")
 
@@ -108,6 +110,7 @@ def _draw_ranks(
     at, scores = locations[order], best_scores[order]
     segments = np.stack([at, at + 0.8 * _spacing(locations) * best_axes[order]], axis=1)
     norm = Normalize(0, 1)
+    draw_segments(axes, house, segments, color="white", linewidth=3.2)
     draw_segments(axes, house, segments, color=INK, linewidth=2.2)
     lines = draw_segments(axes, house, segments, array=scores, cmap="cividis", norm=norm, linewidth=1.5)
     draw_points(axes, house, at, s=15, c=scores, cmap="cividis", norm=norm, edgecolors=INK, linewidths=0.4, zorder=3)

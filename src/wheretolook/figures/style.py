@@ -45,8 +45,17 @@ def new_figure(width_in: float, height_in: float) -> Figure:
         return Figure(figsize=(width_in, height_in), layout="constrained")
 
 
+_SCENES = {"aws_house": "furnished house", "nexuiz": "game level"}
+"""Names that say nothing to people: of the scenes made by others, and of the package that some are from."""
+
+
 def scene_label(name: str) -> str:
-    """The name of a scene for people: "apartment 210" of "apartment-210"."""
+    """The name of a scene for people: "apartment 210" of "apartment-210", "game level aggressor" of its file's name."""
+    if name in _SCENES:
+        return _SCENES[name]
+    package, _, rest = name.partition("_")
+    if package in _SCENES and rest:
+        name = f"{_SCENES[package]} {rest}"
     return name.replace("_", " ").replace("-", " ")
 
 

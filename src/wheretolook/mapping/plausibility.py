@@ -34,10 +34,15 @@ def warn_of_frame(model: str | Path, mapping_distance_m: ArrayLike, cam_from_wor
 
     Takes the mean distance of each landmark's mapping cameras (N,), and the poses (M, 3, 4) of all.
     """
+    for doubt in frame_doubts(mapping_distance_m, cam_from_world):
+        warnings.warn(f"{model}: {doubt}", MapWarning, stacklevel=3)
+
+
+def frame_doubts(mapping_distance_m: ArrayLike, cam_from_world: ArrayLike) -> tuple[str, ...]:
+    """`scale_doubt` and `axes_doubt` of a map, as far as there are any; arguments as of `warn_of_frame`."""
     poses = np.asarray(cam_from_world, dtype=np.float64)
-    for doubt in (scale_doubt(mapping_distance_m, camera_centers(poses)), axes_doubt(poses)):
-        if doubt:
-            warnings.warn(f"{model}: {doubt}", MapWarning, stacklevel=3)
+    found = scale_doubt(mapping_distance_m, camera_centers(poses)), axes_doubt(poses)
+    return tuple(doubt for doubt in found if doubt)
 
 
 def warn_of_mesh(mesh: str | Path, points: ArrayLike, raycaster: MeshRaycaster) -> None:

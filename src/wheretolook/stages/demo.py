@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from tqdm.auto import tqdm
 
 from wheretolook import stages
@@ -20,7 +21,7 @@ from wheretolook.dataset.stamps import STAGES, stage_key
 from wheretolook.evaluation.report import best_in_words
 from wheretolook.evaluation.results import SCORES_CSV, SCORES_MD, SCORES_PNG, results_folder
 from wheretolook.evaluation.scores import read_scores
-from wheretolook.geometry.poses import camera_centers, poses_looking_along
+from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
 from wheretolook.methods.features_learnt import folder_for
 from wheretolook.methods.registry import best_weights, load_scorer, methods_named, scorers
 from wheretolook.stages.evaluate import not_logged
@@ -37,6 +38,7 @@ SECONDS = {"scenes": 5.0, "map": 15.0, "sample": 1.0, "label": 75.0, "train": 25
 """Rough cost of a stage on two cores (the first four for each scene), from which the share done is estimated."""
 
 OVERVIEW = "overview.png"
+LEVEL_DEG = 25.0  # pitch at most of a camera held level
 STAMP = "compared.json"  # in the dataset's folder: what the demo's comparison was made from
 
 
@@ -114,8 +116,10 @@ def draw_overview(experiment: Experiment, weights: Path) -> None:
     file, or a folder of files of which the best is taken, for a camera of the dataset's field of view. Raises
     TableError if there is no dataset or its last scene is not labelled, WeightsError if the weights cannot be used.
     """
-    from wheretolook.figures.overview import overview_figure
-    from wheretolook.figures.style import save_figure
+    from wheretolook.figures.house_image import dollhouse
+    from wheretolook.figures.overview import Overview, overview_figure
+    from wheretolook.figures.style import save_figure, scene_label
+    from wheretolook.methods.styles import method_style
     from wheretolook.release.showcase_figures import rendered_views
     from wheretolook.viewpoints.table import instructive_location, outcome_in_words, poses, shares_good
 
@@ -131,13 +135,39 @@ def draw_overview(experiment: Experiment, weights: Path) -> None:
     place = locations[np.searchsorted(ids, chosen)]
     candidates = table[table["location_id"] == chosen]
     scores = scorer.score(poses(candidates))
-    ends = [int(np.argmax(scores)), int(np.argmin(scores))]
-    best, worst = rendered_views(scene, candidates.iloc[ends], scores[ends], outcome_in_words)
+    best, worst = rendered_views(scene, *_ends(candidates, scores), outcome_in_words)
     directions = experiment.sample.axes()
     around = scorer.score(poses_looking_along(np.tile(place, (len(directions), 1)), directions))
-    points, shares = localization_map.landmarks.points, shares_good(table)[1]
-    figure = overview_figure(points, locations, shares, place, directions, around, best, worst)
-    save_figure(figure, dataset.root / "results" / OVERVIEW)
+    by_height = np.argsort(np.abs(locations[:, 2] - place[2]), kind="stable")
+    shown = by_height[np.unique(locations[by_height, :2].round(2), axis=0, return_index=True)[1]]
+    drawn = Overview(
+        scene=scene_label(dataset.scenes[-1].name),
+        method=method_style(scorer.name).label,
+        plan=dollhouse(scene.mesh, elevation_deg=90, cut_m=float(place[2]), one_sided=False, device=scene.device),
+        locations=locations[shown],
+        share_good=shares_good(table)[1][shown],
+        place=place,
+        directions=directions,
+        scores=around,
+        best=best,
+        worst=worst,
+    )
+    save_figure(overview_figure(drawn), dataset.root / "results" / OVERVIEW)
+
+
+def _ends(candidates: pd.DataFrame, scores: Float) -> tuple[pd.DataFrame, Float]:
+    """Rows and scores of the viewpoint with the highest score, and of the one with the lowest.
+
+    The lowest is that of a camera held about level, if there is one: what a robot sees that looks ahead, and not the
+    bare ceiling.
+    """
+    from wheretolook.viewpoints.table import poses
+
+    pitch = np.arcsin(np.clip(poses(candidates)[:, 2, 2], -1, 1))
+    level = np.abs(pitch) <= np.radians(LEVEL_DEG)
+    lowest = np.where(level, scores, np.inf) if level.any() else scores
+    ends = [int(np.argmax(scores)), int(np.argmin(lowest))]
+    return candidates.iloc[ends], scores[ends]
 
 
 def _say(stage: str, text: str) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 HINT = "Click a place on the coloured floor: the score of every direction there, and the best views."
 LIMITS = {threshold_label(threshold_key(limits)): limits for limits in THRESHOLDS}
+T = TypeVar("T")
 FILES = {
     "CSV": ("csv", ".csv"),
     "JSON": ("json", ".json"),
@@ -33,6 +34,7 @@ FILES = {
 class Controls:
     """Handles of everything in the panel."""
 
+    doubts: Any
     status: Any
     legend: Any
     method: Any
@@ -76,6 +78,8 @@ def build(gui: GuiApi, shared: Shared, state: ViewState) -> Controls:
     blank = np.full((270, 360, 3), (38, 40, 46), np.uint8)
     tabs = gui.add_tab_group()
     with tabs.add_tab("Look"):
+        doubts = "\n\n".join(f"⚠ {plain(doubt[0].upper() + doubt[1:])}." for doubt in opened.doubts)
+        made["doubts"] = gui.add_markdown(doubts, visible=bool(doubts))
         made["status"] = gui.add_markdown("")
         made["legend"] = gui.add_html(legend(0, 1, "score"))
         made["method"] = gui.add_dropdown("method", opened.methods, initial_value=state.method)
@@ -154,8 +158,21 @@ def _within(value: float, low: float, high: float) -> float:
 def check_value(handle: Any, before: Any) -> None:
     """Raise ConfigError if a client has set a control to what it does not offer, and set it to what it was before."""
     value = getattr(handle, "value", None)
-    options, most = getattr(handle, "options", None), getattr(handle, "max", None)
-    if (options is None or value in options) and (most is None or handle.min <= value <= most):
+    if _offers(handle, value):
         return
     handle.value = before
     raise ConfigError("this control has no such value", value=value, fix="Choose one that it offers.")
+
+
+def value_of(handle: Any, known: T) -> T:
+    """The value of a control; what is known instead, while a client has set it to what it does not offer.
+
+    Callbacks come in several threads: another control's can read it before its own has put it back (`check_value`).
+    """
+    value = handle.value
+    return value if _offers(handle, value) else known
+
+
+def _offers(handle: Any, value: Any) -> bool:
+    options, most = getattr(handle, "options", None), getattr(handle, "max", None)
+    return bool((options is None or value in options) and (most is None or handle.min <= value <= most))

@@ -22,6 +22,9 @@ GOOD, BAD, PROMISED, MISSED = (0, 158, 115), (150, 150, 150), (213, 94, 0), (0, 
 FADE = 0.65  # share of grey in the colour of a place below the threshold
 CELL_PX = 6  # pixels of a floor's cell: its edges stay sharp
 MOST_FRUSTA = 1500  # mapping cameras that are drawn
+DARK_GROUND = np.full((2, 2, 3), (72, 74, 80), np.uint8)
+"""What is behind the scene in the dark: on black, the blue of low scores would not be seen."""
+
 PICTURE_PX = 360  # width of pictures in the panel
 
 

@@ -62,6 +62,15 @@ class Opened:
         return (*(("mesh",) if self.mesh is not None else ()), "hidden-points", "none")
 
     @cached_property
+    def doubts(self) -> tuple[str, ...]:
+        """Why it seems not to be in metres with z up, if so: the scores then say nothing."""
+        from wheretolook.mapping.plausibility import frame_doubts
+
+        if self.mapping_poses is None or len(self.mapping_poses) == 0:
+            return ()
+        return frame_doubts(self.landmarks.mapping_distance_m, self.mapping_poses)
+
+    @cached_property
     def methods(self) -> tuple[str, ...]:
         """Names of the methods that can score here, that of the best weights first."""
         return self.weights.methods

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from wheretolook.geometry.poses import Float, camera_centers, quaternion_from_rotation
+from wheretolook.view.controls import value_of
 from wheretolook.view.scores import landmarks_seen
 from wheretolook.view.session import PATH_COLORS, Session
 from wheretolook.view.texts import plain
@@ -32,15 +33,16 @@ class Player:
         self.session, self.paths = session, session.shared.paths
         self.length = max(map(len, self.paths.values()))
         self._reports: dict[tuple[str, str, str], ViewReport] = {}
-        self._playing, self._shown = threading.Event(), threading.Event()
+        self._playing, self._shown, self._lock = threading.Event(), threading.Event(), threading.Lock()
+        self._thread: threading.Thread | None = None  # that plays: one at most, however often the button is pressed
         for name, color in zip(self.paths, self._colors(), strict=False):
             line = camera_centers(self.paths[name].cam_from_world)
             segments = np.stack([line[:-1], line[1:]], axis=1)
             session.scene.add_line_segments(f"/path/{name}", segments, color, thickness=4.0, thickness_units="screen")
         controls = session.controls
-        session.on(controls.step, lambda: self.show(int(controls.step.value) - 1))
+        session.on(controls.step, lambda: self.show(int(value_of(controls.step, 1)) - 1))
         for handle in (controls.method, controls.occlusion):
-            session.on(handle, lambda: self.show(int(controls.step.value) - 1))
+            session.on(handle, lambda: self.show(int(value_of(controls.step, 1)) - 1))
         session.on(controls.play, self.toggle, "on_click")
         self.show(0)
 
@@ -51,29 +53,39 @@ class Player:
     def toggle(self) -> None:
         """Play, or pause."""
         button = self.session.controls.play
-        if self._playing.is_set():
-            self._playing.clear()
-            button.label = "Play"
-        else:
+        with self._lock:
+            if self._playing.is_set():
+                self._playing.clear()
+                button.label = "Play"
+                return
             self._playing.set()
             button.label = "Pause"
-            threading.Thread(target=self._play, daemon=True).start()
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._play, daemon=True)
+                self._thread.start()
 
     def _play(self) -> None:
-        session, slider = self.session, self.session.controls.step
-        step = int(slider.value) % self.length
-        while self._playing.is_set() and not session.closed:
+        slider = self.session.controls.step
+        step = int(value_of(slider, 1)) % self.length
+        while not self._ended(step):
             begun = time.monotonic()
             self._shown.clear()
             slider.value = step + 1  # whose callback shows the step
             self._shown.wait(timeout=10)
             time.sleep(max(0.0, STEP_S - (time.monotonic() - begun)))
             step += 1
-            if step >= self.length:
-                break
-        self._playing.clear()
-        if not session.closed:
-            session.controls.play.label = "Play"
+
+    def _ended(self, step: int) -> bool:
+        """Whether there is nothing more to play; the next press of the button then starts anew."""
+        with self._lock:
+            session = self.session
+            if self._playing.is_set() and not session.closed and step < self.length:
+                return False
+            self._playing.clear()
+            self._thread = None
+            if not session.closed:
+                session.controls.play.label = "Play"
+            return True
 
     def show(self, step: int) -> None:
         """Show a step of all paths."""

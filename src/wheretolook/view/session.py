@@ -16,7 +16,7 @@ from wheretolook.geometry.poses import Float, poses_looking_along, quaternion_fr
 from wheretolook.planning.turns import pan_tilt_angles
 from wheretolook.utils.errors import ConfigError, TableError, WhereToLookError
 from wheretolook.view import drawing
-from wheretolook.view.controls import build, check_value
+from wheretolook.view.controls import build, check_value, value_of
 from wheretolook.view.scenery import Scenery
 from wheretolook.view.scores import Place, landmarks_seen, look_around, report_of
 from wheretolook.view.shared import Shared
@@ -128,12 +128,14 @@ class Session:
         self.client.camera.on_update(lambda _: self.safely(self._camera_moved))
 
     def theme(self, dark: bool) -> None:
-        """Light or dark."""
+        """Light or dark; the ground of the dark scene is grey, since low scores are dark themselves."""
+        self.client.scene.set_background_image(drawing.DARK_GROUND if dark else None, format="png")
         self.client.gui.configure_theme(dark_mode=dark, show_logo=False, show_share_button=False, control_width="large")
 
     def _chosen(self) -> None:
         c = self.controls
-        self.note(method=c.method.value, occlusion=c.occlusion.value)
+        known = self.state
+        self.note(method=value_of(c.method, known.method), occlusion=value_of(c.occlusion, known.occlusion))
         self.fill_floor()
         if self.place is not None:
             self.go_to(self.place.position, self._angles())
@@ -148,7 +150,8 @@ class Session:
     def _slid(self) -> None:
         c = self.controls
         before = self.state
-        self.note(height=float(c.height.value), threshold=float(c.threshold.value))
+        height, threshold = value_of(c.height, before.height), value_of(c.threshold, before.threshold)
+        self.note(height=height, threshold=float(threshold))
         self.fill_floor()
         if before.threshold != self.state.threshold:
             self.judge()
@@ -158,10 +161,13 @@ class Session:
         self.submit("scene", SOON, _once(self.draw_scene))
 
     def _turned(self) -> None:
-        self.turn_to(axes_of_angles((self.controls.yaw.value, self.controls.pitch.value)), sliders=True)
+        self.turn_to(
+            axes_of_angles((value_of(self.controls.yaw, 0.0), value_of(self.controls.pitch, 0.0))), sliders=True
+        )
 
     def _angles(self) -> tuple[float, float] | None:
-        return None if self.axis is None else (float(self.controls.yaw.value), float(self.controls.pitch.value))
+        c = self.controls
+        return None if self.axis is None else (float(value_of(c.yaw, 0.0)), float(value_of(c.pitch, 0.0)))
 
     def _look_through(self) -> None:
         """Stand at the place with the camera's field of view, or look from outside again."""
@@ -357,8 +363,14 @@ class Session:
 def _told(place: Place, state: ViewState) -> str:
     x, y, z = place.position
     share = np.mean(place.scores >= state.threshold)
-    told = f"At {x:.2f}, {y:.2f}, {z:.2f} m: best {place.best.score[0]:.3g}, median {np.median(place.scores):.3g}"
+    median = _brief(float(np.median(place.scores)))
+    told = f"At {x:.2f}, {y:.2f}, {z:.2f} m: best {place.best.score[0]:.3g}, median {median}"
     return f"{told}; {100 * share:.0f} % of directions are good." if place.scores.max() <= 1 else f"{told}."
+
+
+def _brief(score: float) -> str:
+    """A score in few letters: of a probability two decimals, since 5.26e-05 tells nobody anything."""
+    return f"{score:.2f}" if 0 <= score <= 1 else f"{score:.3g}"
 
 
 def _once(then: Callable[[], None]) -> Iterator[None]:

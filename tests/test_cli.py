@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -96,6 +97,15 @@ def test_ctrl_c_stays_one_where_it_is_lost_or_made_another_error_of(
     monkeypatch.setattr(cli, "_run", goes_on)
     start = time.monotonic()
     assert main(["scenes"]) == 130
+    began = threading.Thread.start
+
+    def starts_slowly(thread: threading.Thread) -> None:
+        began(thread)
+        time.sleep(0.1)
+
+    monkeypatch.setattr(threading.Thread, "start", starts_slowly)  # as on a busy machine
+    assert main(["scenes"]) == 130
+    monkeypatch.setattr(threading.Thread, "start", began)
     assert time.monotonic() - start < 30
     assert "Traceback" not in capsys.readouterr().err
     monkeypatch.setattr(cli, "_run", reads)

@@ -92,13 +92,21 @@ def _noting(interrupts: list[int]) -> Iterator[None]:
 
     def interrupt_again(lost: sys.UnraisableHookArgs) -> None:
         if lost.exc_type is KeyboardInterrupt:  # it came while an object was removed, where Python drops errors
-            main_thread = threading.main_thread().ident or 0  # a real signal, which also ends what waits
-            later.append(threading.Timer(0.01, signal.pthread_kill, (main_thread, signal.SIGINT)))
-            later[-1].start()
+            threading.Thread(target=send_again, daemon=True).start()
         else:
             usual(lost)
 
-    later: list[threading.Timer] = []
+    def send_again() -> None:
+        main_thread = threading.main_thread().ident or 0
+        while not ended.wait(0.005):
+            frame = sys._current_frames().get(main_thread)
+            while frame is not None and frame.f_code is not interrupt_again.__code__:
+                frame = frame.f_back
+            if frame is None:  # within that function it would be dropped once more
+                signal.pthread_kill(main_thread, signal.SIGINT)  # a real signal, which also ends what waits
+                return
+
+    ended = threading.Event()
     usual, sys.unraisablehook = sys.unraisablehook, interrupt_again
     signal.signal(signal.SIGINT, note)
     try:
@@ -106,8 +114,7 @@ def _noting(interrupts: list[int]) -> Iterator[None]:
     finally:
         signal.signal(signal.SIGINT, signal.default_int_handler)
         sys.unraisablehook = usual
-        for timer in later:
-            timer.cancel()
+        ended.set()
 
 
 def _in_main_thread() -> bool:

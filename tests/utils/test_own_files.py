@@ -154,3 +154,11 @@ def test_good_weights_are_read(tmp_path: Path) -> None:
     write_weights(path, "set", {"a": torch.full((3,), torch.inf)}, {"training": {"method": "set"}})
     tensors, header = read_weights(path)
     assert tensors["a"].isinf().all() and json.loads(json.dumps(header))["training"] == {"method": "set"}
+
+
+@pytest.mark.parametrize("value", [float("inf"), -1e38])
+def test_weights_that_are_too_large(value: float, tmp_path: Path) -> None:
+    path = tmp_path / "a.safetensors"
+    write_weights(path, "set", {"good": torch.full((3,), 500.0), "bad": torch.tensor([1, value])}, {})
+    with pytest.raises(WeightsError, match=r"a\.safetensors: these weights are too large.*bad"):
+        read_weights(path)

@@ -55,7 +55,7 @@ class Processes:
                     return
                 yield pending.popleft().result()
         except BrokenProcessPool as error:
-            problem, fix = "a process was killed, probably for lack of memory", "Lower label.workers and run again."
+            problem, fix = "a process was killed, probably for lack of memory", "Use fewer workers (--label.workers, or --workers) and run again."
             raise WorkerError(problem, value=f"{self.workers} workers", fix=fix) from error
         finally:
             for future in pending:

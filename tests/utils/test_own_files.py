@@ -156,7 +156,7 @@ def test_good_weights_are_read(tmp_path: Path) -> None:
     assert tensors["a"].isinf().all() and json.loads(json.dumps(header))["training"] == {"method": "set"}
 
 
-@pytest.mark.parametrize("value", [float("inf"), -1e38])
+@pytest.mark.parametrize("value", [1e20, -1e38])
 def test_weights_that_are_too_large(value: float, tmp_path: Path) -> None:
     path = tmp_path / "a.safetensors"
     write_weights(path, "set", {"good": torch.full((3,), 500.0), "bad": torch.tensor([1, value])}, {})

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 FORMAT_VERSION = 1  # version of the layout of the metadata
 MOST = 1e12
-"""What no weight exceeds in size; the places that adapted weights know lie within the coordinates of a planet."""
+"""What no finite weight exceeds in size; the places that adapted weights know lie within the coordinates of a planet."""
 
 METADATA_KEY = "wheretolook"  # key of the JSON text in the header of the file
 
@@ -106,7 +106,8 @@ def read_weights(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     unknown = next((name for name, x in tensors.items() if x.is_floating_point() and bool(x.isnan().any())), None)
     if unknown is not None:
         raise WeightsError("these weights are not numbers (NaN)", path=path, value=unknown, fix="Train again.")
-    large = next((name for name, x in tensors.items() if x.is_floating_point() and bool((x.abs() > MOST).any())), None)
+    finite = {name: x[x.isfinite()] for name, x in tensors.items() if x.is_floating_point()}
+    large = next((name for name, x in finite.items() if bool((x.abs() > MOST).any())), None)
     if large is not None:
         raise WeightsError("these weights are too large: they are damaged", path=path, value=large, fix="Train again.")
     return tensors, header

@@ -55,7 +55,8 @@ class Processes:
                     return
                 yield pending.popleft().result()
         except BrokenProcessPool as error:
-            problem, fix = "a process was killed, probably for lack of memory", "Use fewer workers (--label.workers, or --workers) and run again."
+            problem = "a process was killed, probably for lack of memory"
+            fix = "Use fewer workers (--label.workers, or --workers) and run again."
             raise WorkerError(problem, value=f"{self.workers} workers", fix=fix) from error
         finally:
             for future in pending:

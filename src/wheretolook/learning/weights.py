@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 FORMAT_VERSION = 1  # version of the layout of the metadata
 MOST = 1e12
-"""What no finite weight exceeds in size; the places that adapted weights know lie within the coordinates of a planet."""
+"""What no finite weight exceeds in size. Places that adapted weights know have coordinates of a planet at most."""
 
 METADATA_KEY = "wheretolook"  # key of the JSON text in the header of the file
 

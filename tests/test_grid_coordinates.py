@@ -20,6 +20,7 @@ from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.local_origin import local_origin, poses_from
 from wheretolook.geometry.poses import Float, camera_centers, pose_error, poses_looking_along, transform
+from wheretolook.geometry.tsdf import DepthImage, TsdfVolume
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.labelling.localizer import Localizer
 from wheretolook.mapping.building import build_map
@@ -42,7 +43,7 @@ from wheretolook.utils.errors import OutOfRangeWarning
 from wheretolook.visibility.hidden_points import HiddenPointRemoval
 from wheretolook.visibility.occlusion import MeshOcclusion, OcclusionModel
 from wheretolook.visibility.survey import survey
-from wheretolook.visibility.tsdf import DepthImage, TsdfOcclusion, TsdfVolume
+from wheretolook.visibility.tsdf import TsdfOcclusion
 
 SHIFT = np.array([4e6, 5e6, 300.0])  # as of a place in Europe in UTM, and its height
 ROOM_POSES = poses_looking_along(

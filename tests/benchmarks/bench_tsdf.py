@@ -21,6 +21,7 @@ from mask_agreement import MaskAgreement
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import poses_looking_along
+from wheretolook.geometry.tsdf import BYTES_PER_BLOCK, DepthImage, TsdfConfig, TsdfVolume
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.rendering.types import camera_rays
@@ -29,7 +30,7 @@ from wheretolook.scenes.loading import load_mesh
 from wheretolook.scenes.procedural.generator import generate_apartment
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.visibility.occlusion import MeshOcclusion
-from wheretolook.visibility.tsdf import BYTES_PER_BLOCK, DepthImage, TsdfConfig, TsdfOcclusion, TsdfVolume
+from wheretolook.visibility.tsdf import TsdfOcclusion
 
 MAX_DEPTH_M = 20.0
 

@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from depth_room import CAMERA, ROOM, depth_images, room
 from planning.rooms import patiently
-from visibility.test_tsdf import CAMERA, ROOM, depth_images, room
 from wheretolook.geometry.poses import poses_looking_along
+from wheretolook.geometry.tsdf import DepthImage, TsdfConfig, TsdfVolume
 from wheretolook.planning.config import PathConfig
 from wheretolook.planning.path_planning import plan_path
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.space.config import FreeSpaceConfig
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.space.tsdf_space import TsdfSpace, seen_through
-from wheretolook.visibility.tsdf import DepthImage, TsdfConfig, TsdfVolume
 
 VOXEL_M, CLEARANCE_M = 0.03, 0.2
 

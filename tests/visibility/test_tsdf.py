@@ -6,53 +6,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from box_scenes import box_quads, quads_mesh, random_texture
+from depth_room import CAMERA, depth_images, free_points, room
 from mask_agreement import MaskAgreement
-from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
-from wheretolook.geometry.poses import poses_looking_along
+from wheretolook.geometry.tsdf import DepthImage, TsdfConfig, TsdfVolume
 from wheretolook.rendering.raycasting import MeshRaycaster
-from wheretolook.rendering.types import camera_rays
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.visibility.occlusion import MeshOcclusion
-from wheretolook.visibility.tsdf import DepthImage, TsdfConfig, TsdfOcclusion, TsdfVolume, estimate_blocks
-
-ROOM = np.array([4.0, 3.0, 2.5])
-CUPBOARD = np.array([[0.0, 2.2, 0.0], [1.2, 3.0, 1.6]])
-CAMERA = PinholeCamera(320, 240, 160.0)
-
-
-def room(wall_m: float = 0.1) -> TexturedMesh:
-    """A room with a wall, open at one end, across it, and a cupboard; the wall may have no thickness."""
-    wall = box_quads((2 - wall_m / 2, 0, 0), (2 + wall_m / 2, 2, 2.5))
-    if wall_m == 0:
-        wall = np.array([[[2, 0, 0], [2, 2, 0], [2, 2, 2.5], [2, 0, 2.5]]], dtype=np.float64)
-    quads = np.concatenate([box_quads((0, 0, 0), ROOM, inward=True), wall, box_quads(*CUPBOARD)])
-    return quads_mesh(quads, [random_texture(np.random.default_rng(0), 4, 4)])
-
-
-def free_points(rng: np.random.Generator, n: int, clearance_m: float = 0.25) -> np.ndarray:
-    """Random points in the room, clear of the wall and outside the cupboard."""
-    points = rng.uniform(clearance_m, ROOM - clearance_m, (3 * n, 3))
-    in_wall = (np.abs(points[:, 0] - 2) < clearance_m) & (points[:, 1] < 2 + clearance_m)
-    in_cupboard = ((points > CUPBOARD[0] - clearance_m) & (points < CUPBOARD[1] + clearance_m)).all(1)
-    return points[~in_wall & ~in_cupboard][:n]
-
-
-def depth_images(mesh: TexturedMesh, seed: int, n: int, camera: PinholeCamera = CAMERA) -> list[DepthImage]:
-    """Exact depth images from random free places in random, mostly level directions."""
-    rng = np.random.default_rng(seed)
-    poses = poses_looking_along(free_points(rng, n), rng.normal(size=(n, 3)) * (1, 1, 0.5))
-    raycaster = MeshRaycaster(mesh)
-    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    pixels = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
-    images = []
-    for pose, center, ray_from_pixel in zip(poses, *camera_rays(camera, poses), strict=True):
-        rays = pixels @ ray_from_pixel.T
-        distance = raycaster.cast(np.broadcast_to(center, rays.shape), rays).distance_m
-        z = (distance / np.linalg.norm(rays, axis=1)).reshape(x.shape)
-        images.append(DepthImage(z.astype(np.float32), camera, pose))
-    return images
+from wheretolook.visibility.tsdf import TsdfOcclusion
 
 
 def lines_of_sight(mesh: TexturedMesh, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -87,15 +48,6 @@ def test_agrees_with_the_mesh_at_2_cm(occlusion: TsdfOcclusion) -> None:
     assert 0.4 < truth.mean() < 0.8
     assert agreement.precision >= 0.98
     assert agreement.recall >= 0.98
-
-
-def test_the_surface_lies_where_the_mesh_is(volume: TsdfVolume) -> None:
-    surface = volume.surface()
-    distance = MeshRaycaster(room()).distance_to_surface(surface.vertices, 0.5)
-    assert np.quantile(distance, 0.95) < 0.005
-    again = volume.surface()  # extracting has left the volume as it was, but for rounding
-    assert len(again.triangles) == pytest.approx(len(surface.triangles), rel=1e-4)
-    np.testing.assert_allclose(again.vertices.mean(0), surface.vertices.mean(0), atol=1e-4)
 
 
 @pytest.mark.parametrize(("wall_m", "precision", "recall"), [(0.05, 0.98, 0.98), (0.0, 0.95, 0.92)])
@@ -175,20 +127,6 @@ def test_a_location_inside_geometry_is_refused(occlusion: TsdfOcclusion) -> None
         assert repr(tuple(np.float64(location).tolist())) in str(caught.value)
 
 
-def test_a_depth_camera_may_have_two_focal_lengths_and_its_own_centre() -> None:
-    depth, pose = np.random.default_rng(0).uniform(1, 2, (240, 320)), np.eye(4)[:3]
-    camera = ColmapCamera("PINHOLE", 320, 240, (200.0, 210.0, 155.0, 118.0))
-    points = DepthImage(depth, camera, pose).points(10.0)
-    rows, columns = np.divmod(np.arange(320 * 240), 320)
-    np.testing.assert_allclose(camera.project(points), np.column_stack([columns + 0.5, rows + 0.5]), atol=1e-4)
-    np.testing.assert_allclose(points[:, 2], depth.ravel(), rtol=1e-6)
-    same = ColmapCamera("SIMPLE_PINHOLE", 320, 240, (CAMERA.focal_px, CAMERA.cx, CAMERA.cy))
-    assert (CAMERA.width, CAMERA.height) == (320, 240)
-    np.testing.assert_allclose(DepthImage(depth, same, pose).points(10.0), DepthImage(depth, CAMERA, pose).points(10.0))
-    with pytest.raises(ConfigError, match=r"no intrinsic matrix.*RADIAL"):
-        DepthImage(depth, ColmapCamera("RADIAL", 320, 240, (200.0, 160.0, 120.0, 0.1, 0.0)), pose)
-
-
 def test_voxels_larger_than_the_scene_show_no_surface(images: list[DepthImage]) -> None:
     with pytest.raises(SceneError, match="no surface"):
         TsdfOcclusion(
@@ -196,54 +134,14 @@ def test_voxels_larger_than_the_scene_show_no_surface(images: list[DepthImage]) 
         )
 
 
-def test_a_depth_image_must_fit_its_camera() -> None:
-    pose = np.eye(4)[:3]
-    with pytest.raises(ConfigError, match=r"240 x 320 pixels.*\(got \(320, 240\)\)"):
-        DepthImage(np.ones((320, 240)), CAMERA, pose)
-    with pytest.raises(ConfigError, match="uint16"):
-        DepthImage(np.ones((240, 320), np.uint16), CAMERA, pose)
-    for bad in (np.eye(4), 2 * pose, np.full((3, 4), np.nan), pose * [[-1.0], [1], [1]]):
-        with pytest.raises(ConfigError, match="rigid transform"):
-            DepthImage(np.ones((240, 320)), CAMERA, bad)
-
-
-def test_voxels_that_do_not_fit_the_memory_are_refused_before_the_fusion(
-    images: list[DepthImage], volume: TsdfVolume, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    needed = estimate_blocks(images, volume.config)
-    assert 1 <= needed / len(volume) < 2
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(TsdfVolume, "integrate", lambda *_: pytest.fail("fused all the same"))
-        with pytest.raises(ConfigError, match=r"bytes.*voxel_size_m=0\.0005.*would fit"):
-            TsdfVolume.from_images(images, TsdfConfig(voxel_size_m=0.0005), progress=False)
-        limit = 50 << 20
-        with pytest.raises(ConfigError, match=rf"{limit // 24576 * 24576:,} bytes.*voxel_size_m=0\.02") as caught:
-            TsdfVolume.from_images(images, TsdfConfig(memory_limit_bytes=limit), progress=False)
-    fitting = float(str(caught.value).split("voxel_size_m of ")[1].split()[0])
-    assert 0.02 < fitting < 0.06
-    TsdfVolume.from_images(images[:5], TsdfConfig(voxel_size_m=fitting, memory_limit_bytes=limit), progress=False)
-    outgrown = TsdfVolume(TsdfConfig(memory_limit_bytes=5 << 20))
-    with pytest.raises(ConfigError, match=r"voxel_size_m=0\.02"):
-        for image in images:
-            outgrown.integrate(image)
-
-
-def test_settings_and_scenes_without_sense_are_refused(volume: TsdfVolume, images: list[DepthImage]) -> None:
-    for setting in (
-        {"voxel_size_m": 0.0},
-        {"voxel_size_m": float("nan")},
-        {"truncation_voxels": 0.5},
-        {"max_depth_m": -1.0},
-        {"memory_limit_bytes": 0},
-    ):
-        ((name, value),) = setting.items()
-        with pytest.raises(ConfigError, match=rf"{name}.*\(got {value}\)"):
-            TsdfConfig(**setting)
+def test_a_margin_and_a_volume_without_sense_are_refused(volume: TsdfVolume) -> None:
     with pytest.raises(ConfigError, match=r"margin.*-0\.1"):
         TsdfOcclusion(volume, margin_m=-0.1)
-    with pytest.raises(SceneError, match="0 images"):
-        TsdfVolume.from_images([], progress=False)
-    with pytest.raises(SceneError, match=r"up to 0\.1 m"):
-        TsdfVolume.from_images(images, TsdfConfig(max_depth_m=0.1), progress=False)
     with pytest.raises(SceneError, match="no surface"):
         TsdfOcclusion(TsdfVolume())
+
+
+def test_what_depth_images_are_fused_with_can_be_imported_from_where_it_was() -> None:
+    from wheretolook.visibility import tsdf
+
+    assert (tsdf.DepthImage, tsdf.TsdfConfig, tsdf.TsdfVolume) == (DepthImage, TsdfConfig, TsdfVolume)

@@ -23,6 +23,7 @@ from wheretolook.visibility.config import OcclusionConfig
 
 if TYPE_CHECKING:
     from wheretolook.geometry.mesh import TexturedMesh
+    from wheretolook.geometry.tsdf import DepthImage, TsdfVolume
     from wheretolook.inputs.localization_map import LocalizationMap
     from wheretolook.mapping.landmarks import Landmarks
     from wheretolook.rendering.raycasting import MeshRaycaster
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
     from wheretolook.space.free_space import FreeSpace
     from wheretolook.space.mapped_space import MappedSpace
     from wheretolook.visibility.occlusion import OcclusionModel
-    from wheretolook.visibility.tsdf import DepthImage, TsdfVolume
 
 
 @dataclass(frozen=True)
@@ -221,8 +221,8 @@ class Scene:
     @cached_property
     def _fused(self) -> tuple[TsdfVolume, RenderedDepth]:
         """The volume that depth images fuse to, and these, rendered where the map's images were taken."""
+        from wheretolook.geometry.tsdf import TsdfConfig, TsdfVolume
         from wheretolook.mapping.colmap_model import colmap_poses, read_model
-        from wheretolook.visibility.tsdf import TsdfConfig, TsdfVolume
 
         config = self.config.occlusion
         model = read_model(self.files.map)
@@ -248,7 +248,7 @@ class RenderedDepth(Sequence["DepthImage"]):
     def __getitem__(self, index: int | slice) -> DepthImage | RenderedDepth:
         if isinstance(index, slice):
             return RenderedDepth(self.renderer, self.camera, self.cam_from_world[index])
-        from wheretolook.visibility.tsdf import DepthImage
+        from wheretolook.geometry.tsdf import DepthImage
 
         pose = self.cam_from_world[index]
         return DepthImage(self.renderer.render(self.camera, pose[None]).depth_m[0], self.camera, pose)

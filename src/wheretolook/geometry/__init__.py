@@ -1,1 +1,1 @@
-"""Poses, cameras, lattices of directions and voxels, meshes."""
+"""Poses, cameras, lattices of directions and voxels, meshes, depth images fused to a surface."""

@@ -16,6 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float
+from wheretolook.geometry.tsdf import DepthImage, TsdfConfig, TsdfVolume
 from wheretolook.mapping.colmap_model import write_model
 from wheretolook.mapping.gravity import estimate_gravity, rotation_to_z
 from wheretolook.mapping.scale import Similarity
@@ -26,7 +27,6 @@ from wheretolook.scans.frames import Frames, RgbdFrames
 from wheretolook.scans.textures import textured
 from wheretolook.scans.upright import find_up
 from wheretolook.utils.errors import MapWarning, SceneError
-from wheretolook.visibility.tsdf import DepthImage, TsdfConfig, TsdfVolume
 
 _LEAST_READINGS = 3.0  # of a voxel, for its surface to be believed
 _LEAST_PIECE_M2 = 0.01  # smaller pieces that hang in the air are noise

@@ -18,10 +18,10 @@ from wheretolook.utils.npz_files import load_npy
 from wheretolook.visibility.config import OCCLUSION_NAMES, OcclusionConfig
 
 if TYPE_CHECKING:
+    from wheretolook.geometry.tsdf import DepthImage
     from wheretolook.inputs.localization_map import LocalizationMap
     from wheretolook.space.mapped_space import MappedSpace
     from wheretolook.visibility.occlusion import OcclusionModel
-    from wheretolook.visibility.tsdf import DepthImage
 
 MOST_LOCATIONS = 1_000_000  # voxels of a grid; more are refused before any work
 REACH_SHARE = 0.95  # of the landmarks' mapping distances: so far from all of them nothing is known
@@ -58,8 +58,9 @@ def surroundings(
         if name == "mesh":
             return MeshOcclusion(space.raycaster, config.margin_m, space.two_sided), space
     if depth is not None:
+        from wheretolook.geometry.tsdf import TsdfConfig, TsdfVolume
         from wheretolook.space.tsdf_space import TsdfSpace
-        from wheretolook.visibility.tsdf import TsdfConfig, TsdfOcclusion, TsdfVolume
+        from wheretolook.visibility.tsdf import TsdfOcclusion
 
         images = read_depth_images(model, depth, depth_scale)
         fused = TsdfVolume.from_images(images, TsdfConfig(config.voxel_m, max_depth_m=config.max_depth_m))
@@ -77,8 +78,8 @@ def read_depth_images(model: Path, folder: Path, scale: float = 1000.0) -> list[
     "rgb". Its pixels lie on the image's: another size is that of the scaled camera, which must have no distortion.
     Raises a SceneError if there are none or one cannot be read, a ConfigError if the camera has distortion.
     """
+    from wheretolook.geometry.tsdf import DepthImage
     from wheretolook.mapping.colmap_model import read_model
-    from wheretolook.visibility.tsdf import DepthImage
 
     if not folder.is_dir():
         raise SceneError("there is no such folder of depth images", path=folder, fix="Correct the path.")

@@ -12,9 +12,9 @@ from tqdm.auto import tqdm
 
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float
+from wheretolook.geometry.tsdf import DepthImage, TsdfVolume
 from wheretolook.space.config import FreeSpaceConfig
 from wheretolook.space.free_space import FreeSpace
-from wheretolook.visibility.tsdf import DepthImage, TsdfVolume
 
 CELL_M = 0.05
 """Side of the cells that were seen through or not; half the clearance if that is less, but at least a voxel."""

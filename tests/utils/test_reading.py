@@ -115,6 +115,19 @@ def test_a_bomb_is_refused_within_a_second_and_200_mb(
     assert seconds < 1 and megabytes < 200
 
 
+@pytest.mark.parametrize("compiled", [True, False])
+def test_yaml_makes_plain_values_alone(compiled: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    if not compiled:
+        monkeypatch.delattr(yaml, "CSafeLoader", raising=False)  # as where PyYAML was built without it
+    path = tmp_path / "file"
+    for text in ("!!python/object:fractions.Fraction {}", "!!python/name:os.system", "!!python/tuple [1, 2]"):
+        path.write_text(text)
+        with pytest.raises(ValueError, match="could not determine a constructor"):
+            read_yaml(path)
+    path.write_text("a: [1, 2.5, no]")
+    assert read_yaml(path) == {"a": [1, 2.5, False]}
+
+
 def test_good_files_are_read_as_they_were_written(tmp_path: Path) -> None:
     path = tmp_path / "file"
     content = {"a": [1, 2.5, None, {"b": "ü"}], "c": list(range(100_000))}

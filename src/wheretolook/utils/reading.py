@@ -68,14 +68,18 @@ def read_json_object(path: Path) -> dict[str, Any]:
 
 
 def read_yaml(path: Path) -> Any:
-    """The value of a YAML file of plain values; ValueError if it is none, or its aliases write out to too much."""
+    """The value of a YAML file of plain values; ValueError if it is none, or its aliases write out to too much.
+
+    Nothing else can come of it: both safe loaders are SafeConstructors, which make no objects of classes that a file
+    names. CSafeLoader is no subclass of SafeLoader but does the same in compiled code, where PyYAML was built with it.
+    """
     import yaml
 
     text = read_text(path, MAX_YAML_BYTES)
-    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    safe_loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     try:
-        _check_yaml_size(yaml.parse(text, Loader=loader))
-        return yaml.load(text, Loader=loader)
+        _check_yaml_size(yaml.parse(text, Loader=safe_loader))
+        return yaml.load(text, Loader=safe_loader)
     except (yaml.YAMLError, RecursionError, TypeError, OverflowError) as error:
         raise ValueError(" ".join(str(error).split())) from error
 

@@ -25,7 +25,7 @@ from wheretolook.check import leave_out
 from wheretolook.check.blocks import KEPT, LEAST_REST, Block, choose_blocks, landmarks_kept, observation_matrix
 from wheretolook.check.command import run
 from wheretolook.check.leave_out import without
-from wheretolook.check.source import open_map
+from wheretolook.check.source import WORK, open_map
 from wheretolook.cli import main
 from wheretolook.dataset.folders import Dataset, SceneFolder
 from wheretolook.geometry.poses import camera_centers
@@ -413,7 +413,7 @@ def test_photographs_without_features_are_extracted_anew(tmp_path: Path, capsys:
 
 
 @pytest.mark.parametrize(
-    "link", ["data/checks", "data/checks/corridor", "out/work", "out/work/blocks-0", "out/check.csv"]
+    "link", ["data/checks", "data/checks/corridor", f"out/{WORK}", f"out/{WORK}/blocks-0", "out/check.csv"]
 )
 def test_results_are_not_written_where_a_link_leads(
     link: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -15,7 +15,7 @@ from synthetic_dataset import make_dataset
 from wheretolook.check.command import run
 from wheretolook.check.learning import evaluated_photographs
 from wheretolook.check.leave_out import left_out_blocks
-from wheretolook.check.source import open_map
+from wheretolook.check.source import WORK, open_map
 from wheretolook.cli import main
 from wheretolook.dataset.folders import Dataset
 from wheretolook.evaluation.config import EvaluateConfig
@@ -59,7 +59,7 @@ def test_weights_that_hope_too_little_are_adapted_by_photographs_alone(
     timid = TrainedNetwork.load(SET, SetNetwork, "set")
     timid.offset -= 4
     timid.save(tmp_path / "timid.safetensors", read_training(SET))
-    before = {path: path.stat().st_mtime_ns for path in data.glob("checks/corridor/work/*/*/views.csv")}
+    before = {path: path.stat().st_mtime_ns for path in data.glob(f"checks/corridor/{WORK}/*/*/views.csv")}
     assert adapt(checked, tmp_path, "--weights", str(tmp_path / "timid.safetensors")) == 0
     said, adapted = capsys.readouterr().out, data / "checks" / "corridor" / "adapted.safetensors"
     assert "left-out photographs" in said and "the adapted weights are better" in said

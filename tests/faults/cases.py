@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from faults.runs import at_file_events, contents, run
+from wheretolook.check.source import WORK
 
 EXPERIMENT = """\
 name: tiny
@@ -271,7 +272,7 @@ class Workshop:
 
 def _one_name(files: dict[str, str]) -> dict[str, str]:
     """Files with one name for the only folder of blocks, which tells when features were made: of photographs, now."""
-    blocks = [found[0] for path in files if (found := re.search(r"(?<=/work/blocks-)\w+(?=/)", path))]
+    blocks = [found[0] for path in files if (found := re.search(rf"(?<=/{WORK}/blocks-)\w+(?=/)", path))]
     if len({*blocks}) != 1:
         return files
     return {path.replace(blocks[0], "key"): digest for path, digest in files.items()}

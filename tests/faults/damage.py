@@ -13,6 +13,7 @@ from pathlib import Path
 from faults.cases import CHECK, CORRIDOR, SPACE, SYNTHETIC, Case, Workshop, stage
 from faults.kills import Outcome, _labels_here
 from faults.runs import Run, contents
+from wheretolook.check.source import WORK
 
 WAYS = ("removed", "emptied", "truncated", "a bit flipped")
 
@@ -44,7 +45,7 @@ def planned(workshop: Workshop, readers: Sequence[str], n: int, rng: random.Rand
     chosen = []
     for reader in readers:
         paths = contents(workshop.state(READERS[reader][0]))
-        files = [path for path in paths if "/work/" in path or not any(part in path for part in NOT_READ)]
+        files = [path for path in paths if f"/{WORK}/" in path or not any(part in path for part in NOT_READ)]
         chosen += [(reader, file, way) for file in files for way in WAYS if not file.endswith("/")]
     rng.shuffle(chosen)
     return (chosen * (n // max(1, len(chosen)) + 1))[:n]

@@ -102,7 +102,7 @@ def run(arguments: Sequence[str]) -> int:
     try:
         with _reading(scene), hold(out / ".lock", "check"):
             source, occlusion = _open(options, scene, out, device, workers)
-            report = check_map(source, out / "work", scoring, occlusion, options.views, workers, device)
+            report = check_map(source, out / sources.WORK, scoring, occlusion, options.views, workers, device)
             report.save(out)
             save_figure(check_figure(report), out / "check.png")
     finally:
@@ -192,6 +192,6 @@ def _open(
         fix = "Map the scene again with `wheretolook map --map.keep_database true`, which keeps the features."
         raise MapError(problem, path=model, fix=fix)
     extractor = ExtractorConfig(options.extractor or "opencv", weights=options.extractor_weights)
-    where = (out / "work", workers, device, extractor)
+    where = (out / source.WORK, workers, device, extractor)
     model, features = source.features_of(model, options.images, options.database, *where)
     return source.open_map(model, features, metric, name, keep_frame=mesh is not None), hides

@@ -39,6 +39,7 @@ DEPTH_M = MAX_ERROR_M / MAX_ERROR_OF_DEPTH
 """Median depth that a map without metres is brought to. There the two limits on the position agree, and scorers, which
 have learnt in rooms, see distances as in rooms."""
 CHECKS = "checks"  # folder of the folders of checks, beside the datasets
+WORK = "work"  # folder, in that of a check, of what it has finished and need not do again
 LEAST_PHOTOGRAPHS = 20  # of fewer, blocks are too small to tell anything
 LEAST_OBSERVED = 10  # landmarks that the median photograph observes; fewer are accidents
 

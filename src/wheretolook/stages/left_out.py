@@ -54,19 +54,19 @@ def leave_photographs_out(
     model's cameras seem to lie on their side.
     """
     from wheretolook.check.leave_out import left_out_blocks
-    from wheretolook.check.source import check_links_of, features_of, folder_of_check, open_map
+    from wheretolook.check.source import WORK, check_links_of, features_of, folder_of_check, open_map
 
     out, workers, device = folder_of_check(experiment.data, name), experiment.n_workers, experiment.warp_device
     check_links_of(out)
     try:
         with hold(out / ".lock", stage):
-            folder, features = features_of(model, images, database, out / "work", workers, device)
+            folder, features = features_of(model, images, database, out / WORK, workers, device)
             source = open_map(folder, features, metric, name, keep_frame=keep_frame)
             if upright and source.is_turned:
                 fix = "Make a scene of it: `wheretolook map --name NAME --model SPARSE --map.existing.level true`."
                 raise MapError("the map lies on its side, and this needs z up", path=model, fix=fix)
             say(f"{name}: leaving out blocks of {len(source.poses)} photographs")
-            return source, left_out_blocks(source, out / "work", workers=workers, device=device)
+            return source, left_out_blocks(source, out / WORK, workers=workers, device=device)
     finally:
         with suppress(OSError):  # made for the lock of a stage that then found nothing to work on
             out.rmdir()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pandas as pd
 import pytest
@@ -72,7 +73,11 @@ def test_a_film_shows_each_look_each_turn_and_all_together(tmp_path: Path) -> No
         save_moving([image for image, _ in frames], [time for _, time in frames], tmp_path / name)
         with Image.open(tmp_path / name) as film:
             assert film.n_frames == 5
-    with pytest.raises(ConfigError, match=r"\.webp or a \.gif"):
+    save_moving([image for image, _ in frames], [time for _, time in frames], tmp_path / "a.mp4")
+    video = cv2.VideoCapture(str(tmp_path / "a.mp4"))
+    seconds = video.get(cv2.CAP_PROP_FRAME_COUNT) / video.get(cv2.CAP_PROP_FPS)
+    assert seconds == pytest.approx(sum(time for _, time in frames) / 1000, abs=0.01)
+    with pytest.raises(ConfigError, match=r"a\.png: a film is a \.webp, a \.gif or an \.mp4"):
         save_moving([], [], tmp_path / "a.png")
     titles = [axes.get_title() for axes in still_figure(told, house).axes if axes.get_title()]
     assert [title.split(":")[0] for title in titles] == ["look 1", "look 2", "together"]

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from wheretolook.figures.path_film import film_frames, methods_figure, save_film, still_figure
+from wheretolook.figures.moving import save_moving
+from wheretolook.figures.path_film import FRAME_MS, film_frames, methods_figure, still_figure
 from wheretolook.planning.route_views import PathView
 from wheretolook.utils.errors import ConfigError
 
@@ -43,17 +44,18 @@ def test_frames_show_each_view(images: bool) -> None:
 
 def test_films_can_be_played(tmp_path: Path) -> None:
     views = some_views(5)
-    save_film(film_frames(views, LANDMARKS), tmp_path / "a.gif")
+    save_moving(film_frames(views, LANDMARKS), FRAME_MS, tmp_path / "a.gif")
     with Image.open(tmp_path / "a.gif") as film:
         assert film.n_frames == 5 and film.info["duration"] == 120
-    save_film(film_frames(views, LANDMARKS), tmp_path / "a.mp4")
+    save_moving(film_frames(views, LANDMARKS), FRAME_MS, tmp_path / "a.mp4")
     video = cv2.VideoCapture(str(tmp_path / "a.mp4"))
+    assert video.get(cv2.CAP_PROP_FPS) == 8
     count = 0
     while video.read()[0]:
         count += 1
     assert count == 5
     with pytest.raises(ConfigError, match=r"a\.avi"):
-        save_film(iter(()), tmp_path / "a.avi")
+        save_moving(iter(()), FRAME_MS, tmp_path / "a.avi")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.gif", "a.mp4"]
 
 

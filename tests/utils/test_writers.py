@@ -15,7 +15,7 @@ from tests.box_scenes import furnished_room
 from tests.disks import file_limit, fill, read_only, small_disk
 from tests.synthetic_dataset import CAMERA, make_landmarks, make_mapping_poses
 
-from wheretolook.figures.path_film import save_film
+from wheretolook.figures.moving import save_moving
 from wheretolook.figures.style import save_figure
 from wheretolook.learning.weights import write_weights
 from wheretolook.mapping.building import partial_folder
@@ -41,7 +41,7 @@ def _figure(path: Path) -> None:
 
 
 def _film(path: Path) -> None:
-    save_film(iter(RNG.integers(0, 255, (4, 120, 160, 3), np.uint8)), path)
+    save_moving(iter(RNG.integers(0, 255, (4, 120, 160, 3), np.uint8)), 125, path)
 
 
 def _table(path: Path) -> None:

@@ -1,8 +1,10 @@
-"""Moving pictures as files that browsers and READMEs show: animated WebP or GIF."""
+"""Moving pictures as files: animated WebP or GIF, which browsers and READMEs show, or MP4."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from itertools import repeat
+from math import gcd
 from pathlib import Path
 from typing import Any
 
@@ -11,32 +13,70 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from wheretolook.utils.errors import ConfigError
-from wheretolook.utils.files import replacing
+from wheretolook.utils.errors import ConfigError, StorageError
+from wheretolook.utils.files import MAKE_ROOM, replacing
+
+Pixels = NDArray[np.uint8]  # an image (H, W, 3)
 
 QUALITY = 55  # of WebP, of 100
 
 
-def pixels_of(figure: Figure) -> NDArray[np.uint8]:
+def pixels_of(figure: Figure) -> Pixels:
     """A figure as an image (H, W, 3)."""
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
-def save_moving(frames: Iterable[NDArray[np.uint8]], times_ms: Sequence[int], path: Path) -> None:
-    """Write frames (H, W, 3), each standing for its time, as .webp or .gif by the file's ending; in one step.
+def save_moving(frames: Iterable[Pixels], times_ms: int | Sequence[int], path: Path) -> None:
+    """Write frames (H, W, 3), at least one and all of one size, as .webp, .gif or .mp4 by the file's ending; in one
+    step.
 
-    Raises ConfigError for another ending.
+    `times_ms` tells for how many milliseconds a frame stands: all of them, or each. Raises ConfigError for another
+    ending, or if MP4 cannot be written here.
     """
+    if path.suffix not in (".webp", ".gif", ".mp4"):
+        raise ConfigError("a film is a .webp, a .gif or an .mp4", path=path, value=path.suffix, fix="Name it so.")
+    with replacing(path, path.with_name(f".partial-{path.name}")) as partial:
+        if path.suffix == ".mp4":
+            _save_mp4(frames, times_ms, partial, path)
+        else:
+            _save_animation(frames, times_ms, partial)
+
+
+def _save_animation(frames: Iterable[Pixels], times_ms: int | Sequence[int], partial: Path) -> None:
     from PIL import Image
 
-    if path.suffix not in (".gif", ".webp"):
-        raise ConfigError("a moving picture is a .webp or a .gif", path=path, value=path.suffix, fix="Name it so.")
-    images = [Image.fromarray(frame) for frame in frames]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path, path.with_name(f".partial-{path.name}")) as partial:
-        if path.suffix == ".gif":
-            images = [image.quantize(128) for image in images]
-        more: dict[str, Any] = {"quality": QUALITY, "method": 6} if path.suffix == ".webp" else {}
-        images[0].save(partial, save_all=True, append_images=images[1:], duration=list(times_ms), loop=0, **more)
+    images = (Image.fromarray(frame) for frame in frames)
+    more: dict[str, Any] = {"quality": QUALITY, "method": 6}
+    if partial.suffix == ".gif":
+        images, more = (image.quantize(128) for image in images), {}
+    first, *rest = images
+    times = times_ms if isinstance(times_ms, int) else list(times_ms)
+    first.save(partial, save_all=True, append_images=rest, duration=times, loop=0, **more)
+
+
+def _save_mp4(frames: Iterable[Pixels], times_ms: int | Sequence[int], partial: Path, path: Path) -> None:
+    """Write the file `partial` of the film that is to be `path`. Raises as `save_moving`."""
+    import cv2
+
+    partial.write_bytes(b"")  # OpenCV does not tell why it cannot open a file
+    step_ms, times = (times_ms, repeat(times_ms)) if isinstance(times_ms, int) else (gcd(*times_ms), times_ms)
+    writer, n_frames = None, 0
+    for frame, time_ms in zip(frames, times, strict=False):  # all of an MP4 stand equally long: some are repeated
+        even = frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2]  # the codec needs even sides
+        if writer is None:
+            codec = cv2.VideoWriter.fourcc(*"mp4v")
+            writer = cv2.VideoWriter(str(partial), codec, 1000 / step_ms, even.shape[1::-1])
+            if not writer.isOpened():
+                raise ConfigError("this OpenCV cannot write MP4", path=path, fix="Ask for a .gif.")
+        for _ in range(time_ms // step_ms):
+            writer.write(np.ascontiguousarray(even[..., ::-1]))
+            n_frames += 1
+    if writer is not None:
+        writer.release()
+        written = cv2.VideoCapture(str(partial))  # OpenCV does not notice a full disk
+        whole = written.get(cv2.CAP_PROP_FRAME_COUNT) == n_frames
+        written.release()
+        if not whole:
+            raise StorageError("cannot be written whole: is the disk full?", path=path, fix=MAKE_ROOM)

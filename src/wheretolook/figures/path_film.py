@@ -3,28 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.style import context
 from numpy.typing import NDArray
 
 from wheretolook.figures.config import Look
+from wheretolook.figures.moving import Pixels, pixels_of
 from wheretolook.figures.style import INK, RC, new_figure
 from wheretolook.geometry.poses import Float
 from wheretolook.methods.styles import method_style
 from wheretolook.planning.route_views import PathView
 from wheretolook.planning.sequences import lengths_along
-from wheretolook.utils.errors import ConfigError, StorageError
-from wheretolook.utils.files import MAKE_ROOM, replacing
-
-Pixels = NDArray[np.uint8]
 
 PATH, SEEN = "#CC3311", "#EE9900"
-FRAMES_PER_SECOND = 8
+FRAME_MS = 125  # how long a view stands
 STILLS, ARROWS = 5, 12
 
 
@@ -41,7 +36,7 @@ def film_frames(views: Sequence[PathView], landmarks: Float) -> Iterator[Pixels]
             _draw_view(figure.add_subplot(grid[:, 0]), views[number])
             _draw_map(figure.add_subplot(grid[0, 1]), views, landmarks, number)
             _draw_scores(figure.add_subplot(grid[1, 1]), views, number)
-            yield _pixels(figure)
+            yield pixels_of(figure)
 
 
 def still_figure(views: Sequence[PathView], landmarks: Float, title: str = "") -> Figure:
@@ -79,56 +74,9 @@ def methods_figure(paths: Mapping[str, Sequence[PathView]], landmarks: Float) ->
         return figure
 
 
-def save_film(frames: Iterator[Pixels], path: Path) -> None:
-    """Write frames, all of one size, as an animated GIF or an MP4, by the file's ending; atomically.
-
-    Raises ConfigError for another ending, or if MP4 cannot be written here.
-    """
-    if path.suffix not in (".gif", ".mp4"):
-        raise ConfigError("a film is a .gif or an .mp4", path=path, value=path.suffix, fix="Name it so.")
-    with replacing(path, path.with_name(f".partial-{path.name}")) as partial:
-        if path.suffix == ".gif":
-            from PIL import Image
-
-            first, *rest = (Image.fromarray(frame).quantize(128) for frame in frames)
-            first.save(partial, save_all=True, append_images=rest, duration=round(1000 / FRAMES_PER_SECOND), loop=0)
-        else:
-            _save_mp4(frames, partial, path)
-
-
-def _save_mp4(frames: Iterator[Pixels], partial: Path, path: Path) -> None:
-    """Write the file `partial` of the film that is to be `path`. Raises as `save_film`."""
-    import cv2
-
-    partial.write_bytes(b"")  # OpenCV does not tell why it cannot open a file
-    writer, n_frames = None, 0
-    for frame in frames:
-        even = frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2]  # the codec needs even sides
-        if writer is None:
-            codec = cv2.VideoWriter.fourcc(*"mp4v")
-            writer = cv2.VideoWriter(str(partial), codec, FRAMES_PER_SECOND, even.shape[1::-1])
-            if not writer.isOpened():
-                raise ConfigError("this OpenCV cannot write MP4", path=path, fix="Ask for a .gif.")
-        writer.write(np.ascontiguousarray(even[..., ::-1]))
-        n_frames += 1
-    if writer is not None:
-        writer.release()
-        written = cv2.VideoCapture(str(partial))  # OpenCV does not notice a full disk
-        whole = written.get(cv2.CAP_PROP_FRAME_COUNT) == n_frames
-        written.release()
-        if not whole:
-            raise StorageError("cannot be written whole: is the disk full?", path=path, fix=MAKE_ROOM)
-
-
 def score_text(score: float) -> str:
     """A score in few digits: of a probability two decimals; scores of other methods may be of any size."""
     return f"{score:.2f}" if abs(score) < 10 else f"{score:.3g}"
-
-
-def _pixels(figure: Figure) -> Pixels:
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
 def _draw_view(axes: Axes, view: PathView, before: str = "") -> None:

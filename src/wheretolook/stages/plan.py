@@ -82,7 +82,8 @@ Film = Literal["gif", "mp4", "none"]
 
 def _draw(views: dict[str, list[PathView]], landmarks: np.ndarray, title: str, folder: Path, film: Film) -> list[str]:
     """Draw the last of several methods' paths, and all side by side. Returns the names of the files written."""
-    from wheretolook.figures.path_film import film_frames, methods_figure, save_film, still_figure
+    from wheretolook.figures.moving import save_moving
+    from wheretolook.figures.path_film import FRAME_MS, film_frames, methods_figure, still_figure
     from wheretolook.figures.style import save_figure
 
     written, seen = ["path.png"], list(views.values())[-1]
@@ -91,7 +92,7 @@ def _draw(views: dict[str, list[PathView]], landmarks: np.ndarray, title: str, f
         save_figure(methods_figure(views, landmarks), folder / "methods.png")
         written.append("methods.png")
     if film != "none":
-        save_film(film_frames(seen, landmarks), folder / f"path.{film}")
+        save_moving(film_frames(seen, landmarks), FRAME_MS, folder / f"path.{film}")
         written.append(f"path.{film}")
     return written
 

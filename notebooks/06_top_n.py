@@ -14,9 +14,9 @@
 # %% [markdown]
 # # Several viewpoints of a location
 #
-# A planner may not be able to take the best view: is the fifth or tenth best still good? This is the paper's figure
-# "Multiple viewpoints results", from the newest evaluation in the tracking store; on a fresh clone that of the release
-# is logged first.
+# **Is the fifth or tenth best view of a place still good?** A planner may not be able to take the best one. This is the
+# paper's figure "Multiple viewpoints results", from the newest evaluation in the tracking store; on a fresh clone that
+# of the release is logged first.
 
 # %%
 # %matplotlib inline

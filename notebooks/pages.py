@@ -118,7 +118,8 @@ def _texts(notebook: Any) -> list[str]:
 def _first_sentence(source: str) -> str:
     """Of Markdown, without its heading and its marks."""
     text = " ".join(line for line in source.splitlines() if not line.startswith("#"))
-    text = re.sub(r"!?\[([^\]]*)\]\([^)]*\)|[*`_]", lambda found: found[1] or "", text).strip()
+    text = re.sub(r"!?\[([^\]]*)\]\([^)]*\)|[*`]|\b_|_\b", lambda found: found[1] or "", text)
+    text = text.strip().removeprefix("- ")
     return re.split(r"(?<=[.?!:]) ", text)[0].rstrip(":")
 
 

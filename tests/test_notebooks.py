@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
 from nbclient import NotebookClient
-from pages import main, notebook_page, small_picture, small_table
+from pages import about_of, main, notebook_page, small_picture, small_table
 from PIL import Image
 
 from synthetic_release import make_release
@@ -81,6 +81,7 @@ def test_notebooks_say_what_they_show(path: Path) -> None:
     """Each opens with words, and no cell of code stands without some before it; none holds a pipeline."""
     cells = nbformat.read(path, as_version=4).cells
     assert cells[0].cell_type == "markdown" and cells[0].source.startswith("# ")
+    assert about_of(nbformat.read(path, as_version=4)).endswith("?")  # the first page asks it, whole
     for before, cell in pairwise(cells):
         if cell.cell_type == "code":
             assert before.cell_type == "markdown", cell.source
@@ -121,7 +122,7 @@ def test_pages_are_small_and_whole(
     folder = tmp_path / "notebooks"
     folder.mkdir()
     (folder / "01_one.py").write_text(
-        "# %% [markdown]\n# # One & all\n# ![a picture](images/one.webp), [elsewhere](https://example.org)\n\n"
+        "# %% [markdown]\n# # One & all\n# - ![a_picture](images/one.webp), _[elsewhere](https://example.org)_\n\n"
         "# %%\n# %matplotlib inline\nimport sys\nfrom IPython.display import display\n"
         "from matplotlib.figure import Figure\nprint('1 < 2')\nprint('std' + 'error', file=sys.stderr)\n"
         "figure = Figure()\nfigure.subplots().plot([0, 1])\ndisplay(figure)\n"
@@ -136,7 +137,7 @@ def test_pages_are_small_and_whole(
     assert 'src="../images/one.webp"' in text and 'href="https://example.org"' in text
     assert text.count("data:image/webp;base64,") == 1 and len(text) < 40_000
     assert 'href="02_broken.html"' in text and 'href="index.html">All notebooks' in text
-    assert '<meta name="viewport"' in text and 'alt="a picture, elsewhere"' in text
+    assert '<meta name="viewport"' in text and 'alt="a_picture, elsewhere"' in text
     text = first.read_text()
     assert '<a href="01_one.html">One &amp; all</a>' in text and "02_broken" not in text
     assert text.count("data:image/webp;base64,") == 1

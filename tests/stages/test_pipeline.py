@@ -409,10 +409,12 @@ def test_stages_are_plain_functions(demo: Path) -> None:
     assert dataset.name == "tiny"
 
 
+PATHS = ["--paths.grid", "[4, 4, 2]", "--paths.directions", "40", "--paths.min_distance_m", "1", "--paths.max_turn_deg",
+         "60", "--paths.planner.time_s", "1", "--paths.planner.spacing_m", "0.5"]  # fmt: skip
+
+
 def test_planned_paths_are_rendered_and_localized(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    options = ["--paths.pairs", "2", "--paths.methods", "[forward,visible]", "--paths.grid", "[4, 4, 2]",
-               "--paths.directions", "40", "--paths.min_distance_m", "1", "--paths.planner.time_s", "1",
-               "--paths.planner.spacing_m", "0.5", "--paths.max_turn_deg", "60"]  # fmt: skip
+    options = ["--paths.pairs", "2", "--paths.methods", "[forward,visible]", *PATHS]
     assert run("compare-paths", copy, *options) == 0
     root = copy / "data" / "tiny" / "results"
     table = pd.read_csv(root / "paths.csv")
@@ -440,9 +442,7 @@ def test_planned_paths_are_rendered_and_localized(copy: Path, capsys: pytest.Cap
 
 
 def test_views_along_paths_are_localized_together(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    options = ["--paths.pairs", "1", "--paths.methods", "[forward,set]", "--paths.grid", "[4, 4, 2]",
-               "--paths.directions", "40", "--paths.min_distance_m", "1", "--paths.planner.time_s", "1",
-               "--paths.planner.spacing_m", "0.5", "--paths.max_turn_deg", "60"]  # fmt: skip
+    options = ["--paths.pairs", "1", "--paths.methods", "[forward,set]", *PATHS]
     assert run("compare-paths", copy, *options) == 0
     root = copy / "data" / "tiny" / "results"
     plain = pd.read_csv(root / "paths.csv")

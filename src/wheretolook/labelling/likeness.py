@@ -30,7 +30,6 @@ NONE = 10.0
 SUPPORT = 0.2
 """Power of the ratio of two poses' support that counts beside that of their own places."""
 
-
 RIVAL = 0.1
 """Support of a rival at least, as a share of the best supported pose's."""
 

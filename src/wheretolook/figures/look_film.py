@@ -9,11 +9,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.style import context
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from wheretolook.figures.config import Look as Style
 from wheretolook.figures.house_image import Dollhouse, draw_house, draw_segments, frustum_segments
-from wheretolook.figures.moving import pixels_of
+from wheretolook.figures.moving import Pixels, pixels_of
 from wheretolook.figures.style import BLUE, GREEN, INK, RC, VERMILION, new_figure
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float, camera_centers, pose_error
@@ -23,8 +23,6 @@ from wheretolook.labelling.localizer import Localizer
 from wheretolook.labelling.look import Look, rig_of
 from wheretolook.utils.errors import PoseError
 from wheretolook.viewpoints.thresholds import THRESHOLDS
-
-Pixels = NDArray[np.uint8]
 
 MAX_ERROR_M, MAX_ERROR_DEG = THRESHOLDS[0]
 

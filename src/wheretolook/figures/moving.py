@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from wheretolook.utils.errors import ConfigError, StorageError
 from wheretolook.utils.files import MAKE_ROOM, replacing
 
-Pixels = NDArray[np.uint8]  # an image (H, W, 3)
+Pixels = NDArray[np.uint8]  # an image (H, W, 3), or several (N, H, W, 3)
 
 QUALITY = 55  # of WebP, of 100
 

@@ -24,13 +24,13 @@ copy of a thing is a copy, but not the same points of it were mapped."""
 PLACE_M = 0.25
 """Landmarks in one cube of this edge count once: those of one thing are matched together, and wrongly together."""
 
-NONE = 10.0
+PSEUDOCOUNT = 10.0
 """Places added to both poses' own before they are compared, so that one against none is no proof."""
 
-SUPPORT = 0.2
+SUPPORT_POWER = 0.2
 """Power of the ratio of two poses' support that counts beside that of their own places."""
 
-RIVAL = 0.1
+LEAST_OF_RIVAL = 0.1
 """Support of a rival at least, as a share of the best supported pose's."""
 
 
@@ -57,12 +57,14 @@ class Likeness:
 
 def log_ratio(own: ArrayLike, others: ArrayLike) -> Float:
     """Of places that only one pose explains and that only the other does, (...,) each: log of their ratio, damped."""
-    return np.log((np.asarray(own, dtype=np.float64) + NONE) / (np.asarray(others, dtype=np.float64) + NONE))
+    return np.log(
+        (np.asarray(own, dtype=np.float64) + PSEUDOCOUNT) / (np.asarray(others, dtype=np.float64) + PSEUDOCOUNT)
+    )
 
 
 def preference(own: tuple[int, int], support: tuple[float, float]) -> float:
     """By how much the first of two poses is to be preferred, by the places of their own and their support."""
-    return float(log_ratio(*own) + SUPPORT * np.log((support[0] + 1) / (support[1] + 1)))
+    return float(log_ratio(*own) + SUPPORT_POWER * np.log((support[0] + 1) / (support[1] + 1)))
 
 
 def strongest_rival(
@@ -78,7 +80,7 @@ def most_likely(own: NDArray[np.int64], support: Sequence[float]) -> int:
 
     Not by one duel after the other: these may go round in a circle.
     """
-    able = [k for k, of in enumerate(support) if of > RIVAL * support[0]]
+    able = [k for k, of in enumerate(support) if of > LEAST_OF_RIVAL * support[0]]
     if len(able) < 2:
         return 0
     return max(able, key=lambda k: _against(own, support, k, strongest_rival(own, support, k, able)))

@@ -6,7 +6,9 @@ import json
 import socket
 import threading
 import time
+import warnings
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from urllib.parse import quote
 
@@ -19,9 +21,11 @@ import pytest
 
 pytest.importorskip("viser")
 
+from box_scenes import furnished_room
 from selection.room import POINTS, WEIGHTS, write_room
 from wheretolook.cli import main
 from wheretolook.geometry.poses import camera_centers, poses_looking_along
+from wheretolook.scenes.loading import save_glb
 from wheretolook.select.where_to_look import WhereToLook
 from wheretolook.utils.errors import ConfigError, InUseError, MapWarning, TableError
 from wheretolook.view import drawing
@@ -403,6 +407,30 @@ def test_a_map_that_lies_is_told_on_the_page(sparse: Path, viewer: Viewer, tmp_p
         assert str(tmp_path) not in said
     finally:
         lying.stop()
+
+
+@pytest.mark.parametrize(("scale", "up_m", "doubted"), [(1.0, 0.0, False), (1.0, 40.0, True), (0.01, 0.0, True)])
+def test_a_mesh_in_another_frame_or_unit_is_told_in_terminal_and_page(
+    scale: float, up_m: float, doubted: bool, sparse: Path, tmp_path: Path
+) -> None:
+    room = furnished_room()
+    vertices = (scale * room.vertices + np.float32([0, 0, up_m])).astype(np.float32)
+    save_glb(replace(room, vertices=vertices), tmp_path / "room.glb")
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        opened = open_map(sparse, tmp_path / "room.glb", weights=WEIGHTS)
+    said = [str(one.message) for one in told if one.category is MapWarning]
+    assert [f"{tmp_path / 'room.glb'}: half of the landmarks are" in text for text in said] == [True] * doubted
+    shown = Viewer(Shared(opened), port=0, state=ViewState(method="visible", occlusion="none"))
+    try:
+        with _client(shown) as client:
+            client.send(camera_message())
+            _until(lambda: shown.sessions)
+            doubts = next(iter(shown.sessions.values())).controls.doubts
+        assert doubts.visible == doubted and ("from the mesh" in doubts.content) == doubted
+        assert str(tmp_path) not in doubts.content
+    finally:
+        shown.stop()
 
 
 def test_values_that_no_control_offers_are_told_and_put_back(viewer: Viewer) -> None:

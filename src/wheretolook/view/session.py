@@ -22,6 +22,7 @@ from wheretolook.view.scores import Place, landmarks_seen, look_around, report_o
 from wheretolook.view.shared import Shared
 from wheretolook.view.state import ViewState
 from wheretolook.view.texts import plain
+from wheretolook.view.turning import Turning
 from wheretolook.view.worker import LATER, NOW, SOON, Worker
 
 if TYPE_CHECKING:
@@ -58,6 +59,7 @@ class Session:
         self._outside: Any = None  # where the scene was seen from before one stood in it
         self.controls = build(client.gui, shared, self.state)
         self.scenery = Scenery(client.scene, shared, self.controls)
+        self._turning_camera = Turning(self._thin)
         self._connect()
         self.draw_scene()
         self.fill_floor()
@@ -207,8 +209,14 @@ class Session:
         camera = self.opened.camera
         return 2 * float(np.arctan(camera.height / 2 / camera.mean_focal_px))
 
+    def _thin(self, thinned: bool) -> None:
+        if not self.closed:
+            self.scenery.thin(thinned)
+            self.client.flush()
+
     def _camera_moved(self) -> None:
         camera = self.client.camera
+        self._turning_camera.moved()
         point = tuple(float(x) for x in camera.position), tuple(float(x) for x in camera.look_at)
         if np.isfinite(point).all():
             self.note(eye=point[0], target=point[1])

@@ -361,7 +361,6 @@ def test_a_browser_that_draws_slowly_is_shown_fewer_landmarks_while_it_turns(
         for _ in range(8):
             client.send(camera_message())
             time.sleep(pause_s)
-            assert some.visible != whole.visible
             thinned.append(some.visible)
         assert any(thinned) == slow and not thinned[0]
         _until(lambda: whole.visible and not some.visible, 2)  # it stands still

@@ -211,8 +211,8 @@ class Session:
 
     def _thin(self, thinned: bool) -> None:
         if not self.closed:
-            self.scenery.thin(thinned)
-            self.client.flush()
+            with self.client.atomic():
+                self.scenery.thin(thinned)
 
     def _camera_moved(self) -> None:
         camera = self.client.camera

@@ -18,7 +18,8 @@ class Turning:
 
     def __init__(self, thin: Callable[[bool], None]) -> None:
         self._thin, self._lock = thin, threading.Lock()
-        self._moved, self._slow, self._timer = -PAUSE_S, 0, None  # type: ignore[var-annotated]
+        self._moved, self._slow = -PAUSE_S, 0  # when the camera has, and how many slow pictures in a row
+        self._timer: threading.Timer | None = None  # one at most, while the camera moves
 
     def moved(self) -> None:
         """The camera has moved."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise, product
 from pathlib import Path
 
@@ -23,7 +24,15 @@ from wheretolook.methods.set.network import TOLD, SetNetwork
 from wheretolook.methods.set.score import SetScorer
 from wheretolook.scenes.loading import save_glb
 from wheretolook.select.where_to_look import WhereToLook
-from wheretolook.utils.errors import ConfigError, MapError, SceneError, TableError, WeightsError, WhereToLookError
+from wheretolook.utils.errors import (
+    ConfigError,
+    MapError,
+    MapWarning,
+    SceneError,
+    TableError,
+    WeightsError,
+    WhereToLookError,
+)
 from wheretolook.visibility.hidden_points import HiddenPointRemoval
 
 AXES = direction_lattice(60)
@@ -165,6 +174,16 @@ def test_a_mesh_hides_landmarks_and_holds_waypoints_inside_geometry(sparse: Path
         room.grid(0.001)
     with pytest.raises(ConfigError, match="length"):
         room.grid(0)
+
+
+def test_a_mesh_of_another_frame_is_doubted(sparse: Path, tmp_path: Path) -> None:
+    room = furnished_room()
+    save_glb(replace(room, vertices=room.vertices + np.float32([0, 0, 40])), tmp_path / "room.glb")
+    told = r"room\.glb: half of the landmarks are 38\.\d\d m or more from the mesh"  # 40 m, less half of the wall
+    with pytest.warns(MapWarning, match=told):
+        WhereToLook.from_colmap(sparse, method="visible", mesh=tmp_path / "room.glb", device="cpu")
+    with pytest.warns(MapWarning, match=told):
+        LocalizationMap.from_colmap(sparse, mesh=tmp_path / "room.glb")
 
 
 def test_a_grid_without_a_mesh_lies_near_the_images(look: WhereToLook) -> None:

@@ -6,7 +6,9 @@ import json
 import socket
 import threading
 import time
+import warnings
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from urllib.parse import quote
 
@@ -19,9 +21,11 @@ import pytest
 
 pytest.importorskip("viser")
 
+from box_scenes import furnished_room
 from selection.room import POINTS, WEIGHTS, write_room
 from wheretolook.cli import main
 from wheretolook.geometry.poses import camera_centers, poses_looking_along
+from wheretolook.scenes.loading import save_glb
 from wheretolook.select.where_to_look import WhereToLook
 from wheretolook.utils.errors import ConfigError, InUseError, MapWarning, TableError
 from wheretolook.view import drawing
@@ -29,12 +33,14 @@ from wheretolook.view.checks import check_port
 from wheretolook.view.controls import check_value, value_of
 from wheretolook.view.opened import open_map
 from wheretolook.view.played import FORWARD, Played, looking_ahead, read_paths
-from wheretolook.view.saving import views_file
+from wheretolook.view.saving import views_at, views_file
+from wheretolook.view.scenery import ALL, THINNED
 from wheretolook.view.server import Viewer, where_clicked
+from wheretolook.view.session import Session
 from wheretolook.view.shared import Shared
 from wheretolook.view.state import ViewState
 from wheretolook.view.texts import plain
-from wheretolook.view.worker import LATER, NOW, Worker
+from wheretolook.view.worker import LATER, NOW, SOON, Worker
 from wheretolook.viewpoints.table import pose_columns
 
 STATE = ViewState("visible", "none", 3, 0.25, 1.4, 2.0, (1.0, 2.0, 1.5), -30.0, 5.0, (0.0, 0.0, 9.0), (1.0, 1.0, 0.0))
@@ -177,7 +183,7 @@ def test_waypoints_are_saved_as_select_writes_them(sparse: Path, tmp_path: Path,
     }[format]
     n = 1 if kind in ("tum", "benchmark") else 3
     look.best(POINTS, n).save(tmp_path / f"wanted{ending}", kind)
-    assert views_file(look, POINTS, 3, format) == (tmp_path / f"wanted{ending}").read_bytes()
+    assert views_file([*views_at(look, POINTS, 3, format)], format) == (tmp_path / f"wanted{ending}").read_bytes()
 
 
 def test_urgent_work_goes_first_and_what_fails_stops_nothing_else() -> None:
@@ -294,7 +300,8 @@ def test_each_client_has_its_own_state_and_nonsense_hurts_nobody(viewer: Viewer)
         _until(lambda: len(viewer.sessions) == 2)
 
 
-def test_a_flood_of_messages_is_outlived_and_a_path_is_played_by_one_thread(sparse: Path) -> None:
+def test_a_flood_of_messages_holds_nobody_else_up(sparse: Path) -> None:
+    """One client sends thousands of messages, good ones, wrong ones and ones that wait; another's score still comes."""
     import msgspec
 
     paths = {FORWARD: Played(looking_ahead(np.tile(POINTS, (20, 1))))}
@@ -306,29 +313,79 @@ def test_a_flood_of_messages_is_outlived_and_a_path_is_played_by_one_thread(spar
             _until(lambda: len(flooded.sessions) == 1)
             (session,) = flooded.sessions.values()
 
-            def set_to(name: str, value: object) -> bytes:
-                about = {"uuid": getattr(session.controls, name)._impl.uuid, "updates": {"value": value}}
+            def set_to(which: Session, name: str, value: object, what: str = "value") -> bytes:
+                about = {"uuid": getattr(which.controls, name)._impl.uuid, "updates": {what: value}}
                 return msgspec.msgpack.encode({"type": "GuiUpdateMessage", **about})
 
             ray = {"ray_origin": [1.5, 2.0, 9.0], "ray_direction": [0.01, 0, -1]}
             click = {"type": "ScenePointerMessage", "event_type": "click", "screen_pos": [[0.5, 0.5]], "modifier": None}
-            all_at_once = [
-                msgspec.msgpack.encode({**click, **ray}), camera_message(), set_to("yaw", 12.5), set_to("step", 3),
-                set_to("threshold", 0.7), set_to("play", True), set_to("height", 1e308), set_to("state", "x" * 1000),
-            ]  # fmt: skip
-            before = threading.active_count()
-            for _ in range(300):
-                for message in all_at_once:
-                    bad.send(message)
+            before, times = threading.active_count(), 400
+            for turn in range(times):
+                good_and_wrong = {
+                    "yaw": turn % 180, "step": turn % 80 + 1, "threshold": turn / times, "play": True, "add": True,
+                    "save": True, "photo": True, "method": f"no such {turn}", "height": 1e308, "state": "x" * 1000,
+                }  # fmt: skip
+                bad.send(msgspec.msgpack.encode({**click, **ray}))
+                bad.send(camera_message())
+                for name, value in good_and_wrong.items():
+                    bad.send(set_to(session, name, value))
+                bad.send(set_to(session, "yaw", 1.0, "no such thing"))
             good.send(camera_message())
             _until(lambda: len(flooded.sessions) == 2, 60)
-            good.send(msgspec.msgpack.encode({**click, **ray}))
             joined = max(flooded.sessions.items())[1]
-            _until(lambda: joined.place is not None, 60)
+            _until(lambda: joined.client.scene._scene_pointer_cb, 60)  # it can be clicked in
+            good.send(msgspec.msgpack.encode({**click, **ray}))
+            _until(lambda: joined.place is not None and bool(joined.controls.picture_told.content), 60)
+            joined.controls.picture_told.content = ""
+            good.send(set_to(joined, "yaw", 77.0))
+            _until(lambda: "landmarks in view" in joined.controls.picture_told.content, 10)
             playing = [thread for thread in threading.enumerate() if "_play" in thread.name]
-            assert len(playing) <= 1 and threading.active_count() < before + 60
+            assert len(playing) <= 1 and threading.active_count() < before + 12
     finally:
         flooded.stop()
+
+
+@pytest.mark.parametrize(("pause_s", "slow"), [(0.12, True), (0.005, False)])
+def test_a_browser_that_draws_slowly_is_shown_fewer_landmarks_while_it_turns(
+    pause_s: float, slow: bool, viewer: Viewer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("wheretolook.view.scenery.FEW", 100)
+    with _client(viewer) as client:
+        client.send(camera_message())
+        _until(lambda: viewer.sessions)
+        (session,) = viewer.sessions.values()
+        thinned: list[bool] = []
+        _until(lambda: session.client.scene._scene_pointer_cb)
+        whole, some = (session.scene.get_handle_by_name(name) for name in (ALL, THINNED))
+        assert len(whole.points) == 400 and len(some.points) == 100 and whole.visible and not some.visible
+        for _ in range(8):
+            client.send(camera_message())
+            time.sleep(pause_s)
+            thinned.append(some.visible)
+        assert any(thinned) == slow and not thinned[0]
+        _until(lambda: whole.visible and not some.visible, 2)  # it stands still
+
+
+def test_turns_without_end_do_not_keep_places_and_floors_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("wheretolook.view.worker.PATIENCE_S", 0.5)
+    monkeypatch.setattr("wheretolook.view.worker.CLICK_PATIENCE_S", 0.2)
+    worker, done = Worker(), []  # type: ignore[var-annotated]
+
+    def step(name: str) -> Iterator[None]:
+        done.append(name)
+        yield
+
+    def turns() -> Iterator[None]:
+        while True:  # the next is there before this one is done
+            time.sleep(0.01)
+            yield
+
+    worker.submit(1, "view", NOW, turns(), pytest.fail)
+    for name in ("first", "second"):  # the first of a kind need not wait
+        worker.submit(2, "place", SOON, step(f"{name} place"), pytest.fail)
+        worker.submit(2, "floor", LATER, step(f"{name} floor"), pytest.fail)
+        _until(lambda name=name: {f"{name} place", f"{name} floor"} <= {*done}, 10)  # type: ignore[misc]
+    worker.stop()
 
 
 def test_nothing_but_the_page_is_served_and_no_client_opens_it_to_the_world(viewer: Viewer) -> None:
@@ -403,6 +460,30 @@ def test_a_map_that_lies_is_told_on_the_page(sparse: Path, viewer: Viewer, tmp_p
         assert str(tmp_path) not in said
     finally:
         lying.stop()
+
+
+@pytest.mark.parametrize(("scale", "up_m", "doubted"), [(1.0, 0.0, False), (1.0, 40.0, True), (0.01, 0.0, True)])
+def test_a_mesh_in_another_frame_or_unit_is_told_in_terminal_and_page(
+    scale: float, up_m: float, doubted: bool, sparse: Path, tmp_path: Path
+) -> None:
+    room = furnished_room()
+    vertices = (scale * room.vertices + np.float32([0, 0, up_m])).astype(np.float32)
+    save_glb(replace(room, vertices=vertices), tmp_path / "room.glb")
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        opened = open_map(sparse, tmp_path / "room.glb", weights=WEIGHTS)
+    said = [str(one.message) for one in told if one.category is MapWarning]
+    assert [f"{tmp_path / 'room.glb'}: half of the landmarks are" in text for text in said] == [True] * doubted
+    shown = Viewer(Shared(opened), port=0, state=ViewState(method="visible", occlusion="none"))
+    try:
+        with _client(shown) as client:
+            client.send(camera_message())
+            _until(lambda: shown.sessions)
+            doubts = next(iter(shown.sessions.values())).controls.doubts
+        assert doubts.visible == doubted and ("from the mesh" in doubts.content) == doubted
+        assert str(tmp_path) not in doubts.content
+    finally:
+        shown.stop()
 
 
 def test_values_that_no_control_offers_are_told_and_put_back(viewer: Viewer) -> None:

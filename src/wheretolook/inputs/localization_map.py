@@ -15,6 +15,7 @@ from wheretolook.geometry.poses import Float, camera_centers, check_poses
 from wheretolook.inputs.bins import BinnedViews, bin_views, count_bins
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.mapping.opened_map import open_colmap
+from wheretolook.mapping.plausibility import warn_of_mesh
 from wheretolook.utils.errors import ConfigError
 from wheretolook.visibility import frustum
 from wheretolook.visibility.frustum import LandmarkSets, PosedViews, landmarks_in_view
@@ -54,7 +55,8 @@ class LocalizationMap:
     ) -> LocalizationMap:
         """From any COLMAP model (version 3 or 4, binary or text) in metres, z up.
 
-        A `MapWarning` says which points are left out, and if the model seems not to be in metres or not to have z up.
+        A `MapWarning` says which points are left out, if the model seems not to be in metres or not to have z up, and
+        if the mesh seems to be in another frame.
 
         Args:
             model: folder of the model.
@@ -89,6 +91,7 @@ class LocalizationMap:
 
             space = FreeSpace(load_mesh(Path(mesh), colored=False), device=device)
             occlusion = MeshOcclusion(space.raycaster, two_sided=space.two_sided)
+            warn_of_mesh(mesh, landmarks.points, space.raycaster)
         return cls(landmarks, camera, occlusion, device, poses)
 
     def of_camera(self, camera: Camera) -> LocalizationMap:

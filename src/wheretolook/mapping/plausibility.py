@@ -26,6 +26,7 @@ TILT_DEG = {"level": 25.0, "mean": 50.0}
 few degrees, but may tilt all their photographs of a thing the same way."""
 MESH_DISTANCE_M = (0.3, 100.0)
 """Median distance of landmarks to the mesh of the same place that is too far, and the farthest that is measured."""
+_MOST_MEASURED = 10_000  # landmarks whose distance to a mesh is measured: enough for a median
 _LOOKING_DOWN = 0.7  # mean of the cameras' directions along -z; how such cameras are turned says nothing about up
 
 
@@ -46,16 +47,27 @@ def frame_doubts(mapping_distance_m: ArrayLike, cam_from_world: ArrayLike) -> tu
 
 
 def warn_of_mesh(mesh: str | Path, points: ArrayLike, raycaster: MeshRaycaster) -> None:
-    """Warn with a `MapWarning` if a map's landmarks (N, 3) are mostly far from the surface that a mesh shows."""
+    """Warn with a `MapWarning` if a map's landmarks (N, 3) m seem not to be in the frame or unit of a mesh."""
+    if doubt := mesh_doubt(points, raycaster):
+        warnings.warn(f"{mesh}: {doubt}", MapWarning, stacklevel=2)
+
+
+def mesh_doubt(points: ArrayLike, raycaster: MeshRaycaster) -> str:
+    """Why a mesh seems not to be in a map's frame and unit, and what to do; empty if it may be.
+
+    Landmarks lie on surfaces: those of the map (N, 3) m are mostly near what the mesh shows, or it shows another place.
+    """
     at = np.asarray(points, dtype=np.float64)
+    at = at[:: max(1, -(-len(at) // _MOST_MEASURED))]
     off_m = float(np.median(raycaster.distance_to_surface(at, MESH_DISTANCE_M[1])))
-    if off_m > MESH_DISTANCE_M[0]:
-        far = f"{off_m:.2f} m" if np.isfinite(off_m) else f"more than {MESH_DISTANCE_M[1]:g} m"
-        text = (
-            f"{mesh}: half of the landmarks are {far} or more from the mesh, so it seems to be in another frame than "
-        )
-        text += "the model. Try --map.existing.mesh_up y (glTF's own), or export both in the same frame"
-        warnings.warn(text, MapWarning, stacklevel=2)
+    if not off_m > MESH_DISTANCE_M[0]:
+        return ""
+    far = f"{off_m:.2f} m or more" if np.isfinite(off_m) else f"more than {MESH_DISTANCE_M[1]:g} m"
+    return (
+        f"half of the landmarks are {far} from the mesh, so it seems to be in another frame or unit than the model. "
+        "Export both in the same frame, in metres; a mesh with y up (glTF's own) `wheretolook map --model` "
+        "turns with --map.existing.mesh_up y"
+    )
 
 
 def scale_doubt(mapping_distance_m: ArrayLike, centers: ArrayLike) -> str:

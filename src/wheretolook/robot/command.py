@@ -66,6 +66,7 @@ def run(arguments: Sequence[str]) -> int:
 def _export(given: argparse.Namespace) -> None:
     from wheretolook.geometry.camera_text import parse_camera
     from wheretolook.inputs.localization_map import LocalizationMap
+    from wheretolook.mapping.plausibility import warn_of_mesh
     from wheretolook.robot.export import export_robot, pinhole_of
     from wheretolook.visibility.occlusion import MeshOcclusion, NoOcclusion, OcclusionModel
 
@@ -80,6 +81,8 @@ def _export(given: argparse.Namespace) -> None:
         occlusion = MeshOcclusion(space.raycaster, two_sided=space.two_sided)
     named = given.camera_id if given.camera is None else parse_camera(given.camera)
     found = LocalizationMap.from_colmap(given.map, named, occlusion=occlusion, database=given.database)
+    if given.mesh is not None:
+        warn_of_mesh(given.mesh, found.landmarks.points, space.raycaster)
     camera = pinhole_of(found.camera)
     if camera != found.camera:
         print("the map's camera has distortion, the robot's is the pinhole of its rectified images; or give --camera")

@@ -15,6 +15,7 @@ from wheretolook.geometry.lattices import Lattice, direction_lattice
 from wheretolook.geometry.poses import Float, check_poses, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.looks.around import best_looks
+from wheretolook.mapping.plausibility import warn_of_mesh
 from wheretolook.planning.config import StopConfig
 from wheretolook.planning.route_views import PlannedPath
 from wheretolook.planning.sequences import TurnLimit, best_sequence
@@ -134,6 +135,8 @@ class WhereToLook:
         if hides.name != "none":
             hides = RememberedOcclusion(hides)
         around = LocalizationMap.from_colmap(model, camera, occlusion=hides, device=device, **options)
+        if mesh is not None:
+            warn_of_mesh(mesh, around.landmarks.points, space.raycaster)
         weights = weights_of(method, weights, around.landmarks.features)
         if method:
             scorer = make_scorer(method, around, weights=weights, anywhere=anywhere)

@@ -78,7 +78,7 @@ def build(gui: GuiApi, shared: Shared, state: ViewState) -> Controls:
     blank = np.full((270, 360, 3), (38, 40, 46), np.uint8)
     tabs = gui.add_tab_group()
     with tabs.add_tab("Look"):
-        doubts = "\n\n".join(f"⚠ {plain(doubt[0].upper() + doubt[1:])}." for doubt in opened.doubts)
+        doubts = "\n\n".join(f"⚠ {plain(doubt[0].upper() + doubt[1:])}." for doubt in shared.doubts)
         made["doubts"] = gui.add_markdown(doubts, visible=bool(doubts))
         made["status"] = gui.add_markdown("")
         made["legend"] = gui.add_html(legend(0, 1, "score"))

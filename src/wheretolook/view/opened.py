@@ -63,12 +63,14 @@ class Opened:
 
     @cached_property
     def doubts(self) -> tuple[str, ...]:
-        """Why it seems not to be in metres with z up, if so: the scores then say nothing."""
-        from wheretolook.mapping.plausibility import frame_doubts
+        """Why it seems not to be in metres with z up, or the mesh not in its frame: the scores then say nothing."""
+        from wheretolook.mapping.plausibility import frame_doubts, mesh_doubt
 
-        if self.mapping_poses is None or len(self.mapping_poses) == 0:
-            return ()
-        return frame_doubts(self.landmarks.mapping_distance_m, self.mapping_poses)
+        found: tuple[str, ...] = ()
+        if self.mapping_poses is not None and len(self.mapping_poses) > 0:
+            found = frame_doubts(self.landmarks.mapping_distance_m, self.mapping_poses)
+        doubt = "" if self.mesh is None else mesh_doubt(self.landmarks.points, self._mesh_space.raycaster)
+        return (*found, f"The mesh: {doubt}") if doubt else found
 
     @cached_property
     def methods(self) -> tuple[str, ...]:
@@ -188,6 +190,7 @@ def open_map(
     """
     from wheretolook.mapping.beside import photographs_of
     from wheretolook.mapping.opened_map import open_colmap
+    from wheretolook.mapping.plausibility import warn_of_mesh
     from wheretolook.view.photographs import Photographs
 
     landmarks, camera, poses = open_colmap(path, camera)
@@ -201,7 +204,10 @@ def open_map(
         known = map_weights(path, data, landmarks.points, features)
     else:
         known = given_weights(weights, features)
-    return Opened(name, landmarks, camera, poses, known, _mesh(mesh), photographs=shown, device=device)
+    opened = Opened(name, landmarks, camera, poses, known, _mesh(mesh), photographs=shown, device=device)
+    if mesh is not None:
+        warn_of_mesh(mesh, landmarks.points, opened.space.raycaster)
+    return opened
 
 
 def open_scene(

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import io
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,6 +18,7 @@ from wheretolook.view.session import Session
 from wheretolook.view.worker import SOON
 
 if TYPE_CHECKING:
+    from wheretolook.select.views import SelectedViews
     from wheretolook.select.where_to_look import WhereToLook
 
 MOST = 500  # waypoints
@@ -25,16 +27,28 @@ WAIT_S = 20.0  # for a browser to draw a picture
 LARGEST_PX = 2160
 
 
-def views_file(look: WhereToLook, points: Float, n: int, format: str) -> bytes:
-    """The file of the n best views at points (W, 3) m, in a format of `FILES`; formats of one view each get that.
+def views_at(look: WhereToLook, points: Float, n: int, format: str) -> Iterator[SelectedViews]:
+    """The n best views at each of points (W, 3) m, one point at a time; for formats of one view each the best.
 
     Raises a TableError for points outside the map or inside geometry.
     """
+    from wheretolook.select.surroundings import usable_waypoints
+    from wheretolook.select.waypoints import Waypoints
+
+    usable_waypoints(look.localization_map, Waypoints.of(points))
+    for number, point in enumerate(points):
+        found = look.best(point, 1 if FILES[format][0] in ("tum", "benchmark") else n, ids=(str(number),))
+        yield replace(found, waypoint=found.waypoint + number)
+
+
+def views_file(views: Sequence[SelectedViews], format: str) -> bytes:
+    """The file of views of several points, one after another, in a format of `FILES`."""
+    from wheretolook.select.views import joined
+
     kind, ending = FILES[format]
-    views = look.best(points, 1 if kind in ("tum", "benchmark") else n)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"views{ending}"
-        views.save(path, kind)
+        joined(views).save(path, kind)
         return path.read_bytes()
 
 
@@ -94,7 +108,11 @@ class WaypointList:
         check_value(session.controls.format, next(iter(FILES)))
         format = str(session.controls.format.value)
         look = session.shared.look(session.state.method, session.state.occlusion)
-        content = views_file(look, np.array(self.points), session.state.n, format)
+        views = []
+        for found in views_at(look, np.array(self.points), session.state.n, format):
+            views.append(found)
+            yield  # others do not wait for hundreds of places
+        content = views_file(views, format)
         session.client.send_file_download(f"views{FILES[format][1]}", content, save_immediately=True)
         yield
 

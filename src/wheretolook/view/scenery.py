@@ -24,6 +24,8 @@ AT_ONCE = 2  # places of a floor between two looks at what is more urgent: one f
 ABOVE_GROUND_M = 0.03  # a floor is drawn over carpets
 READ_S = 1.5  # until a browser has read a mesh
 MOST_SHOWN = 400_000  # landmarks that are sent to a browser
+FEW = 20_000  # of them, while a slow browser turns
+ALL, THINNED = "/landmarks", "/landmarks-thinned"
 
 
 class Scenery:
@@ -76,20 +78,29 @@ class Scenery:
             self.scene.remove_by_name(name)
 
     def _landmarks(self, points: Float) -> None:
-        if len(points) == 0:
-            self.scene.remove_by_name("/landmarks")
-            return
-        center = points.mean(0)  # from the origin, single precision would be coarse in a map far from it
-        self.scene.add_point_cloud(
-            "/landmarks",
-            (points - center).astype(np.float32),
-            (150, 150, 155),
-            point_size=0.0018 * self.shared.size_m,
-            point_shape="circle",
-            precision="float32",
-            position=center,
-            point_shading="flat",
-        )
+        step = -(-len(points) // FEW)
+        for name, part in ((ALL, points), (THINNED, points[::step] if step > 1 else points[:0])):
+            if len(part) == 0:
+                self.scene.remove_by_name(name)
+                continue
+            center = part.mean(0)  # from the origin, single precision would be coarse in a map far from it
+            self.scene.add_point_cloud(
+                name,
+                (part - center).astype(np.float32),
+                (150, 150, 155),
+                point_size=0.0018 * self.shared.size_m,
+                point_shape="circle",
+                precision="float32",
+                position=center,
+                point_shading="flat",
+                visible=name == ALL,
+            )
+
+    def thin(self, thinned: bool) -> None:
+        """Show some of the landmarks instead of all, where they are many."""
+        whole, some = (self.scene.get_handle_by_name(name) for name in (ALL, THINNED))
+        if whole is not None and some is not None:
+            whole.visible, some.visible = not thinned, thinned
 
     def fill(self, state: ViewState) -> Iterator[None]:
         """Colour the floor, some places at each step."""

@@ -7,6 +7,7 @@ import io
 import logging
 import re
 import threading
+import time
 import warnings
 from collections.abc import Mapping
 from dataclasses import replace
@@ -110,7 +111,7 @@ class Viewer:
                 Player(session)
             if state.eye is not None and state.target is not None:
                 client.camera.position, client.camera.look_at = np.array(state.eye), np.array(state.target)
-            client.scene.on_click()(lambda event: session.safely(lambda: self._clicked(session, waypoints, event)))
+            client.scene.on_click()(session.newest(lambda event: self._clicked(session, waypoints, event)))
             if problem is not None:
                 session.failed(problem)
             if client.client_id not in self.server.get_clients():
@@ -195,10 +196,21 @@ def _server(host: str, port: int, label: str) -> Any:
     return made
 
 
-def _one_line(record: logging.LogRecord) -> bool:
-    """Tell of a connection or a message that failed in a line: a client that sends nonsense is no fault of ours."""
-    if record.exc_info and record.exc_info[1] is not None:
-        error = record.exc_info[1]
-        record.msg, record.args = f"what a client sent was of no use: {type(error).__name__}: {error}", ()
-        record.exc_info, record.exc_text = None, None
-    return True
+class _OneLine(logging.Filter):
+    """Tell of connections and messages that failed in a line, and at most one a second: a client that sends nonsense is
+    no fault of ours, and may send much of it."""
+
+    _told = -1.0
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        if record.exc_info and record.exc_info[1] is not None:
+            now = time.monotonic()
+            if now - self._told < 1.0:
+                return False
+            self._told, error = now, record.exc_info[1]
+            record.msg, record.args = f"what a client sent was of no use: {type(error).__name__}: {error}", ()
+            record.exc_info, record.exc_text = None, None
+        return True
+
+
+_one_line = _OneLine()  # one for all servers of this process

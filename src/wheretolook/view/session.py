@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Coroutine, Iterator
 from dataclasses import replace
 from threading import Lock
 from typing import TYPE_CHECKING, Any
@@ -22,7 +22,8 @@ from wheretolook.view.scores import Place, landmarks_seen, look_around, report_o
 from wheretolook.view.shared import Shared
 from wheretolook.view.state import ViewState
 from wheretolook.view.texts import plain
-from wheretolook.view.worker import LATER, NOW, SOON
+from wheretolook.view.turning import Turning
+from wheretolook.view.worker import LATER, NOW, SOON, Worker
 
 if TYPE_CHECKING:
     from viser import ClientHandle
@@ -31,6 +32,8 @@ _log = logging.getLogger(__name__)
 
 IN_THE_WAY = ("/sphere", "/view", "/views", "/turn", "/seen")
 """What stands in the way of one who looks from the place itself."""
+
+NOTICE_S = 0.5  # at least, between two notices of what went wrong
 
 PATH_COLORS = ((120, 120, 120), (213, 94, 0), (0, 114, 178), (0, 158, 115), (204, 121, 167))
 
@@ -49,12 +52,14 @@ class Session:
         self.state = replace(state, method=method, occlusion=occlusion, height=height)
         self.place: Place | None = None
         self.axis: Float | None = None
-        self.closed, self._lock = False, Lock()
+        self.closed, self._lock, self._inbox = False, Lock(), Worker(f"client {client.client_id}")
+        self._failed = -NOTICE_S  # when this client was told what went wrong
         self._follows = 0.0  # when the browser's camera was last put somewhere by the program
         self._gizmo: Any = None
         self._outside: Any = None  # where the scene was seen from before one stood in it
         self.controls = build(client.gui, shared, self.state)
         self.scenery = Scenery(client.scene, shared, self.controls)
+        self._turning_camera = Turning(self._thin)
         self._connect()
         self.draw_scene()
         self.fill_floor()
@@ -71,25 +76,33 @@ class Session:
 
         before = [getattr(handle, "value", None)]
 
-        def checked() -> None:
+        def checked(_: object) -> None:
             check_value(handle, before[0])
             before[0] = getattr(handle, "value", None)
             then()
 
-        getattr(handle, event)(lambda told: None if by_hand and told.client is None else self.safely(checked))
+        getattr(handle, event)(self.newest(checked, by_hand))
 
-    def safely(self, then: Callable[[], None]) -> None:
-        """Do something; an error becomes a notice."""
-        try:
-            if not self.closed:
-                then()
-        except Exception as error:
-            self.failed(error)
+    def newest(self, then: Callable[[Any], None], by_hand: bool = False) -> Callable[[Any], Coroutine[Any, Any, None]]:
+        """A callback for viser: does something with an event in the thread of this client, unless a newer one has come.
+
+        A function that is no coroutine viser would queue for each message, in threads that all clients share: one that
+        floods would hold up the others.
+        """
+        kind = object()
+
+        async def noted(event: Any) -> None:
+            if not (by_hand and event.client is None):
+                self._inbox.submit(self.client.client_id, kind, NOW, _once(lambda: then(event)), self.failed)
+
+        return noted
 
     def failed(self, error: Exception) -> None:
-        """Tell this client what went wrong."""
-        if self.closed:
+        """Tell this client what went wrong, unless it was just told of something: all it sends may be wrong."""
+        now = time.monotonic()
+        if self.closed or now - self._failed < NOTICE_S:
             return
+        self._failed = now
         if isinstance(error, WhereToLookError):
             body = str(error)
         else:
@@ -125,7 +138,7 @@ class Session:
             self.on(c.shown[name], self.draw_scene)
         self.on(c.limits, self.judge)
         self.on(c.dark, lambda: self.theme(bool(c.dark.value)))
-        self.client.camera.on_update(lambda _: self.safely(self._camera_moved))
+        self.client.camera.on_update(self.newest(lambda _: self._camera_moved()))
 
     def theme(self, dark: bool) -> None:
         """Light or dark; the ground of the dark scene is grey, since low scores are dark themselves."""
@@ -196,8 +209,14 @@ class Session:
         camera = self.opened.camera
         return 2 * float(np.arctan(camera.height / 2 / camera.mean_focal_px))
 
+    def _thin(self, thinned: bool) -> None:
+        if not self.closed:
+            with self.client.atomic():
+                self.scenery.thin(thinned)
+
     def _camera_moved(self) -> None:
         camera = self.client.camera
+        self._turning_camera.moved()
         point = tuple(float(x) for x in camera.position), tuple(float(x) for x in camera.look_at)
         if np.isfinite(point).all():
             self.note(eye=point[0], target=point[1])
@@ -268,7 +287,7 @@ class Session:
             depth_test=False,
             line_width=1.5,
         )
-        self._gizmo.on_update(lambda _: self.safely(self._dragged))
+        self._gizmo.on_update(self.newest(lambda _: self._dragged()))
 
     def _dragged(self) -> None:
         self.turn_to(rotation_from_quaternion(self._gizmo.wxyz)[:, 2], rings=True)
@@ -357,6 +376,7 @@ class Session:
     def close(self) -> None:
         """The client has gone."""
         self.closed = True
+        self._inbox.stop(wait=False)
         self.shared.worker.forget(self.client.client_id)
 
 

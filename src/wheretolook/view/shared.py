@@ -34,6 +34,7 @@ class Shared:
         self.opened, self.paths, self.worker = opened, paths or {}, Worker()
         self.low_m, self.high_m, self.usual_m = heights_of(opened.space, centers_of(opened))
         self.size_m = size_of(opened.landmarks.points)
+        self.doubts = opened.doubts
         self._floors: OrderedDict[tuple[str, str, float], Floor] = OrderedDict()
         self._meshes: OrderedDict[float | None, bytes] = OrderedDict()
         self._lock = Lock()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable, Hashable, Iterator
@@ -16,6 +17,9 @@ QUIET_S, PATIENCE_S = 0.4, 4.0
 """So long after a view was turned nothing is begun that can wait, as the next turn would have to wait for its step;
 unless for so long nothing of that kind was done: where many look, somebody always turns."""
 
+CLICK_PATIENCE_S = 1.0
+"""After so long without a place being done, one goes before turns: a client that floods turns without end."""
+
 _log = logging.getLogger(__name__)
 
 
@@ -23,28 +27,33 @@ _log = logging.getLogger(__name__)
 class _Job:
     urgency: int
     turn: int
-    key: tuple[Hashable, str] = field(compare=False)
+    key: tuple[Hashable, Hashable] = field(compare=False)
     steps: Iterator[object] = field(compare=False)
     failed: Callable[[Exception], None] = field(compare=False)
 
 
 class Worker:
-    """Computes jobs, iterators each, one step at a time.
+    """Computes jobs, iterators each, one step at a time, in a thread of this name.
 
     Scorers are not for several threads, and two cores have no more to give. Between two steps a more urgent job goes
     first; jobs as urgent take turns, so that nobody waits for all of another's floor. While somebody turns a view,
-    floors wait. A job that raises is told so, by `failed`, and ends; others go on.
+    floors wait. None waits for ever. A job that raises is told so, by `failed`, and ends; others go on.
     """
 
-    def __init__(self) -> None:
-        self._jobs: dict[tuple[Hashable, str], _Job] = {}
+    def __init__(self, name: str = "scores") -> None:
+        self._jobs: dict[tuple[Hashable, Hashable], _Job] = {}
         self._turns, self._wake, self._stopped = itertools.count(), threading.Condition(), False
-        self._turned = self._waited = -PATIENCE_S  # when a view was turned, and when what can wait was done last
-        self._thread = threading.Thread(target=self._run, name="scores", daemon=True)
+        self._done = dict.fromkeys((NOW, SOON, LATER), -math.inf)  # when one as urgent was done last
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
     def submit(
-        self, owner: Hashable, kind: str, urgency: int, steps: Iterator[object], failed: Callable[[Exception], None]
+        self,
+        owner: Hashable,
+        kind: Hashable,
+        urgency: int,
+        steps: Iterator[object],
+        failed: Callable[[Exception], None],
     ) -> None:
         """Do a job of an owner, in place of the one of that kind that is still to be done."""
         with self._wake:
@@ -57,12 +66,13 @@ class Worker:
             for key in [key for key in self._jobs if key[0] == owner]:
                 del self._jobs[key]
 
-    def stop(self) -> None:
-        """End after the step that is being done."""
+    def stop(self, wait: bool = True) -> None:
+        """End after the step that is being done; wait for it, unless told not to."""
         with self._wake:
             self._stopped = True
             self._wake.notify()
-        self._thread.join(timeout=10)
+        if wait:
+            self._thread.join(timeout=10)
 
     def _run(self) -> None:
         while True:
@@ -71,16 +81,22 @@ class Worker:
                     self._wake.wait()
                 if self._stopped:
                     return
-                job = min(self._jobs.values())
-                until = min(self._turned + QUIET_S, self._waited + PATIENCE_S) - time.monotonic()
+                job, now = self._next(), time.monotonic()
+                until = min(self._done[NOW] + QUIET_S, self._done[LATER] + PATIENCE_S) - now
                 if job.urgency == LATER and until > 0:
                     self._wake.wait(until)
                     continue
             self._step(job)
-            if job.urgency == NOW:
-                self._turned = time.monotonic()
-            elif job.urgency == LATER:
-                self._waited = time.monotonic()
+            self._done[job.urgency] = time.monotonic()
+
+    def _next(self) -> _Job:
+        """The most urgent job, or a less urgent one whose kind has waited for too long."""
+        for urgency, patience_s in ((SOON, CLICK_PATIENCE_S), (LATER, PATIENCE_S)):
+            if time.monotonic() - self._done[urgency] > patience_s:
+                waiting = [job for job in self._jobs.values() if job.urgency == urgency]
+                if waiting:
+                    return min(waiting)
+        return min(self._jobs.values())
 
     def _step(self, job: _Job) -> None:
         goes_on = False

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from wheretolook.features.aliked_batch import detect_and_describe, found_plain
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.features.descriptors import quantize_descriptors, unit_descriptors
 from wheretolook.features.extraction import KeypointExtractor
@@ -152,6 +153,42 @@ def test_learned_extractors_give_unit_descriptors_within_the_image(method, tmp_p
         assert nothing.descriptors.shape == (0, kind_of(method).dimension)
     assert len(extractor.extract(image()[:16, :40])) <= 50
     assert extractor.extract_batch([]) == []
+
+
+@pytest.mark.parametrize("least", [0.0, 0.9])  # as a share of scores: of all maxima, and of few
+def test_aliked_finds_in_a_batch_what_kornia_finds_image_by_image(least, tmp_path):
+    torch = pytest.importorskip("torch")
+    extractor = KeypointExtractor(ExtractorConfig("aliked", weights=str(untrained("aliked", tmp_path))))
+    network = extractor._extraction._network
+    whole = np.stack([image(seed) for seed in range(4)])
+    whole[2], whole[3, :50] = 128, 40  # two images with flat parts, one has nothing else
+    images = torch.from_numpy(whole).permute(0, 3, 1, 2) / 255
+    with torch.inference_mode():
+        scores = network.extract_dense_map(images)[1]
+        network.dkd.scores_th = float(scores.quantile(least)) if least else float(scores.min()) - 1e-3
+        network.dkd.n_limit = 300  # of which some images have more
+        found, plain = detect_and_describe(network, images), found_plain(network, images)
+    assert len(found) == 4 and any(0 < len(each[2]) < 300 for each in plain)
+    for (pixels, descriptors, scored), expected in zip(found, plain, strict=True):
+        assert len(pixels) == len(expected[0])
+        np.testing.assert_allclose(pixels, expected[0], atol=1e-3)
+        np.testing.assert_allclose(descriptors, expected[1], atol=2e-4)
+        np.testing.assert_allclose(scored, expected[2], atol=1e-5)
+
+
+def test_matches_of_images_that_go_together_are_those_of_each_alone(monkeypatch):
+    landmarks = unit(500, 64).astype(np.float16)
+    images = [
+        (unit_descriptors(landmarks[rows] + 0.05 * unit(len(rows), 64, 1))).astype(np.float16)
+        for rows in (np.arange(90), np.arange(0), np.arange(40, 300), np.arange(7))
+    ]
+    for descriptors in (landmarks, landmarks[:0], -np.abs(landmarks)):  # the last are unlike every keypoint
+        matcher = SimilarityMatcher(descriptors)
+        monkeypatch.setattr("wheretolook.features.similarity._TOGETHER", {"cpu": 3})
+        for (keypoints, rows), of_image in zip(matcher.match(images, -1.0), images, strict=True):
+            expected = mutual_plain(of_image, descriptors, -1.0) if len(of_image) and len(descriptors) else ([], [])
+            np.testing.assert_array_equal(keypoints, expected[0])
+            np.testing.assert_array_equal(rows, expected[1])
 
 
 def test_images_that_go_together_hold_as_much_as_their_pixels(tmp_path):

@@ -18,6 +18,7 @@ _LEAST_SCORE = 0.2  # of a keypoint, the authors' own
 def _build(config: ExtractorSettings, device: str) -> Extraction:
     from torch import Tensor, nn
 
+    from wheretolook.features.aliked_batch import detect_and_describe
     from wheretolook.features.learned import Found, LearnedExtraction, kornia_feature, load_state
 
     class Aliked(LearnedExtraction):
@@ -29,8 +30,8 @@ def _build(config: ExtractorSettings, device: str) -> Extraction:
 
         def detect(self, images: Tensor) -> list[Found]:
             # ALIKED counts pixels from the middle of the first
-            found = self._network(images)
-            return [(each.keypoints + 0.5, each.descriptors, each.keypoint_scores) for each in found]
+            found = detect_and_describe(self._network, images)
+            return [(pixels + 0.5, descriptors, scores) for pixels, descriptors, scores in found]
 
     return Aliked(config, device)
 

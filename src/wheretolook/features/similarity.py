@@ -13,6 +13,7 @@ from torch import Tensor
 from wheretolook.features.matching import Matches
 
 _PRODUCTS = {"cpu": 2**22, "cuda": 2**25}  # at a time: of a CPU they stay in its cache, on a GPU more are slower
+_TOGETHER = {"cpu": 1, "cuda": 16}  # images: those of learned features are few keypoints, and a GPU waits for each step
 
 
 class SimilarityMatcher:
@@ -35,26 +36,40 @@ class SimilarityMatcher:
         """
         # OpenMP's limit is per thread: without this, the first product in a new thread would start a thread per core.
         torch.set_num_threads(torch.get_num_threads())
-        return [self._match(of_image, min_similarity) for of_image in descriptors]
+        together = _TOGETHER[self.device.type]
+        return [
+            found
+            for start in range(0, len(descriptors), together)
+            for found in self._match(descriptors[start : start + together], min_similarity)
+        ]
 
-    def _match(self, descriptors: NDArray[np.float16], min_similarity: float) -> Matches:
-        n = len(descriptors)
-        if n == 0 or self.n_landmarks == 0:
-            return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
-        queries = torch.from_numpy(descriptors).to(self.device, self._number)
-        best = torch.full((n,), -torch.inf, device=self.device)
-        rows = torch.zeros(n, dtype=torch.int64, device=self.device)
+    def _match(self, descriptors: Sequence[NDArray[np.float16]], min_similarity: float) -> list[Matches]:
+        """Of images that go together. Their keypoints lie in rows as long as that of the image with most."""
+        counts = np.array([len(of_image) for of_image in descriptors])
+        images, most = len(counts), counts.max()
+        if most == 0 or self.n_landmarks == 0:
+            return [(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)) for _ in descriptors]
+        padded = np.zeros((images, most, self._descriptors.shape[1]), np.float16)
+        for row, of_image in zip(padded, descriptors, strict=True):
+            row[: len(of_image)] = of_image
+        queries = torch.from_numpy(padded).to(self.device, self._number).flatten(0, 1)
+        missing = torch.from_numpy(np.arange(most) >= counts[:, None]).to(self.device)[..., None]
+        best = torch.full((images, most), -torch.inf, device=self.device)
+        rows = torch.zeros((images, most), dtype=torch.int64, device=self.device)
         keypoint_of: list[Tensor] = []
-        block = max(1, _PRODUCTS[self.device.type] // n)
+        block = max(1, _PRODUCTS[self.device.type] // len(queries))
         for start in range(0, self.n_landmarks, block):
-            product = self._product(queries, self._descriptors[start : start + block])
-            keypoint_of.append(product.argmax(0))
-            value, row = product.max(1)
+            product = self._product(queries, self._descriptors[start : start + block]).view(images, most, -1)
+            product = product.masked_fill_(missing, -torch.inf)
+            keypoint_of.append(product.argmax(1))
+            value, row = product.max(2)
             better = value > best
             best, rows = torch.where(better, value, best), torch.where(better, row + start, rows)
-        mutual = torch.cat(keypoint_of)[rows] == torch.arange(n, device=self.device)
-        keypoints = (mutual & (best >= min_similarity)).nonzero()[:, 0]
-        return keypoints.cpu().numpy(), rows[keypoints].cpu().numpy()
+        mutual = torch.cat(keypoint_of, 1).gather(1, rows) == torch.arange(most, device=self.device)
+        image, keypoint = (mutual & (best >= min_similarity) & ~missing[..., 0]).nonzero().unbind(1)
+        found = torch.stack([image, keypoint, rows[image, keypoint]]).cpu().numpy()
+        ends = np.searchsorted(found[0], np.arange(1, images))
+        return list(zip(np.split(found[1], ends), np.split(found[2], ends), strict=True))
 
     def _product(self, queries: Tensor, landmarks: Tensor) -> Tensor:
         if self.device.type == "cpu":

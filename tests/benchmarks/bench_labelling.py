@@ -6,7 +6,8 @@
 SCENE is the folder of a mapped scene, with its `mesh.glb` and `map/`. First one process does the stages one after the
 other, in batches, waiting for the device after each: rendering, extraction (of ALIKED also its parts), matching, pose.
 `--variants` extracts the same images in other ways and tells how many keypoints stay: half is autocast to half
-precision, channels_last the order of memory that suits tensor cores. `--products` matches with other sizes of a block
+precision, channels_last the order of memory that suits tensor cores, contiguous the other one, plain kornia's ALIKED.
+`--together` matches the images of a batch so many at a time. `--products` matches with other sizes of a block
 of products, in bytes, and tells what each holds on the GPU. Then, with `--workers`, so many processes label the same
 views as the label stage does; told is the rate between the first tenth and the last, without their start.
 """
@@ -26,7 +27,7 @@ import numpy as np
 import torch
 
 from wheretolook.dataset.folders import SceneFolder
-from wheretolook.features import matching, similarity
+from wheretolook.features import aliked_batch, matching, similarity
 from wheretolook.features.extraction import KeypointExtractor
 from wheretolook.labelling import labeller
 from wheretolook.labelling.config import LabelConfig
@@ -64,7 +65,7 @@ class Stages:
             with self(name):
                 return inner(*arguments, **options)
 
-        object.__setattr__(owner, method, call)
+        setattr(owner, method, call)
 
     def told(self, n: int) -> str:
         """Milliseconds a view."""
@@ -79,13 +80,9 @@ def by_stage(folder: SceneFolder, renderer: Any, views: Any, batch: int, device:
     for warm in (True, False):
         clock = Stages(device)
         if not warm and hasattr(network, "dkd"):
-            for method, name in (
-                ("extract_dense_map", "of it dense maps"),
-                ("dkd", "detection"),
-                ("desc_head", "description"),
-            ):
-                clock.timed(network if method == "extract_dense_map" else getattr(network, method),
-                            method if method == "extract_dense_map" else "forward", name)  # fmt: skip
+            clock.timed(network, "extract_dense_map", "of it dense maps")
+            clock.timed(aliked_batch, "_detected", "detection")
+            clock.timed(aliked_batch, "_described", "description")
         for start in range(0, min(len(views), 2 * batch) if warm else len(views), batch):
             at = views[start : start + batch]
             with clock("render"):
@@ -109,7 +106,14 @@ def variant(folder: SceneFolder, images: list[Any], name: str, batch: int, devic
     usual, other = KeypointExtractor(config, device), KeypointExtractor(config, device)
     extraction: Any = other._extraction
     kind = torch.device(device).type
-    if name == "channels_last":
+    if name == "plain":
+        extraction.detect = lambda x: [
+            (at + 0.5, *rest) for at, *rest in aliked_batch.found_plain(extraction._network, x)
+        ]
+    elif name == "contiguous":
+        inner = extraction.detect
+        extraction.detect = lambda x: inner(x.contiguous())
+    elif name == "channels_last":
         extraction._network.to(memory_format=torch.channels_last)
         inner = extraction.detect
         extraction.detect = lambda x: inner(x.contiguous(memory_format=torch.channels_last))
@@ -143,14 +147,17 @@ def variant(folder: SceneFolder, images: list[Any], name: str, batch: int, devic
     print(f"{name}: {ms}, {told}; cosine of descriptors {likeness} (5 %, median)", flush=True)
 
 
-def blocks(folder: SceneFolder, images: list[Any], sizes: list[int], device: str) -> None:
-    """Matches with blocks of products of other sizes, for learned features and SIFT."""
+def blocks(folder: SceneFolder, images: list[Any], sizes: list[int], at_a_time: list[int], device: str) -> None:
+    """Matches with blocks of products of other sizes, and so many images at a time."""
     landmarks = Landmarks.load(folder.landmarks)
     localizer = Localizer(landmarks, next(iter(folder.cameras().values())), None, extractor_of(folder), device)
-    keypoints, kind = localizer.extract(images[:8]), torch.device(device).type
-    for size in sizes:
-        matching._PRODUCT_BYTES[kind] = size
-        similarity._PRODUCTS[kind] = size // 4
+    keypoints, kind = localizer.extract(images[:16]), torch.device(device).type
+    for size, together in [(size, 0) for size in sizes] + [(0, n) for n in at_a_time]:
+        if together:
+            similarity._TOGETHER[kind] = together
+        else:
+            matching._PRODUCT_BYTES[kind] = size
+            similarity._PRODUCTS[kind] = size // 4
         spent = []
         for n in range(12):
             if device != "cpu" and n == 2:
@@ -162,9 +169,8 @@ def blocks(folder: SceneFolder, images: list[Any], sizes: list[int], device: str
             spent.append(1000 * clock.seconds["match"] / len(keypoints))
         held = f", {torch.cuda.max_memory_reserved() / 1e9:.2f} GB held" if device != "cpu" else ""
         text = bench_scenes.format_spread(bench_scenes.spread(spent[2:]), 2)
-        print(
-            f"blocks of {size / 2**20:.0f} MiB, {len(landmarks):,} landmarks: match {text} ms a view{held}", flush=True
-        )
+        what = f"{together} images at a time" if together else f"blocks of {size / 2**20:.0f} MiB"
+        print(f"{what}, {len(landmarks):,} landmarks: match {text} ms a view{held}", flush=True)
 
 
 def together(folder: SceneFolder, table: Any, workers: int, device: str) -> None:
@@ -199,8 +205,15 @@ def main() -> None:
     add("scene", type=Path, metavar="SCENE")
     add("--views", type=int, default=400, help="number of viewpoints (default: %(default)s)")
     add("--batches", nargs="*", type=int, default=[8], help="views that go together (default: 8)")
-    add("--variants", nargs="*", choices=["half", "channels_last"], default=[], help="other ways to extract")
+    add(
+        "--variants",
+        nargs="*",
+        choices=["plain", "contiguous", "half", "channels_last"],
+        default=[],
+        help="other ways to extract",
+    )
     add("--products", nargs="*", type=int, default=[], help="bytes of a block of products")
+    add("--together", nargs="*", type=int, default=[], help="images to match at a time")
     add("--workers", nargs="*", type=int, default=[], help="numbers of processes to label with")
     add("--device", default="cpu")
     args = parser.parse_args()
@@ -214,7 +227,7 @@ def main() -> None:
         )
     table = table.iloc[np.linspace(0, len(table) - 1, min(args.views, len(table))).astype(int)].reset_index(drop=True)
     images: list[Any] = []
-    if args.batches or args.variants or args.products:
+    if args.batches or args.variants or args.products or args.together:
         from wheretolook.scenes.loading import load_mesh
 
         renderer = WarpRenderer(load_mesh(folder.mesh), args.device)
@@ -223,8 +236,8 @@ def main() -> None:
             images = by_stage(folder, renderer, at, batch, args.device)
         for name in args.variants:
             variant(folder, images, name, args.batches[-1], args.device)
-        if args.products:
-            blocks(folder, images, args.products, args.device)
+        if args.products or args.together:
+            blocks(folder, images, args.products, args.together, args.device)
     for workers in args.workers:
         together(folder, table, workers, args.device)
 

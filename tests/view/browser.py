@@ -121,10 +121,10 @@ class Tab:
 class Browser:
     """Several tabs of one browser, whose profile lies in a folder."""
 
-    def __init__(self, folder: Path, size: tuple[int, int] = (1280, 800)) -> None:
+    def __init__(self, folder: Path, size: tuple[int, int] = (1280, 800), angle: str = "swiftshader") -> None:
         program = chromium()
         assert program is not None
-        options = ["--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--use-angle=swiftshader"]
+        options = ["--headless=new", "--no-sandbox", "--disable-dev-shm-usage", f"--use-angle={angle}"]
         options += [
             "--enable-unsafe-swiftshader",
             "--ignore-gpu-blocklist",

@@ -34,7 +34,6 @@ from wheretolook.view.controls import check_value, value_of
 from wheretolook.view.opened import open_map
 from wheretolook.view.played import FORWARD, Played, looking_ahead, read_paths
 from wheretolook.view.saving import views_at, views_file
-from wheretolook.view.scenery import ALL, THINNED
 from wheretolook.view.server import Viewer, where_clicked
 from wheretolook.view.session import Session
 from wheretolook.view.shared import Shared
@@ -345,25 +344,38 @@ def test_a_flood_of_messages_holds_nobody_else_up(sparse: Path) -> None:
         flooded.stop()
 
 
-@pytest.mark.parametrize(("pause_s", "slow"), [(0.12, True), (0.005, False)])
-def test_a_browser_that_draws_slowly_is_shown_fewer_landmarks_while_it_turns(
-    pause_s: float, slow: bool, viewer: Viewer, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("pause_s", "least"), [(0.12, 20), (0.05, 400), (0.005, 400)])
+def test_a_browser_that_draws_slowly_is_shown_fewer_and_fewer_landmarks_while_it_turns(
+    pause_s: float, least: int, viewer: Viewer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("wheretolook.view.scenery.FEW", 100)
+    monkeypatch.setattr("wheretolook.view.scenery.FEWER", (500, 100, 20))  # of 400 there are
     with _client(viewer) as client:
         client.send(camera_message())
         _until(lambda: viewer.sessions)
         (session,) = viewer.sessions.values()
-        thinned: list[bool] = []
         _until(lambda: session.client.scene._scene_pointer_cb)
-        whole, some = (session.scene.get_handle_by_name(name) for name in (ALL, THINNED))
-        assert len(whole.points) == 400 and len(some.points) == 100 and whole.visible and not some.visible
-        for _ in range(8):
+        clouds = [session.scene.get_handle_by_name(f"/landmarks{name}") for name in ("", "-1", "-2", "-3")]
+        assert clouds[1] is None
+        clouds.remove(None)
+        assert [len(cloud.points) for cloud in clouds] == [400, 100, 20]
+
+        def drawn() -> list[int]:
+            return [len(cloud.points) for cloud in clouds if cloud.visible]
+
+        seen = drawn()
+        assert seen == [400]
+        for _ in range(30):
             client.send(camera_message())
             time.sleep(pause_s)
-            thinned.append(some.visible)
-        assert any(thinned) == slow and not thinned[0]
-        _until(lambda: whole.visible and not some.visible, 2)  # it stands still
+            seen += drawn()
+        steps = [400, 100, 20]
+        assert list(dict.fromkeys(seen)) == steps[: steps.index(least) + 1]
+        _until(lambda: drawn() == [400], 2)  # it stands still
+        if least < 400:  # and begins again, with what it was shown last
+            for _ in range(3):
+                client.send(camera_message())
+                time.sleep(pause_s)
+            assert drawn() == [20]
 
 
 def test_turns_without_end_do_not_keep_places_and_floors_waiting(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -24,8 +24,7 @@ AT_ONCE = 2  # places of a floor between two looks at what is more urgent: one f
 ABOVE_GROUND_M = 0.03  # a floor is drawn over carpets
 READ_S = 1.5  # until a browser has read a mesh
 MOST_SHOWN = 400_000  # landmarks that are sent to a browser
-FEW = 20_000  # of them, while a slow browser turns
-ALL, THINNED = "/landmarks", "/landmarks-thinned"
+FEWER = (20_000, 5_000, 1_500)  # of them, while a slow browser turns: the slower it is, the fewer
 
 
 class Scenery:
@@ -78,14 +77,15 @@ class Scenery:
             self.scene.remove_by_name(name)
 
     def _landmarks(self, points: Float) -> None:
-        step = -(-len(points) // FEW)
-        for name, part in ((ALL, points), (THINNED, points[::step] if step > 1 else points[:0])):
-            if len(part) == 0:
-                self.scene.remove_by_name(name)
+        for less, most in enumerate((len(points), *FEWER)):
+            step = -(-len(points) // max(1, most))
+            if len(points) == 0 or (less and step == 1):
+                self.scene.remove_by_name(_cloud(less))
                 continue
+            part = points[::step]
             center = part.mean(0)  # from the origin, single precision would be coarse in a map far from it
             self.scene.add_point_cloud(
-                name,
+                _cloud(less),
                 (part - center).astype(np.float32),
                 (150, 150, 155),
                 point_size=0.0018 * self.shared.size_m,
@@ -93,14 +93,18 @@ class Scenery:
                 precision="float32",
                 position=center,
                 point_shading="flat",
-                visible=name == ALL,
+                visible=less == 0,
             )
 
-    def thin(self, thinned: bool) -> None:
-        """Show some of the landmarks instead of all, where they are many."""
-        whole, some = (self.scene.get_handle_by_name(name) for name in (ALL, THINNED))
-        if whole is not None and some is not None:
-            whole.visible, some.visible = not thinned, thinned
+    def thin(self, less: int) -> None:
+        """Show all landmarks (0), or some of them (1 to the number of `FEWER`), where they are more."""
+        clouds = {n: self.scene.get_handle_by_name(_cloud(n)) for n in range(len(FEWER) + 1)}
+        drawn = [n for n, cloud in clouds.items() if cloud is not None]
+        shown = max((n for n in drawn if n <= less), default=0)
+        for n in drawn:
+            cloud: Any = clouds[n]
+            if cloud.visible != (n == shown):
+                cloud.visible = n == shown
 
     def fill(self, state: ViewState) -> Iterator[None]:
         """Colour the floor, some places at each step."""
@@ -176,3 +180,8 @@ class Scenery:
         segments = drawing.label_arrows(told.positions, told.axes, colors, self.shared.mark_m)
         self.scene.add_line_segments("/labels", *segments, thickness=2.0, thickness_units="screen")
         self.controls.judged.content = text
+
+
+def _cloud(less: int) -> str:
+    """The name of all landmarks (0), or of some of them."""
+    return f"/landmarks-{less}" if less else "/landmarks"

@@ -17,7 +17,7 @@ from wheretolook.planning.turns import pan_tilt_angles
 from wheretolook.utils.errors import ConfigError, TableError, WhereToLookError
 from wheretolook.view import drawing
 from wheretolook.view.controls import build, check_value, value_of
-from wheretolook.view.scenery import Scenery
+from wheretolook.view.scenery import FEWER, Scenery
 from wheretolook.view.scores import Place, landmarks_seen, look_around, report_of
 from wheretolook.view.shared import Shared
 from wheretolook.view.state import ViewState
@@ -59,7 +59,7 @@ class Session:
         self._outside: Any = None  # where the scene was seen from before one stood in it
         self.controls = build(client.gui, shared, self.state)
         self.scenery = Scenery(client.scene, shared, self.controls)
-        self._turning_camera = Turning(self._thin)
+        self._turning_camera = Turning(self._thin, len(FEWER))
         self._connect()
         self.draw_scene()
         self.fill_floor()
@@ -209,10 +209,10 @@ class Session:
         camera = self.opened.camera
         return 2 * float(np.arctan(camera.height / 2 / camera.mean_focal_px))
 
-    def _thin(self, thinned: bool) -> None:
+    def _thin(self, less: int) -> None:
         if not self.closed:
             with self.client.atomic():
-                self.scenery.thin(thinned)
+                self.scenery.thin(less)
 
     def _camera_moved(self) -> None:
         camera = self.client.camera

@@ -1,24 +1,30 @@
-"""When a browser that draws slowly is to be shown less: while its camera moves."""
+"""How much a browser that draws slowly is to be shown while its camera moves."""
 
 from __future__ import annotations
 
+import statistics
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 
 SLOW_S, IN_A_ROW = 1 / 15, 3
 """A browser tells its camera with each picture it draws, at most fifty times a second: so many so far apart, and it
-draws slowly."""
+draws slowly. Then it is shown less and less, until it draws smoothly or there is nothing to leave out."""
+SMOOTH_S, LAST = 1 / 28, 5  # the median of so many gaps
 PAUSE_S = 1.0  # no picture takes so long: the camera stood still
 STILL_S = 0.3  # after which all is shown again
 
 
 class Turning:
-    """Calls `thin` with True when the camera of a slow browser begins to move, and with False when it stands still."""
+    """Calls `show` with 1 when the camera of a slow browser begins to move, with 2 up to `most` while that still is too
+    much for it, and with 0 when the camera stands still. What was too much is not tried again.
+    """
 
-    def __init__(self, thin: Callable[[bool], None]) -> None:
-        self._thin, self._lock = thin, threading.Lock()
-        self._moved, self._slow = -PAUSE_S, 0  # when the camera has, and how many slow pictures in a row
+    def __init__(self, show: Callable[[int], None], most: int) -> None:
+        self._show, self._most, self._lock = show, most, threading.Lock()
+        self._moved, self._less = -PAUSE_S, 0  # when the camera has; how much less is shown while it moves
+        self._gaps_s: deque[float] = deque(maxlen=LAST)
         self._timer: threading.Timer | None = None  # one at most, while the camera moves
 
     def moved(self) -> None:
@@ -26,12 +32,23 @@ class Turning:
         with self._lock:
             now = time.monotonic()
             gap_s, self._moved = now - self._moved, now
-            if self._slow < IN_A_ROW:
-                self._slow = self._slow + 1 if SLOW_S < gap_s < PAUSE_S else 0
-            if self._slow < IN_A_ROW or self._timer is not None:
-                return
-            self._wait(STILL_S)
-        self._thin(True)
+            if gap_s < PAUSE_S:
+                self._gaps_s.append(gap_s)
+            changed = self._less < self._most and self._is_slow()
+            if changed:
+                self._less += 1
+                self._gaps_s.clear()
+            begins = self._less > 0 and self._timer is None
+            if begins:
+                self._wait(STILL_S)
+            less = self._less
+        if changed or begins:
+            self._show(less)
+
+    def _is_slow(self) -> bool:
+        if self._less == 0:
+            return len(self._gaps_s) >= IN_A_ROW and min(list(self._gaps_s)[-IN_A_ROW:]) > SLOW_S
+        return len(self._gaps_s) == LAST and statistics.median(self._gaps_s) > SMOOTH_S
 
     def _wait(self, seconds: float) -> None:
         self._timer = threading.Timer(seconds, self._look)
@@ -45,4 +62,5 @@ class Turning:
                 self._wait(rest_s)
                 return
             self._timer = None
-        self._thin(False)
+            self._gaps_s.clear()
+        self._show(0)

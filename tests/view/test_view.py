@@ -64,10 +64,18 @@ def test_a_state_survives_text_and_link() -> None:
     assert link.startswith("http://localhost:8080/?websocket=ws://localhost:8080/?view=")
     assert not {*link.partition("?")[2]} & {*' &#%+"<>'}  # the browser takes it as it is
     assert ViewState.of_path("/" + link.rpartition("/")[2]) == STATE
+    far = replace(STATE, place=(431207.125, 5412345.5, 312.046), eye=(431207.0, 5412345.5, 312.05), cut=1234.05)
+    assert ViewState.parse(far.text()) == far
     assert ViewState.of_path("/") is None and ViewState.of_path("/?other=1") is None
 
 
-@pytest.mark.parametrize("text", ["n=0", "n=x", "height=nan", "place=1,2", "place=1,2,inf", "what=1", "n", "x" * 3000])
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("n=0", "n=x", "height=nan", "place=1,2", "place=1,2,inf", "what=1", "n", "x" * 3000),
+        "eye=1,2,3;target=1,2,3",  # looks nowhere
+    ],
+)
 def test_nonsense_is_no_state(text: str) -> None:
     with pytest.raises(ConfigError):
         ViewState.parse(text)

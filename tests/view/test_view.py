@@ -408,6 +408,20 @@ def test_all_is_shown_at_last_however_long_less_took_to_be_shown() -> None:
     assert shown[0] == 1 and shown[-1] == 0
 
 
+def test_the_slow_picture_that_a_turn_begins_with_does_not_end_it() -> None:
+    shown: list[int] = []
+    turning = Turning(shown.append, 1)
+    for step in range(5):
+        turning.moved((float(step), 0.0, 9.0), (0.0, 0.0, 0.0))
+        time.sleep(0.2)
+    _until(lambda: shown == [1, 0], 2)
+    for step in range(2):
+        turning.moved((5.0 + step, 0.0, 9.0), (0.0, 0.0, 0.0))
+        time.sleep(0.4 if step == 0 else 0.0)
+    assert shown == [1, 0, 1]
+    _until(lambda: shown == [1, 0, 1, 0], 2)
+
+
 def test_turns_without_end_do_not_keep_places_and_floors_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("wheretolook.view.worker.PATIENCE_S", 0.5)
     monkeypatch.setattr("wheretolook.view.worker.CLICK_PATIENCE_S", 0.2)

@@ -30,6 +30,7 @@ class Turning:
         self._moved, self._less = -PAUSE_S, 0  # when the camera has; how much less is shown while it moves
         self._eye: Point = (0.0, 0.0, 0.0)  # where it was then, and the point it looked at
         self._target = self._eye
+        self._slow_s = 0.0  # between pictures when it was found slow
         self._gaps_s: deque[float] = deque(maxlen=LAST)
         self._timer: threading.Timer | None = None  # one at most, while the camera moves
 
@@ -46,10 +47,11 @@ class Turning:
             changed = self._less < self._most and self._is_slow()
             if changed:
                 self._less += 1
+                self._slow_s = max(self._slow_s, statistics.median(self._gaps_s))
                 self._gaps_s.clear()
             begins = self._less > 0 and self._timer is None
             if begins:
-                self._wait(STILL_S)
+                self._wait(STILL_S + self._slow_s)  # the picture that is being drawn still shows all
             if changed or begins:
                 self._show(self._less)  # nothing may come between, or less would be shown for good
 

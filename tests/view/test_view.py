@@ -39,6 +39,7 @@ from wheretolook.view.session import Session
 from wheretolook.view.shared import Shared
 from wheretolook.view.state import ViewState
 from wheretolook.view.texts import plain
+from wheretolook.view.turning import Turning
 from wheretolook.view.worker import LATER, NOW, SOON, Worker
 from wheretolook.viewpoints.table import pose_columns
 
@@ -63,10 +64,18 @@ def test_a_state_survives_text_and_link() -> None:
     assert link.startswith("http://localhost:8080/?websocket=ws://localhost:8080/?view=")
     assert not {*link.partition("?")[2]} & {*' &#%+"<>'}  # the browser takes it as it is
     assert ViewState.of_path("/" + link.rpartition("/")[2]) == STATE
+    far = replace(STATE, place=(431207.125, 5412345.5, 312.046), eye=(431207.0, 5412345.5, 312.05), cut=1234.05)
+    assert ViewState.parse(far.text()) == far
     assert ViewState.of_path("/") is None and ViewState.of_path("/?other=1") is None
 
 
-@pytest.mark.parametrize("text", ["n=0", "n=x", "height=nan", "place=1,2", "place=1,2,inf", "what=1", "n", "x" * 3000])
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("n=0", "n=x", "height=nan", "place=1,2", "place=1,2,inf", "what=1", "n", "x" * 3000),
+        "eye=1,2,3;target=1,2,3",  # looks nowhere
+    ],
+)
 def test_nonsense_is_no_state(text: str) -> None:
     with pytest.raises(ConfigError):
         ViewState.parse(text)
@@ -254,14 +263,14 @@ def _client(viewer: Viewer, view: str = "", headers=None):  # type: ignore[no-un
 
     address = f"ws://127.0.0.1:{viewer.port}/{view}"
     protocols = [f"viser-v{viser.__version__}"]
-    return connect(address, subprotocols=protocols, max_size=None, additional_headers=headers)  # type: ignore[arg-type]
+    return connect(address, subprotocols=protocols, max_size=None, close_timeout=1, additional_headers=headers)  # type: ignore[arg-type]
 
 
-def camera_message() -> bytes:
-    """What a browser says of its camera when it joins."""
+def camera_message(x: float = 0.0) -> bytes:
+    """What a browser says of its camera when it joins, and where it then goes."""
     import msgspec
 
-    about = {"wxyz": [1, 0, 0, 0], "position": [0, 0, 9], "fov": 1.0, "near": 0.1, "far": 99.0}
+    about = {"wxyz": [1, 0, 0, 0], "position": [x, 0, 9], "fov": 1.0, "near": 0.1, "far": 99.0}
     about |= {"look_at": [0, 0, 0], "up_direction": [0, 0, 1], "image_height": 600, "image_width": 800}
     return msgspec.msgpack.encode({"type": "ViewerCameraMessage", **about})
 
@@ -344,9 +353,12 @@ def test_a_flood_of_messages_holds_nobody_else_up(sparse: Path) -> None:
         flooded.stop()
 
 
-@pytest.mark.parametrize(("pause_s", "least"), [(0.12, 20), (0.05, 400), (0.005, 400)])
+@pytest.mark.parametrize(
+    ("pause_s", "step_m", "least"),
+    [(0.12, 0.4, 20), (0.12, 0.1, 400), (0.05, 0.4, 400), (0.005, 0.4, 400)],  # a slow hand is no slow browser
+)
 def test_a_browser_that_draws_slowly_is_shown_fewer_and_fewer_landmarks_while_it_turns(
-    pause_s: float, least: int, viewer: Viewer, monkeypatch: pytest.MonkeyPatch
+    pause_s: float, step_m: float, least: int, viewer: Viewer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("wheretolook.view.scenery.FEWER", (500, 100, 20))  # of 400 there are
     with _client(viewer) as client:
@@ -354,28 +366,60 @@ def test_a_browser_that_draws_slowly_is_shown_fewer_and_fewer_landmarks_while_it
         _until(lambda: viewer.sessions)
         (session,) = viewer.sessions.values()
         _until(lambda: session.client.scene._scene_pointer_cb)
-        clouds = [session.scene.get_handle_by_name(f"/landmarks{name}") for name in ("", "-1", "-2", "-3")]
-        assert clouds[1] is None
-        clouds.remove(None)
-        assert [len(cloud.points) for cloud in clouds] == [400, 100, 20]
 
-        def drawn() -> list[int]:
-            return [len(cloud.points) for cloud in clouds if cloud.visible]
+        def sizes(seen_alone: bool) -> list[int]:
+            clouds = [session.scene.get_handle_by_name(f"/landmarks{name}") for name in ("", "-1", "-2", "-3")]
+            return [len(cloud.points) for cloud in clouds if cloud is not None and (cloud.visible or not seen_alone)]
 
-        seen = drawn()
-        assert seen == [400]
-        for _ in range(30):
-            client.send(camera_message())
-            time.sleep(pause_s)
-            seen += drawn()
+        def turn(times: int) -> list[int]:
+            seen = []
+            for step in range(times):
+                client.send(camera_message(step_m * (step + 1)))
+                time.sleep(0.02 * (pause_s > 0.1))
+                client.send(camera_message(step_m * (step + 1)))  # a browser tells it once more
+                time.sleep(pause_s - 0.02 * (pause_s > 0.1))
+                seen += sizes(True)
+            return seen
+
+        assert sizes(False) == [400, 100, 20] and sizes(True) == [400]
         steps = [400, 100, 20]
-        assert list(dict.fromkeys(seen)) == steps[: steps.index(least) + 1]
-        _until(lambda: drawn() == [400], 2)  # it stands still
+        assert list(dict.fromkeys([400, *turn(30)])) == steps[: steps.index(least) + 1]
+        _until(lambda: sizes(True) == [400], 2)  # it stands still
         if least < 400:  # and begins again, with what it was shown last
-            for _ in range(3):
-                client.send(camera_message())
-                time.sleep(pause_s)
-            assert drawn() == [20]
+            assert turn(3)[-1] == 20
+            session.draw_scene()  # such as cut elsewhere
+            assert sizes(False) == [400, 100, 20] and sizes(True) == [20]
+            _until(lambda: sizes(True) == [400], 2)
+
+
+def test_all_is_shown_at_last_however_long_less_took_to_be_shown() -> None:
+    shown = []
+
+    def show(less: int) -> None:
+        time.sleep(0.5 if less else 0.0)  # longer than a camera must stand still
+        shown.append(less)
+
+    turning = Turning(show, 1)
+    for step in range(5):
+        turning.moved((float(step), 0.0, 9.0), (0.0, 0.0, 0.0))
+        time.sleep(0.1)
+    _until(lambda: len(shown) > 1 and turning._timer is None)
+    time.sleep(0.2)
+    assert shown[0] == 1 and shown[-1] == 0
+
+
+def test_the_slow_picture_that_a_turn_begins_with_does_not_end_it() -> None:
+    shown: list[int] = []
+    turning = Turning(shown.append, 1)
+    for step in range(5):
+        turning.moved((float(step), 0.0, 9.0), (0.0, 0.0, 0.0))
+        time.sleep(0.2)
+    _until(lambda: shown == [1, 0], 2)
+    for step in range(2):
+        turning.moved((5.0 + step, 0.0, 9.0), (0.0, 0.0, 0.0))
+        time.sleep(0.4 if step == 0 else 0.0)
+    assert shown == [1, 0, 1]
+    _until(lambda: shown == [1, 0, 1, 0], 2)
 
 
 def test_turns_without_end_do_not_keep_places_and_floors_waiting(monkeypatch: pytest.MonkeyPatch) -> None:

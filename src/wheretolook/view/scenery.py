@@ -38,6 +38,7 @@ class Scenery:
         self._floor: Floor | None = None
         self._mesh: bytes | None = None
         self._mesh_name = ""
+        self._less, self._drawing = 0, threading.Lock()  # of landmarks; drawn and thinned in several threads
 
     def draw(self, state: ViewState, inside: bool = False) -> None:
         """Draw mesh, landmarks and mapping cameras, as far as they are to be seen; the mesh whole and nothing else for
@@ -77,34 +78,36 @@ class Scenery:
             self.scene.remove_by_name(name)
 
     def _landmarks(self, points: Float) -> None:
-        for less, most in enumerate((len(points), *FEWER)):
-            step = -(-len(points) // max(1, most))
-            if len(points) == 0 or (less and step == 1):
-                self.scene.remove_by_name(_cloud(less))
-                continue
-            part = points[::step]
-            center = part.mean(0)  # from the origin, single precision would be coarse in a map far from it
-            self.scene.add_point_cloud(
-                _cloud(less),
-                (part - center).astype(np.float32),
-                (150, 150, 155),
-                point_size=0.0018 * self.shared.size_m,
-                point_shape="circle",
-                precision="float32",
-                position=center,
-                point_shading="flat",
-                visible=less == 0,
-            )
+        with self._drawing:
+            parts = [points, *(points[:: max(1, -(-len(points) // most))] for most in FEWER)]
+            drawn = [n for n, part in enumerate(parts) if len(part) > 0 and (n == 0 or len(part) < len(points))]
+            for n, part in enumerate(parts):
+                if n not in drawn:
+                    self.scene.remove_by_name(_cloud(n))
+                    continue
+                center = part.mean(0)  # from the origin, single precision would be coarse in a map far from it
+                self.scene.add_point_cloud(
+                    _cloud(n),
+                    (part - center).astype(np.float32),
+                    (150, 150, 155),
+                    point_size=0.0018 * self.shared.size_m,
+                    point_shape="circle",
+                    precision="float32",
+                    position=center,
+                    point_shading="flat",
+                    visible=n == _shown(drawn, self._less),
+                )
 
     def thin(self, less: int) -> None:
         """Show all landmarks (0), or some of them (1 to the number of `FEWER`), where they are more."""
-        clouds = {n: self.scene.get_handle_by_name(_cloud(n)) for n in range(len(FEWER) + 1)}
-        drawn = [n for n, cloud in clouds.items() if cloud is not None]
-        shown = max((n for n in drawn if n <= less), default=0)
-        for n in drawn:
-            cloud: Any = clouds[n]
-            if cloud.visible != (n == shown):
-                cloud.visible = n == shown
+        with self._drawing:
+            self._less = less
+            clouds = {n: self.scene.get_handle_by_name(_cloud(n)) for n in range(len(FEWER) + 1)}
+            drawn = [n for n, cloud in clouds.items() if cloud is not None]
+            for n in drawn:
+                cloud: Any = clouds[n]
+                if cloud.visible != (n == _shown(drawn, less)):
+                    cloud.visible = not cloud.visible
 
     def fill(self, state: ViewState) -> Iterator[None]:
         """Colour the floor, some places at each step."""
@@ -180,6 +183,11 @@ class Scenery:
         segments = drawing.label_arrows(told.positions, told.axes, colors, self.shared.mark_m)
         self.scene.add_line_segments("/labels", *segments, thickness=2.0, thickness_units="screen")
         self.controls.judged.content = text
+
+
+def _shown(drawn: list[int], less: int) -> int:
+    """Which of the clouds that are drawn is shown."""
+    return max((n for n in drawn if n <= less), default=0)
 
 
 def _cloud(less: int) -> str:

@@ -216,10 +216,11 @@ class Session:
 
     def _camera_moved(self) -> None:
         camera = self.client.camera
-        self._turning_camera.moved()
-        point = tuple(float(x) for x in camera.position), tuple(float(x) for x in camera.look_at)
-        if np.isfinite(point).all():
-            self.note(eye=point[0], target=point[1])
+        (ex, ey, ez), (tx, ty, tz) = (map(float, point) for point in (camera.position, camera.look_at))
+        eye, target = (ex, ey, ez), (tx, ty, tz)
+        if np.isfinite((eye, target)).all():
+            self._turning_camera.moved(eye, target)
+            self.note(eye=eye, target=target)
             self.submit("state", LATER, _once(self.tell_state))
         if self.controls.through.value and time.monotonic() - self._follows > 0.3:
             self.turn_to(rotation_from_quaternion(camera.wxyz)[:, 2])

@@ -56,7 +56,10 @@ class ViewState:
                 found[name] = _READ[name](value)
             except (KeyError, ValueError, TypeError) as error:
                 raise ConfigError("this is no state of a view", value=part, fix=_FIX) from error
-        return cls(**found)  # type: ignore[arg-type]
+        state = cls(**found)  # type: ignore[arg-type]
+        if state.eye is not None and state.eye == state.target:
+            raise ConfigError("a scene is seen from elsewhere than the point looked at", value=state.eye, fix=_FIX)
+        return state
 
     @classmethod
     def of_path(cls, path: str) -> Self | None:
@@ -76,7 +79,8 @@ _FIX = "Copy it from the field `state` of the viewer, such as n=3;height=1.4;pla
 
 
 def _short(value: object) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+    """To the millimetre, however far a map lies from its origin."""
+    return f"{value:.3f}".rstrip("0").rstrip(".") if isinstance(value, float) else str(value)
 
 
 def _number(text: str) -> float:

@@ -216,6 +216,18 @@ def test_weights_that_are_not_the_networks(method, tmp_path, monkeypatch):
         with pytest.raises(WeightsError, match=rf"{name}.*{all_extractors()[method].weights}.*--map.extractor.weights"):
             KeypointExtractor(ExtractorConfig(method, weights=str(tmp_path / name)))
 
+    torch = pytest.importorskip("torch")
+    torch.save({"a": Path()}, tmp_path / "object.pth")
+    with pytest.raises(WeightsError, match=r"object\.pth: cannot read.*: it holds more than tensors") as caught:
+        KeypointExtractor(ExtractorConfig(method, weights=str(tmp_path / "object.pth")))
+    assert "weights_only" not in str(caught.value)  # PyTorch's advice to load it nevertheless
+    state = torch.load(weights, weights_only=True)
+    tensors = state["extractor"] if method == "disk" else state
+    next(value for value in tensors.values() if value.is_floating_point()).view(-1)[0] = torch.nan
+    torch.save(state, tmp_path / "nan.pth")
+    with pytest.raises(WeightsError, match=r"nan\.pth: these weights hold numbers that are not finite"):
+        KeypointExtractor(ExtractorConfig(method, weights=str(tmp_path / "nan.pth")))
+
     def offline(*arguments, **options):
         raise OSError("Name or service not known")
 

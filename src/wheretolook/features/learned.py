@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any
 
 import numpy as np
@@ -123,6 +124,8 @@ def load_state(
             state = load_state_dict_from_url(list(urls), map_location="cpu", timeout=30)
     except Exception as error:  # the unpickler and the network raise errors of many kinds
         reason = str(error).strip().partition("\n")[0].partition(" Cache path:")[0].rstrip(".") or type(error).__name__
+        if isinstance(error, UnpicklingError):  # PyTorch's own text tells how to load it nevertheless
+            reason = "it holds more than tensors, or none"
         problem = f"cannot read the weights: {reason}" if weights else f"{name} cannot be downloaded: {reason}"
         raise WeightsError(problem, path=weights or None, fix=fix) from error
     try:
@@ -132,4 +135,6 @@ def load_state(
     except (RuntimeError, AttributeError, TypeError, ValueError, KeyError) as error:
         problem = f"these weights are not those of {type(network).__name__} as in {name}"
         raise WeightsError(problem, path=weights or None, fix=fix) from error
+    if not all(bool(tensor.isfinite().all()) for tensor in network.state_dict().values()):
+        raise WeightsError("these weights hold numbers that are not finite", path=weights or None, fix=fix)
     return network

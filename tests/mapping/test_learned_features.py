@@ -91,7 +91,9 @@ def test_learned_descriptors_are_read_and_averaged(tmp_path, kind, source):
         again = Landmarks.load(tmp_path / "landmarks.npz")
         assert again.features == features_of(tmp_path / "landmarks.npz") == kind.name
         assert (again.descriptors is None) == compact
-    known, found = read_features(path, ["0.png"])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        known, found = read_features(path, ["0.png"])
     assert known is kind
     np.testing.assert_allclose(found[0][0], keypoints[0], atol=1e-4)
     np.testing.assert_allclose(found[0][1], stored[0], atol=2e-3)
@@ -113,9 +115,40 @@ def test_what_hdf5_does_not_say_its_numbers_tell(tmp_path):
         (tmp_path / name).mkdir()
         _, folder, keypoints, stored = case(tmp_path / name, all_kinds()[name])
         assert load_colmap_landmarks(folder, hdf5_of(tmp_path / name / "f.h5", keypoints, stored)).features == name
-    with pytest.warns(MapWarning, match=r"no descriptors of a kind that is known.*aliked"):  # or disk: who knows?
+    # or disk: who knows?
+    with pytest.warns(MapWarning, match=r"no descriptors of a kind that is known.*say so in the file's name: feats-al"):
         _, folder, keypoints, stored = case(tmp_path, all_kinds()["disk"])
         assert load_colmap_landmarks(folder, hdf5_of(tmp_path / "f.h5", keypoints, stored)).features == ""
+
+
+@pytest.mark.parametrize("times", [1.0, 2.5, 6.0])  # as large as 640 x 480
+def test_hdf5_in_half_precision_is_of_the_model_that_hloc_makes_of_it(tmp_path, times):
+    """hloc keeps pixels as halves, and adds half a pixel as halves when it writes them into COLMAP's database."""
+    kind = all_kinds()["superpoint"]
+    model, keypoints = hand_written_model()
+    stored = [kind.store(unit(len(found), kind.dimension, seed)) for seed, found in enumerate(keypoints)]
+    # the last keypoint of each image, of those that are compared, lies in its far corner
+    spread = [found * times + [0, 0] for found in keypoints]
+    for found in spread:
+        found[-1] = np.array([639.3, 479.6]) * times
+    halves = [(found - 0.5).astype(np.float16) for found in spread]
+    for image_id, of_image in enumerate(halves, 1):
+        for point, pixel in zip(model.images[image_id].points2D, of_image + np.float16(0.5), strict=True):
+            point.xy = pixel.astype(np.float64)
+    folder = written(model, tmp_path / "model")
+    path = hdf5_of(tmp_path / "feats-superpoint-n4096-r1024.h5", [of + 0.5 for of in halves], stored)
+    import h5py
+
+    with h5py.File(path, "a") as file:
+        for name, of_image in zip(("0.png", "1.png", "2.png"), halves, strict=True):
+            _replaced(file[name], "keypoints", data=of_image)
+    assert load_colmap_landmarks(folder, path).features == kind.name
+    with h5py.File(path, "a") as file:  # those of other photographs are not
+        moved = halves[0].copy()
+        moved[-1] -= np.float16(8)
+        _replaced(file["0.png"], "keypoints", data=moved)
+    with pytest.raises(MapError, match="other keypoints than the model"):
+        load_colmap_landmarks(folder, path)
 
 
 def test_features_that_do_not_fit(tmp_path):
@@ -126,6 +159,15 @@ def test_features_that_do_not_fit(tmp_path):
         load_colmap_landmarks(folder, path)
     path = hdf5_of(tmp_path / "feats-aliked.h5", keypoints, stored, names=("0.png", "other.png", "2.png"))
     with pytest.raises(MapError, match=r"lack an image of the model.*1\.png"):
+        load_colmap_landmarks(folder, path)
+    path = hdf5_of(tmp_path / "feats-sift.h5", keypoints, [descriptors[:, :64] for descriptors in stored])
+    with pytest.raises(MapError, match=r"feats-sift\.h5: descriptors of sift have 128 numbers \(got 64\)"):
+        load_colmap_landmarks(folder, path)
+    path = database_of(tmp_path / "narrow.db", model, keypoints, stored, kinds["aliked"])
+    with sqlite3.connect(path) as database:
+        database.execute("UPDATE descriptors SET cols = 256, data = substr(data, 1, 256 * rows)")
+    database.close()
+    with pytest.raises(MapError, match=r"narrow\.db: descriptors of aliked take 512 bytes each \(got 256\)"):
         load_colmap_landmarks(folder, path)
     path = database_of(tmp_path / "mixed.db", model, keypoints, stored, kinds["aliked"])
     with sqlite3.connect(path) as database:
@@ -164,6 +206,7 @@ def _replaced(group, name, **made):
         (lambda g: g["keypoints"].write_direct(np.full(g["keypoints"].shape, np.nan)), "no finite numbers"),
         (lambda g: g["descriptors"].write_direct(np.full(g["descriptors"].shape, np.nan, "f2")), "no finite numbers"),
         (lambda g: _replaced(g, "descriptors", data=np.full(g["descriptors"].shape, b"x")), "cannot read"),
+        (lambda g: g.pop("descriptors"), "1.png has no descriptors"),
     ],
 )  # fmt: skip
 def test_hdf5_that_was_made_to_hurt(tmp_path, spoil, told):
@@ -246,3 +289,10 @@ def test_one_warning_says_that_weights_have_learnt_from_other_features(name):
     assert len(said) == 1 and said[0].filename == __file__
     assert ("best views" if name != "superpoint" else "not known") in str(said[0].message)
     assert np.isfinite(scorer.score(pose[None])).all()
+
+
+@pytest.mark.parametrize(("name", "told"), [("disk", "they lose 14"), ("xfeat", "they lose 18"), ("superpoint", "not")])
+def test_weights_by_aliked_on_maps_by_others_say_what_was_measured(name, told):
+    landmarks, _ = room(all_kinds()[name])
+    with pytest.warns(OutOfRangeWarning, match=f"learnt from maps by aliked, and this one is by {name}.*{told}"):
+        load_scorer("data/release/weights/aliked/set.safetensors", LocalizationMap(landmarks, PinholeCamera()))

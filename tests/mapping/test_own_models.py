@@ -250,7 +250,7 @@ def test_features_in_hdf5_need_h5py(tmp_path, monkeypatch):
     folder = written(hand_written_model()[0], tmp_path / "model")
     (tmp_path / "feats.h5").write_bytes(b"not HDF5")
     monkeypatch.setitem(sys.modules, "h5py", None)  # as where it is not installed
-    with pytest.raises(MapError, match=r"feats\.h5.*pip install h5py"):
+    with pytest.raises(MapError, match=r"feats\.h5.*pip install 'wheretolook\[hloc\]'"):
         LocalizationMap.from_colmap(folder, camera=1, database=tmp_path / "feats.h5")
 
 

@@ -28,7 +28,7 @@ _TABLES = ("images", "keypoints", "descriptors", _TABLE)  # that are read
 _LEAST_ROW = 4  # bytes that a row takes at least
 _STEPS = 10_000  # of SQLite's machine, between two looks at how many there were
 _FREE_STEPS, _STEPS_OF_BYTE = 20_000_000, 10  # that a database may take, and for each of its bytes; a row takes some 10
-_MOST = 1e15  # what no pixel and no number of a descriptor comes near
+_MOST = np.float32(1e15)  # what no pixel and no number of a descriptor comes near
 # An image's keypoints (K, 2) in pixels, its descriptors (K, D) as `DescriptorKind.store` gives them, and their kind;
 # None where it has none, or of a kind that is not known.
 _Features = tuple[NDArray[np.float64], NDArray[Any] | None, DescriptorKind | None]
@@ -66,7 +66,7 @@ def read_descriptors(
                 problem = f"the database and the model disagree on the number of keypoints of {name}"
                 raise MapError(problem, path=path, value=(len(keypoints), number), fix=mismatch)
             of_model = [image.points2D[0].xy, image.points2D[-1].xy] if number else []
-            if number and np.abs(keypoints[[0, -1]] - of_model).max() > 0.01:
+            if number and (np.abs(keypoints[[0, -1]] - of_model) > _tolerance_px(keypoints[[0, -1]], path)).any():
                 problem = "the database holds other keypoints than the model"
                 raise MapError(problem, path=path, value=name, fix=mismatch)
             rows = order[ends[row] : ends[row + 1]]
@@ -87,6 +87,8 @@ def read_descriptors(
             f"{path} holds no descriptors of a kind that is known ({', '.join(all_kinds())}), so how easily landmarks "
             "are mistaken for one another (their ambiguity) is unknown; scores do without it"
         )
+        if path.suffix.lower() in HDF5_SUFFIXES and _kind_in_name(path) is None:
+            text += ". If they are of one of these, say so in the file's name: feats-aliked.h5"
         warnings.warn(text, MapWarning, stacklevel=2)
         return None
     return kind, found
@@ -123,6 +125,16 @@ def _same(kind: DescriptorKind | None, of_image: DescriptorKind, path: Path, nam
     return of_image
 
 
+def _tolerance_px(keypoints: NDArray[np.float64], path: Path) -> NDArray[np.float64]:
+    """How far keypoints of a file of features may be from those of the model that was built from it.
+
+    hloc keeps them in half precision, and adds half a pixel in it, which from 1024 pixels on moves them by as much.
+    """
+    if path.suffix.lower() not in HDF5_SUFFIXES:
+        return np.full(keypoints.shape, 0.01)
+    return 0.01 + np.spacing(np.clip(np.abs(keypoints), 0, 2.0**15).astype(np.float16)).astype(np.float64) / 2
+
+
 def _reader(path: Path, mismatch: str) -> Any:
     return (_hdf5 if path.suffix.lower() in HDF5_SUFFIXES else _database)(path, mismatch)
 
@@ -152,11 +164,11 @@ def _kind_written(database: sqlite3.Connection) -> DescriptorKind | None:
 
 def _fitting(named: DescriptorKind | None, numbers: int, path: Path) -> DescriptorKind | None:
     """The kind of learned descriptors of so many numbers: the one named, or else the only one that has as many."""
+    if named is not None and named.dimension != numbers:
+        problem = f"descriptors of {named.name} have {named.dimension} numbers"
+        fix = "Name the file by what is in it, as hloc does: feats-disk.h5, feats-superpoint.h5."
+        raise MapError(problem, path=path, value=numbers, fix=fix)
     if named is not None and not named.in_bytes:
-        if named.dimension != numbers:
-            problem = f"descriptors of {named.name} have {named.dimension} numbers"
-            fix = "Name the file by what is in it, as hloc does: feats-disk.h5, feats-superpoint.h5."
-            raise MapError(problem, path=path, value=numbers, fix=fix)
         return named
     kinds = [kind for kind in all_kinds().values() if not kind.in_bytes and kind.dimension == numbers]
     return kinds[0] if len(kinds) == 1 else None
@@ -234,8 +246,11 @@ def _kind_in_database(
         return SIFT
     if colmap_type == -1:
         return _fitting(named, columns // 4, path) if columns and columns % 4 == 0 else None
-    said = [kind for kind in all_kinds().values() if kind.colmap_type == colmap_type]
-    return said[0] if said and said[0].columns == columns else None
+    said = next((kind for kind in all_kinds().values() if kind.colmap_type == colmap_type), None)
+    if said is not None and not said.in_bytes and columns not in (0, said.columns):
+        problem = f"descriptors of {said.name} take {said.columns} bytes each"
+        raise MapError(problem, path=path, value=columns, fix="Extract features again, or give no database.")
+    return said if said is not None and said.columns == columns else None
 
 
 @contextmanager
@@ -244,7 +259,7 @@ def _hdf5(path: Path, mismatch: str) -> Iterator[Callable[[str], _Features]]:
     try:
         import h5py
     except ImportError as error:
-        fix = "pip install h5py, or leave the features out."
+        fix = "pip install 'wheretolook[hloc]', or leave the features out."
         raise MapError("features in HDF5 are read with h5py, which is not installed", path=path, fix=fix) from error
     try:
         check_file(path)
@@ -257,6 +272,9 @@ def _hdf5(path: Path, mismatch: str) -> Iterator[Callable[[str], _Features]]:
             def read(name: str) -> _Features:
                 if name not in file:
                     raise MapError("the features lack an image of the model", path=path, value=name, fix=mismatch)
+                lacking = [what for what in ("keypoints", "descriptors") if f"{name}/{what}" not in file]
+                if lacking:
+                    raise ValueError(f"{name} has no {' and no '.join(lacking)}")
                 # hloc counts pixels from the centre of the top-left one, COLMAP from its corner
                 keypoints = _stored(file[name]["keypoints"], name).astype(np.float64)[:, :2] + 0.5
                 descriptors = _stored(file[name]["descriptors"], name).T

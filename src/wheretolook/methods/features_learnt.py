@@ -9,11 +9,15 @@ from wheretolook.utils.errors import OutOfRangeWarning
 from wheretolook.utils.shipped import WEIGHTS, or_shipped
 
 _LOST = {
-    "aliked": "Of 100 best views by ALIKED they lose 15, weights learnt by ALIKED 10, bins 33",
-    "disk": "Of 100 best views by DISK they lose 19, weights learnt by ALIKED 14, bins 35",
-    "xfeat": "Of 100 best views by XFeat they lose 17, weights learnt by ALIKED 18, bins 30",
+    ("sift", "aliked"): "Of 100 best views by ALIKED they lose 15, weights learnt by ALIKED 10, bins 33",
+    ("sift", "disk"): "Of 100 best views by DISK they lose 19, weights learnt by ALIKED 14, bins 35",
+    ("sift", "xfeat"): "Of 100 best views by XFeat they lose 17, weights learnt by ALIKED 18, bins 30",
+    ("aliked", "sift"): "Of 100 best views by SIFT they lose 9, weights learnt by SIFT 7, bins 14",
+    ("aliked", "disk"): "Of 100 best views by DISK they lose 14, weights learnt by SIFT 19, bins 35",
+    ("aliked", "xfeat"): "Of 100 best views by XFeat they lose 18, weights learnt by SIFT 17, bins 30",
 }
-"""What the default scorer learnt from SIFT costs on maps by other features, as measured (docs/features.md)."""
+"""What the default scorer costs that has learnt from the first features, on maps by the second, as measured
+(docs/features.md)."""
 
 
 def folder_for(folder: Path, features: str) -> Path:
@@ -33,7 +37,7 @@ def warn_of_features(of_map: str, weights: Path, stacklevel: int) -> None:
     if not of_map or of_map in learnt:
         return
     text = f"the weights {weights.name} have learnt from maps by {', '.join(learnt)}, and this one is by {of_map}"
-    lost = _LOST.get(of_map, "") if learnt == ["sift"] else ""
+    lost = _LOST.get((learnt[0], of_map), "") if len(learnt) == 1 else ""
     fix = f"{lost or 'How much is lost is not known'} (docs/features.md); `wheretolook check` measures it on your map"
     theirs = f"{WEIGHTS}/{of_map}"
     if or_shipped(theirs).is_dir():

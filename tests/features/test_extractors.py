@@ -14,7 +14,7 @@ from wheretolook.features.descriptors import quantize_descriptors, unit_descript
 from wheretolook.features.extraction import KeypointExtractor
 from wheretolook.features.registry import all_extractors, all_kinds, kind_of, that_extract
 from wheretolook.features.similarity import SimilarityMatcher, mutual_plain
-from wheretolook.labelling.config import LocalizerConfig
+from wheretolook.labelling.config import LabelConfig, LocalizerConfig
 from wheretolook.utils.errors import ConfigError, WeightsError
 
 LEARNED = ("aliked", "disk", "xfeat")
@@ -73,6 +73,11 @@ def test_settings_that_no_extractor_has(options, told):
 def test_a_similarity_is_a_cosine():
     with pytest.raises(ConfigError, match=r"cosine.*1\.5"):
         LocalizerConfig(min_similarity=1.5)
+
+
+def test_lightglue_needs_the_database_which_does_not_travel_to_ray():
+    with pytest.raises(ConfigError, match=r"Ray's machines.*label\.engine local"):
+        LabelConfig(LocalizerConfig(lightglue="aliked_lightglue.pth"), engine="ray")
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 700, 2000])

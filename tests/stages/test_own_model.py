@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,7 @@ from wheretolook import stages
 from wheretolook.cli import main
 from wheretolook.config import Experiment, ScenesConfig
 from wheretolook.dataset.folders import Dataset, SceneFolder
+from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.camera import CameraConfig, PinholeCamera
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
 from wheretolook.mapping.colmap_model import colmap_poses, read_model
@@ -26,7 +27,8 @@ from wheretolook.planning.config import PathConfig, PlanConfig, ViewpointMapConf
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.scenes.loading import save_glb
 from wheretolook.space.config import MappedSpaceConfig
-from wheretolook.utils.errors import ConfigError, MapError, MapWarning, SceneError
+from wheretolook.stages.inputs import extractor_of
+from wheretolook.utils.errors import ConfigError, MapError, MapWarning, SceneError, WeightsError
 from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.viewpoints.config import SampleConfig
 
@@ -276,3 +278,19 @@ def test_landmarks_are_triangulated_anew_at_known_poses(tmp_path):
     off_m = MeshRaycaster(marker_room()).distance_to_surface(points / report.scale.factor, 10.0)
     assert np.median(off_m) < 0.02
     shutil.rmtree(tmp_path / "photos")
+
+
+def test_weights_of_a_network_that_moved_since_the_map_was_made(tmp_path):
+    """Queries are extracted with the file that is named now; without one, the error says how to name it."""
+    was, now = tmp_path / "was.pth", tmp_path / "now.pth"
+    now.write_bytes(b"weights")
+    made_with = ExtractorConfig("aliked", max_keypoints=500, weights=str(was))
+    files = SceneFolder(tmp_path / "scene", "train")
+    files.map.mkdir(parents=True)
+    (files.map / "report.json").write_text(json.dumps({"config": {"extractor": asdict(made_with)}}))
+    with pytest.raises(WeightsError, match=r"was\.pth.*--map.extractor.method aliked --map.extractor.weights FILE"):
+        extractor_of(files, ExtractorConfig())
+    named = ExtractorConfig("aliked", weights=str(now))
+    assert extractor_of(files, named) == replace(made_with, weights=str(now))
+    was.write_bytes(b"weights")
+    assert extractor_of(files) == extractor_of(files, ExtractorConfig("xfeat", weights=str(now))) == made_with

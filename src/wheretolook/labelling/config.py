@@ -105,5 +105,8 @@ class LabelConfig:
     def __post_init__(self) -> None:
         if self.engine not in ("local", "ray"):
             raise ConfigError("unknown label.engine", value=self.engine, fix="Use local or ray.")
+        if self.engine == "ray" and self.localizer.lightglue:
+            fix = "Use label.engine local, or leave label.localizer.lightglue out."
+            raise ConfigError("LightGlue reads the map's database, which does not travel to Ray's machines", fix=fix)
         if self.workers < 0 or self.shard_size < 1:
             raise ConfigError("workers must be >= 0 and shard_size >= 1", value=(self.workers, self.shard_size))

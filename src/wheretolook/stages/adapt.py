@@ -245,7 +245,7 @@ def _label_for(experiment: Experiment, files: SceneFolder, scene: Scene, say: Sa
     order = np.random.default_rng(config.seed).permutation(len(ids))[row.reshape(-1)]
     table = table.iloc[np.argsort(order, kind="stable")].reset_index(drop=True)
     cameras = tuple(files.cameras().items()) if files.cameras_file.is_file() else ()
-    options = (label.localizer, extractor_of(files), scene.device, False)
+    options = (label.localizer, extractor_of(files, experiment.map.extractor), scene.device, False)
     job = SceneJob(files.mesh, files.landmarks, scene.camera, *options, cameras)
     begins = range(0, len(table), _AT_ONCE)
     parts = {begin: table.iloc[begin : begin + _AT_ONCE] for begin in begins}

@@ -135,7 +135,8 @@ def _localize(
     config, paths, tasks = experiment.label, experiment.paths, []
     joint, further = joint_paths.is_joint(paths), {}
     for scene in scenes:
-        name, files, extractor, folder = scene.name, scene.files, extractor_of(scene.files), _folder(dataset, scene)
+        name, files, folder = scene.name, scene.files, _folder(dataset, scene)
+        extractor = extractor_of(files, experiment.map.extractor)
         shards = folder / "shards"
         job = SceneJob(files.mesh, files.landmarks, scene.camera, config.localizer, extractor, scene.device)
         job = replace(job, store_pixels=joint or _holds_pixels(shards / MANIFEST))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,7 +14,7 @@ from wheretolook.dataset.names import RELEASE_FILE
 from wheretolook.dataset.scene import Scene, SceneConfig
 from wheretolook.dataset.stamps import read_stamp
 from wheretolook.geometry.camera import CameraConfig
-from wheretolook.utils.errors import ConfigError, MapError, SceneError, TableError
+from wheretolook.utils.errors import ConfigError, MapError, SceneError, TableError, WeightsError
 from wheretolook.utils.files import fingerprint
 from wheretolook.utils.options import recorded
 from wheretolook.utils.reading import read_json_object
@@ -77,10 +78,12 @@ def naming_scene(path: Path) -> Iterator[None]:
         raise type(error)(error.problem, path=path, value=error.value, fix=error.fix) from error
 
 
-def extractor_of(scene: SceneFolder) -> ExtractorConfig:
+def extractor_of(scene: SceneFolder, given: ExtractorConfig | None = None) -> ExtractorConfig:
     """The keypoint extractor the map was made with: queries must use the same.
 
-    Raises MapError without the map's report, or if its landmarks have no descriptors to match queries with.
+    Weights of a network are those that settings of the same method name, if they do: the map's may have moved. Raises
+    MapError without the map's report, or if its landmarks have no descriptors to match queries with; WeightsError if
+    the weights are not where they were.
     """
     from wheretolook.features.config import ExtractorConfig
 
@@ -93,6 +96,11 @@ def extractor_of(scene: SceneFolder) -> ExtractorConfig:
     if not report.get("has_descriptors", True):
         fix = "Run the map stage again with --database, or with --images to triangulate anew."
         raise MapError("the landmarks have no descriptors, so nothing can be localized", path=scene.map, fix=fix)
+    if given is not None and given.weights and given.method == extractor.method:
+        extractor = replace(extractor, weights=given.weights)
+    if extractor.weights and not Path(extractor.weights).is_file():
+        fix = f"Say where they are: --map.extractor.method {extractor.method} --map.extractor.weights FILE."
+        raise WeightsError("the weights that this map was made with are not there", path=extractor.weights, fix=fix)
     return extractor
 
 

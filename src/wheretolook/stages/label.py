@@ -42,7 +42,11 @@ def label(experiment: Experiment, say: Say = print, tick: Tick = lambda work: No
             raise SceneError(f"{problem}and so not labelled", path=files.folder, fix=fix)
     to_label: list[tuple[SceneFolder, str]] = []
     for files in sorted(dataset.scenes, key=lambda files: files.split == "train"):  # those to evaluate on come first
-        parts = [config.localizer.record(), extractor_of(files).record(), files.camera.record()]
+        parts = [
+            config.localizer.record(),
+            extractor_of(files, experiment.map.extractor).record(),
+            files.camera.record(),
+        ]
         made_from = [existing(files.mesh, SceneError, "scenes"), existing(files.landmarks, MapError, "map")]
         matches = [name for name in ("store_matches", "store_pixels") if getattr(config, name)]
         key = stage_key("label", [*parts, *made_from, read_stamp(files, "sample"), *matches])
@@ -75,7 +79,7 @@ def _label(
     tasks: list[LabelTask] = []
     for files, _ in to_label:
         scene = open_scene(experiment, dataset, files)
-        options = (config.localizer, extractor_of(files), scene.device, config.store_matches)
+        options = (config.localizer, extractor_of(files, experiment.map.extractor), scene.device, config.store_matches)
         cameras = tuple(files.cameras().items()) if files.cameras_file.is_file() else ()
         job = SceneJob(files.mesh, files.landmarks, scene.camera, *options, cameras, config.store_pixels)
         tasks.append(LabelTask(scene.name, job, files.read_table(), _shards(files)))

@@ -24,6 +24,7 @@ from wheretolook.mapping.colmap_model import model_arrays
 from wheretolook.mapping.descriptors import read_features
 from wheretolook.mapping.landmarks import Landmarks, features_of, load_colmap_landmarks
 from wheretolook.mapping.triangulation import fill_database, match_pairs
+from wheretolook.methods.features_learnt import folder_for
 from wheretolook.methods.registry import load_scorer
 from wheretolook.select.weights import weights_of
 from wheretolook.utils.errors import MapError, MapWarning, OutOfRangeWarning
@@ -282,13 +283,29 @@ def test_weights_that_have_learnt_by_the_features_of_the_map_score_it():
 
 
 @pytest.mark.parametrize("name", ["xfeat", "disk", "superpoint"])
-def test_one_warning_says_that_weights_have_learnt_from_other_features(name):
+def test_weights_by_aliked_score_maps_by_other_learned_features_and_say_what_that_costs(name):
     landmarks, pose = room(all_kinds()[name])
-    with pytest.warns(OutOfRangeWarning, match=f"learnt from maps by sift, and this one is by {name}") as said:
-        scorer = load_scorer(LocalizationMap(landmarks, PinholeCamera()))
+    looked, named = LocalizationMap(landmarks, PinholeCamera()), "data/release/weights"
+    with pytest.warns(OutOfRangeWarning, match=f"learnt from maps by aliked, and this one is by {name}") as said:
+        scorer = load_scorer(looked)
     assert len(said) == 1 and said[0].filename == __file__
     assert ("best views" if name != "superpoint" else "not known") in str(said[0].message)
-    assert np.isfinite(scorer.score(pose[None])).all()
+    assert "suit it better" not in str(said[0].message)
+    with pytest.warns(OutOfRangeWarning):
+        np.testing.assert_array_equal(
+            scorer.score(pose[None]), load_scorer(f"{named}/aliked/set.safetensors", looked).score(pose[None])
+        )
+    with pytest.warns(OutOfRangeWarning, match=r"by sift.*Weights that suit it better ship, .*weights/aliked"):
+        load_scorer(f"{named}/set.safetensors", looked)
+
+
+def test_without_weights_by_aliked_a_folder_s_own_score_learned_features(tmp_path):
+    for name in ("", "disk"):
+        folder_of = tmp_path / "some" / name
+        folder_of.mkdir(parents=True, exist_ok=True)
+        (folder_of / "set.safetensors").touch()
+    assert folder_for(tmp_path / "some", "xfeat") == tmp_path / "some"
+    assert folder_for(tmp_path / "some", "disk") == tmp_path / "some" / "disk"
 
 
 @pytest.mark.parametrize(("name", "told"), [("disk", "they lose 14"), ("xfeat", "they lose 18"), ("superpoint", "not")])

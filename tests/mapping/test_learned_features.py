@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sqlite3
 import warnings
 from dataclasses import replace
@@ -186,6 +187,23 @@ def test_features_that_do_not_fit(tmp_path):
         Landmarks.load(tmp_path / "orb.npz")
     with pytest.raises(MapError, match=r"described by aliked.*opencv.*--map.extractor.method"):
         Localizer(landmarks, PinholeCamera(), extractor=ExtractorConfig())
+
+
+def test_a_database_as_hloc_leaves_it_names_the_features_beside_it(tmp_path):
+    kind = all_kinds()["aliked"]
+    model, _, keypoints, stored = case(tmp_path, kind)
+    (tmp_path / "sfm").mkdir()
+    path = database_of(tmp_path / "sfm" / "database.db", model, keypoints, stored, kind)
+    with sqlite3.connect(path) as database:
+        database.execute("DELETE FROM descriptors")
+    database.close()
+    (tmp_path / "feats-aliked-n16_matches-lightglue.h5").touch()
+    (tmp_path / "global-feats-netvlad.h5").touch()
+    with pytest.raises(MapError, match=r"no descriptors of .*: --database feats-\*\.h5"):
+        read_features(path, ["0.png"])
+    theirs = hdf5_of(tmp_path / "feats-aliked-n16.h5", keypoints, stored)
+    with pytest.raises(MapError, match=re.escape(f"--database {theirs}")):
+        read_features(path, ["0.png"])
 
 
 def _replaced(group, name, **made):

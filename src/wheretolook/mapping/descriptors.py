@@ -108,13 +108,24 @@ def read_features(features: str | Path, names: Sequence[str]) -> tuple[Descripto
         for name in names:
             keypoints, descriptors, its_kind = read(name)
             if descriptors is None and len(keypoints):
-                known = ", ".join(all_kinds())
-                raise MapError(f"this image has no descriptors of {known} in the database", path=path, value=name)
+                known, fix = ", ".join(all_kinds()), _fix_by_hdf5(path)
+                problem = f"this image has no descriptors of {known} in the database"
+                raise MapError(problem, path=path, value=name, fix=fix)
             if its_kind is not None:
                 kind = _same(kind, its_kind, path, name)
             found.append((keypoints.astype(np.float32), descriptors))
     kind = kind or SIFT
     return kind, [(pixels, kind.none() if descriptors is None else descriptors) for pixels, descriptors in found]
+
+
+def _fix_by_hdf5(database: Path) -> str | None:
+    """What to give instead of a database without descriptors, as hloc leaves one: its own features, by their name."""
+    if database.suffix.lower() in HDF5_SUFFIXES:
+        return None
+    places = database.parent, database.parent.parent
+    found = [path for place in places for suffix in HDF5_SUFFIXES for path in sorted(place.glob(f"feats-*{suffix}"))]
+    named = next((path for path in found if "matches" not in path.name), "feats-*.h5")
+    return f"hloc keeps them in HDF5: --database {named}."
 
 
 def _same(kind: DescriptorKind | None, of_image: DescriptorKind, path: Path, name: str) -> DescriptorKind:
